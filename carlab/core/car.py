@@ -1,0 +1,85 @@
+"""The contract of every car, real or not."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Self
+
+from carlab.core.clock import Clock
+from carlab.core.errors import ActionOutOfRangeError
+from carlab.core.quantities import Action, ActionLimits, CarState, Health, Observation, Reality
+
+
+class Car(ABC):
+    """A car that can be driven.
+
+    Constructing does nothing. ``open`` connects and moves nothing; the car stays disarmed and takes only neutral.
+    ``arm`` lets commands through. ``stop`` and ``close`` leave the car in neutral, whatever happened before. A
+    failure latches: the car takes no command until ``reset_fault`` and a new ``arm``.
+    """
+
+    name: str
+    reality: Reality
+    limits: ActionLimits
+    clock: Clock
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect to everything; idempotent. Raises NotReadyError with every reason at once."""
+
+    @abstractmethod
+    def observe(self) -> Observation:
+        """Newest state, without blocking. Raises PoseLostError before the first pose, NotOpenError when closed."""
+
+    @abstractmethod
+    def arm(self) -> None:
+        """Let commands through. Raises NotReadyError with every reason; ActuatorFaultError while a fault is latched."""
+
+    @abstractmethod
+    def command(self, action: Action) -> Action:
+        """Hand over a command, held until the next one or until the watchdog's deadline; returns what is sent.
+
+        Raises ActionOutOfRangeError (nothing is sent), NotArmedError, ActuatorFaultError, NotOpenError.
+        """
+
+    @abstractmethod
+    def stop(self, *, planned: bool) -> None:
+        """Neutral, and disarm. ``planned=False`` latches as a fault. Never raises for a car that is closed."""
+
+    @abstractmethod
+    def reset_fault(self) -> None:
+        """Clear a latched fault; the car stays disarmed. Raises ActuatorFaultError where the cause persists."""
+
+    @abstractmethod
+    def health(self) -> Health:
+        """A snapshot of links, firmware and motion capture."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Neutral, then disconnect. Idempotent and safe after any failure."""
+
+    def place(self, state: CarState) -> bool:
+        """Put the car at ``state`` where that can be done without driving; False where a person has to do it."""
+        return False
+
+    def check(self, action: Action) -> None:
+        """Raise ActionOutOfRangeError if ``action`` is not a number or beyond the limits; never moves the car."""
+        if not action.is_finite:
+            raise ActionOutOfRangeError(f"{action} is not a number; the policy that made it has diverged.")
+        for channel, limit in (("steering", self.limits.max_steering), ("throttle", self.limits.max_throttle)):
+            value = getattr(action, channel)
+            if abs(value) > limit + 1e-9:
+                raise ActionOutOfRangeError(
+                    f"{channel} {value:+.3f} is beyond the car's limit of {limit:.3f}; clip it or raise the limit."
+                )
+
+    def __enter__(self) -> Self:
+        try:
+            self.open()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()

@@ -1,0 +1,111 @@
+"""Clocks and pacing. The only module, beside the receiver threads and processes at the wire, that asks for the time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+
+@runtime_checkable
+class Clock(Protocol):
+    """A monotonic clock that can be slept on."""
+
+    def now_s(self) -> float:
+        """Seconds on this clock; only differences mean anything."""
+
+    def sleep_until(self, t_s: float) -> None:
+        """Return when ``now_s()`` has reached ``t_s``; at once if it has."""
+
+
+class MonotonicClock:
+    """The host's monotonic clock (``time.monotonic``), shared by all processes of the host."""
+
+    def now_s(self) -> float:
+        """Seconds of the host's monotonic clock."""
+        return time.monotonic()
+
+    def sleep_until(self, t_s: float) -> None:
+        """Sleep to an absolute deadline, so that errors do not add up."""
+        while (left_s := t_s - time.monotonic()) > 0:
+            time.sleep(left_s)
+
+
+class SimulatedClock:
+    """A clock that moves only when it is slept on: simulated episodes run as fast as they compute."""
+
+    def __init__(self, start_s: float = 0.0) -> None:
+        self._now_s = start_s
+
+    def now_s(self) -> float:
+        """Simulated seconds."""
+        return self._now_s
+
+    def sleep_until(self, t_s: float) -> None:
+        """Jump to ``t_s``; never back."""
+        self._now_s = max(self._now_s, t_s)
+
+
+def wall_clock_ns() -> int:
+    """Unix time [ns], for stamping files only."""
+    return time.time_ns()
+
+
+def monotonic_ns() -> int:
+    """Host monotonic time [ns]."""
+    return time.monotonic_ns()
+
+
+@dataclass(frozen=True, slots=True)
+class TickTiming:
+    """When a tick was due and how late it woke, on the pacer's clock."""
+
+    deadline_s: float
+    late_s: float
+    skipped: int
+
+
+@dataclass(slots=True)
+class Pacer:
+    """Absolute deadlines one period apart; missed ones are skipped and counted, never made up in a burst."""
+
+    clock: Clock
+    period_s: float
+    late_s: list[float] = field(default_factory=list)
+    skipped: int = 0
+    _next_s: float | None = None
+
+    def start(self) -> float:
+        """Set the first deadline to now and return it [s]."""
+        self._next_s = self.clock.now_s()
+        return self._next_s
+
+    def wait(self) -> TickTiming:
+        """Sleep to the next deadline that is still ahead and say how late the wake-up was."""
+        if self._next_s is None:
+            self.start()
+        assert self._next_s is not None
+        deadline_s = self._next_s + self.period_s
+        behind_s = self.clock.now_s() - deadline_s
+        skipped = int(behind_s // self.period_s) if behind_s >= self.period_s else 0
+        deadline_s += skipped * self.period_s
+        self.clock.sleep_until(deadline_s)
+        late_s = self.clock.now_s() - deadline_s
+        self._next_s = deadline_s
+        self.skipped += skipped
+        self.late_s.append(late_s)
+        return TickTiming(deadline_s, late_s, skipped)
+
+    def statistics_ms(self) -> dict[str, float]:
+        """Lateness percentiles [ms] and the count of skipped ticks."""
+        if not self.late_s:
+            return {"late_p50_ms": 0.0, "late_p99_ms": 0.0, "late_max_ms": 0.0, "skipped": 0.0}
+        p50, p99, top = np.percentile(self.late_s, [50, 99, 100]) * 1e3
+        return {
+            "late_p50_ms": float(p50),
+            "late_p99_ms": float(p99),
+            "late_max_ms": float(top),
+            "skipped": float(self.skipped),
+        }

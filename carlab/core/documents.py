@@ -1,0 +1,100 @@
+"""What an episode emits while it runs. Recorders and displays listen; the loop knows none of them.
+
+Order: one EpisodeStarted; then Tick, Transition, SafetyEvent and HealthReading as they happen; one EpisodeEnded.
+All ``t_s`` are on the car's clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import Action, FloatArray, Health, Observation, Reality
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeStarted:
+    """The first document. ``arena_m`` are corners of the geofence (n, 2); ``goal`` is (x [m], y [m], yaw [rad])."""
+
+    episode: int
+    t_s: float
+    wall_ns: int
+    car: str
+    reality: Reality
+    policy: str
+    task: str
+    seed: int
+    period_s: float
+    history_length: int
+    goal: tuple[float, float, float] | None = None
+    arena_m: tuple[tuple[float, float], ...] = ()
+    path_m: tuple[tuple[float, float], ...] = ()
+    config_toml: str = ""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """One control tick: what was seen, asked for and sent.
+
+    ``features`` is the encoded observation the policy saw; ``late_s`` is how late the tick woke; ``policy_s`` is how
+    long the policy thought; ``safety_state`` is the gate's state after the command.
+    """
+
+    step: int
+    t_s: float
+    late_s: float
+    observation: Observation
+    features: FloatArray
+    requested: Action
+    sent: Action
+    policy_s: float
+    safety_state: str
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One row of experience: the action sent at tick ``step`` and what came of it one period later."""
+
+    step: int
+    t_s: float
+    features: FloatArray
+    action: Action
+    reward: float
+    next_features: FloatArray
+    terminated: bool
+    truncated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyEvent:
+    """The safety gate changed a command or its own state. ``kind`` is a short id such as ``clip`` or ``geofence``."""
+
+    t_s: float
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class HealthReading:
+    """The car's condition, once a second or so."""
+
+    t_s: float
+    health: Health
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeEnded:
+    """The last document. ``last`` is the observation after the last command, where there is one."""
+
+    t_s: float
+    reason: EndReason
+    detail: str
+    steps: int
+    total_reward: float
+    last: Observation | None = None
+    statistics: Mapping[str, float] = field(default_factory=dict)
+
+
+Document = EpisodeStarted | Tick | Transition | SafetyEvent | HealthReading | EpisodeEnded

@@ -1,0 +1,58 @@
+"""One finished episode as arrays: what replay, learning and diagnosis read, whatever it was recorded by."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeData:
+    """An episode of T commands. Row k of ``sent`` was sent at ``times_s[k]`` and held until ``times_s[k + 1]``.
+
+    times_s     (T + 1,)     [s] when each state was observed, on the recording's own clock
+    states      (T + 1, 6)   x, y [m], yaw [rad] of base_link in map; vx, vy [m/s], yaw rate [rad/s] in the body frame
+    requested   (T, 2)       steering, throttle as the policy asked for them
+    sent        (T, 2)       steering, throttle as they left the safety gate
+    rewards     (T,)         reward of each transition; NaN where the recording has none
+    poses       (P, 4)       raw motion capture: capture time [s], x, y [m], yaw [rad]; P may be 0
+    metadata                 texts: car, reality, policy, task, seed, end_reason, end_detail, units ...
+    extra                    further columns of a foreign file by name, each (T + 1,)
+    """
+
+    times_s: FloatArray
+    states: FloatArray
+    requested: FloatArray
+    sent: FloatArray
+    rewards: FloatArray
+    poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    extra: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        ticks = self.sent.shape[0]
+        shapes = {
+            "times_s": (self.times_s.shape, (ticks + 1,)),
+            "states": (self.states.shape, (ticks + 1, 6)),
+            "requested": (self.requested.shape, (ticks, 2)),
+            "sent": (self.sent.shape, (ticks, 2)),
+            "rewards": (self.rewards.shape, (ticks,)),
+        }
+        for name, (found, wanted) in shapes.items():
+            if found != wanted:
+                raise DataError(f"{name} has shape {found} where {wanted} belongs to {ticks} commands.")
+
+    @property
+    def ticks(self) -> int:
+        """Number of commands T."""
+        return int(self.sent.shape[0])
+
+    @property
+    def period_s(self) -> float:
+        """Median time between observations [s]; NaN for fewer than two."""
+        return float(np.median(np.diff(self.times_s))) if self.ticks else float("nan")

@@ -1,0 +1,138 @@
+"""Quantities that cross a boundary: frozen, SI units, the unit in every name.
+
+Frames (REP-103, REP-105): world frame ``map`` and body frame ``base_link``; x forward, y left, yaw counter-clockwise.
+Commands are dimensionless in [-1, 1]; steering is positive to the left, throttle is positive forward.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping
+from dataclasses import astuple, dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """A normalised command: ``steering`` and ``throttle`` in [-1, 1]."""
+
+    steering: float = 0.0
+    throttle: float = 0.0
+
+    def to_array(self) -> FloatArray:
+        """Return ``[steering, throttle]``, shape (2,)."""
+        return np.array([self.steering, self.throttle], dtype=np.float64)
+
+    @classmethod
+    def from_array(cls, values: NDArray[np.floating]) -> Action:
+        """Build an action from ``[steering, throttle]``, shape (2,)."""
+        steering, throttle = (float(v) for v in np.asarray(values).reshape(2))
+        return cls(steering, throttle)
+
+    @property
+    def is_neutral(self) -> bool:
+        """True when both channels are exactly zero."""
+        return self.steering == 0.0 and self.throttle == 0.0
+
+    @property
+    def is_finite(self) -> bool:
+        """True when neither channel is NaN or infinite."""
+        return math.isfinite(self.steering) and math.isfinite(self.throttle)
+
+
+NEUTRAL = Action()
+ACTION_NAMES = ("steering", "throttle")
+STATE_NAMES = ("x", "y", "yaw", "vx", "vy", "yaw_rate")
+STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+
+
+@dataclass(frozen=True, slots=True)
+class CarState:
+    """Pose of ``base_link`` in ``map`` and velocities in the body frame."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    vx_mps: float = 0.0
+    vy_mps: float = 0.0
+    yaw_rate_radps: float = 0.0
+
+    def to_array(self) -> FloatArray:
+        """Return ``[x, y, yaw, vx, vy, yaw_rate]``, shape (6,)."""
+        return np.array(astuple(self), dtype=np.float64)
+
+    @classmethod
+    def from_array(cls, values: NDArray[np.floating]) -> CarState:
+        """Build a state from ``[x, y, yaw, vx, vy, yaw_rate]``, shape (6,)."""
+        return cls(*(float(v) for v in np.asarray(values).reshape(6)))
+
+    @property
+    def speed_mps(self) -> float:
+        """Speed over ground [m/s]."""
+        return math.hypot(self.vx_mps, self.vy_mps)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSample:
+    """One motion-capture sample of ``base_link`` in ``map``.
+
+    ``t_capture_s`` is the moment of exposure and ``t_receive_s`` the moment of arrival, both on the host's monotonic
+    clock; ``sequence`` is the frame number of the source.
+    """
+
+    sequence: int
+    t_capture_s: float
+    t_receive_s: float
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    z_m: float = 0.0
+    tracked: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """The newest state of a car, with when it was true and when it was known.
+
+    ``velocity_delay_s`` is the known delay of the velocity filter; ``poses`` are the raw samples that arrived since
+    the previous observation, oldest first.
+    """
+
+    state: CarState
+    t_capture_s: float
+    t_receive_s: float
+    sequence: int
+    tracked: bool = True
+    velocity_delay_s: float = 0.0
+    poses: tuple[PoseSample, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """A snapshot of a car's condition. ``readings`` are numbers whose names end in their units (``battery_v``)."""
+
+    ready: bool
+    problems: tuple[str, ...] = ()
+    readings: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ActionLimits:
+    """Largest commands a car accepts, dimensionless, symmetric about neutral."""
+
+    max_steering: float = 1.0
+    max_throttle: float = 1.0
+
+
+class Reality(enum.Enum):
+    """What a car is made of. Printed in capitals at the start of each run and written into each recording."""
+
+    SIMULATED = "simulated"
+    EMULATED = "emulated"
+    DRY_RUN = "dry run"
+    REAL = "real"

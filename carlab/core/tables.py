@@ -1,0 +1,84 @@
+"""Strict reading of configuration tables into dataclasses: unknown keys are errors that name the nearest known one."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from carlab.core.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+    """Raise ConfigError for the first key of ``table`` that is not in ``known``."""
+    names = sorted(known)
+    for key in table:
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
+            hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(names)}."
+            raise ConfigError(f"Unknown key '{key}' in {where}; {hint}")
+
+
+def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """Build dataclass ``cls`` from a TOML table. Nested dataclasses take nested tables; lists become tuples.
+
+    ``where`` names the table in messages, for example ``[mocap] of car.toml``. Raises ConfigError for an unknown
+    key, a missing one, a value of the wrong type or a number that is not finite.
+    """
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"{where} must be a table, not {table!r}.")
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+    check_keys(table, fields, where)
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for name, f in fields.items():
+        if name in table:
+            values[name] = _convert(hints[name], table[name], f"'{name}' in {where}")
+        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
+            raise ConfigError(f"'{name}' is missing in {where}; add it.")
+    return cls(**values)
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        options = [h for h in typing.get_args(hint) if h is not type(None)]
+        if value is None:
+            return None
+        return _convert(options[0], value, where)
+    if origin is typing.Literal:
+        if value not in typing.get_args(hint):
+            raise ConfigError(f"{where} is {value!r}; it must be one of {', '.join(map(repr, typing.get_args(hint)))}.")
+        return value
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise ConfigError(f"{where} must be a list, not {value!r}.")
+        items = typing.get_args(hint)
+        if len(items) == 2 and items[1] is Ellipsis:
+            return tuple(_convert(items[0], v, where) for v in value)
+        if len(value) != len(items):
+            raise ConfigError(f"{where} must have {len(items)} entries, not {len(value)}.")
+        return tuple(_convert(h, v, where) for h, v in zip(items, value, strict=True))
+    if origin in (dict, Mapping) or hint in (dict, Mapping):
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{where} must be a table, not {value!r}.")
+        return dict(value)
+    if dataclasses.is_dataclass(hint):
+        return from_table(typing.cast(type, hint), value, where)
+    if hint is float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise ConfigError(f"{where} must be a number, not {value!r}.")
+        if math.isnan(value):
+            raise ConfigError(f"{where} is NaN; give a number.")
+        return float(value)
+    if hint is int and (isinstance(value, bool) or not isinstance(value, int)):
+        raise ConfigError(f"{where} must be a whole number, not {value!r}.")
+    if hint in (str, bool) and not isinstance(value, hint):
+        raise ConfigError(f"{where} must be {'text' if hint is str else 'true or false'}, not {value!r}.")
+    return value
