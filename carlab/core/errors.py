@@ -9,7 +9,8 @@
     ├── NotArmedError (RuntimeError)     a moving command before arm()
     ├── ActionOutOfRangeError (ValueError)  a command beyond the car's limits, or not a number
     ├── PoseLostError (TimeoutError)     no pose, or one that is too old
-    └── ActuatorFaultError (OSError)     the link, the firmware or the sender process failed; latched
+    ├── ActuatorFaultError (OSError)     the link, the firmware or the sender process failed; latched
+    └── SafetyStop                       the safety gate ended the episode (beside the gate, in carlab.core.safety)
 
 Each message is one sentence with the next step. The command line prints it alone and exits with ``exit_code``.
 """

@@ -99,8 +99,9 @@ class PoseSample:
 class Observation:
     """The newest state of a car, with when it was true and when it was known.
 
-    ``velocity_delay_s`` is the known delay of the velocity filter; ``poses`` are the raw samples that arrived since
-    the previous observation, oldest first.
+    State, times and sequence are those of the newest *tracked* pose; ``tracked`` says whether the very newest frame
+    saw the body, so that an unseen body shows as a state that grows old. ``velocity_delay_s`` is the known delay of
+    the velocity filter; ``poses`` are the raw samples that arrived since the previous observation, oldest first.
     """
 
     state: CarState

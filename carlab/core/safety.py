@@ -1,0 +1,173 @@
+"""The one gate that every command passes: pure limits, and SafeCar which applies them to a car.
+
+Numbers to start from are those of common drivers: a stale pose gives neutral after 100 ms and ends the episode after
+500 ms; commands are clipped and slew-limited (towards zero is always allowed at once); a geofence asks whether the
+car could still stop inside. What is recorded as sent is what came out of this gate.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NoReturn
+
+from carlab.core.car import Car
+from carlab.core.documents import SafetyEvent
+from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, CarlabError, ConfigError, NotArmedError
+from carlab.core.geofence import can_stop_inside
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import NEUTRAL, Action, Observation
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyEnvelope:
+    """Limits of one car in one place. Rates are per second of normalised command; the arena is corners [m] or empty."""
+
+    max_steering: float = 1.0
+    max_throttle: float = 1.0
+    steering_rate_per_s: float = 20.0
+    throttle_rate_per_s: float = 20.0
+    max_speed_mps: float = 5.0
+    stale_pose_s: float = 0.1
+    lost_pose_s: float = 0.5
+    reaction_s: float = 0.15
+    deceleration_mps2: float = 3.0
+    arena_m: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("steering_rate_per_s", "throttle_rate_per_s", "max_speed_mps", "stale_pose_s", "lost_pose_s"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"{name} must be above zero, not {getattr(self, name)}.")
+        if not self.deceleration_mps2 > 0 or self.reaction_s < 0:
+            raise ConfigError("deceleration_mps2 must be above zero and reaction_s not below it.")
+        if not (0 < self.max_steering <= 1 and 0 < self.max_throttle <= 1):
+            raise ConfigError("max_steering and max_throttle must lie in (0, 1].")
+        if self.lost_pose_s < self.stale_pose_s:
+            raise ConfigError("lost_pose_s must not be shorter than stale_pose_s.")
+
+
+def clip(value: float, limit: float) -> float:
+    """Clip to [-limit, limit]."""
+    return min(max(value, -limit), limit)
+
+
+def slew(target: float, previous: float, max_step: float) -> float:
+    """Move from ``previous`` towards ``target`` by at most ``max_step``; the way to zero is never held back."""
+    if target * previous < 0.0:
+        previous = 0.0
+    if abs(target) <= abs(previous):
+        return target
+    return min(max(target, previous - max_step), previous + max_step)
+
+
+def limit(requested: Action, previous: Action, dt_s: float, envelope: SafetyEnvelope) -> Action:
+    """Clip and slew-limit a command. ``previous`` is what was sent ``dt_s`` ago."""
+    steering = clip(requested.steering, envelope.max_steering)
+    throttle = clip(requested.throttle, envelope.max_throttle)
+    return Action(
+        slew(steering, previous.steering, envelope.steering_rate_per_s * dt_s),
+        slew(throttle, previous.throttle, envelope.throttle_rate_per_s * dt_s),
+    )
+
+
+def violation(observation: Observation, now_s: float, envelope: SafetyEnvelope) -> tuple[EndReason, str] | None:
+    """The reason to end the episode now, with its figures; None while all is well."""
+    state = observation.state
+    age_s = now_s - observation.t_receive_s
+    if age_s > envelope.lost_pose_s:
+        reason = EndReason.POSE_STALE if observation.tracked else EndReason.TRACKING_LOST
+        return reason, f"The newest usable pose is {age_s * 1e3:.0f} ms old."
+    if state.speed_mps > envelope.max_speed_mps:
+        return EndReason.OVERSPEED, f"{state.speed_mps:.2f} m/s where {envelope.max_speed_mps:.2f} m/s is the limit."
+    if envelope.arena_m and not can_stop_inside(
+        envelope.arena_m, state, envelope.reaction_s, envelope.deceleration_mps2
+    ):
+        return EndReason.GEOFENCE, f"At ({state.x_m:.2f}, {state.y_m:.2f}) m with {state.speed_mps:.2f} m/s."
+    return None
+
+
+class SafetyState(enum.Enum):
+    """State of the gate."""
+
+    DISARMED = "disarmed"
+    ARMED = "armed"
+    PAUSED = "paused"
+    FAULT = "fault"
+
+
+class SafetyStop(CarlabError):
+    """The gate has put the car in neutral and ended the episode. ``reason`` says why, ``detail`` with what figures."""
+
+    exit_code = 4
+
+    def __init__(self, reason: EndReason, detail: str) -> None:
+        self.reason = reason
+        self.detail = detail
+        super().__init__(f"{reason.value} {detail}".strip())
+
+
+class SafeCar:
+    """Applies an envelope to a car. Nothing else in carlab calls ``Car.command``.
+
+    Emits a SafetyEvent whenever the kind of intervention changes, not on every tick that it lasts.
+    """
+
+    def __init__(self, car: Car, envelope: SafetyEnvelope, on_event: Callable[[SafetyEvent], None]) -> None:
+        self.car = car
+        self.envelope = envelope
+        self.state = SafetyState.DISARMED
+        self._on_event = on_event
+        self._sent = NEUTRAL
+        self._sent_s: float | None = None
+        self._active: frozenset[str] = frozenset()
+
+    def arm(self) -> None:
+        """Arm the car. Raises what Car.arm raises."""
+        self.car.arm()
+        self.state = SafetyState.ARMED
+        self._sent, self._sent_s = NEUTRAL, None
+
+    def command(self, requested: Action, observation: Observation, period_s: float) -> Action:
+        """Pass a command through the gate and return what was sent; raise SafetyStop where the episode must end."""
+        now_s = self.car.clock.now_s()
+        if self.state not in (SafetyState.ARMED, SafetyState.PAUSED):
+            raise NotArmedError("The safety gate is not armed; call arm() first.")
+        if not requested.is_finite:
+            self._end(EndReason.BAD_COMMAND, f"It asked for {requested}.", now_s)
+        found = violation(observation, now_s, self.envelope)
+        if found is not None:
+            self._end(*found, now_s)
+        age_s = now_s - observation.t_receive_s
+        kinds: dict[str, str] = {}
+        if age_s > self.envelope.stale_pose_s:
+            target = NEUTRAL
+            kinds["stale_pose"] = f"The pose is {age_s * 1e3:.0f} ms old: neutral until it is fresh."
+            self.state = SafetyState.PAUSED
+        else:
+            dt_s = period_s if self._sent_s is None else min(now_s - self._sent_s, 2.0 * period_s)
+            target = limit(requested, self._sent, dt_s, self.envelope)
+            if target != requested:
+                kinds["limited"] = f"Asked for {requested}, limited to {target}."
+            self.state = SafetyState.ARMED
+        for kind in kinds.keys() - self._active:
+            self._on_event(SafetyEvent(now_s, kind, kinds[kind]))
+        self._active = frozenset(kinds)
+        try:
+            sent = self.car.command(target)
+        except ActionOutOfRangeError as error:
+            self._end(EndReason.BAD_COMMAND, str(error), now_s)
+        except (ActuatorFaultError, NotArmedError) as error:
+            self._end(EndReason.ACTUATOR_FAULT, str(error), now_s)
+        self._sent, self._sent_s = target, now_s
+        return sent
+
+    def stop(self, *, planned: bool) -> None:
+        """Neutral and disarm; ``planned=False`` latches."""
+        self.state = SafetyState.DISARMED if planned else SafetyState.FAULT
+        self.car.stop(planned=planned)
+
+    def _end(self, reason: EndReason, detail: str, now_s: float) -> NoReturn:
+        self.stop(planned=False)
+        self._on_event(SafetyEvent(now_s, reason.name.lower(), f"{reason.value} {detail}"))
+        raise SafetyStop(reason, detail)

@@ -1,0 +1,1 @@
+"""Episodes, policies and campaigns."""

@@ -1,0 +1,239 @@
+"""Driving by hand, gamepad or keyboard, with a dead-man control.
+
+Nothing moves unless the dead-man is held: release gives neutral within one tick. The device is polled each tick, so a
+held button sends no events and is still seen; an unplugged gamepad or a window that lost the focus counts as released.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import Any, Protocol, Self
+
+from carlab.core.errors import NotReadyError
+from carlab.core.outcome import EndReason
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import NEUTRAL, Action
+
+
+@dataclass(frozen=True, slots=True)
+class TeleopInput:
+    """What the driver's hands say at one moment. Steering and throttle in [-1, 1], steering positive to the left."""
+
+    steering: float = 0.0
+    throttle: float = 0.0
+    deadman: bool = False
+    emergency_stop: bool = False
+    finish: bool = False
+    present: bool = True
+
+
+class InputSource(Protocol):
+    """A device in somebody's hands. Constructing does nothing."""
+
+    name: str
+
+    def open(self) -> None:
+        """Find the device. Raises NotReadyError with what to do."""
+
+    def poll(self) -> TeleopInput:
+        """The state of the device now, without blocking."""
+
+    def close(self) -> None:
+        """Let go of the device. Idempotent."""
+
+
+@dataclass(frozen=True, slots=True)
+class GamepadMapping:
+    """Axes and buttons by number, as SDL counts them on common gamepads; triggers rest at -1 and end at +1."""
+
+    steering_axis: int = 0
+    forward_axis: int = 5
+    reverse_axis: int = 2
+    deadman_button: int = 4
+    emergency_button: int = 1
+    finish_button: int = 7
+    dead_zone: float = 0.08
+
+
+def gamepad_input(axes: list[float], buttons: list[bool], mapping: GamepadMapping) -> TeleopInput:
+    """Translate raw axes in [-1, 1] and buttons. An axis or button that the device lacks reads as rest."""
+
+    def axis(index: int, rest: float) -> float:
+        return axes[index] if index < len(axes) else rest
+
+    def button(index: int) -> bool:
+        return index < len(buttons) and buttons[index]
+
+    def without_dead_zone(value: float) -> float:
+        size = max(abs(value) - mapping.dead_zone, 0.0) / (1.0 - mapping.dead_zone)
+        return size if value > 0 else -size
+
+    forward = 0.5 * (axis(mapping.forward_axis, -1.0) + 1.0)
+    reverse = 0.5 * (axis(mapping.reverse_axis, -1.0) + 1.0)
+    return TeleopInput(
+        steering=-without_dead_zone(axis(mapping.steering_axis, 0.0)),
+        throttle=without_dead_zone(forward - reverse),
+        deadman=button(mapping.deadman_button),
+        emergency_stop=button(mapping.emergency_button),
+        finish=button(mapping.finish_button),
+    )
+
+
+def _pygame(*, window: bool) -> Any:
+    """Import pygame on demand, quietly; without a window it runs on SDL's dummy video driver."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    if not window:
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    import pygame
+
+    return pygame
+
+
+@dataclass(slots=True)
+class GamepadSource:
+    """The first gamepad, or number ``index``."""
+
+    index: int = 0
+    mapping: GamepadMapping = field(default_factory=GamepadMapping)
+    name: str = "gamepad"
+    _pygame: Any = None
+    _stick: Any = None
+    # SDL reports triggers as 0 until they are first touched; read as pressed half-way, they would move the car.
+    _touched: set[int] = field(default_factory=set)
+
+    def open(self) -> None:
+        """Find the gamepad."""
+        self._pygame = _pygame(window=False)
+        self._pygame.display.init()
+        self._pygame.joystick.init()
+        count = self._pygame.joystick.get_count()
+        if self.index >= count:
+            self.close()
+            raise NotReadyError(
+                "Gamepad", [f"{count} found, number {self.index} wanted; plug it in, press a button, try again."]
+            )
+        self._stick = self._pygame.joystick.Joystick(self.index)
+        self._stick.init()
+
+    def poll(self) -> TeleopInput:
+        """The gamepad's state; released where it is gone."""
+        if self._stick is None:
+            return TeleopInput(present=False)
+        for event in self._pygame.event.get():
+            if event.type == self._pygame.JOYDEVICEREMOVED:
+                self._stick = None
+                return TeleopInput(present=False)
+            if event.type == self._pygame.JOYAXISMOTION:
+                self._touched.add(event.axis)
+        triggers = (self.mapping.forward_axis, self.mapping.reverse_axis)
+        axes = [
+            -1.0 if i in triggers and i not in self._touched else float(self._stick.get_axis(i))
+            for i in range(self._stick.get_numaxes())
+        ]
+        buttons = [bool(self._stick.get_button(i)) for i in range(self._stick.get_numbuttons())]
+        return gamepad_input(axes, buttons, self.mapping)
+
+    def close(self) -> None:
+        """Let go of the gamepad."""
+        self._stick = None
+        if self._pygame is not None:
+            self._pygame.quit()
+            self._pygame = None
+
+
+@dataclass(slots=True)
+class KeyboardSource:
+    """Arrow keys or WASD in a small window; hold shift (dead-man), space stops at once, escape ends."""
+
+    throttle: float = 0.4
+    name: str = "keyboard"
+    _pygame: Any = None
+    _held: set[int] = field(default_factory=set)
+
+    def open(self) -> None:
+        """Open the window that receives the keys."""
+        self._pygame = _pygame(window=True)
+        try:
+            self._pygame.display.init()
+            self._pygame.display.set_mode((420, 120))
+        except self._pygame.error as error:
+            self.close()
+            raise NotReadyError(
+                "Keyboard", [f"no window can be opened ({error}); run it on a desktop, or use a gamepad."]
+            ) from error
+        self._pygame.display.set_caption("carlab: hold SHIFT, drive with the arrows, SPACE stops, ESC ends")
+
+    def poll(self) -> TeleopInput:
+        """The keys held now; none where the window has lost the focus."""
+        if self._pygame is None:
+            return TeleopInput(present=False)
+        pg = self._pygame
+        emergency = finish = False
+        for event in pg.event.get():
+            if event.type == pg.KEYDOWN:
+                self._held.add(event.key)
+                emergency |= event.key == pg.K_SPACE
+                finish |= event.key == pg.K_ESCAPE
+            elif event.type == pg.KEYUP:
+                self._held.discard(event.key)
+            elif event.type == pg.WINDOWFOCUSLOST:
+                self._held.clear()
+            elif event.type == pg.QUIT:
+                finish = True
+
+        def held(*keys: int) -> bool:
+            return any(key in self._held for key in keys)
+
+        return TeleopInput(
+            steering=float(held(pg.K_LEFT, pg.K_a)) - float(held(pg.K_RIGHT, pg.K_d)),
+            throttle=self.throttle * (float(held(pg.K_UP, pg.K_w)) - float(held(pg.K_DOWN, pg.K_s))),
+            deadman=held(pg.K_LSHIFT, pg.K_RSHIFT),
+            emergency_stop=emergency,
+            finish=finish,
+        )
+
+    def close(self) -> None:
+        """Close the window."""
+        self._held.clear()
+        if self._pygame is not None:
+            self._pygame.quit()
+            self._pygame = None
+
+
+class TeleopPolicy:
+    """A policy that asks an input source each tick. ``stop_reason`` goes into the episode's hooks."""
+
+    def __init__(self, source: InputSource, max_throttle: float = 1.0) -> None:
+        self.name = f"teleop:{source.name}"
+        self._source = source
+        self._max_throttle = max_throttle
+        self._stop: EndReason | None = None
+
+    def __enter__(self) -> Self:
+        self._source.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._source.close()
+
+    def reset(self) -> None:
+        """Forget an earlier stop."""
+        self._stop = None
+
+    def act(self, view: PolicyInput) -> Action | None:
+        """What the hands say while the dead-man is held, else neutral; None when the driver ends the episode."""
+        hands = self._source.poll()
+        if not hands.present:
+            self._stop = EndReason.DEADMAN_RELEASED
+        elif hands.emergency_stop:
+            self._stop = EndReason.EMERGENCY_STOP
+        elif hands.finish:
+            return None
+        if self._stop is not None or not hands.deadman:
+            return NEUTRAL
+        return Action(hands.steering, hands.throttle * self._max_throttle)
+
+    def stop_reason(self) -> EndReason | None:
+        """Emergency stop, or a device that is gone; None while neither."""
+        return self._stop

@@ -1,0 +1,55 @@
+"""Shared fixtures: seeded randomness, the folder of reference material, and a check for threads left behind."""
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SHARED = Path(__file__).resolve().parents[1].parent / "shared"
+
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--hil", action="store", default=None, metavar="CAR.toml", help="also test this real car")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        if "slow" in item.keywords and "slow" not in (config.getoption("-m") or ""):
+            item.add_marker(pytest.mark.skip(reason="a long study; run it with -m slow"))
+        if "hil" in item.keywords and config.getoption("--hil") is None:
+            item.add_marker(pytest.mark.skip(reason="needs real hardware; run it with --hil CAR.toml"))
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20240607)
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of reference material beside the repository; tests that need it are skipped where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip("the folder 'shared' with reference captures and recordings is not beside the repository")
+    return SHARED
+
+
+@pytest.fixture(autouse=True)
+def no_thread_left_behind() -> Iterator[None]:
+    """Every thread is owned by an object whose close() joins it; a test that leaks one fails."""
+    before = set(threading.enumerate())
+    yield
+    left = [t for t in threading.enumerate() if t not in before and t.is_alive() and not _belongs_to_a_library(t)]
+    for thread in left:
+        thread.join(timeout=2.0)
+    still = [t.name for t in left if t.is_alive()]
+    assert not still, f"threads left behind: {still}"
+
+
+def _belongs_to_a_library(thread: threading.Thread) -> bool:
+    return thread.name.startswith(("pytest_timeout", "rerun", "QueueFeederThread", "tqdm"))

@@ -1,0 +1,120 @@
+"""Rewards and encoder: closed forms, NumPy and torch alike, and the row that is learned from."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from carlab.core.observation import ActionHistory, decode_history, decode_state, encode, feature_size
+from carlab.core.quantities import Action, CarState
+from carlab.core.task import ParkingTask, PathTask, figure_eight_path
+
+
+def features_of(states: np.ndarray, history: int = 3) -> np.ndarray:
+    return encode(states, np.zeros((*states.shape[:-1], history, 2)))
+
+
+def test_encode_and_decode_are_inverse(rng: np.random.Generator) -> None:
+    states = rng.uniform(-3, 3, (50, 6))
+    history = rng.uniform(-1, 1, (50, 3, 2))
+    features = encode(states, history)
+    assert features.shape == (50, feature_size(3)) == (50, 13)
+    np.testing.assert_allclose(decode_state(features), states, atol=1e-12)
+    np.testing.assert_array_equal(decode_history(features), history)
+    # The layout is written down, not merely invertible: oldest action first, steering before throttle.
+    np.testing.assert_allclose(features[0, 2:4], [math.sin(states[0, 2]), math.cos(states[0, 2])])
+    np.testing.assert_array_equal(features[0, 7:], history[0].reshape(-1))
+
+
+def test_history_keeps_the_newest_action_last() -> None:
+    history = ActionHistory(3)
+    for k in range(1, 6):
+        history.push(Action(k / 10, -k / 10))
+    np.testing.assert_allclose(history.rows[:, 0], [0.3, 0.4, 0.5])
+    np.testing.assert_allclose(history.rows[-1], [0.5, -0.5])
+
+
+def test_parking_reward_is_the_paper_s_closed_form() -> None:
+    task = ParkingTask()
+    # d <= 0.1 gives 1; d = 0.1 + margin gives 0.1; yaw counts like metres; the action costs 0.005 |a|^2.
+    states = np.zeros((4, 6))
+    states[1, 0] = 0.1
+    states[2, 1] = 2.1
+    states[3, 2] = -2.1
+    actions = np.tile([1.0, -1.0], (4, 1))
+    reward = task.reward(features_of(states), actions, features_of(states))
+    np.testing.assert_allclose(reward, np.array([1.0, 1.0, 0.1, 0.1]) - 0.01, atol=1e-6)
+    # Beyond pi the yaw error is the short way round.
+    turned = np.zeros((1, 6))
+    turned[0, 2] = 2 * math.pi - 0.05
+    assert task.reward(features_of(turned), np.zeros((1, 2)), features_of(turned))[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("task", [ParkingTask(), PathTask()], ids=["parking", "path"])
+def test_numpy_and_torch_give_the_same_reward(task: ParkingTask | PathTask, rng: np.random.Generator) -> None:
+    before, after = (features_of(rng.uniform(-2, 2, (200, 6))) for _ in range(2))
+    action = rng.uniform(-1, 1, (200, 2))
+    expected = task.reward(before, action, after)
+    tensors = [torch.tensor(a, requires_grad=True) for a in (before, action, after)]
+    reward = task.reward(*tensors)
+    np.testing.assert_allclose(reward.detach().numpy(), expected, atol=1e-12)
+    np.testing.assert_array_equal(task.terminated(tensors[2]).numpy(), task.terminated(after))
+    reward.sum().backward()
+    assert all(torch.isfinite(t.grad).all() for t in tensors if t.grad is not None)
+
+
+def test_parking_start_matches_its_description(rng: np.random.Generator) -> None:
+    task = ParkingTask()
+    starts = np.array([task.sample_start(rng).to_array() for _ in range(4000)])
+    assert abs(starts[:, 0] - 1.42).max() <= 0.1
+    assert abs(starts[:, 1] + 1.04).max() <= 0.1
+    turn = np.abs(np.abs(starts[:, 2]) - math.pi)
+    assert turn.max() <= 0.1 * math.pi
+    assert turn.max() > 0.09 * math.pi
+    np.testing.assert_allclose(starts[:, 3:].std(axis=0), [0.005, 0.005, 0.02], rtol=0.05)
+    assert abs(np.corrcoef(starts[:, 0], starts[:, 1])[0, 1]) < 0.06
+
+
+@pytest.mark.parametrize(
+    ("final", "parked"),
+    [
+        (CarState(0.19, 0.0, 0.3, 0.2), True),
+        (CarState(0.21, 0.0, 0.0), False),
+        (CarState(0.0, 0.0, 0.36), False),
+        (CarState(0.0, 0.0, 2 * math.pi - 0.3), True),
+        (CarState(0.0, 0.0, 0.0, 0.22, 0.22), False),
+    ],
+)
+def test_parked_means_place_heading_and_speed(final: CarState, parked: bool) -> None:
+    task = ParkingTask()
+    assert bool(task.summary(final)["parked"]) is parked
+    assert bool(task.parked(features_of(final.to_array()[None]))[0]) is parked
+
+
+def test_progress_along_a_circle_is_its_arc_length() -> None:
+    angles = np.linspace(0, 2 * math.pi, 720, endpoint=False)
+    circle = tuple((float(np.cos(a)), float(np.sin(a))) for a in angles)
+    task = PathTask(path_m=circle, speed_mps=1.0, period_s=0.1, action_cost=0.0)
+    states = np.zeros((3, 6))
+    for row, angle in enumerate((0.3, 0.4, -0.05)):
+        states[row, :2] = np.cos(angle), np.sin(angle)
+    features = features_of(states)
+    forward = task.reward(features[0:1], np.zeros((1, 2)), features[1:2])[0]
+    assert forward == pytest.approx(1.0, rel=1e-3)
+    # Across the closing point, backwards: an arc of 0.35 rad.
+    back = task.reward(features[0:1], np.zeros((1, 2)), features[2:3])[0]
+    assert back == pytest.approx(-3.5, rel=1e-3)
+
+
+def test_a_crossing_is_no_short_cut() -> None:
+    task = PathTask()
+    path = np.array(figure_eight_path(1.2))
+    # Just before and after the crossing at half a lap: progress is one step, not half a lap.
+    middle = len(path) // 2
+    states = np.zeros((2, 6))
+    states[:, :2] = path[[middle - 1, middle + 1]]
+    features = features_of(states)
+    step = np.hypot(*(path[middle + 1] - path[middle])) + np.hypot(*(path[middle] - path[middle - 1]))
+    reward = task.reward(features[:1], np.zeros((1, 2)), features[1:])[0]
+    assert reward == pytest.approx(step / (task.speed_mps * task.period_s), rel=1e-3)
