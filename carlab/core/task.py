@@ -25,12 +25,23 @@ PAPER_ARENA_M: Corners = rectangle(-1.4, 2.8, -2.6, 1.5)
 
 @runtime_checkable
 class Task(Protocol):
-    """What an episode is about. ``history_length`` is H of the encoder."""
+    """What an episode is about."""
 
-    name: str
-    history_length: int
-    max_ticks: int
-    arena_m: Corners
+    @property
+    def name(self) -> str:
+        """Short name, as the command line and recordings have it."""
+
+    @property
+    def history_length(self) -> int:
+        """H, the number of past actions in the features."""
+
+    @property
+    def max_ticks(self) -> int:
+        """Ticks of an episode."""
+
+    @property
+    def arena_m(self) -> Corners:
+        """Corners of the area [m] the task takes place in."""
 
     @property
     def goal(self) -> tuple[float, float, float] | None:

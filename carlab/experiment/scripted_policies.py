@@ -11,6 +11,7 @@ from carlab.core.angles import wrap
 from carlab.core.manoeuvres import Manoeuvre
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import NEUTRAL, Action, FloatArray
+from sim_backends.car_parameters import SimulatorConfig
 
 
 class NeutralPolicy:
@@ -64,12 +65,12 @@ class ReplayPolicy:
 
 @dataclass(slots=True)
 class ReverseParkingPolicy:
-    """Backs into a pose by feedback on polar coordinates; a baseline to compare a learned policy with.
+    """Backs into a pose by feedback; a baseline to compare a learned policy with.
 
-    Aicardi et al., "Closed loop steering of unicycle-like vehicles via Lyapunov techniques", IEEE Robotics and
-    Automation Magazine 1995, for the car reversed: with rho the distance, alpha the bearing of the goal from the rear,
-    and delta the bearing seen from the goal, curvature = (k_alpha alpha + k_delta delta terms) / rho, clipped to what
-    the steering can do. Speed follows the distance and is held by a proportional throttle with feed-forward.
+    The reversed car drives along its tail. Its course is drawn onto the line through the goal by a vector field
+    (Nelson et al., "Vector field path following for miniature air vehicles", IEEE Transactions on Robotics 2007): far
+    from the line across it, on the line along it. Speed follows what braking at ``braking_mps2`` allows, held by a
+    proportional throttle with feed-forward. State is predicted over the reaction time before anything is decided.
     """
 
     goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -78,42 +79,55 @@ class ReverseParkingPolicy:
     drive_gain_n: float = 8.2
     damping_nspm: float = 1.56
     mass_kg: float = 1.65
-    cruise_mps: float = 1.15
     reaction_s: float = 0.12
+    cruise_mps: float = 1.02
+    braking_mps2: float = 1.15
+    approach_rad: float = 1.9
+    line_width_m: float = 0.67
+    turn_gain_per_m: float = 7.3
+    swing_s: float = 0.13
+    left_weight: float = 0.72
     name: str = "reverse_parking"
-    _forward: bool = False
+
+    @classmethod
+    def for_car(cls, simulator: SimulatorConfig) -> ReverseParkingPolicy:
+        """Gains for a car as its file describes it."""
+        p = simulator.parameters
+        return cls(
+            wheelbase_m=p.wheelbase_m,
+            max_angle_rad=p.max_angle_rad,
+            drive_gain_n=p.drive_gain_n,
+            damping_nspm=p.damping_nspm,
+            mass_kg=p.mass_kg,
+            reaction_s=simulator.command_delay_s + 0.04,
+        )
 
     def reset(self) -> None:
-        """Begin in reverse."""
-        self._forward = False
+        """Feedback has no memory."""
 
     def act(self, view: PolicyInput) -> Action | None:
         """Steering and throttle of this tick."""
         state = view.observation.state
-        # Where the car will be when this command acts.
         yaw = state.yaw_rad + state.yaw_rate_radps * self.reaction_s
-        course = state.yaw_rad + 0.5 * state.yaw_rate_radps * self.reaction_s
-        x = state.x_m + self.reaction_s * (state.vx_mps * math.cos(course) - state.vy_mps * math.sin(course))
-        y = state.y_m + self.reaction_s * (state.vx_mps * math.sin(course) + state.vy_mps * math.cos(course))
+        middle = state.yaw_rad + 0.5 * state.yaw_rate_radps * self.reaction_s
+        x = state.x_m + self.reaction_s * (state.vx_mps * math.cos(middle) - state.vy_mps * math.sin(middle))
+        y = state.y_m + self.reaction_s * (state.vx_mps * math.sin(middle) + state.vy_mps * math.cos(middle))
+        # Along and left of the line that leads, tail first, into the goal.
+        line = self.goal[2] + math.pi
         dx, dy = self.goal[0] - x, self.goal[1] - y
-        rho = math.hypot(dx, dy)
-        # The reversed car drives "forward" along its tail: heading yaw + pi towards the goal heading + pi.
-        heading = yaw + math.pi
-        bearing = math.atan2(dy, dx)
-        alpha = wrap(bearing - heading)
-        delta = wrap(bearing - (self.goal[2] + math.pi))
-        ahead = rho * math.cos(alpha)
-        speed_goal = -math.copysign(min(self.cruise_mps, 1.3 * math.sqrt(max(abs(ahead) - 0.02, 0.0))), ahead)
-        if rho < 0.08:
-            speed_goal = 0.0
-        sinc = math.cos(alpha) * (math.sin(alpha) / alpha if abs(alpha) > 1e-3 else 1.0)
-        curvature = (2.2 * alpha + 1.6 * sinc * (alpha + 1.2 * delta)) / max(rho, 0.3)
-        if ahead < 0:
-            curvature = -2.0 * wrap(self.goal[2] - yaw)
+        ahead = dx * math.cos(line) + dy * math.sin(line)
+        left = dx * math.sin(line) - dy * math.cos(line)
+        wanted = -self.approach_rad * (2.0 / math.pi) * math.atan(left / self.line_width_m)
+        # Tyres let the heading swing on: what counts is where it will point.
+        pointing = wrap(yaw + self.swing_s * state.yaw_rate_radps + math.pi - line)
+        turn = wrap(wanted - pointing)
         limit = math.tan(self.max_angle_rad) / self.wheelbase_m
-        curvature = min(max(curvature, -limit), limit)
+        curvature = min(max(self.turn_gain_per_m * turn, -limit), limit)
         # Turning left along the tail is turning the front wheels right.
         steering = -math.atan(self.wheelbase_m * curvature) / self.max_angle_rad
-        wanted_mps2 = 5.0 * (speed_goal - state.vx_mps)
-        throttle = (self.mass_kg * wanted_mps2 + self.damping_nspm * speed_goal) / self.drive_gain_n
-        return Action(min(max(steering, -1.0), 1.0), min(max(throttle, -1.0), 1.0))
+        rest = ahead + self.left_weight * abs(left)
+        # Braking at a constant rate asks for too much at the very end: there, in proportion to the rest.
+        braked = min(math.sqrt(2.0 * self.braking_mps2 * abs(rest)), 2.5 * abs(rest))
+        speed = -math.copysign(min(self.cruise_mps, braked), rest) if abs(rest) > 0.02 else 0.0
+        push = self.mass_kg * 6.0 * (speed - state.vx_mps) + self.damping_nspm * speed
+        return Action(min(max(steering, -1.0), 1.0), min(max(push / self.drive_gain_n, -1.0), 1.0))

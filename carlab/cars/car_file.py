@@ -1,0 +1,104 @@
+"""The car file (TOML): a simulator's parameters, and under ``[hardware]`` the real car they describe."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from carlab.core.errors import ConfigError
+from carlab.core.geofence import as_polygon
+from carlab.core.safety import SafetyEnvelope
+from carlab.core.tables import check_keys, from_table
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig, HardwareConfig
+from mocap.mocap_config import MocapConfig
+from sim_backends.car_parameters import TABLES, SimulatorConfig
+
+_ARMING = tuple(f.name for f in fields(HardwareConfig) if f.name.startswith("arm_"))
+
+
+@dataclass(frozen=True, slots=True)
+class RealCar:
+    """What ``[hardware]`` holds: actuator and calibration, motion capture, and the limits of the safety gate."""
+
+    name: str
+    hardware: HardwareConfig
+    mocap: MocapConfig
+    envelope: SafetyEnvelope
+
+
+@dataclass(frozen=True, slots=True)
+class CarFile:
+    """One car file: its text, the simulator in it, and the real car where it has one."""
+
+    name: str
+    text: str
+    simulator: SimulatorConfig
+    real: RealCar | None
+
+
+def load_car_file(path: Path) -> CarFile:
+    """Read a car file. Raises ConfigError for a missing file, bad TOML, an unknown key or an impossible value."""
+    if not path.is_file():
+        raise ConfigError(f"There is no car file '{path}'; name a TOML file, or one of sim, emulated, emulated-can.")
+    try:
+        text = path.read_text(encoding="utf-8")
+        tables = tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not a text file; a car file is TOML.") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}.") from error
+    check_keys(tables, (*TABLES, "hardware"), str(path))
+    hardware = tables.pop("hardware", None)
+    simulator = SimulatorConfig.from_tables(tables, str(path))
+    real = None if hardware is None else _real_car(hardware, path)
+    return CarFile(path.stem if real is None else real.name, text, simulator, real)
+
+
+def default_car() -> CarFile:
+    """The car that sim and emulated drive unless told otherwise."""
+    return CarFile("rc_car", "", SimulatorConfig.from_preset(), None)
+
+
+def _real_car(tables: Any, path: Path) -> RealCar:
+    where = f"[hardware] of {path}"
+    if not isinstance(tables, Mapping):
+        raise ConfigError(f"{where} must be a table.")
+    check_keys(tables, ("name", "actuator", "calibration", "mocap", "arena", "limits", *_ARMING), where)
+
+    def table(name: str) -> Mapping[str, Any]:
+        found = tables.get(name, {})
+        if not isinstance(found, Mapping):
+            raise ConfigError(f"'{name}' in {where} must be a table [hardware.{name}].")
+        return found
+
+    arena = table("arena")
+    check_keys(arena, ("corners_m",), f"[hardware.arena] of {path}")
+    limits = table("limits")
+    check_keys(limits, [f.name for f in fields(SafetyEnvelope) if f.name != "arena_m"], f"[hardware.limits] of {path}")
+    envelope = from_table(SafetyEnvelope, limits, f"[hardware.limits] of {path}")
+    if "corners_m" not in arena:
+        raise ConfigError(
+            f"[hardware.arena] of {path} is missing; list the corners the car must stay in, "
+            "for example corners_m = [[-2, -2], [2, -2], [2, 2], [-2, 2]]."
+        )
+    hardware = HardwareConfig(
+        actuator=from_table(ActuatorConfig, table("actuator"), f"[hardware.actuator] of {path}"),
+        calibration=from_table(ActuatorCalibration, table("calibration"), f"[hardware.calibration] of {path}"),
+        **{name: _number(tables[name], name, where) for name in _ARMING if name in tables},
+    )
+    return RealCar(
+        name=str(tables.get("name", path.stem)),
+        hardware=hardware,
+        mocap=from_table(MocapConfig, table("mocap"), f"[hardware.mocap] of {path}"),
+        envelope=replace(envelope, arena_m=as_polygon(arena["corners_m"], f"corners_m in [hardware.arena] of {path}")),
+    )
+
+
+def _number(value: Any, name: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ConfigError(f"'{name}' in {where} must be a number, not {value!r}.")
+    return float(value)

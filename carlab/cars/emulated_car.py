@@ -1,0 +1,253 @@
+"""A hardware car whose wire ends in emulators: the same driver code as a real one, down to the bytes."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from carlab.cars.car_file import CarFile
+from carlab.cars.emulated_world import BODY_NAME, WorldConfig
+from carlab.core.car import Car
+from carlab.core.clock import MonotonicClock
+from carlab.core.errors import NotOpenError, NotReadyError
+from carlab.core.quantities import Action, ActionLimits, CarState, Health, Observation, Reality
+from carlab.core.state_estimator import StateEstimator
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.config import MULTICAST_GROUP, ActuatorConfig
+from drivers.hardware_car import HardwareCar
+from mocap.mocap_config import MocapConfig
+from mocap.rigid_body import RigidBodyPoseSource
+
+START_TIMEOUT_S = 30.0
+ANSWER_TIMEOUT_S = 5.0
+SETTLE_S = 0.15
+
+
+class EmulatedWorld:
+    """Owns the process with physics, fake firmware and NatNet server. ``open`` starts it and learns its addresses."""
+
+    def __init__(self, config: WorldConfig) -> None:
+        self.config = config
+        self.addresses: dict[str, Any] = {}
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+        self._pending = b""
+
+    def open(self) -> None:
+        """Start the process. Raises NotReadyError where it does not come up."""
+        if self._process is not None:
+            return
+        self._pending = b""
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "carlab.cars.emulated_world"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+            bufsize=0,
+        )
+        try:
+            self.addresses = self._ask(dataclasses.asdict(self.config), START_TIMEOUT_S)
+        except BaseException:
+            self.close()
+            raise
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """Send a request and return its answer. Raises NotOpenError, or NotReadyError where no answer comes."""
+        return self._ask(request, ANSWER_TIMEOUT_S)
+
+    def close(self) -> None:
+        """Tell the process to leave, and wait for it. Idempotent."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with contextlib.suppress(OSError):
+            process.stdin.write(b'{"do": "leave"}\n')
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+        process.stdout.close()
+        try:
+            process.wait(ANSWER_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def _ask(self, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+        with self._lock:
+            if self._process is None:
+                raise NotOpenError("The emulated world is not open.")
+            assert self._process.stdin is not None
+            assert self._process.stdout is not None
+            try:
+                self._process.stdin.write(json.dumps(request).encode() + b"\n")
+                line = self._read_line(self._process.stdout.fileno(), timeout_s)
+            except OSError as error:
+                raise NotReadyError("The emulated car's world has ended", [str(error)]) from error
+        answer = json.loads(line)
+        if "error" in answer:
+            raise NotReadyError("The emulated car's world", [answer["error"]])
+        return dict(answer)
+
+    def _read_line(self, descriptor: int, timeout_s: float) -> bytes:
+        clock = MonotonicClock()
+        deadline_s = clock.now_s() + timeout_s
+        while b"\n" not in self._pending:
+            ready, _, _ = select.select([descriptor], [], [], max(deadline_s - clock.now_s(), 0.0))
+            data = os.read(descriptor, 65536) if ready else b""
+            if not data:
+                why = "it ended" if ready else f"no answer within {timeout_s:g} s"
+                raise NotReadyError("The emulated car's world does not answer", [f"{why}; the lines above say more."])
+            self._pending += data
+        line, self._pending = self._pending.split(b"\n", 1)
+        return line
+
+
+class EmulatedCar(Car):
+    """``HardwareCar`` over a pty or CAN bus and NatNet on loopback, with the emulated world at the other end.
+
+    Args:
+        file: whose physics and motion capture the world has.
+        actuator: ``serial`` or ``can``.
+        seed: of the motion capture's noise.
+        world: further options of the world (bitstream, multicast ...).
+        actuator_options: further options of the actuator (rates, watchdog ...).
+    """
+
+    reality = Reality.EMULATED
+
+    def __init__(
+        self,
+        file: CarFile,
+        *,
+        actuator: str = "serial",
+        seed: int = 0,
+        world: Mapping[str, Any] | None = None,
+        actuator_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.name = f"{file.name} ({actuator})"
+        self.limits = ActionLimits()
+        self.clock = MonotonicClock()
+        self._actuator = actuator
+        self._actuator_options = dict(actuator_options or {})
+        self._config = WorldConfig(simulator=file.simulator.to_tables(), actuator=actuator, seed=seed, **(world or {}))
+        self._world: EmulatedWorld | None = None
+        self._car: HardwareCar | None = None
+
+    def log_to(self, folder: Path) -> None:
+        """Write what the firmware hears and does to ``firmware.jsonl`` in a folder."""
+        self._config = dataclasses.replace(self._config, log=str(folder / "firmware.jsonl"))
+
+    @property
+    def world(self) -> EmulatedWorld:
+        """The process behind the wire, to ask for its log or to break something. Raises NotOpenError."""
+        if self._world is None:
+            raise NotOpenError(f"{self.name} is not open; call open() first, or use it in a with block.")
+        return self._world
+
+    @property
+    def hardware(self) -> HardwareCar:
+        """The car as the driver sees it. Raises NotOpenError."""
+        if self._car is None:
+            raise NotOpenError(f"{self.name} is not open; call open() first, or use it in a with block.")
+        return self._car
+
+    def open(self) -> None:
+        """Start the world, then connect to it as to any hardware."""
+        if self._car is not None:
+            return
+        if self._actuator == "can" and not self._config.can_channel:
+            self._config = dataclasses.replace(self._config, can_channel=f"{MULTICAST_GROUP}:{free_udp_port()}")
+        world = EmulatedWorld(self._config)
+        world.open()
+        self._world = world
+        there = world.addresses
+        options: dict[str, Any] = {"kind": "vesc_serial", "port": there["port"]}
+        if self._actuator == "can":
+            options = {"kind": "vesc_can", "interface": "udp_multicast", "channel": there["can_channel"]}
+        mocap = MocapConfig(
+            mode="multicast" if self._config.mode == "multicast" else "unicast",
+            command_port=there["command_port"],
+            local_interface="127.0.0.1",
+            bitstream=self._config.bitstream,
+            body=BODY_NAME,
+        )
+        self._car = HardwareCar(
+            self.name,
+            Actuator(ActuatorConfig(**(options | self._actuator_options)), ActuatorCalibration()),
+            RigidBodyPoseSource(mocap),
+            StateEstimator(),
+            reality=Reality.EMULATED,
+            place=self._place,
+        )
+        try:
+            self._car.open()
+        except BaseException:
+            self.close()
+            raise
+
+    def observe(self) -> Observation:
+        """The driver's."""
+        return self.hardware.observe()
+
+    def arm(self) -> None:
+        """The driver's."""
+        self.hardware.arm()
+
+    def command(self, action: Action) -> Action:
+        """The driver's."""
+        return self.hardware.command(action)
+
+    def stop(self, *, planned: bool) -> None:
+        """The driver's."""
+        if self._car is not None:
+            self._car.stop(planned=planned)
+
+    def reset_fault(self) -> None:
+        """The driver's."""
+        self.hardware.reset_fault()
+
+    def health(self) -> Health:
+        """The driver's."""
+        return Health(False, (f"{self.name} is not open.",)) if self._car is None else self._car.health()
+
+    def place(self, state: CarState) -> bool:
+        """Put the car at ``state`` in its world and wait until nothing of the old place is in any window."""
+        placed = self.hardware.place(state)
+        if placed:
+            self.clock.sleep_until(self.clock.now_s() + SETTLE_S)
+            self.hardware.observe()
+        return placed
+
+    def close(self) -> None:
+        """Neutral, disconnect, and let the world end."""
+        car, self._car = self._car, None
+        try:
+            if car is not None:
+                car.close()
+        finally:
+            if self._world is not None:
+                self._world.close()
+                self._world = None
+
+    def _place(self, state: CarState) -> bool:
+        self.world.ask(do="place", state=list(state.to_array()))
+        return True
+
+
+def free_udp_port() -> int:
+    """A UDP port that is free right now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,238 @@
+"""The world of an emulated car, in a process of its own: physics, fake firmware and a NatNet server around it.
+
+    actuator bytes (pty or CAN) ──> fake VESC ──> plant (physics, delays) ──> NatNet server ──> UDP frames
+
+Run as ``python -m carlab.cars.emulated_world``. The first line of standard input is the configuration, each further
+line a request; each gets one line of answer, all JSON, but for "leave", which ends the process. When standard input
+ends without it (its owner died), the world stays until the firmware's own motor time-out has been seen, then leaves.
+It ignores ^C: its owner decides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import select
+import signal
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from carlab.core.clock import MonotonicClock
+from carlab.core.errors import CarlabError
+from carlab.core.quantities import Action, CarState
+from drivers.calibration import MOTOR_SCALES, ActuatorCalibration, MotorKind
+from drivers.emulators.can_firmware import CanFirmware
+from drivers.emulators.command_log import CommandLog
+from drivers.emulators.serial_firmware import SerialFirmware
+from drivers.emulators.vesc_firmware import RESTING, VescFirmware
+from drivers.vesc_payloads import MotorValues
+from mocap.emulated_scene import EmulatedBody, RigidBodySample
+from mocap.emulator import NatNetServer
+from mocap.emulator_faults import ServerFaults
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.plant import Plant
+from sim_backends.sensor import MocapSensor
+
+ERPM_PER_MPS = 3000.0
+LINGER_AFTER_TIMEOUT_S = 0.5
+BODY_NAME = "car"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class WorldConfig:
+    """What the world is made of. Ports of 0 are chosen and reported; ``can_channel`` is GROUP or GROUP:PORT."""
+
+    simulator: Mapping[str, Any]
+    actuator: str = "serial"
+    seed: int = 0
+    log: str = ""
+    serial_link: str = ""
+    can_channel: str = ""
+    controller_id: int = 23
+    command_port: int = 0
+    data_port: int = 0
+    mode: str = "unicast"
+    bitstream: str = "4.1"
+    multicast_group: str = "239.255.42.99"
+    motor_timeout_s: float = 1.0
+    body: str = BODY_NAME
+
+
+class World:
+    """Plant, firmware and NatNet server, wired together. ``with`` starts and stops them."""
+
+    def __init__(self, config: WorldConfig) -> None:
+        simulator = SimulatorConfig.from_tables(config.simulator, "the emulated car")
+        self.config = config
+        self.clock = MonotonicClock()
+        self.calibration = ActuatorCalibration()
+        self.log = CommandLog(Path(config.log) if config.log else None)
+        self._lock = threading.Lock()
+        self._plant = Plant(simulator, config.seed)
+        self._sensor = MocapSensor(simulator, config.seed)
+        self._command = Action()
+        firmware = VescFirmware(
+            self.log,
+            on_motor=self._on_motor,
+            on_servo=self._on_servo,
+            readings=self._readings,
+            motor_timeout_s=config.motor_timeout_s,
+            controller_id=config.controller_id,
+        )
+        self.firmware: SerialFirmware | CanFirmware
+        if config.actuator == "serial":
+            self.firmware = SerialFirmware(
+                firmware, link=Path(config.serial_link) if config.serial_link else None, baud=115200
+            )
+        else:
+            self.firmware = CanFirmware(firmware, "udp_multicast", config.can_channel)
+        self.server = NatNetServer(
+            self._poses,
+            (EmulatedBody(config.body),),
+            rate_hz=simulator.mocap.rate_hz,
+            mode="multicast" if config.mode == "multicast" else "unicast",
+            version=config.bitstream,
+            command_port=config.command_port,
+            data_port=config.data_port,
+            multicast_group=config.multicast_group,
+            seed=config.seed,
+        )
+        self._stack = ExitStack()
+
+    def __enter__(self) -> World:
+        self._plant.reset(CarState(), self.clock.now_s())
+        try:
+            self._stack.enter_context(self.firmware)
+            self._stack.enter_context(self.server)
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._stack.close()
+
+    @property
+    def addresses(self) -> dict[str, Any]:
+        """Where a host finds everything."""
+        serial = isinstance(self.firmware, SerialFirmware)
+        return {
+            "port": self.firmware.port if isinstance(self.firmware, SerialFirmware) else "",
+            "can_channel": "" if serial else self.config.can_channel,
+            "command_port": self.server.command_port,
+            "data_port": self.server.data_port,
+            "pid": os.getpid(),
+        }
+
+    def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Do what a request asks for; the answer is ready for JSON."""
+        match request.get("do"):
+            case "place":
+                with self._lock:
+                    now_s = self.clock.now_s()
+                    self._plant.reset(CarState(*(float(v) for v in request["state"])), now_s)
+                    self._command = Action()
+                return {"t_s": now_s}
+            case "state":
+                with self._lock:
+                    now_s = self.clock.now_s()
+                    return {"t_s": now_s, "state": list(self._plant.advance(now_s).to_array())}
+            case "log":
+                since_s = float(request.get("since_s", float("-inf")))
+                return {"entries": [dataclasses.astuple(e) for e in self.log.entries(since_s=since_s)]}
+            case "unplug" if isinstance(self.firmware, SerialFirmware):
+                self.firmware.unplug()
+            case "replug" if isinstance(self.firmware, SerialFirmware):
+                self.firmware.replug()
+            case "wire":
+                for name, value in request["faults"].items():
+                    setattr(self.firmware.faults, name, value)
+            case "mocap":
+                self.server.faults = ServerFaults(**request["faults"])
+            case other:
+                return {"error": f"The emulated world cannot do '{other}'."}
+        return {"t_s": self.clock.now_s()}
+
+    def linger(self) -> None:
+        """Stay until the firmware has timed out, as the hardware would be seen to do."""
+        deadline_s = self.clock.now_s() + self.config.motor_timeout_s + LINGER_AFTER_TIMEOUT_S
+        while self.clock.now_s() < deadline_s:
+            self.clock.sleep_until(self.clock.now_s() + 0.05)
+
+    def _on_motor(self, t_s: float, kind: str, value: float) -> None:
+        throttle = 0.0
+        if kind in ("current", "duty"):
+            motor = MotorKind.CURRENT if kind == "current" else MotorKind.DUTY
+            throttle = self.calibration.throttle_of(motor, value * MOTOR_SCALES[motor])
+        self._act(t_s, Action(self._command.steering, throttle))
+
+    def _on_servo(self, t_s: float, position: float) -> None:
+        self._act(t_s, Action(self.calibration.steering_of(position), self._command.throttle))
+
+    def _act(self, t_s: float, command: Action) -> None:
+        with self._lock:
+            if command != self._command:
+                self._command = command
+                self._plant.command(t_s, command)
+
+    def _readings(self, t_s: float) -> MotorValues:
+        with self._lock:
+            speed_mps = self._plant.advance(t_s).vx_mps
+        return dataclasses.replace(RESTING, erpm=ERPM_PER_MPS * speed_mps)
+
+    def _poses(self, t_s: float) -> Sequence[RigidBodySample | None]:
+        with self._lock:
+            self._plant.advance(t_s)
+            sample = self._sensor.expose(t_s - self._sensor.latency_s, self._plant)
+        if sample is None:
+            return [None]
+        return [RigidBodySample.planar(sample.t_capture_s, sample.x_m, sample.y_m, sample.yaw_rad)]
+
+
+def main() -> int:
+    """Serve until standard input ends."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    try:
+        config = WorldConfig(**json.loads(sys.stdin.buffer.readline()))
+        world = World(config)
+        world.__enter__()
+    except (CarlabError, OSError) as error:
+        _say({"error": str(error)})
+        return 1
+    try:
+        _say(world.addresses)
+        pending = b""
+        while True:
+            select.select([0], [], [])
+            data = os.read(0, 65536)
+            if not data:
+                break
+            *lines, pending = (pending + data).split(b"\n")
+            requests = [json.loads(line) for line in lines]
+            if any(request.get("do") == "leave" for request in requests):
+                return 0
+            for request in requests:
+                _say(world.answer(request))
+        world.linger()
+    finally:
+        world.__exit__()
+    return 0
+
+
+def _say(answer: Mapping[str, Any]) -> None:
+    try:
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The owner is gone; standard input will say so too.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""``carlab VERB``: one file a verb, help from the docstrings, exit codes that mean something.
+
+Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+EXIT_INTERRUPTED = 130
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of the ``carlab`` command."""
+    sys.exit(run(sys.argv[1:] if argv is None else argv))
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run one command line and return its exit code."""
+    # A Python program that drives a car on two cores wants neither thread pools fighting over them nor banners.
+    os.environ.setdefault("OMP_NUM_THREADS", "2")
+    import tyro
+
+    from carlab.cli.console import fail, log_to_console
+    from carlab.core.errors import CarlabError
+
+    verb = tyro.cli(_verbs(), args=list(argv), prog="carlab", description=_DESCRIPTION)
+    log_to_console(verbose=bool(getattr(verb, "verbose", False)))
+    try:
+        return int(verb.run())
+    except CarlabError as error:
+        fail(str(error))
+        return error.exit_code
+    except KeyboardInterrupt:
+        fail("Interrupted.")
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        named = f"{error.filename}: " if error.filename else ""
+        fail(f"{named}{error.strerror or error}; check the path, its permissions and the disk.")
+        return 1
+
+
+_DESCRIPTION = "Drive, learn and diagnose small race cars: real, emulated on the wire, or simulated."
+
+
+def _verbs() -> Any:
+    from typing import Union
+
+    import tyro
+
+    from carlab.cli.bench import Bench
+    from carlab.cli.check import Check
+    from carlab.cli.drive import Drive
+    from carlab.cli.emulate import Emulate
+    from carlab.cli.export import Export
+    from carlab.cli.import_ import Import
+    from carlab.cli.listen import Listen
+    from carlab.cli.replay import Replay
+    from carlab.cli.view import View
+
+    verbs = {
+        "drive": Drive,
+        "replay": Replay,
+        "view": View,
+        "import": Import,
+        "export": Export,
+        "check": Check,
+        "emulate": Emulate,
+        "listen": Listen,
+        "bench": Bench,
+    }
+    named = tuple(Annotated[cls, tyro.conf.subcommand(name=name)] for name, cls in verbs.items())
+    return tyro.conf.OmitSubcommandPrefixes[Union[named]]  # noqa: UP007

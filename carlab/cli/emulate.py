@@ -1,0 +1,90 @@
+"""``carlab emulate``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from carlab.cli.console import console
+
+
+@dataclass
+class Emulate:
+    """Run fake hardware as a process: a VESC on a pty or CAN bus, and a NatNet server, driven by one physics.
+
+    Any program that speaks these protocols can use it; carlab itself does with a car file that names the port. It
+    runs until ^C.
+    """
+
+    actuator: Literal["serial", "can"] = "serial"
+    """A VESC on a pseudo-terminal, or on a CAN bus (python-can udp_multicast, kept on this host)."""
+
+    port: Path = Path("carlab-vesc")
+    """Name of the serial port: a link to the pseudo-terminal."""
+
+    can_channel: str = "239.74.163.2:43113"
+    """Group and port of the CAN bus."""
+
+    vehicle: Path | None = None
+    """A car file for physics and motion capture; the default car without it."""
+
+    mode: Literal["unicast", "multicast"] = "unicast"
+    """How NatNet frames are sent."""
+
+    bitstream: str = "4.1"
+    """NatNet bitstream version: 3.0, 3.1, 4.0 or 4.1."""
+
+    command_port: int = 1510
+    """NatNet command port; 0 for any."""
+
+    data_port: int = 1511
+    """NatNet data port; 0 for any."""
+
+    seed: int = 0
+    """Of the sensor noise."""
+
+    log: Path | None = None
+    """Write each command the firmware hears as a JSON line."""
+
+    verbose: bool = False
+    """Show the whole log."""
+
+    def run(self) -> int:
+        """Serve until interrupted."""
+        from carlab.cars import default_car, load_car_file
+        from carlab.cars.emulated_world import World, WorldConfig
+        from carlab.core.errors import NotReadyError
+        from carlab.experiment.interrupts import Interrupts
+
+        file = default_car() if self.vehicle is None else load_car_file(self.vehicle)
+        if self.actuator == "serial" and self.port.exists() and not self.port.is_symlink():
+            raise NotReadyError(f"{self.port}", ["a file of that name is there already; choose another --port."])
+        config = WorldConfig(
+            simulator=file.simulator.to_tables(),
+            actuator=self.actuator,
+            seed=self.seed,
+            log="" if self.log is None else str(self.log),
+            serial_link=str(self.port) if self.actuator == "serial" else "",
+            can_channel=self.can_channel,
+            command_port=self.command_port,
+            data_port=self.data_port,
+            mode=self.mode,
+            bitstream=self.bitstream,
+        )
+        with Interrupts() as interrupts, World(config) as world:
+            there = world.addresses
+            console.print("[bold]EMULATED[/bold]  in the car file of a program on this host:")
+            # Square brackets are rich's mark-up; here they are TOML.
+            lines = ["[hardware.actuator]"]
+            if self.actuator == "serial":
+                lines += ['kind = "vesc_serial"', f'port = "{there["port"]}"']
+            else:
+                lines += ['kind = "vesc_can"', 'interface = "udp_multicast"', f'channel = "{there["can_channel"]}"']
+            lines += ["[hardware.mocap]", 'server_address = "127.0.0.1"', 'local_interface = "127.0.0.1"']
+            lines += [f'mode = "{self.mode}"', f"command_port = {there['command_port']}", f'body = "{config.body}"']
+            console.print("\n".join(lines), markup=False)
+            console.print("^C ends it.")
+            while not interrupts.requested.wait(0.2):
+                pass
+        return 0

@@ -1,0 +1,93 @@
+"""``carlab listen``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from carlab.cli.console import console, table
+from carlab.core.errors import ConfigError
+
+
+@dataclass
+class Listen:
+    """Print motion-capture frames as they come: pose, rate, latency, losses."""
+
+    car: Path | None = None
+    """A car file whose [hardware.mocap] to use; the options below otherwise."""
+
+    server: str = "127.0.0.1"
+    """Address of the computer that runs Motive."""
+
+    interface: str = ""
+    """Address of this computer's interface towards it; empty for the one the system would use."""
+
+    mode: Literal["unicast", "multicast"] = "unicast"
+    """Transmission type of the server."""
+
+    command_port: int = 1510
+    """NatNet command port of the server."""
+
+    body: str = ""
+    """Rigid body by name; the only one there is where empty."""
+
+    body_id: int | None = None
+    """Rigid body by streaming id, in place of its name."""
+
+    bitstream: str = "4.1"
+    """Newest bitstream version to ask for."""
+
+    up_axis: Literal["y", "z"] = "y"
+    """Up axis of the stream."""
+
+    seconds: float | None = None
+    """Stop after this long; without it, at ^C."""
+
+    verbose: bool = False
+    """Show the whole log."""
+
+    def run(self) -> int:
+        """Listen and print four lines a second, then the statistics."""
+        from carlab.cars import load_car_file
+        from carlab.core.clock import MonotonicClock
+        from carlab.experiment.interrupts import Interrupts
+        from mocap.mocap_config import MocapConfig
+        from mocap.rigid_body import RigidBodyPoseSource
+
+        config = MocapConfig(
+            server_address=self.server,
+            local_interface=self.interface,
+            mode=self.mode,
+            command_port=self.command_port,
+            body=self.body,
+            body_id=self.body_id,
+            bitstream=self.bitstream,
+            up_axis=self.up_axis,
+        )
+        if self.car is not None:
+            real = load_car_file(self.car).real
+            if real is None:
+                raise ConfigError(f"{self.car} has no [hardware]; give --server and --body instead.")
+            config = real.mocap
+        clock = MonotonicClock()
+        with Interrupts() as interrupts, RigidBodyPoseSource(config) as source:
+            end_s = float("inf") if self.seconds is None else clock.now_s() + self.seconds
+            sequence = -1
+            while not interrupts.requested.is_set() and clock.now_s() < end_s:
+                sample = source.wait_for(sequence, 0.5)
+                if sample is None:
+                    console.print("[yellow]no frame for half a second[/yellow]")
+                    continue
+                sequence = sample.sequence
+                age_ms = (sample.t_receive_s - sample.t_capture_s) * 1e3
+                seen = "" if sample.tracked else "  [yellow]not tracked[/yellow]"
+                console.print(
+                    f"frame {sample.sequence:8d}  x {sample.x_m:+8.4f} m  y {sample.y_m:+8.4f} m  "
+                    f"yaw {sample.yaw_rad:+7.4f} rad  latency {age_ms:5.1f} ms{seen}"
+                )
+                clock.sleep_until(min(clock.now_s() + 0.25, end_s))
+            statistics = source.statistics()
+        rows = [[name.replace("_", " "), f"{value:.4g}"] for name, value in statistics.items()]
+        table("Stream", ["figure", "value"], rows)
+        return 0
