@@ -16,7 +16,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(VENV)/.installed
-	$(BIN)/carlab drive --car emulated --episodes 3 --name demo
+	$(BIN)/carlab drive --car emulated --episodes 3 --ticks 150 --name demo
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -4,8 +4,8 @@
 
 Run as ``python -m carlab.cars.emulated_world``. The first line of standard input is the configuration, each further
 line a request; each gets one line of answer, all JSON, but for "leave", which ends the process. When standard input
-ends without it (its owner died), the world stays until the firmware's own motor time-out has been seen, then leaves.
-It ignores ^C: its owner decides.
+ends without it (its owner died), or the motor is still powered, the world stays until the firmware's own motor
+time-out has been seen, then leaves. It ignores ^C: its owner decides.
 """
 
 from __future__ import annotations
@@ -158,6 +158,11 @@ class World:
                 return {"error": f"The emulated world cannot do '{other}'."}
         return {"t_s": self.clock.now_s()}
 
+    @property
+    def is_driven(self) -> bool:
+        """Whether the motor is powered: its firmware has heard neither neutral nor, for long enough, nothing."""
+        return self._command.throttle != 0.0
+
     def linger(self) -> None:
         """Stay until the firmware has timed out, as the hardware would be seen to do."""
         deadline_s = self.clock.now_s() + self.config.motor_timeout_s + LINGER_AFTER_TIMEOUT_S
@@ -216,6 +221,8 @@ def main() -> int:
             *lines, pending = (pending + data).split(b"\n")
             requests = [json.loads(line) for line in lines]
             if any(request.get("do") == "leave" for request in requests):
+                if world.is_driven:
+                    world.linger()
                 return 0
             for request in requests:
                 _say(world.answer(request))

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
-from typing import Annotated, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 EXIT_INTERRUPTED = 130
 
@@ -27,7 +27,7 @@ def run(argv: Sequence[str]) -> int:
     from carlab.cli.console import fail, log_to_console
     from carlab.core.errors import CarlabError
 
-    verb = tyro.cli(_verbs(), args=list(argv), prog="carlab", description=_DESCRIPTION)
+    verb = tyro.extras.subcommand_cli_from_dict(_verbs(), args=list(argv), prog="carlab", description=_DESCRIPTION)
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))
     try:
         return int(verb.run())
@@ -49,11 +49,7 @@ def run(argv: Sequence[str]) -> int:
 _DESCRIPTION = "Drive, learn and diagnose small race cars: real, emulated on the wire, or simulated."
 
 
-def _verbs() -> Any:
-    from typing import Union
-
-    import tyro
-
+def _verbs() -> dict[str, Callable[..., Any]]:
     from carlab.cli.bench import Bench
     from carlab.cli.check import Check
     from carlab.cli.drive import Drive
@@ -64,7 +60,7 @@ def _verbs() -> Any:
     from carlab.cli.replay import Replay
     from carlab.cli.view import View
 
-    verbs = {
+    return {
         "drive": Drive,
         "replay": Replay,
         "view": View,
@@ -75,5 +71,3 @@ def _verbs() -> Any:
         "listen": Listen,
         "bench": Bench,
     }
-    named = tuple(Annotated[cls, tyro.conf.subcommand(name=name)] for name, cls in verbs.items())
-    return tyro.conf.OmitSubcommandPrefixes[Union[named]]  # noqa: UP007

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from tyro.conf import OmitArgPrefixes
+
 from carlab.cli.console import banner, console, fail, table
 from carlab.cli.options import CarOptions
 from carlab.core.errors import NotReadyError
@@ -18,7 +20,7 @@ class Check:
     Exit code 0 where the car is ready to be armed, 3 where it is not; the reasons are listed together.
     """
 
-    options: CarOptions = field(default_factory=CarOptions)
+    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
     seconds: float = 2.0
     """How long to watch motion capture."""
@@ -34,7 +36,7 @@ class Check:
         from carlab.cars.emulated_car import EmulatedCar
         from carlab.cars.latency import LatencyParts, measure_latency, measure_pose_latency
 
-        choice = self.options.choose(seed=0)
+        choice = self.which_car.choose(seed=0)
         banner(choice.car.reality, choice.car.name)
         with choice.car as car:
             latency: LatencyParts | None = None

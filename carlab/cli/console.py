@@ -12,11 +12,20 @@ from rich.logging import RichHandler
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from carlab.core.quantities import Reality
 
-console = Console(highlight=False, soft_wrap=True)
-error_console = Console(stderr=True, highlight=False, soft_wrap=True)
+WIDTH_OF_A_FILE = 140
+
+
+def _console(*, stderr: bool) -> Console:
+    terminal = (sys.stderr if stderr else sys.stdout).isatty()
+    return Console(stderr=stderr, highlight=False, width=None if terminal else WIDTH_OF_A_FILE)
+
+
+console = _console(stderr=False)
+error_console = _console(stderr=True)
 
 STYLES = {Reality.SIMULATED: "cyan", Reality.EMULATED: "green", Reality.DRY_RUN: "yellow", Reality.REAL: "bold red"}
 SENTENCES = {
@@ -35,16 +44,17 @@ def banner(reality: Reality, car: str) -> None:
 
 def fail(message: str) -> None:
     """Print one error, alone."""
-    error_console.print(f"[bold red]carlab:[/bold red] {message}")
+    error_console.print("[bold red]carlab:[/bold red]", Text(message), soft_wrap=True)
 
 
-def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; columns after the first are right-aligned."""
-    made = Table(title=title, title_justify="left", header_style="bold")
+def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: bool = True) -> None:
+    """Print a table; columns after the first are right-aligned where they are numbers."""
+    # Text, not str: "[m]" is a unit here and no mark-up.
+    made = Table(title=Text(title) if title else None, title_justify="left", header_style="bold")
     for index, column in enumerate(columns):
-        made.add_column(column, justify="left" if index == 0 else "right")
+        made.add_column(Text(column), justify="left" if index == 0 or not numeric else "right")
     for row in rows:
-        made.add_row(*row)
+        made.add_row(*(Text(cell) for cell in row))
     console.print(made)
 
 

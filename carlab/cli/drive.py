@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from tyro.conf import OmitArgPrefixes
+
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.options import CarOptions
 from carlab.core.errors import ConfigError
@@ -46,7 +48,7 @@ class Drive:
     once to end after the tick, twice to stop at once.
     """
 
-    options: CarOptions = field(default_factory=CarOptions)
+    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
     policy: PolicyName = "parking"
     """parking (feedback), a scripted manoeuvre, neutral, or by hand: keyboard, gamepad (hold the dead-man)."""
@@ -94,7 +96,7 @@ class Drive:
             raise ConfigError(f"--episodes {self.episodes}: at least one.")
         if self.ticks is not None and self.ticks < 1:
             raise ConfigError(f"--ticks {self.ticks}: at least one.")
-        choice = self.options.choose(seed=self.seed)
+        choice = self.which_car.choose(seed=self.seed)
         envelope = choice.envelope
         task = TASKS[self.task]()
         if not envelope.arena_m:
@@ -144,21 +146,21 @@ class Drive:
         return ManoeuvrePolicy(MANOEUVRES[self.policy]()), None
 
     def _hooks(self, bar: object, run: RunDirectory, teleop: TeleopPolicy | None) -> SessionHooks:
-        from rich.progress import Progress
+        from rich.progress import Progress, TaskID
 
         from carlab.core.documents import Tick
         from carlab.experiment.session import SessionHooks
 
         assert isinstance(bar, Progress)
-        rows: list[int] = []
+        rows: list[TaskID] = []
 
         def on_episode(number: int, ticks: int) -> None:
-            rows.append(bar.add_task(f"episode {number}", total=ticks, note=""))  # type: ignore[arg-type]
+            rows.append(bar.add_task(f"episode {number}", total=ticks, note=""))
 
         def on_tick(tick: Tick) -> None:
             state = tick.observation.state
             note = f"({state.x_m:+.2f}, {state.y_m:+.2f}) m  {state.speed_mps:.2f} m/s"
-            bar.update(rows[-1], completed=tick.step + 1, note=note)  # type: ignore[arg-type]
+            bar.update(rows[-1], completed=tick.step + 1, note=note)
 
         def place_by_hand(start: CarState) -> None:
             text = f"Put the car at x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad"
@@ -203,12 +205,13 @@ class Drive:
             if r.reason.is_safety_stop:
                 fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())
         if self.picture:
+            from carlab.recording.mcap_source import read_episode
             from carlab.recording.picture import save_summary
 
-            save_summary([r.data for r in results], run.path / "summary.png", title=self.name)
+            save_summary([read_episode(r.path) for r in results if r.path.exists()], run.path / "summary.png")
         first = results[0].path
-        console.print(f"Recorded in {run.path} (summary.png shows it). Look at an episode with:")
-        console.print(f"  carlab view {first}")
+        console.print(f"Recorded in {run.path} (summary.png shows it). Look at an episode with:", soft_wrap=True)
+        console.print(f"  carlab view {first}", soft_wrap=True)
         last = results[-1].reason
         if last is EndReason.STOP_REQUESTED:
             return EXIT_INTERRUPTED

@@ -80,11 +80,11 @@ class ReverseParkingPolicy:
     damping_nspm: float = 1.56
     mass_kg: float = 1.65
     reaction_s: float = 0.12
-    cruise_mps: float = 1.02
-    braking_mps2: float = 1.15
-    approach_rad: float = 1.9
-    line_width_m: float = 0.67
-    turn_gain_per_m: float = 7.3
+    cruise_mps: float = 1.2
+    braking_mps2: float = 1.7
+    approach_rad: float = 1.7
+    line_width_m: float = 0.8
+    turn_gain_per_m: float = 3.0
     swing_s: float = 0.13
     left_weight: float = 0.72
     name: str = "reverse_parking"

@@ -1,0 +1,183 @@
+"""One suite for every car: simulated, emulated over serial, emulated over CAN, dry run, and with --hil a real one.
+
+The emulated cars are the whole hardware path: sender process, bytes on a pty or CAN bus, NatNet over UDP.
+"""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from carlab.cars import choose_car
+from carlab.core.car import Car
+from carlab.core.errors import (
+    ActionOutOfRangeError,
+    ActuatorFaultError,
+    NotArmedError,
+    NotOpenError,
+)
+from carlab.core.quantities import NEUTRAL, Action, CarState, Reality
+
+KINDS = ["sim", "emulated", "emulated-can", "dry-run", pytest.param("real", marks=pytest.mark.hil)]
+
+
+def build(kind: str, request: pytest.FixtureRequest) -> Car:
+    if kind == "real":
+        return choose_car(str(Path(request.config.getoption("--hil")))).car
+    if kind == "dry-run":
+        return choose_car("sim", dry_run=True).car
+    return choose_car(kind).car
+
+
+@pytest.fixture(params=KINDS)
+def closed_car(request: pytest.FixtureRequest) -> Iterator[Car]:
+    car = build(request.param, request)
+    yield car
+    car.close()
+
+
+@pytest.fixture
+def car(closed_car: Car) -> Iterator[Car]:
+    with closed_car:
+        yield closed_car
+        if closed_car.reality is Reality.REAL:
+            assert closed_car.health().ready
+
+
+def wait(car: Car, seconds: float) -> None:
+    car.clock.sleep_until(car.clock.now_s() + seconds)
+
+
+def hold(car: Car, action: Action, seconds: float) -> None:
+    """Command every 30 ms, as a control loop does, so that no watchdog fires."""
+    end_s = car.clock.now_s() + seconds
+    while car.clock.now_s() < end_s:
+        car.command(action)
+        wait(car, 0.03)
+
+
+def test_constructing_does_nothing_and_a_closed_car_refuses(closed_car: Car) -> None:
+    for use in (closed_car.observe, closed_car.arm, lambda: closed_car.command(NEUTRAL)):
+        with pytest.raises(NotOpenError):
+            use()
+    assert not closed_car.health().ready
+    closed_car.stop(planned=True)
+    closed_car.stop(planned=False)
+    closed_car.close()
+
+
+def test_open_and_close_are_idempotent(closed_car: Car) -> None:
+    closed_car.open()
+    closed_car.open()
+    assert closed_car.health().ready, closed_car.health().problems
+    closed_car.close()
+    closed_car.close()
+    with pytest.raises(NotOpenError):
+        closed_car.observe()
+
+
+def test_observations_are_fresh_and_advance(car: Car) -> None:
+    first = car.observe()
+    wait(car, 0.2)
+    second = car.observe()
+    assert second.sequence > first.sequence
+    assert second.t_capture_s > first.t_capture_s
+    assert second.t_receive_s >= second.t_capture_s
+    assert 0.0 <= car.clock.now_s() - second.t_receive_s < 0.15
+    assert second.tracked
+    assert [p.sequence for p in second.poses] == sorted({p.sequence for p in second.poses})
+    assert second.poses[-1].sequence == second.sequence
+    assert second.velocity_delay_s > 0.0
+
+
+def test_nothing_but_neutral_before_arming(car: Car) -> None:
+    assert car.command(NEUTRAL).is_neutral
+    with pytest.raises(NotArmedError):
+        car.command(Action(0.2, 0.2))
+
+
+@pytest.mark.parametrize(
+    "bad", [Action(math.nan, 0), Action(0, math.inf), Action(1.01, 0.0), Action(0.0, -1.5)], ids=str
+)
+def test_bad_commands_are_refused_and_change_nothing(car: Car, bad: Action) -> None:
+    car.arm()
+    with pytest.raises(ActionOutOfRangeError):
+        car.command(bad)
+    with pytest.raises(ActionOutOfRangeError):
+        car.check(bad)
+    assert car.command(NEUTRAL).is_neutral
+
+
+def test_command_returns_what_is_sent(car: Car) -> None:
+    car.arm()
+    for action in (Action(0.5, 0.0), Action(-1.0, 0.0), Action(0.123, 0.0)):
+        sent = car.command(action)
+        # Device steps: one in a thousand of the servo's range, a third of that in steering.
+        assert sent.steering == pytest.approx(action.steering, abs=0.002)
+        assert sent.throttle == pytest.approx(action.throttle, abs=0.002)
+
+
+def test_it_drives_where_it_is_told(car: Car) -> None:
+    if car.reality in (Reality.DRY_RUN, Reality.REAL):
+        pytest.skip("this car moves nothing, or has no room to")
+    assert car.place(CarState(0.0, 0.0, 0.5))
+    start = car.observe().state
+    assert math.hypot(start.x_m, start.y_m) < 0.01
+    assert start.yaw_rad == pytest.approx(0.5, abs=0.02)
+    assert start.speed_mps < 0.1
+    car.arm()
+    hold(car, Action(0.6, 0.3), 0.8)
+    moved = car.observe().state
+    # Forward along its heading, turning left.
+    assert moved.vx_mps > 0.3
+    assert moved.yaw_rate_radps > 0.2
+    assert moved.x_m * math.cos(0.5) + moved.y_m * math.sin(0.5) > 0.1
+
+
+def test_the_watchdog_gives_neutral_when_commands_stop(car: Car) -> None:
+    if car.reality in (Reality.DRY_RUN, Reality.REAL):
+        pytest.skip("this car moves nothing, or has no room to")
+    car.place(CarState())
+    car.arm()
+    hold(car, Action(0.0, 0.5), 0.6)
+    fast = car.observe().state.vx_mps
+    # Silence: the deadline is 0.15 s, the command delay 0.08 s; after that the motor no longer pushes.
+    wait(car, 0.4)
+    later = car.observe().state.vx_mps
+    wait(car, 0.3)
+    latest = car.observe().state.vx_mps
+    assert fast > 0.5
+    assert latest < later
+
+
+def test_a_planned_stop_disarms_and_an_unplanned_one_latches(car: Car) -> None:
+    car.arm()
+    car.stop(planned=True)
+    with pytest.raises(NotArmedError):
+        car.command(Action(0.1, 0.0))
+    car.arm()
+    car.stop(planned=False)
+    with pytest.raises((ActuatorFaultError, NotArmedError)):
+        car.command(Action(0.1, 0.0))
+    with pytest.raises(ActuatorFaultError):
+        car.arm()
+    car.reset_fault()
+    with pytest.raises(NotArmedError):
+        car.command(Action(0.1, 0.0))
+    car.arm()
+    assert car.command(Action(0.1, 0.0)).steering > 0
+
+
+def test_it_can_be_opened_again(closed_car: Car) -> None:
+    for _ in range(2):
+        with closed_car:
+            closed_car.observe()
+            closed_car.arm()
+            closed_car.command(Action(0.1, 0.0))
+
+
+def test_the_data_says_what_the_car_is_made_of(closed_car: Car, request: pytest.FixtureRequest) -> None:
+    kind = request.node.callspec.params["closed_car"]
+    expected = {"sim": Reality.SIMULATED, "dry-run": Reality.DRY_RUN, "real": Reality.REAL}
+    assert closed_car.reality is expected.get(kind, Reality.EMULATED)

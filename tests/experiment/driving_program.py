@@ -1,0 +1,112 @@
+"""A program that drives the emulated car and misbehaves as told; the tests run it as a process and break things.
+
+python driving_program.py RUNS_FOLDER MISBEHAVIOUR
+Prints one JSON line with its process ids and run folder, then ``tick N`` per tick.
+"""
+
+import json
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from carlab.cars import default_car
+from carlab.cars.emulated_car import EmulatedCar
+from carlab.core.documents import Tick
+from carlab.core.outcome import EndReason
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import Action, CarState
+from carlab.core.task import RecordedTask
+from carlab.experiment.session import Session, SessionHooks
+from carlab.recording.rerun_sink import RerunSink
+from carlab.recording.run_directory import RunDirectory
+
+MISBEHAVE_AT_TICK = 20
+FOREVER_TICKS = 3000
+
+
+class MisbehavingPolicy:
+    """Drives a circle; at a tick it does what it is told."""
+
+    name = "misbehaving"
+
+    def __init__(self, how: str) -> None:
+        self.how = how
+
+    def reset(self) -> None: ...
+
+    def act(self, view: PolicyInput) -> Action | None:
+        if view.step == MISBEHAVE_AT_TICK:
+            if self.how == "policy_error":
+                raise RuntimeError("the policy has a bug")
+            if self.how == "nan":
+                return Action(float("nan"), 0.3)
+            if self.how == "hang_sleep":
+                time.sleep(3600)
+            if self.how == "hang_busy":
+                while True:
+                    pass
+            if self.how == "exit":
+                os._exit(7)
+        return Action(1.0, 0.3)
+
+
+def main(folder: str, how: str) -> int:
+    run = RunDirectory.create(folder, how)
+    car = EmulatedCar(default_car())
+    car.log_to(run.path)
+    if how == "recorder_error":
+        written = RerunSink._write
+        count = [0]
+
+        def broken(self: RerunSink, item: object) -> None:
+            count[0] += 1
+            if count[0] > 3 * MISBEHAVE_AT_TICK:
+                raise OSError(28, "No space left on device")
+            written(self, item)  # type: ignore[arg-type]
+
+        RerunSink._write = broken  # type: ignore[method-assign,assignment]
+
+    def on_tick(tick: Tick) -> None:
+        print(f"tick {tick.step}", flush=True)
+        if tick.step == MISBEHAVE_AT_TICK:
+            if how == "unplug":
+                car.world.ask(do="unplug")
+            if how == "mocap_silent":
+                car.world.ask(do="mocap", faults={"silent": True})
+            if how == "mocap_hidden":
+                car.world.ask(do="mocap", faults={"occlusion": 1.0})
+            if how == "mocap_error":
+                car.hardware.pose_source.since = None  # type: ignore[assignment,method-assign]
+
+    def on_abandon(reason: EndReason, detail: str) -> None:
+        print(f"abandoned {reason.name}", flush=True)
+        os._exit(4)
+
+    with car:
+        sender = car.hardware.actuator._sender
+        print(json.dumps({"run": str(run.path), "main": os.getpid(), "sender": sender.pid}), flush=True)  # type: ignore[union-attr]
+        session = Session(
+            car,
+            MisbehavingPolicy(how),
+            RecordedTask(CarState(), max_ticks=FOREVER_TICKS),
+            replace(_envelope()),
+            run,
+            1 / 30,
+            hooks=SessionHooks(on_tick=on_tick, on_abandon=on_abandon),
+            hang_timeout_s=1.0,
+        )
+        results = session.drive(1)
+    print(f"ended {results[0].reason.name}", flush=True)
+    return 4 if results[0].reason.is_safety_stop else 0
+
+
+def _envelope():  # type: ignore[no-untyped-def]
+    from carlab.core.safety import SafetyEnvelope
+
+    return SafetyEnvelope()
+
+
+if __name__ == "__main__":
+    sys.exit(main(str(Path(sys.argv[1])), sys.argv[2]))

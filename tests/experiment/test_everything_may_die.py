@@ -1,0 +1,243 @@
+"""Whatever dies, the motor stops: asserted on the bytes that the fake firmware decoded, and on the recording.
+
+Each case runs a program that drives the emulated car over the whole hardware path, and breaks something.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from carlab.core.episode_data import EpisodeData
+from carlab.recording.mcap_source import read_episode
+from drivers.emulators.command_log import LogEntry, read_log
+
+PROGRAM = Path(__file__).with_name("driving_program.py")
+BREAK_AT_TICK = 25
+
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(120)]
+
+
+@dataclass
+class Driving:
+    """The program while it drives."""
+
+    process: subprocess.Popen[str]
+    run: Path
+    main: int
+    sender: int
+    last_line: str = ""
+
+    def until(self, start: str) -> str:
+        """Read its output up to a line that begins so; fails at its end."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.last_line = line.strip()
+            if self.last_line.startswith(start):
+                return self.last_line
+        raise AssertionError(f"the program ended before '{start}'; its last line was '{self.last_line}'")
+
+    def end(self) -> int:
+        """Wait for its end and return its exit code."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.last_line = line.strip()
+        return self.process.wait()
+
+    def firmware_log(self, settled_s: float = 2.5) -> list[LogEntry]:
+        """What the firmware heard and did; waits until the sender's neutral or the motor's time-out is in it."""
+        deadline_s = time.monotonic() + settled_s + 5.0
+        while time.monotonic() < deadline_s:
+            log = read_log(self.run / "firmware.jsonl")
+            motor = [e for e in log if e.name in ("current", "brake", "duty")]
+            quiet = bool(motor) and time.monotonic() - motor[-1].t_s > settled_s - 1.0
+            if quiet or any(e.name == "motor_timeout" for e in log):
+                return log
+            time.sleep(0.05)
+        return read_log(self.run / "firmware.jsonl")
+
+    @property
+    def recording(self) -> EpisodeData:
+        """The finished recording."""
+        assert not list(self.run.glob("episodes/*.mcap.partial"))
+        return read_episode(self.run / "episodes" / "0001.mcap")
+
+
+@contextmanager
+def driving(folder: Path, how: str) -> Iterator[Driving]:
+    process = subprocess.Popen(
+        [sys.executable, str(PROGRAM), str(folder), how],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line, process.stderr.read() if process.stderr else ""
+        facts = json.loads(line)
+        yield Driving(process, Path(facts["run"]), facts["main"], facts["sender"])
+    finally:
+        process.kill()
+        process.wait()
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+def assert_neutral_at_the_end(log: list[LogEntry], at_least: int = 3, over_s: float = 0.055) -> None:
+    """The last motor commands are zero current, several of them over a while, and the servo is centred."""
+    motor = [e for e in log if e.name in ("current", "brake", "duty")]
+    assert any(e.value > 0.5 for e in motor), "it never drove"
+    tail: list[LogEntry] = []
+    for entry in reversed(motor):
+        if entry.value != 0.0:
+            break
+        tail.append(entry)
+    assert len(tail) >= at_least, f"only {len(tail)} neutral commands at the end"
+    assert tail[0].t_s - tail[-1].t_s >= over_s
+    servo = [e for e in log if e.name == "servo"]
+    assert servo[-1].value == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_episode_in_order(tmp_path: Path, number: signal.Signals) -> None:
+    with driving(tmp_path, "well_behaved") as program:
+        program.until(f"tick {BREAK_AT_TICK}")
+        os.kill(program.main, number)
+        assert program.end() == 0
+        assert program.last_line == "ended STOP_REQUESTED"
+        assert_neutral_at_the_end(program.firmware_log())
+        recording = program.recording
+        assert recording.metadata["end_reason"] == "STOP_REQUESTED"
+        assert recording.ticks >= BREAK_AT_TICK
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ("policy_error", "POLICY_ERROR"),
+        ("nan", "BAD_COMMAND"),
+        ("recorder_error", "RECORDER_ERROR"),
+        ("mocap_silent", "POSE_STALE"),
+        ("mocap_hidden", "TRACKING_LOST"),
+    ],
+)
+def test_an_error_ends_the_episode_in_neutral_with_its_reason(tmp_path: Path, how: str, reason: str) -> None:
+    with driving(tmp_path, how) as program:
+        assert program.end() == 4
+        assert program.last_line == f"ended {reason}"
+        assert_neutral_at_the_end(program.firmware_log())
+        assert program.recording.metadata["end_reason"] == reason
+
+
+def test_an_unexpected_exception_stops_the_car_and_is_not_swallowed(tmp_path: Path) -> None:
+    with driving(tmp_path, "mocap_error") as program:
+        assert program.end() == 1
+        assert program.process.stderr is not None
+        assert "TypeError" in program.process.stderr.read()
+        assert_neutral_at_the_end(program.firmware_log())
+        recording = program.recording
+        assert recording.metadata["end_reason"] == "CRASHED"
+        assert "TypeError" in recording.metadata["end_detail"]
+
+
+@pytest.mark.parametrize("how", ["hang_sleep", "hang_busy"])
+def test_a_hung_loop_is_stopped_from_outside(tmp_path: Path, how: str) -> None:
+    with driving(tmp_path, how) as program:
+        assert program.end() == 4
+        assert program.last_line == "abandoned LOOP_HUNG"
+        log = program.firmware_log()
+        assert_neutral_at_the_end(log)
+        # The sender's watchdog acted long before the loop watch did: no moving command after 0.15 s of silence.
+        moving = [e for e in log if e.name == "current" and e.value != 0.0]
+        recording = program.recording
+        assert recording.metadata["end_reason"] == "LOOP_HUNG"
+        assert moving[-1].t_s - recording.times_s[-1] < 0.4
+
+
+def test_two_interrupts_do_not_wait_for_a_hung_loop(tmp_path: Path) -> None:
+    with driving(tmp_path, "hang_sleep") as program:
+        program.until("tick 19")
+        time.sleep(0.2)
+        for _ in range(2):
+            os.kill(program.main, signal.SIGINT)
+            time.sleep(0.05)
+        assert program.end() == 4
+        assert program.last_line == "abandoned STOP_REQUESTED"
+        assert_neutral_at_the_end(program.firmware_log())
+        assert program.recording.metadata["end_reason"] == "STOP_REQUESTED"
+
+
+def test_unplugging_latches_and_the_firmware_times_out(tmp_path: Path) -> None:
+    with driving(tmp_path, "unplug") as program:
+        assert program.end() == 4
+        assert program.last_line == "ended ACTUATOR_FAULT"
+        log = read_log(program.run / "firmware.jsonl")
+        pulled_s = next(e.t_s for e in log if e.name == "unplug")
+        # Nothing was sent to the port afterwards, by nobody: no re-arming.
+        assert not [e for e in log if e.t_s > pulled_s + 0.05 and e.name in ("current", "servo")]
+        timeout = next(e for e in log if e.name == "motor_timeout")
+        assert pulled_s + 0.9 < timeout.t_s < pulled_s + 1.5
+        assert program.recording.metadata["end_reason"] == "ACTUATOR_FAULT"
+
+
+def test_killing_the_program_leaves_neutral_and_a_recoverable_recording(tmp_path: Path) -> None:
+    with driving(tmp_path, "well_behaved") as program:
+        program.until(f"tick {BREAK_AT_TICK}")
+        os.kill(program.main, signal.SIGKILL)
+        program.process.wait()
+        log = program.firmware_log()
+        assert_neutral_at_the_end(log)
+        partial = program.run / "episodes" / "0001.mcap.partial"
+        recovered = read_episode(partial)
+        assert recovered.ticks >= BREAK_AT_TICK - 18  # At most half a second is lost.
+        assert recovered.metadata["recovered"] == "true"
+        assert recovered.metadata["end_reason"] == "CRASHED"
+
+
+def test_leaving_without_a_word_leaves_neutral(tmp_path: Path) -> None:
+    with driving(tmp_path, "exit") as program:
+        assert program.end() == 7
+        assert_neutral_at_the_end(program.firmware_log())
+
+
+def test_killing_the_sender_brings_the_firmware_s_time_out(tmp_path: Path) -> None:
+    with driving(tmp_path, "well_behaved") as program:
+        program.until(f"tick {BREAK_AT_TICK}")
+        killed_s = time.monotonic()
+        os.kill(program.sender, signal.SIGKILL)
+        assert program.end() == 4
+        assert program.last_line == "ended ACTUATOR_FAULT"
+        log = program.firmware_log()
+        timeouts = [e for e in log if e.name == "motor_timeout"]
+        assert timeouts, "the firmware never noticed"
+        assert timeouts[0].t_s - killed_s < 2.0
+        assert not [e for e in log if e.name == "current" and e.t_s > killed_s + 0.1]
+        assert program.recording.metadata["end_reason"] == "ACTUATOR_FAULT"
+
+
+def test_a_stopped_program_is_braked_by_its_sender(tmp_path: Path) -> None:
+    with driving(tmp_path, "well_behaved") as program:
+        program.until(f"tick {BREAK_AT_TICK}")
+        os.kill(program.main, signal.SIGSTOP)
+        stopped_s = time.monotonic()
+        time.sleep(1.0)
+        log = read_log(program.run / "firmware.jsonl")
+        os.kill(program.main, signal.SIGCONT)
+        moving = [e for e in log if e.name == "current" and e.value != 0.0]
+        assert moving[-1].t_s < stopped_s + 0.4
+        # What was latched while it stood still stays latched when it goes on.
+        assert program.end() == 4
+        later = [e for e in program.firmware_log() if e.name == "current" and e.value != 0.0]
+        assert later[-1].t_s < stopped_s + 0.4
+        assert program.recording.metadata["end_reason"] in ("ACTUATOR_FAULT", "POSE_STALE", "LOOP_HUNG")
