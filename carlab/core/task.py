@@ -260,6 +260,43 @@ class PathTask:
         return {"offset_m": float(self.project(features)[1]), "speed_mps": final.speed_mps}
 
 
+@dataclass(frozen=True, slots=True)
+class RecordedTask:
+    """Nothing but a start: for replaying recorded actions. Every reward is zero."""
+
+    start: CarState
+    max_ticks: int
+    history_length: int = 3
+    arena_m: Corners = ()
+    name: str = "recorded"
+
+    @property
+    def goal(self) -> tuple[float, float, float] | None:
+        """None."""
+        return None
+
+    @property
+    def path_m(self) -> Corners:
+        """None."""
+        return ()
+
+    def sample_start(self, rng: np.random.Generator) -> CarState:
+        """Always the recorded start."""
+        return self.start
+
+    def reward(self, features: Any, action: Any, next_features: Any) -> Any:
+        """Zero."""
+        return 0.0 * next_features[..., 0]
+
+    def terminated(self, next_features: Any) -> Any:
+        """Never."""
+        return (next_features[..., 0] * 0.0) > 1.0
+
+    def summary(self, final: CarState) -> dict[str, float]:
+        """Speed at the end."""
+        return {"speed_mps": final.speed_mps}
+
+
 def wrap_length(length_m: Any, total_m: float) -> Any:
     """Signed arc length on a closed path, in [-total / 2, total / 2)."""
     return (length_m + 0.5 * total_m) % total_m - 0.5 * total_m

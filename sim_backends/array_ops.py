@@ -1,0 +1,145 @@
+"""The few elementary functions that the model's equations are written in, for floats and for NumPy arrays.
+
+The equations stand once in the code, as functions of such a set: one car on plain floats (no array library at all,
+about ten times as fast for one car as NumPy scalars), or a batch of cars on NumPy arrays or, in ``torch_ops``, on
+tensors.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+from numpy.lib import introspect
+
+Value: TypeAlias = Any
+"""A float, a NumPy array or a torch tensor, shape () or (cars,)."""
+
+
+class Ops(Protocol):
+    """Elementary functions of one array library."""
+
+    def sin(self, x: Value, /) -> Value: ...  # noqa: D102
+    def cos(self, x: Value, /) -> Value: ...  # noqa: D102
+    def atan(self, x: Value, /) -> Value: ...  # noqa: D102
+    def atan2(self, y: Value, x: Value, /) -> Value: ...  # noqa: D102
+    def slope_angle(self, y: Value, x: Value, /) -> Value:
+        """``atan2(y, x)`` for positive x, the fastest way."""
+
+    def tanh(self, x: Value, /) -> Value: ...  # noqa: D102
+    def exp(self, x: Value, /) -> Value: ...  # noqa: D102
+    def sqrt(self, x: Value, /) -> Value: ...  # noqa: D102
+    def hypot(self, x: Value, y: Value, /) -> Value: ...  # noqa: D102
+    def abs(self, x: Value, /) -> Value: ...  # noqa: D102
+    def sign(self, x: Value, /) -> Value: ...  # noqa: D102
+    def floor(self, x: Value, low: float, /) -> Value:
+        """``max(x, low)`` with a constant."""
+
+    def clip(self, x: Value, low: Value, high: Value, /) -> Value: ...  # noqa: D102
+    def where(self, condition: Value, yes: Value, no: Value, /) -> Value: ...  # noqa: D102
+    def fma(self, a: Value, b: Value, c: Value, /) -> Value:
+        """``a * b + c``."""
+
+    def fms(self, a: Value, b: Value, c: Value, /) -> Value:
+        """``c - a * b``."""
+
+
+class FloatOps:
+    """Python floats and ``math``: one car."""
+
+    sin = staticmethod(math.sin)
+    cos = staticmethod(math.cos)
+    atan = staticmethod(math.atan)
+    atan2 = staticmethod(math.atan2)
+    tanh = staticmethod(math.tanh)
+    exp = staticmethod(math.exp)
+    sqrt = staticmethod(math.sqrt)
+    hypot = staticmethod(math.hypot)
+    abs = staticmethod(abs)
+
+    @staticmethod
+    def slope_angle(y: Value, x: Value) -> Value:
+        """``atan2(y, x)`` for positive x."""
+        return math.atan(y / x)
+
+    @staticmethod
+    def sign(x: Value) -> Value:
+        """-1, 0 or 1."""
+        return (x > 0) - (x < 0)
+
+    @staticmethod
+    def floor(x: Value, low: float) -> Value:
+        """Not below ``low``."""
+        return x if x > low else low
+
+    @staticmethod
+    def clip(x: Value, low: Value, high: Value) -> Value:
+        """Between ``low`` and ``high``."""
+        return low if x < low else high if x > high else x
+
+    @staticmethod
+    def where(condition: Value, yes: Value, no: Value) -> Value:
+        """Choose."""
+        return yes if condition else no
+
+    @staticmethod
+    def fma(a: Value, b: Value, c: Value) -> Value:
+        """``a * b + c``."""
+        return a * b + c
+
+    @staticmethod
+    def fms(a: Value, b: Value, c: Value) -> Value:
+        """``c - a * b``."""
+        return c - a * b
+
+
+class NumpyOps:
+    """NumPy arrays: a batch of cars without torch."""
+
+    sin = staticmethod(np.sin)
+    cos = staticmethod(np.cos)
+    atan = staticmethod(np.arctan)
+    atan2 = staticmethod(np.arctan2)
+    tanh = staticmethod(np.tanh)
+    exp = staticmethod(np.exp)
+    sqrt = staticmethod(np.sqrt)
+    hypot = staticmethod(np.hypot)
+    abs = staticmethod(np.abs)
+    sign = staticmethod(np.sign)
+    floor = staticmethod(np.maximum)
+    where = staticmethod(np.where)
+
+    @staticmethod
+    def slope_angle(y: Value, x: Value) -> Value:
+        """``atan2(y, x)`` for positive x."""
+        return np.arctan(y / x)
+
+    @staticmethod
+    def clip(x: Value, low: Value, high: Value) -> Value:
+        """Between ``low`` and ``high``; faster than ``numpy.clip``."""
+        return np.minimum(np.maximum(x, low), high)
+
+    @staticmethod
+    def fma(a: Value, b: Value, c: Value) -> Value:
+        """``a * b + c`` with one temporary."""
+        product = a * b
+        product += c
+        return product
+
+    @staticmethod
+    def fms(a: Value, b: Value, c: Value) -> Value:
+        """``c - a * b`` with one temporary."""
+        product = a * b
+        return np.subtract(c, product, out=product) if isinstance(product, np.ndarray) else c - product
+
+
+def has_wide_vectors(dtype: np.dtype) -> bool:
+    """Whether NumPy on this processor computes ``arctan2`` of this type in wide vectors, not one by one."""
+    found = introspect.opt_func_info(func_name="^arctan2$").get("arctan2", {})
+    target = found.get(dtype.char * 3, {}).get("current", "baseline")
+    return not str(target).startswith("baseline")
+
+
+FLOATS: Ops = FloatOps()
+ARRAYS: Ops = NumpyOps()

@@ -1,0 +1,248 @@
+"""The numbers of one simulated car, and the car file (TOML) that they come from."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, Self, get_args
+
+from carlab.core.errors import ConfigError
+from carlab.core.tables import check_keys
+from sim_backends.effects import EFFECTS, DelayEffect
+from sim_backends.registry import REGISTRY, section
+
+ModelKind = Literal["dynamic", "linear_tyre", "kinematic", "blend"]
+GRAVITY_MPS2 = 9.81
+TABLES = ("vehicle", "tyre", "motor", "steering", "timing", "model", "mocap", "effects")
+"""Tables of a car file that describe the simulator; a real car's ``[hardware]`` is not among them."""
+
+_FIELD_OF = {info.name: info.field for info in REGISTRY.values() if info.field}
+
+
+@dataclass(frozen=True, slots=True)
+class CarParameters:
+    """Parameters of the single-track model. ``b``, ``c``, ``mu`` are Pacejka's B, C and D/F_z of each axle [1]."""
+
+    mass_kg: float = 1.65
+    yaw_inertia_kgm2: float = 0.06
+    front_axle_m: float = 0.13
+    rear_axle_m: float = 0.17
+    front_b: float = 2.75
+    front_c: float = 1.45
+    front_mu: float = 0.43
+    rear_b: float = 5.0
+    rear_c: float = 1.3
+    rear_mu: float = 0.42
+    drive_gain_n: float = 8.2
+    damping_nspm: float = 1.56
+    max_angle_rad: float = 0.6
+
+    @property
+    def wheelbase_m(self) -> float:
+        """Distance of the axles [m]."""
+        return self.front_axle_m + self.rear_axle_m
+
+
+@dataclass(frozen=True, slots=True)
+class MocapParameters:
+    """What the motion capture of a simulated car is like. ``dropout`` is the share of frames lost [1]."""
+
+    rate_hz: float = 120.0
+    position_std_m: float = 0.0003
+    yaw_std_rad: float = 0.002
+    latency_s: float = 0.008
+    dropout: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorConfig:
+    """A whole simulator: parameters, timing, kind of model, motion capture, effects, and what is known of each.
+
+    ``effects`` maps ids of the catalogue to their parameters (all of them, in SI units); ``priors`` maps dotted
+    names to (low, high) where the car file gives a range. Building one checks it: ConfigError says what is wrong.
+    """
+
+    parameters: CarParameters = CarParameters()
+    control_period_s: float = 0.0333333333
+    command_delay_s: float = 0.08
+    kind: ModelKind = "dynamic"
+    mocap: MocapParameters = MocapParameters()
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(ModelKind):
+            raise ConfigError(f"kind is {self.kind!r} in [model]; it must be one of {', '.join(get_args(ModelKind))}.")
+        check_keys(self.effects, EFFECTS, "[effects]")
+        check_keys(self.priors, REGISTRY, "the priors")
+        complete = {}
+        for effect_id, given in self.effects.items():
+            known = section(f"effects.{effect_id}")
+            check_keys(given, known, f"[effects.{effect_id}]")
+            complete[effect_id] = {
+                name: float(given[name]) if name in given else self._default_of(info.name, info.default)
+                for name, info in known.items()
+            }
+        object.__setattr__(self, "effects", complete)
+        for name, value in self.values().items():
+            if problem := REGISTRY[name].problem(value):
+                raise ConfigError(problem)
+        for name, (low, high) in self.priors.items():
+            if not low <= self.values()[name] <= high:
+                raise ConfigError(f"{name} = {self.values()[name]:g} lies outside its own range {low:g} to {high:g}.")
+        for channel, delay_s in zip(("steering", "throttle"), self.delays_s(), strict=True):
+            if delay_s < 0.0:
+                raise ConfigError(f"The delay of {channel} adds up to {delay_s:g} s; raise command_delay to 0 or more.")
+
+    def _default_of(self, name: str, default: float | None) -> float:
+        return self.mocap.latency_s if default is None else default
+
+    def values(self) -> dict[str, float]:
+        """Every number of this simulator by its dotted name: the base ones, and those of the effects it has."""
+        found = {name: float(getattr(self._owner(name), attribute)) for name, attribute in _FIELD_OF.items()}
+        for effect_id, given in self.effects.items():
+            found |= {f"effects.{effect_id}.{name}": value for name, value in given.items()}
+        return found
+
+    def _owner(self, name: str) -> Any:
+        table = name.partition(".")[0]
+        return self if table == "timing" else self.mocap if table == "mocap" else self.parameters
+
+    def with_values(self, changes: Mapping[str, float]) -> Self:
+        """The same simulator with other numbers, by dotted names; naming an effect switches it on."""
+        check_keys(changes, REGISTRY, "the parameters")
+        grouped: dict[str, dict[str, Any]] = {"parameters": {}, "mocap": {}, "timing": {}}
+        effects = {effect_id: dict(given) for effect_id, given in self.effects.items()}
+        for name, value in changes.items():
+            table, _, rest = name.partition(".")
+            if table == "effects":
+                effect_id, _, parameter = rest.partition(".")
+                effects.setdefault(effect_id, {})[parameter] = float(value)
+            else:
+                grouped[table if table in grouped else "parameters"][_FIELD_OF[name]] = float(value)
+        return replace(
+            self,
+            parameters=replace(self.parameters, **grouped["parameters"]),
+            mocap=replace(self.mocap, **grouped["mocap"]),
+            effects=effects,
+            **grouped["timing"],
+        )
+
+    def delays_s(self) -> tuple[float, float]:
+        """Time from a command to its effect on steering and on throttle [s], effects included."""
+        steering_s = throttle_s = self.command_delay_s
+        for effect_id, given in self.effects.items():
+            effect = EFFECTS[effect_id]
+            if isinstance(effect, DelayEffect):
+                extra_steering_s, extra_throttle_s = effect.extra_delays_s(given)
+                steering_s += extra_steering_s
+                throttle_s += extra_throttle_s
+        return steering_s, throttle_s
+
+    @classmethod
+    def from_tables(cls, tables: Mapping[str, Any], where: str = "the car file") -> Self:
+        """Read the tables of a car file (``tomllib.load``; without ``[hardware]``). Absent tables mean the defaults.
+
+        A number may be ``{value = 8.2, low = 6.0, high = 10.0}``. Raises ConfigError for unknown keys, wrong types
+        and impossible values; ``where`` names the file in messages.
+        """
+        check_keys(tables, TABLES, where)
+        values: dict[str, float] = {}
+        priors: dict[str, tuple[float, float]] = {}
+        model = _table(tables, "model", where)
+        check_keys(model, ("kind",), f"[model] of {where}")
+        for prefix, table in _sections(tables, where):
+            known = section(prefix)
+            check_keys(table, known, f"[{prefix}] of {where}")
+            for key, entry in table.items():
+                values[f"{prefix}.{key}"], prior = _number(entry, f"'{key}' in [{prefix}] of {where}")
+                if prior is not None:
+                    priors[f"{prefix}.{key}"] = prior
+        effects: dict[str, dict[str, float]] = {name: {} for name in _table(tables, "effects", where)}
+        try:
+            plain = cls(kind=model.get("kind", "dynamic")).with_values(
+                {name: value for name, value in values.items() if not name.startswith("effects.")}
+            )
+            with_effects = replace(plain, effects=effects).with_values(values) if effects else plain
+            return replace(with_effects, priors=priors)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from None
+
+    def to_tables(self) -> dict[str, Any]:
+        """The tables that ``from_tables`` reads back to an equal simulator; ready for TOML."""
+        tables: dict[str, Any] = {}
+        for name, value in self.values().items():
+            *path, key = name.split(".")
+            table = tables
+            for part in path:
+                table = table.setdefault(part, {})
+            if name in self.priors:
+                low, high = self.priors[name]
+                table[key] = {"value": value, "low": low, "high": high}
+            else:
+                table[key] = value
+        tables["model"] = {"kind": self.kind}
+        return tables
+
+    @classmethod
+    def from_preset(cls, name: str = "rc_car") -> Self:
+        """One of the cars that come with the package, see ``preset_names``."""
+        if name not in preset_names():
+            raise ConfigError(f"There is no preset '{name}'; there are: {', '.join(preset_names())}.")
+        text = (resources.files("sim_backends") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+        return cls.from_tables(tomllib.loads(text), f"preset {name}")
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names of the cars that come with the package."""
+    folder = resources.files("sim_backends") / "presets"
+    return tuple(sorted(Path(str(f)).stem for f in folder.iterdir() if f.name.endswith(".toml")))
+
+
+def _table(tables: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    table = tables.get(name, {})
+    if not isinstance(table, Mapping):
+        raise ConfigError(f"[{name}] of {where} must be a table, not {table!r}.")
+    return table
+
+
+def _sections(tables: Mapping[str, Any], where: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    for name in ("vehicle", "motor", "steering", "timing", "mocap"):
+        yield name, _table(tables, name, where)
+    tyre = _table(tables, "tyre", where)
+    check_keys(tyre, ("front", "rear"), f"[tyre] of {where}")
+    for axle in tyre:
+        yield f"tyre.{axle}", _table(tyre, axle, f"[tyre] of {where}")
+    effects = _table(tables, "effects", where)
+    check_keys(effects, EFFECTS, f"[effects] of {where}")
+    for effect_id in effects:
+        yield f"effects.{effect_id}", _table(effects, effect_id, f"[effects] of {where}")
+
+
+def _number(entry: Any, where: str) -> tuple[float, tuple[float, float] | None]:
+    if isinstance(entry, Mapping):
+        check_keys(entry, ("value", "low", "high"), where)
+        for key in ("value", "low", "high"):
+            if key not in entry:
+                raise ConfigError(f"'{key}' is missing in {where}; write {{value = 1.0, low = 0.5, high = 2.0}}.")
+        value, low, high = (_number(entry[key], f"'{key}' of {where}")[0] for key in ("value", "low", "high"))
+        if not low <= value <= high:
+            raise ConfigError(f"{where}: value {value:g} must lie between low {low:g} and high {high:g}.")
+        return value, (low, high)
+    if isinstance(entry, bool) or not isinstance(entry, (int, float)):
+        raise ConfigError(f"{where} must be a number, not {entry!r}.")
+    return float(entry), None
+
+
+__all__ = [
+    "GRAVITY_MPS2",
+    "TABLES",
+    "CarParameters",
+    "MocapParameters",
+    "ModelKind",
+    "SimulatorConfig",
+    "preset_names",
+]

@@ -1,0 +1,85 @@
+"""Every number of a simulator by its dotted name, with unit, default and physical bounds.
+
+The names are those of the car file (``motor.drive_gain``, ``effects.steering_lag.time_constant``), so that system
+identification, the prior over simulators and the diagnosis treat every number alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from sim_backends.effects import EFFECTS
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterInfo:
+    """One number of the car file.
+
+    ``default`` is what a file without it means; None for a latency that the car file gives elsewhere. ``positive``
+    says that ``low`` itself is not allowed.
+    """
+
+    name: str
+    unit: str
+    default: float | None
+    low: float
+    high: float
+    positive: bool = False
+    field: str = ""
+
+    def problem(self, value: float) -> str | None:
+        """What is impossible about ``value`` and what to do; None where nothing is."""
+        if math.isnan(value) or (math.isinf(value) and not self.name.startswith("effects.")):
+            return f"{self.name} is {value}; give a finite number in {self.unit}."
+        if value < self.low or (self.positive and value <= self.low):
+            bound = f"greater than {self.low:g}" if self.positive else f"at least {self.low:g}"
+            return f"{self.name} is {value:g} {self.unit}; it must be {bound} (SI units: is it in another unit?)."
+        if value > self.high:
+            return f"{self.name} is {value:g} {self.unit}; it must be at most {self.high:g} (is it in another unit?)."
+        return None
+
+
+_INF = math.inf
+_BASE = (
+    ParameterInfo("vehicle.mass", "kg", 1.65, 0.0, _INF, True, "mass_kg"),
+    ParameterInfo("vehicle.yaw_inertia", "kg m2", 0.06, 0.0, _INF, True, "yaw_inertia_kgm2"),
+    ParameterInfo("vehicle.front_axle", "m", 0.13, 0.0, _INF, True, "front_axle_m"),
+    ParameterInfo("vehicle.rear_axle", "m", 0.17, 0.0, _INF, True, "rear_axle_m"),
+    ParameterInfo("tyre.front.B", "1", 2.75, 0.0, _INF, True, "front_b"),
+    ParameterInfo("tyre.front.C", "1", 1.45, 0.0, _INF, True, "front_c"),
+    ParameterInfo("tyre.front.mu", "1", 0.43, 0.0, _INF, False, "front_mu"),
+    ParameterInfo("tyre.rear.B", "1", 5.0, 0.0, _INF, True, "rear_b"),
+    ParameterInfo("tyre.rear.C", "1", 1.3, 0.0, _INF, True, "rear_c"),
+    ParameterInfo("tyre.rear.mu", "1", 0.42, 0.0, _INF, False, "rear_mu"),
+    ParameterInfo("motor.drive_gain", "N", 8.2, 0.0, _INF, False, "drive_gain_n"),
+    ParameterInfo("motor.damping", "N s/m", 1.56, 0.0, _INF, False, "damping_nspm"),
+    ParameterInfo("steering.max_angle", "rad", 0.6, 0.0, 1.5, True, "max_angle_rad"),
+    ParameterInfo("timing.control_period", "s", 0.0333333333, 0.0, 10.0, True, "control_period_s"),
+    ParameterInfo("timing.command_delay", "s", 0.08, 0.0, 10.0, False, "command_delay_s"),
+    ParameterInfo("mocap.rate", "Hz", 120.0, 0.0, 10_000.0, True, "rate_hz"),
+    ParameterInfo("mocap.position_std", "m", 0.0003, 0.0, _INF, False, "position_std_m"),
+    ParameterInfo("mocap.yaw_std", "rad", 0.002, 0.0, math.pi, False, "yaw_std_rad"),
+    ParameterInfo("mocap.latency", "s", 0.008, 0.0, 10.0, False, "latency_s"),
+    ParameterInfo("mocap.dropout", "1", 0.0, 0.0, 1.0, False, "dropout"),
+)
+
+
+def _effect_parameters() -> Iterator[ParameterInfo]:
+    for effect in EFFECTS.values():
+        for p in effect.parameters:
+            yield ParameterInfo(f"effects.{effect.id}.{p.name}", p.unit, p.identity, p.low, p.high)
+
+
+REGISTRY: dict[str, ParameterInfo] = {info.name: info for info in (*_BASE, *_effect_parameters())}
+
+
+def section(prefix: str) -> dict[str, ParameterInfo]:
+    """The entries directly under a table, by their last name: ``section("tyre.front")`` has B, C and mu."""
+    start = prefix + "."
+    return {
+        name.removeprefix(start): info
+        for name, info in REGISTRY.items()
+        if name.startswith(start) and "." not in name.removeprefix(start)
+    }

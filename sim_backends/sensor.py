@@ -1,0 +1,107 @@
+"""Motion capture of a simulated car: exposures at a rate, noise, lost frames, latency."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Protocol
+
+import numpy as np
+
+from carlab.core.angles import wrap
+from carlab.core.quantities import PoseSample
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS, ObservationEffect
+from sim_backends.plant import Pose
+
+
+class HasPose(Protocol):
+    """What a sensor looks at: a plant, or anything that knows where its tracked point is."""
+
+    def measured_pose(self, t_s: float) -> Pose:
+        """Pose of the tracked point at ``t_s``, without noise."""
+
+
+def mocap_latency_s(config: SimulatorConfig) -> float:
+    """Age of a pose on arrival [s]: the car file's, or that of the effect ``mocap_latency``."""
+    latency_s = config.mocap.latency_s
+    for effect_id, values in config.effects.items():
+        effect = EFFECTS[effect_id]
+        if isinstance(effect, ObservationEffect) and (instead := effect.latency_s(values)) is not None:
+            latency_s = float(instead)
+    return latency_s
+
+
+class MocapSensor:
+    """Samples a plant at the rate of the car file. Time is what the caller says it is, simulated or by the wall.
+
+    Exposure ``k`` after ``reset`` is at ``start + k / rate`` and has its own random numbers, so what is measured
+    depends on the seed and the exposure alone, not on how often or when the sensor is asked.
+
+    Args:
+        config: Rate, noise, latency and share of lost frames; effects that change the latency.
+        seed: Of the noise.
+        extra_latency_s: Added to the latency, for a wire that was measured [s].
+    """
+
+    def __init__(self, config: SimulatorConfig, seed: int = 0, *, extra_latency_s: float = 0.0) -> None:
+        self._mocap = config.mocap
+        self.latency_s = mocap_latency_s(config) + extra_latency_s
+        self.lost = 0
+        self._rng = np.random.default_rng(seed)
+        self._start_s = 0.0
+        self._next = 0
+        self._sequence = 0
+        self._in_flight: deque[PoseSample] = deque()
+
+    @property
+    def rate_hz(self) -> float:
+        """Exposures a second."""
+        return self._mocap.rate_hz
+
+    def reset(self, t_s: float) -> None:
+        """Start anew with the first exposure at ``t_s``; nothing is in flight. Sequence numbers and noise go on."""
+        self._start_s = t_s
+        self._next = 0
+        self._in_flight.clear()
+
+    def next_exposure_s(self) -> float:
+        """When the next exposure is due [s]."""
+        return self._start_s + self._next / self._mocap.rate_hz
+
+    def expose(self, t_s: float, plant: HasPose) -> PoseSample | None:
+        """One exposure at ``t_s``; None where the frame is lost. Counts sequence numbers, keeps no schedule."""
+        x_noise, y_noise, yaw_noise = self._rng.standard_normal(3)
+        lost = self._rng.random() < self._mocap.dropout
+        sequence = self._sequence
+        self._sequence += 1
+        if lost:
+            self.lost += 1
+            return None
+        pose = plant.measured_pose(t_s)
+        return PoseSample(
+            sequence=sequence,
+            t_capture_s=t_s,
+            t_receive_s=t_s + self.latency_s,
+            x_m=pose.x_m + self._mocap.position_std_m * float(x_noise),
+            y_m=pose.y_m + self._mocap.position_std_m * float(y_noise),
+            yaw_rad=wrap(pose.yaw_rad + self._mocap.yaw_std_rad * float(yaw_noise)),
+        )
+
+    def samples_until(self, t_s: float, plant: HasPose) -> list[PoseSample]:
+        """Make the exposures due up to ``t_s`` and return the samples that have arrived by then, oldest first."""
+        # A nanosecond of slack, so that rounding does not put off an exposure that is due exactly now.
+        while self.next_exposure_s() <= t_s + 1e-9:
+            due_s = self.next_exposure_s()
+            self._next += 1
+            if (sample := self.expose(due_s, plant)) is not None:
+                self._in_flight.append(sample)
+        arrived = []
+        while self._in_flight and self._in_flight[0].t_receive_s <= t_s + 1e-9:
+            arrived.append(self._in_flight.popleft())
+        return arrived
+
+    def settling_time_s(self, window_s: float) -> float:
+        """Time after which a velocity window of ``window_s`` is full of samples that have arrived [s]."""
+        periods = math.ceil(window_s * self._mocap.rate_hz) + 2
+        return periods / self._mocap.rate_hz + self.latency_s

@@ -1,0 +1,266 @@
+"""A car whose physics runs in the process: the same contract as a real one, on a clock that need not wait."""
+
+from __future__ import annotations
+
+import math
+
+from carlab.core.angles import wrap
+from carlab.core.car import Car
+from carlab.core.clock import Clock, SimulatedClock
+from carlab.core.errors import ActuatorFaultError, NotArmedError, NotOpenError, PoseLostError
+from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Health, Observation, PoseSample, Reality
+from carlab.core.state_estimator import StateEstimator
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS, ObservationEffect
+from sim_backends.plant import Plant, Pose
+from sim_backends.sensor import MocapSensor
+
+
+class _Approach:
+    """A tracked point that moves at a constant body velocity and is at ``state`` at ``t_s``: what the camera saw."""
+
+    def __init__(self, config: SimulatorConfig, state: CarState, t_s: float) -> None:
+        self._plant = Plant(config)
+        self._state, self._t_s = state, t_s
+
+    def measured_pose(self, t_s: float) -> Pose:
+        s, dt = self._state, t_s - self._t_s
+        turn = s.yaw_rate_radps * dt
+        # Chord of the arc: sin(turn)/turn along, (1 - cos(turn))/turn across.
+        along, across = (math.sin(turn) / turn, (1.0 - math.cos(turn)) / turn) if abs(turn) > 1e-9 else (1.0, 0.0)
+        forward = dt * (along * s.vx_mps - across * s.vy_mps)
+        left = dt * (across * s.vx_mps + along * s.vy_mps)
+        sin, cos = math.sin(s.yaw_rad), math.cos(s.yaw_rad)
+        x, y = s.x_m + cos * forward - sin * left, s.y_m + sin * forward + cos * left
+        self._plant.reset(CarState(x, y, wrap(s.yaw_rad + turn)), t_s)
+        return self._plant.measured_pose(t_s)
+
+
+class SimulatedCar(Car):
+    """Physics, motion capture and state estimator in one process.
+
+    Time passes when the clock is slept on; ``observe`` moves the car up to the clock. A seed fixes every number.
+
+    Args:
+        config: The car; the default preset unless given.
+        seed: Of the sensor's noise.
+        start: Where the car stands when it is opened.
+        clock: A simulated clock unless given; with a ``MonotonicClock`` the car runs in real time.
+        limits: Largest commands.
+        watchdog_s: A command that is not followed by another for this long [s] gives way to neutral.
+        extra_command_latency_s: Added on the way of commands, for a wire that was measured [s].
+        extra_pose_latency_s: Added on the way of poses [s].
+        window_s: Of the velocity fit [s].
+    """
+
+    reality = Reality.SIMULATED
+
+    def __init__(
+        self,
+        config: SimulatorConfig | None = None,
+        *,
+        seed: int = 0,
+        start: CarState | None = None,
+        clock: Clock | None = None,
+        limits: ActionLimits | None = None,
+        watchdog_s: float = 0.15,
+        extra_command_latency_s: float = 0.0,
+        extra_pose_latency_s: float = 0.0,
+        window_s: float = 0.05,
+        name: str = "sim",
+    ) -> None:
+        self.name = name
+        self.config = SimulatorConfig() if config is None else config
+        self.clock = SimulatedClock() if clock is None else clock
+        self.limits = ActionLimits() if limits is None else limits
+        self.watchdog_s = watchdog_s
+        self._extra_command_latency_s = extra_command_latency_s
+        self._start = CarState() if start is None else start
+        self._plant = Plant(self.config, seed)
+        self._sensor = MocapSensor(self.config, seed, extra_latency_s=extra_pose_latency_s)
+        self._estimator = StateEstimator(window_s)
+        self._filter = _VelocityFilter(self.config)
+        self._open = self._armed = False
+        self._fault: str | None = None
+        self._fresh_until_s: float | None = None
+        self._unseen: list[PoseSample] = []
+
+    def open(self) -> None:
+        """Put the car at its start and wait until motion capture has filled the velocity window."""
+        if self._open:
+            return
+        self._open, self._armed, self._fault = True, False, None
+        self.place(self._start)
+
+    def place(self, state: CarState) -> bool:
+        """Put the car at ``state`` with neutral acting and no command on its way; takes about 0.1 s of the clock.
+
+        The car is at ``state`` when this returns. Motion capture saw it come there at its own velocity, so that the
+        estimated state is right at once.
+        """
+        self._require_open()
+        begin_s = self.clock.now_s()
+        arrive_s = begin_s + self._sensor.settling_time_s(self._estimator.window_s)
+        self._estimator.reset()
+        self._filter.reset()
+        self._sensor.reset(begin_s)
+        self._unseen.clear()
+        self._fresh_until_s = None
+        self._take_in(self._sensor.samples_until(arrive_s, _Approach(self.config, state, arrive_s)))
+        self._plant.reset(state, arrive_s)
+        self.clock.sleep_until(arrive_s)
+        return True
+
+    @property
+    def true_state(self) -> CarState:
+        """Where the car really is now, which no car on the road can tell."""
+        self._require_open()
+        self._run_to(self.clock.now_s())
+        return self._plant.state
+
+    def observe(self) -> Observation:
+        """Newest state that has arrived by now."""
+        self._require_open()
+        self._run_to(self.clock.now_s())
+        estimate, newest = self._estimator.estimate(), self._estimator.newest
+        poses = tuple(self._unseen)
+        self._unseen.clear()
+        if estimate is None or newest is None:
+            raise PoseLostError("No pose has arrived yet; lower [mocap] dropout or wait a little after open().")
+        state, velocity_delay_s = estimate
+        return Observation(
+            state=self._filter.state(state),
+            t_capture_s=newest.t_capture_s,
+            t_receive_s=newest.t_receive_s,
+            sequence=newest.sequence,
+            tracked=True,
+            velocity_delay_s=velocity_delay_s,
+            poses=poses,
+        )
+
+    def arm(self) -> None:
+        """Let commands through."""
+        self._require_open()
+        self._require_no_fault()
+        self._armed = True
+
+    def command(self, action: Action) -> Action:
+        """Hand over a command."""
+        self._require_open()
+        self._require_no_fault()
+        self.check(action)
+        if not self._armed and not action.is_neutral:
+            raise NotArmedError(f"Car '{self.name}' is not armed and takes only neutral; call arm() first.")
+        self._send(action)
+        return action
+
+    def stop(self, *, planned: bool) -> None:
+        """Neutral, and disarm."""
+        if not self._open:
+            return
+        self._armed = False
+        if not planned:
+            self._fault = self._fault or "it was stopped for a fault"
+        self._send(NEUTRAL)
+
+    def reset_fault(self) -> None:
+        """Clear a latched fault."""
+        self._fault = None
+        self._armed = False
+
+    def health(self) -> Health:
+        """Whether the car is open and free of faults; age and losses of its poses."""
+        problems = []
+        if not self._open:
+            problems.append("closed; call open()")
+        if self._fault is not None:
+            problems.append(f"fault latched: {self._fault}; call reset_fault() and arm()")
+        readings = {
+            "mocap_rate_hz": self._sensor.rate_hz,
+            "mocap_latency_s": self._sensor.latency_s,
+            "mocap_lost_frames": float(self._sensor.lost),
+            "pose_dropped_samples": float(self._estimator.dropped),
+            "armed": float(self._armed),
+        }
+        if self._open and (newest := self._estimator.newest) is not None:
+            readings["pose_age_s"] = self.clock.now_s() - newest.t_capture_s
+        return Health(ready=not problems, problems=tuple(problems), readings=readings)
+
+    def close(self) -> None:
+        """Neutral, then closed."""
+        self.stop(planned=True)
+        self._open = False
+
+    def _require_open(self) -> None:
+        if not self._open:
+            raise NotOpenError(f"Car '{self.name}' is not open; use it inside 'with car:' or call open() first.")
+
+    def _require_no_fault(self) -> None:
+        if self._fault is not None:
+            raise ActuatorFaultError(f"Car '{self.name}' takes no command: {self._fault}; call reset_fault(), arm().")
+
+    def _send(self, action: Action) -> None:
+        now_s = self.clock.now_s()
+        self._run_watchdog(now_s)
+        self._plant.command(now_s + self._extra_command_latency_s, action)
+        self._fresh_until_s = None if action.is_neutral else now_s + self.watchdog_s
+
+    def _run_watchdog(self, now_s: float) -> None:
+        if self._fresh_until_s is not None and now_s >= self._fresh_until_s:
+            self._plant.command(self._fresh_until_s + self._extra_command_latency_s, NEUTRAL)
+            self._fresh_until_s = None
+
+    def _run_to(self, now_s: float) -> None:
+        self._run_watchdog(now_s)
+        self._take_in(self._sensor.samples_until(now_s, self._plant))
+        self._plant.advance(now_s)
+
+    def _take_in(self, samples: list[PoseSample]) -> None:
+        for sample in samples:
+            self._estimator.update(sample)
+            self._filter.update(self._estimator)
+        self._unseen.extend(samples)
+
+
+class _VelocityFilter:
+    """The effect ``velocity_filter_lag``: an exact first-order filter on the estimated velocities."""
+
+    def __init__(self, config: SimulatorConfig) -> None:
+        self._time_constant_s = velocity_time_constant_s(config)
+        self._t_s: float | None = None
+        self._input = self._output = (0.0, 0.0, 0.0)
+
+    def reset(self) -> None:
+        self._t_s = None
+
+    def update(self, estimator: StateEstimator) -> None:
+        estimate, newest = estimator.estimate() if self._time_constant_s > 0.0 else None, estimator.newest
+        if estimate is None or newest is None or not estimator.velocity_valid:
+            return
+        velocity = (estimate[0].vx_mps, estimate[0].vy_mps, estimate[0].yaw_rate_radps)
+        if self._t_s is None:
+            self._output = velocity
+        elif newest.t_capture_s > self._t_s:
+            span = (newest.t_capture_s - self._t_s) / self._time_constant_s
+            decay = math.exp(-span)
+            ramp = 1.0 - (1.0 - decay) / span
+            self._output = tuple(  # type: ignore[assignment]
+                decay * y + (1.0 - decay) * u0 + ramp * (u1 - u0)
+                for y, u0, u1 in zip(self._output, self._input, velocity, strict=True)
+            )
+        self._t_s, self._input = newest.t_capture_s, velocity
+
+    def state(self, state: CarState) -> CarState:
+        if self._t_s is None:
+            return state
+        return CarState(state.x_m, state.y_m, state.yaw_rad, *self._output)
+
+
+def velocity_time_constant_s(config: SimulatorConfig) -> float:
+    """Time constant of the filter on measured velocities [s]; 0 where there is none."""
+    total_s = 0.0
+    for effect_id, values in config.effects.items():
+        effect = EFFECTS[effect_id]
+        if isinstance(effect, ObservationEffect) and (own := effect.velocity_time_constant_s(values)) is not None:
+            total_s += float(own)
+    return total_s

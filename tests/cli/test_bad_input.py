@@ -1,0 +1,244 @@
+"""Bad input gets one clear sentence with the next step and a non-zero exit; never a traceback."""
+
+import math
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.cars.emulated_world import World, WorldConfig
+from carlab.cli import run
+from carlab.core.clock import MonotonicClock
+from mocap.emulator_faults import ServerFaults
+from mocap.natnet_models import BitstreamVersion
+from sim_backends.car_parameters import SimulatorConfig
+
+Outcome = tuple[int, str]
+Carlab = Callable[..., Outcome]
+
+CAR = """
+[hardware]
+name = "test car"
+[hardware.actuator]
+port = "{port}"
+open_timeout_s = 1.0
+[hardware.mocap]
+server_address = "127.0.0.1"
+local_interface = "127.0.0.1"
+command_port = {command_port}
+timeout_s = 0.6
+{mocap}
+[hardware.arena]
+corners_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]
+"""
+
+
+@pytest.fixture
+def carlab(capfd: pytest.CaptureFixture[str]) -> Carlab:
+    def call(*argv: object) -> Outcome:
+        try:
+            code = run([str(a) for a in argv])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out, err = capfd.readouterr()
+        text = " ".join((out + err).split())
+        assert "Traceback" not in text
+        return code, text
+
+    return call
+
+
+@pytest.fixture
+def world() -> World:
+    return World(WorldConfig(simulator=SimulatorConfig().to_tables()))
+
+
+def car_file(folder: Path, port: str = "/dev/carlab-nowhere", command_port: int = 9, mocap: str = "") -> Path:
+    path = folder / "car.toml"
+    path.write_text(CAR.format(port=port, command_port=command_port, mocap=mocap), encoding="utf-8")
+    return path
+
+
+def canonical_csv(folder: Path, rows: int = 300) -> tuple[Path, np.ndarray]:
+    """A circle driven at 1 m/s, exactly."""
+    t = np.arange(rows) / 30.0
+    yaw = 0.8 * t
+    columns = [t, np.sin(yaw) / 0.8, (1 - np.cos(yaw)) / 0.8, (yaw + math.pi) % (2 * math.pi) - math.pi]
+    columns += [np.ones(rows), np.zeros(rows), np.full(rows, 0.8), np.full(rows, 0.4), 0.3 + 0.01 * np.sin(t)]
+    data = np.stack(columns, axis=1)
+    return folder / "drive.csv", data
+
+
+def write(path: Path, data: np.ndarray, header: str = "t,x,y,yaw,vx,vy,yaw_rate,steering,throttle") -> Path:
+    np.savetxt(path, data, delimiter=",", header=header, comments="")
+    return path
+
+
+def test_a_wrong_port_and_a_silent_camera_system_are_told_together(carlab: Carlab, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
+        nobody.bind(("127.0.0.1", 0))
+        path = car_file(tmp_path, command_port=nobody.getsockname()[1])
+        code, text = carlab("check", "--car", path)
+    assert code == 3
+    assert "/dev/carlab-nowhere" in text
+    assert "port" in text
+    assert "NatNet" in text or "motion capture" in text.lower()
+    assert "Motive" in text
+
+
+def test_an_unknown_body_is_answered_with_those_there_are(carlab: Carlab, tmp_path: Path, world: World) -> None:
+    with world:
+        there = world.addresses
+        path = car_file(tmp_path, there["port"], there["command_port"], 'body = "truck"')
+        code, text = carlab("check", "--car", path)
+        assert code == 3
+        assert "truck" in text
+        assert "car" in text.split("truck")[1]
+        path = car_file(tmp_path, there["port"], there["command_port"], "body_id = 77")
+        code, text = carlab("listen", "--car", path, "--seconds", "0.2")
+        assert code == 3
+        assert "77" in text
+
+
+def test_frames_of_another_version_are_named(carlab: Carlab, tmp_path: Path, world: World) -> None:
+    world.server.faults = ServerFaults(frame_version=BitstreamVersion(3, 0))
+    with world:
+        there = world.addresses
+        path = car_file(tmp_path, there["port"], there["command_port"])
+        code, text = carlab("listen", "--car", path, "--seconds", "0.3")
+    assert code == 3
+    assert "4.1" in text
+
+
+def test_garbage_and_half_frames_between_good_ones_only_count(carlab: Carlab, tmp_path: Path, world: World) -> None:
+    world.server.faults = ServerFaults(garbage=0.3, truncation=0.3)
+    with world:
+        there = world.addresses
+        path = car_file(tmp_path, there["port"], there["command_port"])
+        code, text = carlab("listen", "--car", path, "--seconds", "0.8")
+    assert code == 0
+    assert "malformed" in text
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("[vehicle]\nmas = 1.6\n", ["'mas'", "did you mean 'mass'?"]),
+        ("[vehicle]\nmass = -1.0\n", ["mass"]),
+        ("[effects.steering_lagg]\ntime_constant = 0.1\n", ["steering_lagg", "steering_lag"]),
+        ("[hardware]\nname = 'x'\n", ["arena"]),
+        ("[hardware.limits]\nmax_sped_mps = 2\n", ["max_sped_mps", "max_speed_mps"]),
+        ("this is no toml\n", ["TOML"]),
+    ],
+)
+def test_a_wrong_car_file_names_the_key(carlab: Carlab, tmp_path: Path, table: str, words: list[str]) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(table, encoding="utf-8")
+    code, text = carlab("drive", "--car", path, "--out", tmp_path / "runs")
+    assert code == 2
+    for word in words:
+        assert word in text
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_car_that_does_not_exist(carlab: Carlab, tmp_path: Path) -> None:
+    code, text = carlab("drive", "--car", "emulatd", "--out", tmp_path)
+    assert code == 2
+    assert "emulated" in text
+    code, text = carlab("drive", "--car", tmp_path / "none.toml", "--out", tmp_path)
+    assert code == 2
+    assert "none.toml" in text
+
+
+def damaged(kind: str, data: np.ndarray) -> tuple[np.ndarray, str]:
+    header = "t,x,y,yaw,vx,vy,yaw_rate,steering,throttle"
+    if kind == "gap":
+        return np.delete(data, np.s_[100:130], axis=0), header
+    if kind == "nan":
+        data[50, 2] = np.nan
+    if kind == "degrees":
+        data[:, 3] = np.degrees(data[:, 3])
+    if kind == "unsorted":
+        data[[40, 41]] = data[[41, 40]]
+    if kind == "column":
+        return np.delete(data, 3, axis=1), header.replace("yaw,", "", 1)
+    return data, header
+
+
+@pytest.mark.parametrize(
+    ("kind", "words", "remedy"),
+    [
+        ("gap", ["gap"], ["--gaps", "split"]),
+        ("nan", ["51"], ["--missing", "drop"]),
+        ("degrees", ["degree"], ["--yaw-unit", "deg"]),
+        ("unsorted", ["row"], ["--stamps", "drop"]),
+        ("column", ["yaw"], None),
+    ],
+)
+def test_a_damaged_csv_is_refused_in_a_sentence_whose_remedy_works(
+    carlab: Carlab, tmp_path: Path, kind: str, words: list[str], remedy: list[str] | None
+) -> None:
+    path, data = canonical_csv(tmp_path)
+    write(path, *damaged(kind, data))
+    out = tmp_path / "drive.mcap"
+    code, text = carlab("import", path, "--out", out)
+    assert code == 1
+    for word in words:
+        assert word in text
+    assert not list(tmp_path.glob("*.mcap*"))
+    if remedy is not None:
+        assert " ".join(remedy) in text
+        code, text = carlab("import", path, "--out", out, *remedy)
+        assert code == 0, text
+        assert list(tmp_path.glob("*.mcap"))
+
+
+def test_an_mcap_cut_short_is_recovered_and_one_of_nothing_refused(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    whole = tmp_path / "drive.mcap"
+    assert carlab("import", write(path, data), "--out", whole)[0] == 0
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    code, text = carlab("export", cut, "--out", tmp_path / "cut.csv")
+    assert code == 0
+    assert "recovered" in text
+    rows = np.genfromtxt(tmp_path / "cut.csv", delimiter=",", names=True)
+    assert 20 < len(rows) < len(data)
+    np.testing.assert_allclose(rows["x"], data[: len(rows), 1], atol=1e-12)
+    for content in (b"", b"\x89MCAP0\r\n", b"t,x,y\n1,2,3\n", whole.read_bytes()[:300]):
+        cut.write_bytes(content)
+        code, text = carlab("view", cut, "--save", tmp_path / "cut.rrd")
+        assert code == 1
+        assert "cut.mcap" in text
+        assert not (tmp_path / "cut.rrd").exists()
+
+
+def test_nothing_is_overwritten(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    out = tmp_path / "drive.mcap"
+    assert carlab("import", write(path, data), "--out", out)[0] == 0
+    before = out.read_bytes()
+    code, text = carlab("import", path, "--out", out)
+    assert code == 1
+    assert "already" in text
+    assert out.read_bytes() == before
+
+
+def test_usage_errors_suggest(carlab: Carlab) -> None:
+    code, text = carlab("drive", "--epsodes", "3")
+    assert code == 2
+    assert "--episodes" in text
+    code, _ = carlab("drive", "--episodes", "0")
+    assert code == 2
+
+
+def test_driving_without_a_folder_to_write_to(carlab: Carlab, tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    start_s = MonotonicClock().now_s()
+    code, text = carlab("drive", "--out", blocked / "runs")
+    assert code == 1
+    assert str(blocked) in text
+    assert MonotonicClock().now_s() - start_s < 60

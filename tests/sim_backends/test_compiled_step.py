@@ -1,0 +1,131 @@
+"""The traced and compiled step against the operators that it was traced from, value and derivative."""
+
+import numpy as np
+import pytest
+import torch
+
+from sim_backends.array_ops import FLOATS
+from sim_backends.batch_rollout import rollout
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS
+from sim_backends.tracing import Tracer, gradients
+
+EVERYTHING = {name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items()}
+
+
+def some(cars, ticks):
+    rng = np.random.default_rng(1)
+    start = rng.uniform(-1, 1, (cars, 6)) * [2, 2, 3, 2, 0.3, 1]
+    return torch.tensor(start), torch.tensor(rng.uniform(-1, 1, (cars, ticks, 2)))
+
+
+@pytest.mark.parametrize("kind", ["dynamic", "linear_tyre", "kinematic", "blend"])
+@pytest.mark.parametrize("effects", [{}, EVERYTHING])
+@pytest.mark.parametrize("per_car_delay", [False, True])
+def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_car_delay):
+    config = SimulatorConfig(kind=kind, effects=effects)
+    cars = 5
+    results = []
+    for engine in ("fastest", "operators"):
+        start, commands = (v.requires_grad_() for v in some(cars, 8))
+        delay = torch.linspace(0.02, 0.09, cars, dtype=torch.float64, requires_grad=True)
+        mu = torch.linspace(0.3, 0.5, cars, dtype=torch.float64, requires_grad=True)
+        values = {"tyre.front.mu": mu, **({"timing.command_delay": delay} if per_car_delay else {})}
+        out = rollout(config, start, commands, values=values, measured=True, engine=engine)
+        (out.states.square().sum() + out.measured[:, 3:].sum()).backward()
+        grads = [start.grad, commands.grad, *([mu.grad] if mu.grad is not None else [])]
+        results.append([out.states.detach(), out.measured.detach(), *grads, *([delay.grad] if per_car_delay else [])])
+    for ours, theirs in zip(*results, strict=True):
+        assert torch.allclose(ours, theirs, rtol=1e-9, atol=1e-10)
+
+
+def test_more_cars_than_a_chunk_of_the_derivative(monkeypatch):
+    start, commands = some(23, 4)
+    gradients_found = []
+    for chunk in (1000, 7):
+        monkeypatch.setattr("sim_backends.compiled_stepper.CHUNK_CARS", chunk)
+        leaf = commands.clone().requires_grad_()
+        rollout(SimulatorConfig(), start, leaf).states.square().sum().backward()
+        gradients_found.append(leaf.grad)
+    assert torch.equal(*gradients_found)
+
+
+def test_few_and_many_cars_use_the_same_arithmetic(monkeypatch):
+    start, commands = some(40, 6)
+    few = rollout(SimulatorConfig(), start, commands).states
+    monkeypatch.setattr("sim_backends.compiled_step.FEW_CARS", 10)
+    many = rollout(SimulatorConfig(), start.flip(0), commands.flip(0)).states.flip(0)
+    assert torch.equal(few, many)
+
+
+def test_second_derivatives_are_refused_unless_on_operators():
+    start, commands = some(1, 6)
+    commands.requires_grad_()
+    loss = rollout(SimulatorConfig(), start, commands, engine="operators").states.square().sum()
+    (first,) = torch.autograd.grad(loss, commands, create_graph=True)
+    (second,) = torch.autograd.grad(first.sum(), commands)
+    assert second.abs().max() > 0
+    loss = rollout(SimulatorConfig(), start, commands).states.square().sum()
+    with pytest.raises(NotImplementedError, match="operators"):
+        torch.autograd.grad(loss, commands, create_graph=True)
+
+
+UNARY = {
+    "sin": 0.7,
+    "cos": 0.7,
+    "atan": -1.3,
+    "tanh": 0.4,
+    "exp": 0.3,
+    "sqrt": 2.0,
+    "abs": -0.6,
+    "sign": -0.6,
+    "neg": 0.2,
+}
+BINARY = ("add", "sub", "mul", "div", "atan2", "hypot", "maximum", "minimum")
+
+
+@pytest.mark.parametrize("operation", [*UNARY, *BINARY])
+def test_each_operation_has_the_derivative_of_its_finite_difference(operation):
+    tracer = Tracer()
+    point = [UNARY[operation]] if operation in UNARY else [0.8, -1.7]
+    inputs = [tracer.input(str(i)) for i in range(len(point))]
+    output = tracer.make(operation, *inputs)
+    seed = tracer.input("seed")
+    symbolic = gradients([output], [seed], inputs)
+
+    def value(node, at):
+        if not hasattr(node, "operation"):
+            return node
+        if node is seed:
+            return 1.0
+        if node in inputs:
+            return at[inputs.index(node)]
+        return Tracer().make(node.operation, *(value(a, at) for a in node.arguments))
+
+    for i, expression in enumerate(symbolic):
+        up, down = ([p + (h if j == i else 0.0) for j, p in enumerate(point)] for h in (1e-6, -1e-6))
+        difference = (value(output, up) - value(output, down)) / 2e-6
+        assert value(expression, point) == pytest.approx(difference, rel=1e-6, abs=1e-9)
+
+
+def test_where_and_clip_pass_the_gradient_to_the_branch_taken():
+    tracer = Tracer()
+    a, b, seed = (tracer.input(n) for n in "abs")
+    chosen = tracer.where(a < b, a * 2.0, b * 3.0)
+    results = gradients([chosen], [seed], [a, b])
+    assert [r.operation for r in results] == ["mul", "mul"]
+    clipped = tracer.clip(a, 0.0, 1.0)
+    assert gradients([clipped], [seed], [b]) == [0.0]
+
+
+def test_constants_fold_and_equal_operations_merge():
+    tracer = Tracer()
+    a = tracer.input("a")
+    assert tracer.sin(0.5) == FLOATS.sin(0.5)
+    assert (a + 0.0) is a
+    assert (a * 1.0) is a
+    assert a * 0.0 == 0.0
+    before = len(tracer.nodes)
+    assert (a * 2.0) is (2.0 * a)
+    assert tracer.fma(a, 2.0, 1.0) is tracer.fma(2.0, a, 1.0)
+    assert len(tracer.nodes) == before + 2
