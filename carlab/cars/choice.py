@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from carlab.cars.car_file import CarFile, default_car, load_car_file
 from carlab.core.car import Car
 from carlab.core.errors import ConfigError
-from carlab.core.quantities import ActionLimits, Reality
+from carlab.core.quantities import Action, ActionLimits, Reality
 from carlab.core.safety import SafetyEnvelope
 
 if TYPE_CHECKING:
@@ -24,7 +24,8 @@ PLUGIN_GROUP = "carlab.cars"
 class CarChoice:
     """A car that is built and not yet open, with what an episode on it needs to know.
 
-    ``log_to`` tells an emulated car where to write what its firmware saw; others ignore it.
+    ``log_to`` tells an emulated car where to write what its firmware saw; others ignore it. ``as_sent`` is what the
+    wire would make of an action, for a dry run.
     """
 
     car: Car
@@ -32,6 +33,7 @@ class CarChoice:
     envelope: SafetyEnvelope
     config_toml: str
     log_to: Callable[[Path], None] = field(default=lambda folder: None)
+    as_sent: Callable[[Action], Action] | None = None
 
     @property
     def control_period_s(self) -> float:
@@ -75,7 +77,7 @@ def choose_car(
     if dry_run:
         from drivers.dry_run_car import DryRunCar
 
-        choice.car = DryRunCar(choice.car)
+        choice.car = DryRunCar(choice.car, choice.as_sent)
     return choice
 
 
@@ -121,7 +123,14 @@ def _real(file: CarFile, seed: int) -> CarChoice:
         reality=Reality.REAL,
         limits=ActionLimits(real.envelope.max_steering, real.envelope.max_throttle),
     )
-    return CarChoice(car, file.simulator, real.envelope, _config_toml(file, real.name))
+    calibration = real.hardware.calibration
+    return CarChoice(
+        car,
+        file.simulator,
+        real.envelope,
+        _config_toml(file, real.name),
+        as_sent=lambda action: calibration.from_device(calibration.to_device(action)),
+    )
 
 
 def _envelope(file: CarFile) -> SafetyEnvelope:

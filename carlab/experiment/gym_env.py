@@ -1,7 +1,7 @@
 """A simulated car and a task as a Gymnasium environment, with the same encoder and reward as every other world.
 
-``gymnasium.make("carlab/Parking-v0")`` and ``"carlab/Path-v0"``; the observation holds the last H actions, oldest
-first, as in Rothfuss et al., arXiv 2403.16644.
+Registered by ``carlab.experiment.gym_registration`` as ``carlab/Parking-v0`` and ``carlab/Path-v0``. The observation
+holds the last H actions, oldest first, as in Rothfuss et al., arXiv 2403.16644.
 """
 
 from __future__ import annotations

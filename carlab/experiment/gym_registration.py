@@ -1,15 +1,17 @@
-"""Makes the environments known to Gymnasium by its plug-in entry point: ``gymnasium.make`` needs no import."""
+"""Importing this module makes the environments known to Gymnasium: ``carlab/Parking-v0`` and ``carlab/Path-v0``.
+
+    import gymnasium
+    import carlab.experiment.gym_registration
+    env = gymnasium.make("carlab/Parking-v0")
+
+or, in one, ``gymnasium.make("carlab.experiment.gym_registration:carlab/Parking-v0")``.
+"""
 
 from __future__ import annotations
 
+from gymnasium.envs.registration import register, registry
 
-def register_environments() -> None:
-    """Register ``carlab/Parking-v0`` and ``carlab/Path-v0`` (Gymnasium adds the namespace of the entry point)."""
-    from gymnasium.envs.registration import register
-
-    for task in ("parking", "path"):
-        register(
-            id=f"{task.capitalize()}-v0",
-            entry_point="carlab.experiment.gym_env:make_env",
-            kwargs={"task": task},
-        )
+for _task in ("parking", "path"):
+    _id = f"carlab/{_task.capitalize()}-v0"
+    if _id not in registry:
+        register(id=_id, entry_point="carlab.experiment.gym_env:make_env", kwargs={"task": _task})

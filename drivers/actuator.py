@@ -1,0 +1,302 @@
+"""The main process's face of the sender: opens it, arms it, hands commands over and reads how it fares."""
+
+from __future__ import annotations
+
+import atexit
+import math
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Self
+
+from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, NotArmedError, NotOpenError, NotReadyError
+from carlab.core.quantities import NEUTRAL, Action, Health
+from drivers.calibration import ActuatorCalibration, DeviceCommand
+from drivers.config import ActuatorConfig
+from drivers.sender_logic import Order, SenderState, Wish
+from drivers.sender_process import Sender, start_sender
+from drivers.sender_status import SenderStatus
+
+START_TIMEOUT_S = 15.0
+ANSWER_TIMEOUT_S = 2.0
+SILENT_SENDER_S = 0.5
+POLL_S = 0.001
+SAFETY_STOP = "The car was stopped for safety; look at it, then reset the fault and arm again."
+
+
+class Actuator:
+    """A steered and driven car seen from the command side.
+
+    The commands are sent by a process of its own, see ``sender_process``; this object only posts the newest one. It
+    belongs to the process that opened it: a fork of it can neither command nor close it.
+    """
+
+    def __init__(
+        self,
+        config: ActuatorConfig,
+        calibration: ActuatorCalibration,
+        start: Callable[[ActuatorConfig, ActuatorCalibration], Sender] = start_sender,
+    ) -> None:
+        self.config = config
+        self.calibration = calibration
+        self._start = start
+        self._sender: Sender | None = None
+        self._owner_pid = 0
+        self._lock = threading.RLock()
+        self._epoch = 0
+        self._number = 0
+        self._armed_epoch = 0
+        self._latched = ""  # a fault known on this side, kept even where the sender could not be told
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a sender belongs to this object in this process."""
+        return self._sender is not None and self._owner_pid == os.getpid()
+
+    def open(self) -> None:
+        """Start the sender and wait until the VESC answers; idempotent.
+
+        Raises NotReadyError where the port is wrong, nothing answers, or the firmware is too old.
+        """
+        if self.is_open:
+            return
+        if self._sender is not None:
+            raise NotReadyError("This actuator was opened by another process", ("make a new one after a fork.",))
+        self._epoch = self._number = self._armed_epoch = 0
+        self._latched = ""
+        self._owner_pid = os.getpid()
+        self._sender = self._start(self.config, self.calibration)
+        atexit.register(self.close)
+        try:
+            self._await_connection()
+        except BaseException:
+            self.close()
+            raise
+
+    def arm(self) -> None:
+        """Let commands through. Raises NotReadyError, or ActuatorFaultError while a fault is latched."""
+        self.require_no_fault()
+        self._await(lambda s: s.state != SenderState.STOPPING, ANSWER_TIMEOUT_S)
+        epoch = self._post_wish(Wish.ARM)
+        status = self._await_epoch(epoch)
+        if status.state == SenderState.FAULT:
+            raise ActuatorFaultError(status.fault)
+        if status.state != SenderState.ARMED or status.epoch != epoch:
+            raise NotReadyError("The actuator cannot be armed", (status.refusal or "it was stopped meanwhile.",))
+        with self._lock:
+            if self._epoch == epoch:
+                self._armed_epoch = epoch
+
+    def command(self, action: Action) -> Action:
+        """Post the newest command and return it as it will be on the wire, clamped and rounded by the calibration.
+
+        Neutral is accepted, and changes nothing, while disarmed. Raises NotOpenError, ActuatorFaultError,
+        ActionOutOfRangeError (not a number) and NotArmedError.
+        """
+        sender = self._opened()
+        if not action.is_finite:
+            raise ActionOutOfRangeError(f"{action} is not a number; the policy that made it has diverged.")
+        status = self._unfaulted_status(sender)
+        device = self.calibration.to_device(action)
+        with self._lock:
+            is_armed = self._armed_epoch == self._epoch > 0 and status.state == SenderState.ARMED
+            if is_armed:
+                self._number += 1
+                sender.post(Order(self._epoch, Wish.ARM, self._number, time.monotonic(), device))
+        if not is_armed:
+            if action.is_neutral:
+                return NEUTRAL
+            raise NotArmedError("The actuator is not armed; arm it before the first moving command.")
+        return self.calibration.from_device(device)
+
+    def stop(self, *, planned: bool) -> None:
+        """Neutral and disarm; ``planned=False`` latches a fault. Returns when neutral was sent three times.
+
+        Does nothing for an actuator that is closed or whose sender is gone, and never waits longer than two seconds.
+        """
+        if not self.is_open or not self._is_sender_alive():
+            return
+        if not planned and not self._latched:
+            self._latched = SAFETY_STOP
+        epoch = self._post_wish(Wish.STOP if planned else Wish.STOP_AND_LATCH)
+        self._await(
+            lambda s: s.is_ended or (s.epoch >= epoch and (s.is_neutral_settled or not s.is_sending)), ANSWER_TIMEOUT_S
+        )
+
+    def reset_fault(self) -> None:
+        """Clear a latched fault, staying disarmed. Raises ActuatorFaultError where its cause persists."""
+        status = self._living_status(self._opened())
+        if not self._latched and status.state != SenderState.FAULT:
+            return
+        if status.state != SenderState.FAULT:
+            self._await_epoch(self._post_wish(Wish.STOP_AND_LATCH))
+        status = self._await_epoch(self._post_wish(Wish.RESET_FAULT))
+        if status.state == SenderState.FAULT:
+            raise ActuatorFaultError(status.refusal or status.fault)
+        self._latched = ""
+
+    def status(self) -> SenderStatus:
+        """What the sender last published. Raises NotOpenError."""
+        return self._opened().status()
+
+    def require_no_fault(self) -> None:
+        """Raise ActuatorFaultError where a fault is latched or the sender is gone."""
+        self._unfaulted_status(self._opened())
+
+    def problems(self) -> tuple[str, ...]:
+        """Why the actuator could not be armed right now, each with the next step; empty where nothing is wrong."""
+        if not self.is_open or self._sender is None:
+            return ("the actuator is not open.",)
+        if not self._is_sender_alive():
+            return ("the sender process has ended; close the car and open it again.",)
+        status = self._sender.status()
+        found = []
+        if status.state == SenderState.FAULT or self._latched:
+            found.append(status.fault or self._latched)
+        age_s = time.monotonic() - status.t_telemetry_s
+        if not age_s <= self.config.telemetry_stale_s and not found:
+            found.append(f"the VESC's telemetry is {age_s:.1f} s old; check the link.")
+        return tuple(found)
+
+    def health(self) -> Health:
+        """Link, firmware and timing."""
+        problems = self.problems()
+        if not self.is_open or self._sender is None:
+            return Health(False, problems)
+        status = self._sender.status()
+        readings = {
+            "battery_v": status.input_v,
+            "motor_erpm": status.erpm,
+            "tachometer_steps": status.tachometer_steps,
+            "vesc_fault_code": float(status.fault_code),
+            "vesc_motor_timeout_flag": float(status.status_bits & 1),
+            "firmware_version": status.firmware_major + status.firmware_minor / 100.0,
+            "telemetry_age_s": time.monotonic() - status.t_telemetry_s,
+            "command_to_wire_s": status.t_written_s - status.t_issued_s,
+            "sender_late_p50_ms": status.late_p50_ms,
+            "sender_late_p99_ms": status.late_p99_ms,
+            "sender_late_max_ms": status.late_max_ms,
+            "sender_skipped_count": float(status.skipped_ticks),
+            "sender_realtime_flag": float(status.is_realtime),
+            "frames_count": float(status.frames),
+            "neutral_frames_count": float(status.neutral_frames),
+            "watchdog_trips_count": float(status.watchdog_trips),
+            "crc_errors_count": float(status.crc_errors),
+            "garbage_bytes_count": float(status.garbage_bytes),
+            "link_opens_count": float(status.link_opens),
+        }
+        return Health(not problems, problems, {name: value for name, value in readings.items() if math.isfinite(value)})
+
+    def close(self) -> None:
+        """Neutral at least three times, then disconnect; bounded in time, idempotent, safe after any failure."""
+        sender = self._sender
+        if sender is None:
+            return
+        if self._owner_pid != os.getpid():
+            self._sender = None
+            return
+        try:
+            if sender.is_alive():
+                self._post_wish(Wish.SHUT_DOWN)
+                sender.join(ANSWER_TIMEOUT_S)
+        finally:
+            self._sender = None
+            atexit.unregister(self.close)
+            sender.close()
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def _opened(self) -> Sender:
+        if self._sender is None:
+            raise NotOpenError("The actuator is not open; call open() first, or use it in a with block.")
+        if self._owner_pid != os.getpid():
+            raise NotOpenError("The actuator was opened by another process; make a new one after a fork.")
+        return self._sender
+
+    def _is_sender_alive(self) -> bool:
+        return self._sender is not None and self._sender.is_alive()
+
+    def _living_status(self, sender: Sender) -> SenderStatus:
+        """The status of a sender that lives and reacts; one that hangs is a fault even if it comes back."""
+        status = sender.status()
+        if not sender.is_alive():
+            raise ActuatorFaultError(
+                status.fault
+                or "The sender process has ended; the VESC's own time-out stops the motor. Open the car anew."
+            )
+        if time.monotonic() - status.t_published_s > SILENT_SENDER_S:
+            raise self._latch("The sender process hangs; the VESC's own time-out stops the motor. Open the car anew.")
+        return status
+
+    def _unfaulted_status(self, sender: Sender) -> SenderStatus:
+        status = self._living_status(sender)
+        if status.state == SenderState.FAULT:
+            raise ActuatorFaultError(status.fault)
+        if self._latched:
+            raise ActuatorFaultError(self._latched)
+        return status
+
+    def _latch(self, text: str) -> ActuatorFaultError:
+        """Remember a fault here and, for when it can hear again, tell the sender; returns the error to raise."""
+        self._latched = self._latched or text
+        self._post_wish(Wish.STOP_AND_LATCH)
+        return ActuatorFaultError(text)
+
+    def _post_wish(self, wish: Wish) -> int:
+        sender = self._opened()
+        with self._lock:
+            self._epoch += 1
+            self._number = 0
+            neutral: DeviceCommand = self.calibration.neutral
+            sender.post(Order(self._epoch, wish, 0, time.monotonic(), neutral))
+            return self._epoch
+
+    def _await(self, is_met: Callable[[SenderStatus], bool], timeout_s: float) -> SenderStatus:
+        """The first status that meets the condition, or the newest one after ``timeout_s`` or the sender's end."""
+        sender = self._opened()
+        until_s = time.monotonic() + timeout_s
+        while not is_met(status := sender.status()):
+            if time.monotonic() > until_s or not sender.is_alive():
+                return sender.status()
+            time.sleep(POLL_S)
+        return status
+
+    def _await_epoch(self, epoch: int) -> SenderStatus:
+        status = self._await(lambda s: s.epoch >= epoch or s.is_ended, ANSWER_TIMEOUT_S)
+        if status.epoch < epoch:
+            raise self._latch(status.fault or "The sender process does not answer; close the car, open it again.")
+        return status
+
+    def _await_connection(self) -> None:
+        what = f"The VESC at {self.config.address} is not ready"
+        status = self._await(lambda s: s.t_published_s > 0.0 or s.is_ended, START_TIMEOUT_S)
+        if status.t_published_s == 0.0:
+            raise NotReadyError(
+                what, ("the sender process did not start; run 'python -m drivers.sender_process' by hand.",)
+            )
+        settled = (SenderState.CONNECTED, SenderState.FAULT)
+        status = self._await(lambda s: s.is_ended or s.state in settled, self.config.open_timeout_s)
+        if status.state == SenderState.CONNECTED:
+            return
+        raise NotReadyError(what, (status.fault or self._silence(status),))
+
+    def _silence(self, status: SenderStatus) -> str:
+        if status.firmware_major:
+            return "it says its version but sends no telemetry; restart it and check its app settings in VESC Tool."
+        heard = status.garbage_bytes + status.crc_errors
+        if self.config.kind == "vesc_can":
+            return (
+                "nothing answers there; check power, termination, the bitrate, and that controller_id in "
+                "[hardware.actuator] is the VESC's id and its CAN mode is VESC."
+            )
+        if heard:
+            return (
+                f"what answers is no VESC ({heard} bytes of garbage); check 'port' and 'baud' in [hardware.actuator]."
+            )
+        return "the port opens but nothing answers; switch the VESC on and check that 'port' is the VESC's."

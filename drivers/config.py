@@ -1,0 +1,79 @@
+"""Configuration of the hardware of a car: what stands in ``[hardware]`` of its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from carlab.core.errors import ConfigError
+from drivers.calibration import ActuatorCalibration
+
+MULTICAST_GROUP = "239.74.163.2"
+
+
+@dataclass(frozen=True, slots=True)
+class ActuatorConfig:
+    """The actuator, the table ``[hardware.actuator]``.
+
+    ``vesc_serial`` uses ``port`` and ``baud`` (ignored on USB). ``vesc_can`` uses ``interface`` (any of python-can:
+    socketcan, slcan, pcan, ..., ``udp_multicast`` between processes, ``virtual`` within one), ``channel``,
+    ``bitrate``, the VESC's ``controller_id`` and a ``host_id`` that nobody else on the bus has. The sender sends at
+    ``rate_hz``; a command older than ``watchdog_s`` becomes neutral and one older than ``latch_s`` a latched fault.
+    Telemetry is polled at ``telemetry_rate_hz``; older than ``telemetry_stale_s`` means neutral, older than
+    ``telemetry_lost_s`` a latched fault. ``realtime_priority`` asks for SCHED_FIFO and goes on without it.
+    """
+
+    kind: Literal["vesc_serial", "vesc_can"] = "vesc_serial"
+    port: str = "/dev/ttyACM0"
+    baud: int = 115200
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: int = 500_000
+    controller_id: int = 23
+    host_id: int = 42
+    rate_hz: float = 100.0
+    watchdog_s: float = 0.15
+    latch_s: float = 0.5
+    telemetry_rate_hz: float = 50.0
+    telemetry_stale_s: float = 0.25
+    telemetry_lost_s: float = 1.0
+    open_timeout_s: float = 3.0
+    realtime_priority: bool = True
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for numbers that could not work together."""
+        if not 10.0 <= self.rate_hz <= 500.0:
+            raise ConfigError(f"rate_hz is {self.rate_hz:g}; it must lie in [10, 500].")
+        if not 1.0 <= self.telemetry_rate_hz <= 200.0:
+            raise ConfigError(f"telemetry_rate_hz is {self.telemetry_rate_hz:g}; it must lie in [1, 200].")
+        if not 1.0 / self.rate_hz < self.watchdog_s < self.latch_s:
+            raise ConfigError(
+                f"watchdog_s {self.watchdog_s:g} must be longer than one period of rate_hz and shorter than latch_s "
+                f"{self.latch_s:g}."
+            )
+        if not 1.0 / self.telemetry_rate_hz < self.telemetry_stale_s < self.telemetry_lost_s:
+            raise ConfigError(
+                "telemetry_stale_s must be longer than a telemetry period and shorter than telemetry_lost_s."
+            )
+        if not 0 <= self.controller_id <= 254 or not 0 <= self.host_id <= 254 or self.controller_id == self.host_id:
+            raise ConfigError("controller_id and host_id must be two different numbers in 0 ... 254.")
+        if self.open_timeout_s <= 0.0 or self.baud <= 0 or self.bitrate <= 0:
+            raise ConfigError("open_timeout_s, baud and bitrate must be positive.")
+
+    @property
+    def address(self) -> str:
+        """Where the actuator is, in words for messages."""
+        if self.kind == "vesc_serial":
+            return self.port
+        return f"controller {self.controller_id} on {self.interface} {self.channel}"
+
+
+@dataclass(frozen=True, slots=True)
+class HardwareConfig:
+    """What the drivers need of ``[hardware]``, and when the car may be armed."""
+
+    actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
+    calibration: ActuatorCalibration = field(default_factory=ActuatorCalibration)
+    arm_max_speed_mps: float = 0.1
+    arm_max_pose_age_s: float = 0.1
+    arm_max_erpm: float = 200.0

@@ -1,0 +1,163 @@
+"""A fake VESC on a CAN bus of python-can: ``virtual`` within a process, ``udp_multicast`` between processes.
+
+Run as ``python -m drivers.emulators.can_firmware --interface udp_multicast --channel 239.74.163.2`` for one in a
+process of its own; it leaves when standard input ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import struct
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Self
+
+import can
+
+from drivers import vesc_can_codec
+from drivers.can_link import open_bus
+from drivers.config import MULTICAST_GROUP
+from drivers.emulators.command_log import CommandLog
+from drivers.emulators.faults import WireFaults
+from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.vesc_can_codec import CanFrame, CanReassembler, Packet, Send
+
+POLL_S = 0.005
+STATUS_PACKETS = (Packet.STATUS_1, Packet.STATUS_4, Packet.STATUS_5)
+_SIMPLE = {
+    Packet.SET_DUTY: ("duty", 1e5),
+    Packet.SET_CURRENT: ("current", 1e3),
+    Packet.SET_CURRENT_BRAKE: ("brake", 1e3),
+    Packet.SET_RPM: ("rpm", 1.0),
+}
+
+
+class CanFirmware:
+    """Puts a ``VescFirmware`` on a CAN bus, served by one thread between ``open`` and ``close``.
+
+    Args:
+        firmware: The firmware; its callbacks run in the serving thread.
+        interface: python-can interface.
+        channel: Its channel; for ``udp_multicast`` GROUP or GROUP:PORT, kept on this host.
+        status_rate_hz: Rate of status broadcasts 1, 4 and 5; 0 for none, as a new VESC comes.
+        faults: Switches for a bad wire.
+    """
+
+    def __init__(
+        self,
+        firmware: VescFirmware,
+        interface: str = "udp_multicast",
+        channel: str = MULTICAST_GROUP,
+        *,
+        status_rate_hz: float = 50.0,
+        faults: WireFaults | None = None,
+    ) -> None:
+        self.firmware = firmware
+        self.log = firmware.log
+        self.interface = interface
+        self.channel = channel
+        self.status_rate_hz = status_rate_hz
+        self.faults = WireFaults() if faults is None else faults
+        self._reassembler = CanReassembler(firmware.controller_id)
+        self._bus: can.BusABC | None = None
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._has_heard = False
+        self._next_status_s = 0.0
+
+    def open(self) -> None:
+        """Join the bus and start to serve. Idempotent."""
+        if self._thread is not None:
+            return
+        self.log.open()
+        self._bus = open_bus(self.interface, self.channel, 500_000)
+        self.log.add(time.monotonic(), "open")
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._serve, args=(self._bus,), name="can-firmware", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop serving and leave the bus. Idempotent."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+        self.log.close()
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def _serve(self, bus: can.BusABC) -> None:
+        while not self._stop.is_set():
+            message = bus.recv(POLL_S)
+            now_s = time.monotonic()
+            if message is not None and message.is_extended_id and not message.is_error_frame:
+                frame = CanFrame(message.arbitration_id, bytes(message.data))
+                if self.faults.pass_on(frame.data) == frame.data:  # a frame with a flipped bit is lost on CAN
+                    self._hear(bus, frame, now_s)
+            self.firmware.poll(now_s)
+            if self.status_rate_hz > 0.0 and now_s >= self._next_status_s:
+                self._next_status_s = now_s + 1.0 / self.status_rate_hz
+                values = self.firmware.values(now_s)
+                for packet in STATUS_PACKETS:
+                    self._send(bus, vesc_can_codec.encode_status(packet, self.firmware.controller_id, values))
+
+    def _hear(self, bus: can.BusABC, frame: CanFrame, now_s: float) -> None:
+        own_id = self.firmware.controller_id
+        if frame.controller_id not in (own_id, vesc_can_codec.BROADCAST_ID):
+            return
+        if frame.packet in _SIMPLE and len(frame.data) >= 4:
+            self._note_first(frame, now_s)
+            name, scale = _SIMPLE[Packet(frame.packet)]
+            self.firmware.set_motor(name, struct.unpack_from(">i", frame.data)[0] / scale, now_s)
+        elif frame.packet == Packet.PING and frame.data:
+            self._note_first(frame, now_s)
+            self._send(bus, vesc_can_codec.pong(frame.data[0], own_id))
+        elif (packet := self._reassembler.feed(frame)) is not None:
+            self._note_first(frame, now_s)
+            reply = self.firmware.handle(packet.payload, now_s)
+            if reply is not None and packet.send == Send.REPLY_TO_SENDER:
+                for answer in vesc_can_codec.encode_payload(packet.sender_id, own_id, reply, Send.IS_REPLY):
+                    self._send(bus, answer)
+
+    def _note_first(self, frame: CanFrame, now_s: float) -> None:
+        if not self._has_heard:
+            self._has_heard = True
+            self.log.add(now_s, "first_byte", float(frame.packet))
+
+    def _send(self, bus: can.BusABC, frame: CanFrame) -> None:
+        data = self.faults.pass_on(frame.data)
+        if not self.faults.is_silent and data == frame.data:
+            bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=True))
+
+
+def main() -> int:
+    """Serve until standard input ends."""
+    parser = argparse.ArgumentParser(description="Fake VESC on a CAN bus.")
+    parser.add_argument("--interface", default="udp_multicast", help="python-can interface")
+    parser.add_argument("--channel", default=MULTICAST_GROUP, help="its channel; GROUP or GROUP:PORT for udp_multicast")
+    parser.add_argument("--log", type=Path, help="JSON lines of what was heard and done")
+    parser.add_argument("--motor-timeout", type=float, default=1.0, help="motor time-out [s]")
+    parser.add_argument("--controller-id", type=int, default=23, help="id on the bus")
+    options = parser.parse_args()
+    firmware = VescFirmware(
+        CommandLog(options.log), motor_timeout_s=options.motor_timeout, controller_id=options.controller_id
+    )
+    with CanFirmware(firmware, options.interface, options.channel) as served:
+        sys.stdout.write(f"{served.interface} {served.channel} id {firmware.controller_id}\n")
+        sys.stdout.flush()
+        sys.stdin.buffer.read()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""What a fake firmware heard and did, with times on the host's monotonic clock."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import deque
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TextIO
+
+ENTRIES_KEPT = 500_000
+MOTOR_NAMES = frozenset({"current", "brake", "duty", "rpm"})
+
+
+@dataclass(frozen=True, slots=True)
+class LogEntry:
+    """A decoded command (``current``, ``brake``, ``duty``, ``rpm``, ``servo``, ``firmware``, ``values``, ``alive``)
+    or an event (``open``, ``first_byte``, ``hang_up``, ``motor_timeout``, ``unplug``, ``replug``, ``close``).
+    """  # noqa: D205
+
+    t_s: float
+    name: str
+    value: float = 0.0
+
+
+class CommandLog:
+    """Entries in memory and, where a path is given, as JSON lines flushed one by one, so that a kill loses none."""
+
+    def __init__(self, path: Path | None = None) -> None:
+        self.path = path
+        self._entries: deque[LogEntry] = deque(maxlen=ENTRIES_KEPT)
+        self._lock = threading.Condition()
+        self._file: TextIO | None = None
+
+    def open(self) -> None:
+        """Open the file, where there is one; entries are appended."""
+        if self.path is not None and self._file is None:
+            self._file = self.path.open("a", encoding="utf-8")
+
+    def add(self, t_s: float, name: str, value: float = 0.0) -> None:
+        """Append an entry."""
+        entry = LogEntry(t_s, name, value)
+        with self._lock:
+            self._entries.append(entry)
+            if self._file is not None:
+                self._file.write(json.dumps(asdict(entry)) + "\n")
+                self._file.flush()
+            self._lock.notify_all()
+
+    def entries(self, *names: str, since_s: float = float("-inf")) -> list[LogEntry]:
+        """Entries with one of ``names`` (all where none is given) from ``since_s`` on, oldest first."""
+        with self._lock:
+            return [e for e in self._entries if (not names or e.name in names) and e.t_s >= since_s]
+
+    def motor(self, since_s: float = float("-inf")) -> list[LogEntry]:
+        """Motor commands, oldest first."""
+        return self.entries(*MOTOR_NAMES, since_s=since_s)
+
+    def wait_for(self, name: str, timeout_s: float, since_s: float = float("-inf")) -> LogEntry | None:
+        """The first entry of that name from ``since_s`` on, waited for; None after ``timeout_s``."""
+        with self._lock:
+            self._lock.wait_for(lambda: self._first(name, since_s) is not None, timeout_s)
+            return self._first(name, since_s)
+
+    def close(self) -> None:
+        """Close the file; the entries in memory stay."""
+        with self._lock:
+            if self._file is not None:
+                self._file.close()
+                self._file = None
+
+    def _first(self, name: str, since_s: float) -> LogEntry | None:
+        return next((e for e in self._entries if e.name == name and e.t_s >= since_s), None)
+
+
+def read_log(path: Path) -> list[LogEntry]:
+    """Entries of a JSON-lines file, also while it is being written (a last line cut short is left out)."""
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+    return [LogEntry(**json.loads(line)) for line in lines]

@@ -1,0 +1,97 @@
+"""Newest-value slots in memory shared by two processes: no queue, so that nothing old can play out later.
+
+A slot holds two copies; the writer fills the one that is not the newest, each with a sequence number and a CRC32. A
+reader takes the valid copy with the higher number: a copy that is torn, because its writer is in the middle or died
+there, fails its CRC and the other one stands. The memory is an anonymous file passed by descriptor: it has no name
+that could collide or leak, and vanishes with the last process, whatever kills it.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import tempfile
+import zlib
+from typing import Self
+
+_HEAD = struct.Struct("<QI")
+_CRC = struct.Struct("<I")
+READ_ATTEMPTS = 5
+
+
+class Slot:
+    """One writer, any number of readers. Construct with ``create`` or, in the other process, ``attach``."""
+
+    def __init__(self, descriptor: int, capacity: int) -> None:
+        self.descriptor = descriptor
+        self.capacity = capacity
+        self.torn_reads = 0
+        self._stride = _HEAD.size + capacity + _CRC.size
+        self._memory: mmap.mmap | None = mmap.mmap(descriptor, 2 * self._stride)
+        self._sequence = max(self._valid_sequences(), default=0)
+
+    @classmethod
+    def create(cls, capacity: int) -> Self:
+        """Make a slot for values of at most ``capacity`` bytes."""
+        if hasattr(os, "memfd_create"):
+            descriptor = os.memfd_create("carlab-slot")
+        else:
+            with tempfile.TemporaryFile() as file:
+                descriptor = os.dup(file.fileno())
+        try:
+            os.ftruncate(descriptor, 2 * (_HEAD.size + capacity + _CRC.size))
+            return cls(descriptor, capacity)
+        except BaseException:
+            os.close(descriptor)
+            raise
+
+    @classmethod
+    def attach(cls, descriptor: int, capacity: int) -> Self:
+        """Map a slot whose descriptor was inherited or duplicated; the slot owns it from now on."""
+        return cls(descriptor, capacity)
+
+    def write(self, value: bytes) -> None:
+        """Publish ``value``; readers see it whole or not at all."""
+        if self._memory is None:
+            raise ValueError("The slot is closed.")
+        if len(value) > self.capacity:
+            raise ValueError(f"A value of {len(value)} bytes does not fit into a slot of {self.capacity}.")
+        sequence = self._sequence + 1
+        body = _HEAD.pack(sequence, len(value)) + value
+        start = sequence % 2 * self._stride
+        record = body + _CRC.pack(zlib.crc32(body))
+        self._memory[start : start + len(record)] = record
+        self._sequence = sequence
+
+    def read(self) -> tuple[int, bytes] | None:
+        """Sequence number and value of the newest whole copy; None before the first, or while both are torn."""
+        for _ in range(READ_ATTEMPTS):
+            copies = [copy for half in (0, 1) if (copy := self._read_half(half)) is not None]
+            if copies:
+                return max(copies)
+        return None
+
+    def close(self) -> None:
+        """Unmap and close the descriptor; idempotent."""
+        if self._memory is not None:
+            self._memory.close()
+            self._memory = None
+            os.close(self.descriptor)
+
+    def _read_half(self, half: int) -> tuple[int, bytes] | None:
+        if self._memory is None:
+            raise ValueError("The slot is closed.")
+        start = half * self._stride
+        record = self._memory[start : start + self._stride]
+        sequence, length = _HEAD.unpack_from(record)
+        if sequence == 0 and length == 0:
+            return None
+        end = _HEAD.size + length
+        if length > self.capacity or zlib.crc32(record[:end]) != _CRC.unpack_from(record, end)[0]:
+            self.torn_reads += 1
+            return None
+        return sequence, record[_HEAD.size : end]
+
+    def _valid_sequences(self) -> list[int]:
+        return [copy[0] for half in (0, 1) if (copy := self._read_half(half)) is not None]

@@ -1,0 +1,118 @@
+"""VESC serial framing: payloads to bytes and a byte stream back to payloads. Pure; time is an argument.
+
+Frame (vedderb/bldc comm/packet.c): ``02 LEN payload CRC16 03`` for 1 to 255 bytes, ``03 LEN_HI LEN_LO payload CRC16
+03`` for more, at most 512. The CRC is CRC-16/XMODEM over the payload, high byte first.
+"""
+
+from __future__ import annotations
+
+import binascii
+from dataclasses import dataclass, field
+
+from carlab.core.errors import ProtocolError
+
+MAX_PAYLOAD = 512
+SHORT_START, LONG_START, STOP = 0x02, 0x03, 0x03
+
+
+def crc16(payload: bytes) -> int:
+    """CRC-16/XMODEM: polynomial 0x1021, start 0, not reflected; 0x31C3 for ``123456789``."""
+    return binascii.crc_hqx(payload, 0)
+
+
+def encode_frame(payload: bytes) -> bytes:
+    """Frame a payload of 1 to 512 bytes; raises ProtocolError for another length."""
+    if not 1 <= len(payload) <= MAX_PAYLOAD:
+        raise ProtocolError(f"A payload has 1 to {MAX_PAYLOAD} bytes, not {len(payload)}.")
+    if len(payload) <= 255:
+        head = bytes((SHORT_START, len(payload)))
+    else:
+        head = bytes((LONG_START,)) + len(payload).to_bytes(2, "big")
+    return head + payload + crc16(payload).to_bytes(2, "big") + bytes((STOP,))
+
+
+@dataclass(slots=True)
+class VescFrameDecoder:
+    """Bytes in, payloads out, with one-byte resynchronisation like the firmware's own decoder.
+
+    Whatever does not continue a valid frame costs one byte, after which the search goes on at the next; so a false
+    start never hides a valid frame for longer than its own bogus length. That length can be 512 bytes: where no byte
+    comes for ``inter_byte_timeout_s`` the unfinished frame is given up the same way, and valid frames inside come out.
+    """
+
+    inter_byte_timeout_s: float | None = 0.03
+    frames: int = 0
+    crc_errors: int = 0
+    garbage_bytes: int = 0
+    timeouts: int = 0
+    _buffer: bytearray = field(default_factory=bytearray)
+    _t_last_byte_s: float = 0.0
+
+    @property
+    def pending_bytes(self) -> int:
+        """Bytes of an unfinished frame."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes, t_s: float) -> list[bytes]:
+        """Take bytes that arrived at ``t_s`` (any monotonic clock; ``data`` may be empty) and return whole payloads."""
+        payloads: list[bytes] = []
+        if self._is_overdue(t_s):
+            self.timeouts += 1
+            while self._buffer:
+                self._drop_byte()
+                self._scan(payloads)
+        if data:
+            self._buffer += data
+            self._t_last_byte_s = t_s
+            self._scan(payloads)
+        return payloads
+
+    def clear(self) -> None:
+        """Forget an unfinished frame, after the link was opened anew."""
+        self._buffer.clear()
+
+    def _is_overdue(self, t_s: float) -> bool:
+        limit_s = self.inter_byte_timeout_s
+        return bool(self._buffer) and limit_s is not None and t_s - self._t_last_byte_s > limit_s
+
+    def _scan(self, payloads: list[bytes]) -> None:
+        while self._buffer:
+            span = self._frame_span()
+            if span is None:
+                return
+            start, end = span
+            if end == 0:
+                self._drop_byte()
+                continue
+            payloads.append(bytes(self._buffer[start:end]))
+            self.frames += 1
+            del self._buffer[: end + 3]
+
+    def _frame_span(self) -> tuple[int, int] | None:
+        """Payload's place of a whole frame at the front; (0, 0) where none can start there; None if bytes lack."""
+        buffer = self._buffer
+        if buffer[0] == SHORT_START:
+            start = 2
+            length = buffer[1] if len(buffer) >= 2 else None
+            is_valid = length != 0
+        elif buffer[0] == LONG_START:
+            start = 3
+            length = int.from_bytes(buffer[1:3], "big") if len(buffer) >= 3 else None
+            is_valid = length is None or 255 <= length <= MAX_PAYLOAD
+        else:
+            return 0, 0
+        if not is_valid:
+            return 0, 0
+        if length is None or len(buffer) < start + length + 3:
+            return None
+        end = start + length
+        if buffer[end + 2] != STOP:
+            return 0, 0
+        if crc16(bytes(buffer[start:end])) != int.from_bytes(buffer[end : end + 2], "big"):
+            self.crc_errors += 1
+            return 0, 0
+        return start, end
+
+    def _drop_byte(self) -> None:
+        del self._buffer[0]
+        self.garbage_bytes += 1

@@ -1,0 +1,273 @@
+"""Actuator and fake firmware over CAN: python-can's virtual bus within a process, UDP multicast between processes."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+from can.interfaces.virtual import VirtualBus
+
+from carlab.core.errors import ActuatorFaultError, NotReadyError
+from carlab.core.quantities import Action
+from drivers import vesc_can_codec
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.can_link import CanLink
+from drivers.config import ActuatorConfig
+from drivers.emulators.can_firmware import CanFirmware
+from drivers.emulators.command_log import CommandLog, read_log
+from drivers.emulators.faults import FaultyFrameLink, WireFaults
+from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.sender_logic import SenderState
+from drivers.sender_process import SenderThread
+from drivers.vesc_can_codec import CanFrame
+from drivers.vesc_can_device import VescCanDevice
+
+ROOT = Path(__file__).resolve().parents[2]
+CALIBRATION = ActuatorCalibration(max_current_a=10.0)
+MOVING = Action(0.5, 0.3)
+PATIENT_S = 20.0
+CHILD = """
+import sys, time
+from carlab.core.quantities import Action
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+config = ActuatorConfig(kind="vesc_can", interface="udp_multicast", channel=sys.argv[1])
+with Actuator(config, ActuatorCalibration()) as actuator:
+    actuator.arm()
+    print(actuator._sender.pid, flush=True)
+    while True:
+        actuator.command(Action(0.5, 0.3))
+        time.sleep(0.02)
+"""
+
+
+def config_for(interface: str, channel: str, **changes: Any) -> ActuatorConfig:
+    config = ActuatorConfig(
+        kind="vesc_can",
+        interface=interface,
+        channel=channel,
+        watchdog_s=2.0,
+        latch_s=30.0,
+        telemetry_stale_s=5.0,
+        telemetry_lost_s=10.0,
+    )
+    return replace(config, **changes)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + PATIENT_S
+    while not condition():
+        assert time.monotonic() < end_s, "waited in vain"
+        time.sleep(0.002)
+
+
+def channel_name() -> str:
+    return f"test-{uuid.uuid4()}"
+
+
+def multicast_channel() -> str:
+    """A port of its own for each test, so that parallel runs do not hear one another."""
+    return f"239.74.163.2:{20000 + uuid.uuid4().int % 20000}"
+
+
+@pytest.mark.parametrize("status_rate_hz", [0.0, 50.0])
+@pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
+def test_drive_and_stop(interface: str, status_rate_hz: float) -> None:
+    channel = channel_name() if interface == "virtual" else multicast_channel()
+    firmware = VescFirmware(CommandLog(), motor_timeout_s=0.4)
+    with CanFirmware(firmware, interface, channel, status_rate_hz=status_rate_hz) as served:
+        with Actuator(config_for(interface, channel), CALIBRATION) as actuator:
+            actuator.arm()
+            actuator.command(MOVING)
+            until(lambda: any(e.value == 3.0 for e in served.log.motor()))
+            until(lambda: any(e.value == 0.65 for e in served.log.entries("servo")))
+            assert actuator.health().readings["battery_v"] == pytest.approx(11.1)
+            t_s = time.monotonic()
+            actuator.stop(planned=True)
+        until(lambda: len([e for e in served.log.motor(t_s) if e.value == 0.0]) >= 6)
+        motor = served.log.motor()
+        last_moving = max(e.t_s for e in motor if e.value)
+        neutral = [e for e in motor if e.t_s > last_moving]
+        assert {e.name for e in neutral} == {"current"}
+        assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+        assert served.log.entries("servo")[-1].value == 0.5
+        assert served.log.wait_for("motor_timeout", PATIENT_S) is not None
+
+
+def test_lost_frames_are_survived() -> None:
+    channel = channel_name()
+    faults = WireFaults(drop_share=0.1, corrupt_share=0.1, seed=1)
+    config = config_for("virtual", channel, open_timeout_s=PATIENT_S)
+    served = CanFirmware(VescFirmware(CommandLog()), "virtual", channel, faults=faults)
+    with served, Actuator(config, CALIBRATION) as actuator:
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: len(served.log.motor()) > 100)
+        assert actuator.status().state == SenderState.ARMED
+        assert {e.value for e in served.log.motor()} <= {0.0, 3.0}
+        assert faults.dropped > 5
+
+
+def test_nobody_on_the_bus_and_no_such_bus() -> None:
+    with pytest.raises(NotReadyError, match="nothing answers there; check power, termination"):
+        Actuator(config_for("virtual", channel_name(), open_timeout_s=0.4), CALIBRATION).open()
+    with pytest.raises(NotReadyError, match="ip link set nocan7 up"):
+        Actuator(config_for("socketcan", "nocan7"), CALIBRATION).open()
+    with pytest.raises(NotReadyError, match="interface"):
+        Actuator(config_for("no_such_interface", "x"), CALIBRATION).open()
+
+
+def test_ping_is_answered() -> None:
+    channel = channel_name()
+    with CanFirmware(VescFirmware(CommandLog()), "virtual", channel, status_rate_hz=0.0):
+        link = CanLink("virtual", channel)
+        link.open()
+        link.write(vesc_can_codec.ping(23, 42))
+        heard: list[CanFrame] = []
+        until(lambda: bool(heard.extend(link.read()) or heard))
+        assert heard == [CanFrame(0x122A, b"\x17\x00")]
+        link.close()
+
+
+def test_a_failing_bus_is_a_latched_fault_and_the_firmwares_timeout() -> None:
+    channel = channel_name()
+    config = config_for("virtual", channel)
+    link = FaultyFrameLink(CanLink("virtual", channel))
+    with CanFirmware(VescFirmware(CommandLog(), motor_timeout_s=0.3), "virtual", channel) as served:
+        device = VescCanDevice(link, 23, 42)
+        with Actuator(config, CALIBRATION, lambda c, k: SenderThread(c, k, device)) as actuator:
+            actuator.arm()
+            actuator.command(MOVING)
+            until(lambda: any(e.value == 3.0 for e in served.log.motor()))
+            link.failure = "the bus is off"
+            until(lambda: actuator.status().state == SenderState.FAULT)
+            with pytest.raises(ActuatorFaultError, match="the bus is off"):
+                actuator.command(MOVING)
+            assert served.log.wait_for("motor_timeout", PATIENT_S) is not None
+            link.failure = None
+            t_s = time.monotonic()
+            until(lambda: len(served.log.motor(t_s)) > 10)
+            assert all(e.value == 0.0 for e in served.log.motor(t_s)), "back on the bus, but only with neutral"
+            with pytest.raises(ActuatorFaultError):
+                actuator.arm()
+            actuator.reset_fault()
+            actuator.arm()
+
+
+class BrokenBus(VirtualBus):
+    """A virtual bus that fails as real ones do."""
+
+    failure: Exception | None = None
+    received: can.Message | None = None
+    flushed = 0
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        assert timeout == 0, "a frame that cannot be sent now must not be sent later"
+        if self.failure is not None:
+            raise self.failure
+        super().send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self.failure is not None and self.received is None:
+            raise self.failure
+        message, self.received = self.received, None
+        return message
+
+    def flush_tx_buffer(self) -> None:
+        self.flushed += 1
+
+
+class BrokenLink(CanLink):
+    """A CAN link on such a bus."""
+
+    bus: BrokenBus
+
+    def _open_bus(self) -> can.BusABC:
+        self.bus = BrokenBus(channel=self.channel)
+        return self.bus
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        can.CanOperationError("transmit buffer full"),
+        OSError(errno.ENOBUFS, "no buffer space"),
+        OSError(errno.ENETDOWN, "network is down"),
+    ],
+)
+def test_errors_of_the_bus_are_faults_and_drop_what_waits(failure: Exception) -> None:
+    link = BrokenLink("virtual", channel_name())
+    link.open()
+    link.bus.failure = failure
+    with pytest.raises(ActuatorFaultError, match="check wiring"):
+        link.write(vesc_can_codec.set_current(23, 1.0))
+    assert link.bus.flushed == 1
+    with pytest.raises(ActuatorFaultError):
+        link.read()
+    link.close()
+    link.close()
+    with pytest.raises(ActuatorFaultError, match="not open"):
+        link.read()
+
+
+def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
+    link = BrokenLink("virtual", channel_name())
+    link.open()
+    link.bus.received = can.Message(arbitration_id=0x04, is_error_frame=True, data=bytes(8))
+    assert link.read() == []
+    assert link.statistics.error_frames == 1
+    link.bus.received = can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8))
+    with pytest.raises(ActuatorFaultError, match="bus-off"):
+        link.read()
+    link.close()
+
+
+@pytest.mark.parametrize("victim", ["main", "sender"])
+def test_sudden_death_across_processes(tmp_path: Path, victim: str) -> None:
+    channel = multicast_channel()
+    log = tmp_path / "log.jsonl"
+    firmware = subprocess.Popen(
+        [sys.executable, "-m", "drivers.emulators.can_firmware", "--channel", channel, "--log", str(log)],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert firmware.stdout is not None
+    assert "id 23" in firmware.stdout.readline()
+    main = subprocess.Popen(
+        [sys.executable, "-c", CHILD, channel], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        assert main.stdout is not None
+        sender_pid = int(main.stdout.readline())
+        until(lambda: any(e.value == 3.0 for e in read_log(log)))
+        os.kill(main.pid if victim == "main" else sender_pid, signal.SIGKILL)
+        main.communicate(timeout=PATIENT_S)
+        until(lambda: any(e.name == "motor_timeout" for e in read_log(log)))
+    finally:
+        main.kill()
+        main.communicate()
+        firmware.communicate(timeout=PATIENT_S)
+    entries = read_log(log)
+    motor = [e for e in entries if e.name in ("current", "brake", "duty", "rpm")]
+    if victim == "main":
+        neutral = [e for e in motor if e.t_s > max(m.t_s for m in motor if m.value)]
+        assert len(neutral) >= 3
+        assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+        assert [e.value for e in entries if e.name == "servo"][-3:] == [0.5] * 3
+    else:
+        assert motor[-1].value == 3.0, "nobody is left to send neutral: the firmware's time-out does it"

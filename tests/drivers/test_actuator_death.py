@@ -1,0 +1,267 @@
+"""Kill tests: whatever happens to main process or sender, the firmware's log ends in neutral or its time-out."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from drivers.emulators.command_log import CommandLog, LogEntry
+from drivers.emulators.serial_firmware import SerialFirmware
+from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.sender_process import SenderProcess
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENT_S = 20.0
+MOTOR_TIMEOUT_S = 0.4
+
+CHILD = """
+import os, sys, threading, time
+from carlab.core.errors import CarlabError
+from carlab.core.quantities import Action
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+
+port, way = sys.argv[1:3]
+actuator = Actuator(ActuatorConfig(port=port, watchdog_s=0.4, latch_s=1.0), ActuatorCalibration())
+
+def say(*words):
+    print(*words, flush=True)
+
+def drive():
+    n = 0
+    while True:
+        n += 1
+        actuator.command(Action(0.5, 0.3))
+        time.sleep(0.02)
+        if n == 20:
+            if way == "exception":
+                raise RuntimeError("planted")
+            if way == "os_exit":
+                os._exit(7)
+            if way == "sys_exit":
+                sys.exit(3)
+            if way == "hang":
+                say("hanging")
+                time.sleep(1.6)
+            if way == "fork":
+                pid = os.fork()
+                if pid == 0:
+                    try:
+                        actuator.command(Action(0.5, 0.3))
+                    except CarlabError as error:
+                        say("forked", type(error).__name__)
+                    actuator.close()
+                    os._exit(0)
+                os.waitpid(pid, 0)
+            if way == "forked_worker_then_sigkill":
+                worker = os.fork()
+                if worker == 0:
+                    time.sleep(60.0)
+                    os._exit(0)
+                say(worker)
+                os.kill(os.getpid(), 9)
+
+def main():
+    if way == "no_close":
+        actuator.open()
+        actuator.arm()
+        for _ in range(20):
+            actuator.command(Action(0.5, 0.3))
+            time.sleep(0.02)
+        return
+    with actuator:
+        actuator.arm()
+        say("sender", actuator._sender.pid)
+        try:
+            drive()
+        except CarlabError as error:
+            say("error", type(error).__name__, str(error).replace(chr(10), " "))
+            if way == "retry_on_request":
+                sys.stdin.readline()
+            for retry in (actuator.arm, lambda: actuator.command(Action(0.5, 0.3))):
+                try:
+                    retry()
+                    say("took it")
+                except CarlabError as again:
+                    say("refused", type(again).__name__)
+
+main()
+"""
+
+
+class Drive:
+    """A child process that drives at 50 Hz, and the fake firmware it drives."""
+
+    def __init__(self, firmware: SerialFirmware, way: str) -> None:
+        self.log = firmware.log
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", CHILD, firmware.port, way],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.lines = self.process.stdout
+        self.sender_pid = int(self.lines.readline().split()[1]) if way != "no_close" else 0
+        wait_for(lambda: any(e.value == 3.0 for e in self.log.motor()))
+
+    def end(self) -> str:
+        """Wait for the child to end and return what it still said."""
+        said, _ = self.process.communicate(timeout=PATIENT_S)
+        return str(said)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + PATIENT_S
+    while not condition():
+        assert time.monotonic() < end_s, "waited in vain"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def firmware(tmp_path: Path) -> SerialFirmware:
+    return SerialFirmware(
+        VescFirmware(CommandLog(tmp_path / "log.jsonl"), motor_timeout_s=MOTOR_TIMEOUT_S), link=tmp_path / "vesc"
+    )
+
+
+def assert_ended_in_neutral(log: CommandLog) -> list[LogEntry]:
+    """Three neutral motor commands or more over 60 ms and a centred servo are the last words before the hang-up."""
+    assert log.wait_for("hang_up", PATIENT_S) is not None
+    motor = log.motor()
+    last_moving = max(i for i, e in enumerate(motor) if e.value != 0.0)
+    neutral = motor[last_moving + 1 :]
+    assert len(neutral) >= 3
+    assert all((e.name, e.value) == ("current", 0.0) for e in neutral)
+    assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+    servo = log.entries("servo")
+    assert [e.value for e in servo[-3:]] == [0.5] * 3
+    assert log.wait_for("motor_timeout", PATIENT_S) is not None, "and then the firmware lets the motor go"
+    return neutral
+
+
+@pytest.mark.parametrize("way", ["exception", "os_exit", "sys_exit", "no_close", "fork", "forked_worker_then_sigkill"])
+def test_every_way_out_from_within_ends_in_neutral(firmware: SerialFirmware, way: str) -> None:
+    with firmware:
+        drive = Drive(firmware, way)
+        if way == "fork":
+            assert drive.lines.readline().split() == ["forked", "NotOpenError"]
+            t_s = time.monotonic()
+            wait_for(lambda: len([e for e in firmware.log.motor(t_s) if e.value == 3.0]) > 20)
+            drive.process.send_signal(signal.SIGINT)
+        if way == "forked_worker_then_sigkill":
+            worker = int(drive.lines.readline())
+            drive.process.wait(PATIENT_S)
+        else:
+            drive.end()
+        try:
+            assert_ended_in_neutral(firmware.log)
+        finally:
+            if way == "forked_worker_then_sigkill":
+                os.kill(worker, signal.SIGKILL)
+                drive.end()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_every_signal_to_the_main_process_ends_in_neutral(firmware: SerialFirmware, number: signal.Signals) -> None:
+    with firmware:
+        drive = Drive(firmware, "forever")
+        drive.process.send_signal(number)
+        t_s = time.monotonic()
+        drive.end()
+        neutral = assert_ended_in_neutral(firmware.log)
+        assert neutral[0].t_s - t_s < 1.0
+
+
+def test_a_stopped_main_process_ends_in_neutral_and_may_not_go_on(firmware: SerialFirmware) -> None:
+    with firmware:
+        drive = Drive(firmware, "forever")
+        drive.process.send_signal(signal.SIGSTOP)
+        time.sleep(1.7)
+        moving = [e.t_s for e in firmware.log.motor() if e.value != 0.0]
+        neutral = [e for e in firmware.log.motor() if e.t_s > moving[-1]]
+        assert len(neutral) >= 20, "neutral goes on while the main process is stopped"
+        t_resumed_s = time.monotonic()
+        drive.process.send_signal(signal.SIGCONT)
+        said = drive.end()
+        assert "error ActuatorFaultError no command came" in said
+        assert said.count("refused ActuatorFaultError") == 2
+        assert "took it" not in said
+        assert all(e.value == 0.0 for e in firmware.log.motor(t_resumed_s))
+
+
+def test_a_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: SerialFirmware) -> None:
+    with firmware:
+        drive = Drive(firmware, "hang")
+        assert drive.lines.readline().strip() == "hanging"
+        t_s = time.monotonic()
+        said = drive.end()
+        assert "error ActuatorFaultError no command came" in said
+        assert said.count("refused ActuatorFaultError") == 2
+        later = [e for e in firmware.log.motor() if e.t_s > t_s + 1.0]
+        assert len(later) >= 20
+        assert all(e.value == 0.0 for e in later)
+
+
+def test_a_killed_sender_leaves_the_motor_to_the_firmwares_timeout(firmware: SerialFirmware) -> None:
+    with firmware:
+        drive = Drive(firmware, "forever")
+        os.kill(drive.sender_pid, signal.SIGKILL)
+        t_s = time.monotonic()
+        said = drive.end()
+        assert "error ActuatorFaultError The sender process has ended" in said
+        assert said.count("refused ActuatorFaultError") == 2
+        timeout = firmware.log.wait_for("motor_timeout", PATIENT_S)
+        assert timeout is not None
+        assert not [e for e in firmware.log.motor() if e.t_s > max(timeout.t_s, t_s + 0.5)]
+
+
+def test_a_stopped_sender_is_noticed_and_cannot_move_the_car_later(firmware: SerialFirmware) -> None:
+    with firmware:
+        drive = Drive(firmware, "retry_on_request")
+        os.kill(drive.sender_pid, signal.SIGSTOP)
+        assert firmware.log.wait_for("motor_timeout", PATIENT_S) is not None
+        line = drive.lines.readline()
+        assert "error ActuatorFaultError The sender process hangs" in line
+        t_s = time.monotonic()
+        os.kill(drive.sender_pid, signal.SIGCONT)
+        wait_for(lambda: len(firmware.log.motor(t_s)) > 10)
+        assert drive.process.stdin is not None
+        drive.process.stdin.write("go on\n")
+        said = drive.end()
+        assert said.count("refused ActuatorFaultError") == 2
+        assert all(e.value == 0.0 for e in firmware.log.motor(t_s))
+
+
+def test_unplugged_is_a_latched_fault_and_the_firmwares_timeout(firmware: SerialFirmware) -> None:
+    with firmware:
+        drive = Drive(firmware, "forever")
+        firmware.unplug()
+        said = drive.end()
+        assert "error ActuatorFaultError" in said
+        assert "was lost" in said
+        assert said.count("refused ActuatorFaultError") == 2
+        assert firmware.log.wait_for("motor_timeout", PATIENT_S) is not None
+        unplugged_s = firmware.log.entries("unplug")[0].t_s
+        assert not [e for e in firmware.log.motor() if e.t_s > unplugged_s + 0.5]
+
+
+def test_a_sender_that_is_hung_up_on_sends_neutral_and_leaves(firmware: SerialFirmware) -> None:
+    with firmware:
+        sender = SenderProcess(ActuatorConfig(port=firmware.port), ActuatorCalibration())
+        wait_for(lambda: len(firmware.log.motor()) > 3)
+        sender.close()
+        assert sender._process.returncode == 0, "by itself: it was not killed"
+        assert firmware.log.wait_for("hang_up", PATIENT_S) is not None

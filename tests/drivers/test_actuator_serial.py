@@ -1,0 +1,333 @@
+"""Actuator, sender process and fake firmware end to end over a pseudo-terminal."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from carlab.core.errors import (
+    ActionOutOfRangeError,
+    ActuatorFaultError,
+    NotArmedError,
+    NotOpenError,
+    NotReadyError,
+)
+from carlab.core.quantities import NEUTRAL, Action
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from drivers.emulators.command_log import CommandLog
+from drivers.emulators.faults import WireFaults
+from drivers.emulators.serial_firmware import SerialFirmware
+from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.sender_logic import SenderState
+from drivers.vesc_payloads import FirmwareVersion, MotorValues, get_values, set_current
+from drivers.vesc_serial_codec import encode_frame
+
+CALIBRATION = ActuatorCalibration(max_current_a=10.0)
+MOVING = Action(0.5, 0.3)  # 3 A, servo 0.65
+PATIENT_S = 20.0
+
+
+def config_for(firmware: SerialFirmware, **changes: object) -> ActuatorConfig:
+    """Watchdog times that a stalling test machine cannot trip by accident."""
+    config = ActuatorConfig(
+        port=firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0
+    )
+    return replace(config, **changes)  # type: ignore[arg-type]
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition; fail after much more time than it can take."""
+    end_s = time.monotonic() + PATIENT_S
+    while not condition():
+        assert time.monotonic() < end_s, "waited in vain"
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def actuator(serial_firmware: SerialFirmware) -> Iterator[Actuator]:
+    with Actuator(config_for(serial_firmware), CALIBRATION) as opened:
+        yield opened
+
+
+def test_commands_arrive_as_returned_and_stop_ends_in_neutral(
+    actuator: Actuator, serial_firmware: SerialFirmware
+) -> None:
+    log = serial_firmware.log
+    actuator.arm()
+    sent = actuator.command(MOVING)
+    assert sent.steering == pytest.approx(0.5)
+    assert sent.throttle == pytest.approx(0.3)
+    until(lambda: any(e.value == 3.0 for e in log.motor()))
+    until(lambda: any(e.value == 0.65 for e in log.entries("servo")))
+    t_stop_s = time.monotonic()
+    actuator.stop(planned=True)
+    t_stopped_s = time.monotonic()
+    after = [e for e in log.motor(t_stop_s) if e.t_s <= t_stopped_s]
+    first_neutral = next(i for i, e in enumerate(after) if e.value == 0.0)
+    neutral = after[first_neutral:]
+    assert all((e.name, e.value) == ("current", 0.0) for e in neutral)
+    assert len(neutral) >= 3
+    assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+    assert log.entries("servo")[-1].value == 0.5
+    with pytest.raises(NotArmedError):
+        actuator.command(MOVING)
+    assert actuator.command(NEUTRAL) == NEUTRAL
+
+
+def test_a_command_is_on_the_wire_before_the_next_deadline(serial_firmware: SerialFirmware) -> None:
+    """At 10 Hz a command that waited for a deadline would be 50 ms late on average; it is sent on the wake instead."""
+    with Actuator(config_for(serial_firmware, rate_hz=10.0, telemetry_rate_hz=10.0), CALIBRATION) as actuator:
+        actuator.arm()
+        delays = []
+        for k in range(1, 16):
+            actuator.command(Action(0.0, 0.01 * k))
+            until(lambda k=k: actuator.status().sent_number == k)  # type: ignore[misc]
+            delays.append(actuator.status().t_written_s - actuator.status().t_issued_s)
+            time.sleep(0.037)
+        assert sorted(delays)[7] < 0.035
+
+
+def test_a_flood_of_commands_does_not_flood_the_wire(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+    actuator.arm()
+    t_start_s = time.monotonic()
+    posted = 0
+    while time.monotonic() < t_start_s + 0.5:
+        actuator.command(Action(0.0, 0.1))
+        posted += 1
+    elapsed_s = time.monotonic() - t_start_s
+    frames = len(serial_firmware.log.motor(t_start_s))
+    assert posted > 1000
+    assert frames <= 4.0 * 100.0 * elapsed_s + 5
+
+
+def test_not_a_number_never_leaves(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+    actuator.arm()
+    for bad in (Action(float("nan"), 0.0), Action(0.0, float("inf")), Action(float("-inf"), float("nan"))):
+        with pytest.raises(ActionOutOfRangeError):
+            actuator.command(bad)
+    assert actuator.command(Action(1e30, -1e30)) == Action(1.0, -1.0), "clamped"
+    until(lambda: any(e.value == -10.0 for e in serial_firmware.log.motor()))
+    assert all(abs(e.value) <= 10.0 for e in serial_firmware.log.motor())
+
+
+def test_watchdog_then_latch_then_reset_and_arm(serial_firmware: SerialFirmware) -> None:
+    config = config_for(serial_firmware, watchdog_s=0.15, latch_s=0.5)
+    with Actuator(config, CALIBRATION) as actuator:
+        actuator.arm()
+        until(lambda: actuator.status().state == SenderState.ARMED)
+        actuator.command(MOVING)
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        motor = serial_firmware.log.motor()
+        moving = [e.t_s for e in motor if e.value == 3.0]
+        assert moving
+        after = [e for e in motor if e.t_s > moving[-1]]
+        assert len(after) >= 3
+        assert all(e.value == 0.0 for e in after)
+        with pytest.raises(ActuatorFaultError, match=r"no command came for 0\.5 s"):
+            actuator.command(MOVING)
+        with pytest.raises(ActuatorFaultError):
+            actuator.command(NEUTRAL)
+        with pytest.raises(ActuatorFaultError):
+            actuator.arm()
+        assert not actuator.health().ready
+        actuator.reset_fault()
+        with pytest.raises(NotArmedError):
+            actuator.command(MOVING)
+        actuator.arm()
+        actuator.command(MOVING)
+
+
+def test_unplanned_stop_latches(actuator: Actuator) -> None:
+    actuator.arm()
+    actuator.stop(planned=False)
+    with pytest.raises(ActuatorFaultError, match="stopped for safety"):
+        actuator.arm()
+    actuator.reset_fault()
+    actuator.arm()
+
+
+def test_firmware_fault_stops_and_persists(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+    actuator.arm()
+    actuator.command(MOVING)
+    serial_firmware.firmware.fault_code = 2
+    until(lambda: actuator.status().state == SenderState.FAULT)
+    with pytest.raises(ActuatorFaultError, match="under-voltage"):
+        actuator.command(MOVING)
+    with pytest.raises(ActuatorFaultError, match="under-voltage"):
+        actuator.reset_fault()
+    serial_firmware.firmware.fault_code = 0
+    until(lambda: actuator.status().fault_code == 0)
+    actuator.reset_fault()
+
+
+def test_silence_becomes_neutral_then_a_fault(serial_firmware: SerialFirmware) -> None:
+    config = config_for(serial_firmware, telemetry_stale_s=0.25, telemetry_lost_s=1.0)
+    with Actuator(config, CALIBRATION) as actuator:
+        actuator.arm()
+        serial_firmware.faults.is_silent = True
+        while actuator.status().state == SenderState.ARMED:
+            try:
+                actuator.command(MOVING)
+            except ActuatorFaultError:
+                break
+            time.sleep(0.01)
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        assert "stopped answering" in actuator.status().fault
+        moving = [e.t_s for e in serial_firmware.log.motor() if e.value == 3.0]
+        neutral = [e for e in serial_firmware.log.motor() if e.t_s > moving[-1]]
+        assert neutral[-1].t_s - neutral[0].t_s > 0.4, "neutral long before the fault"
+
+
+def test_unplugged_then_plugged_in_again(serial_firmware: SerialFirmware) -> None:
+    serial_firmware.firmware.motor_timeout_s = 0.3
+    with Actuator(config_for(serial_firmware), CALIBRATION) as actuator:
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in serial_firmware.log.motor()))
+        serial_firmware.unplug()
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        with pytest.raises(ActuatorFaultError, match="was lost"):
+            actuator.command(MOVING)
+        with pytest.raises(ActuatorFaultError, match="was lost"):
+            actuator.reset_fault()
+        assert serial_firmware.log.wait_for("motor_timeout", PATIENT_S) is not None
+        serial_firmware.replug()
+        t_replug_s = serial_firmware.log.entries("replug")[0].t_s
+        until(lambda: len(serial_firmware.log.motor(t_replug_s)) > 10)
+        assert serial_firmware.log.entries(since_s=t_replug_s)[2].name == "firmware", "nothing before the version"
+        assert all(e.value == 0.0 for e in serial_firmware.log.motor(t_replug_s)), "never re-arms by itself"
+        with pytest.raises(ActuatorFaultError, match="was lost"):
+            actuator.command(MOVING)
+        until(lambda: not actuator.problems() or "old" not in actuator.problems()[0])
+        actuator.reset_fault()
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in serial_firmware.log.motor(t_replug_s)))
+
+
+def test_another_board_on_the_same_port_stays_a_fault(serial_firmware: SerialFirmware) -> None:
+    with Actuator(config_for(serial_firmware), CALIBRATION) as actuator:
+        serial_firmware.unplug()
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        serial_firmware.firmware.version = FirmwareVersion(6, 5, "OTHER", b"another board")
+        serial_firmware.replug()
+        t_replug_s = serial_firmware.log.entries("replug")[0].t_s
+        assert serial_firmware.log.wait_for("firmware", PATIENT_S, t_replug_s) is not None
+        time.sleep(0.3)
+        with pytest.raises(ActuatorFaultError):
+            actuator.reset_fault()
+        assert not serial_firmware.log.motor(t_replug_s)
+
+
+def test_a_device_that_reads_nothing_is_a_fault(serial_firmware: SerialFirmware) -> None:
+    config = config_for(serial_firmware, rate_hz=500.0)
+    with Actuator(config, CALIBRATION) as actuator:
+        actuator.arm()
+        serial_firmware.faults.is_deaf = True
+        until(lambda: actuator.status().state == SenderState.FAULT)
+        assert "takes no more bytes" in actuator.status().fault
+
+
+def test_garbage_lost_and_broken_frames_are_survived_and_counted(tmp_path: Path) -> None:
+    faults = WireFaults(drop_share=0.05, corrupt_share=0.2, seed=3)
+    firmware = SerialFirmware(VescFirmware(CommandLog()), faults=faults)
+    with firmware, Actuator(config_for(firmware, open_timeout_s=PATIENT_S), CALIBRATION) as actuator:
+        actuator.arm()
+        firmware.say(bytes((i * 73 + i // 7) & 255 for i in range(3000)) + encode_frame(set_current(9.0))[:5])
+        firmware.say(encode_frame(get_values() + bytes(20)))  # a reply of no known layout
+        until(lambda: actuator.status().crc_errors >= 3)
+        status = actuator.status()
+        assert status.garbage_bytes >= 1000
+        actuator.command(MOVING)
+        until(lambda: any(e.value == 3.0 for e in firmware.log.motor()))
+        assert actuator.status().state == SenderState.ARMED
+        assert {e.value for e in firmware.log.motor()} <= {0.0, 3.0}
+
+
+def test_paced_line_at_115200_keeps_up(tmp_path: Path) -> None:
+    firmware = SerialFirmware(VescFirmware(CommandLog()), baud=115_200)
+    with firmware, Actuator(config_for(firmware), CALIBRATION) as actuator:
+        actuator.arm()
+        actuator.command(MOVING)
+        until(lambda: len([e for e in firmware.log.motor() if e.value == 3.0]) > 50)
+        moving = [e for e in firmware.log.motor() if e.value == 3.0]
+        wire_s = 18 * 10 / 115_200
+        assert moving[0].t_s >= actuator.status().t_issued_s + wire_s * 0.9
+        t_s = firmware.log.motor()[-1].t_s
+        assert time.monotonic() - t_s < 1.0, "no backlog builds up"
+
+
+def test_telemetry_is_the_firmwares(tmp_path: Path) -> None:
+    firmware = VescFirmware(CommandLog(), readings=lambda t_s: MotorValues(erpm=1234.0, input_v=7.4))
+    with SerialFirmware(firmware) as served, Actuator(config_for(served), CALIBRATION) as actuator:
+        readings = actuator.health().readings
+        assert (readings["motor_erpm"], readings["battery_v"]) == (1234.0, 7.4)
+        assert readings["firmware_version"] == pytest.approx(6.05)
+        assert actuator.status().hardware == "EMULATED"
+
+
+def test_wrong_port_lists_what_exists(tmp_path: Path) -> None:
+    missing = tmp_path / "nothing"
+    with pytest.raises(NotReadyError, match="does not exist") as caught:
+        Actuator(ActuatorConfig(port=str(missing)), CALIBRATION).open()
+    assert "port" in str(caught.value)
+    assert "\nTraceback" not in str(caught.value)
+
+
+def test_port_in_use_silent_port_and_old_firmware(serial_firmware: SerialFirmware) -> None:
+    with Actuator(config_for(serial_firmware), CALIBRATION), pytest.raises(NotReadyError, match="another program"):
+        Actuator(config_for(serial_firmware), CALIBRATION).open()
+    serial_firmware.faults.is_silent = True
+    with pytest.raises(NotReadyError, match="nothing answers"):
+        Actuator(config_for(serial_firmware, open_timeout_s=0.5), CALIBRATION).open()
+    serial_firmware.faults.is_silent = False
+    serial_firmware.firmware.version = FirmwareVersion(3, 0)
+    with pytest.raises(NotReadyError, match=r"3\.00 is older than 3\.07"):
+        Actuator(config_for(serial_firmware), CALIBRATION).open()
+    assert not serial_firmware.log.motor(serial_firmware.log.entries("firmware")[-1].t_s), "no command to an old one"
+
+
+def test_closed_and_half_opened_are_harmless(serial_firmware: SerialFirmware) -> None:
+    actuator = Actuator(config_for(serial_firmware), CALIBRATION)
+    actuator.close()
+    actuator.stop(planned=True)
+    for use in (lambda: actuator.command(NEUTRAL), actuator.arm, actuator.status, actuator.reset_fault):
+        with pytest.raises(NotOpenError):
+            use()
+    assert not actuator.health().ready
+    actuator.open()
+    actuator.open()
+    actuator.close()
+    actuator.close()
+    actuator.open()
+    assert actuator.health().ready
+    actuator.close()
+
+
+def test_sender_is_light_and_ignores_signals(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+    pid = actuator._sender.pid  # type: ignore[union-attr]
+    assert os.getsid(pid) == pid, "in a session of its own: a terminal's ^C does not reach it"
+    mapped = Path(f"/proc/{pid}/maps").read_text(encoding="ascii")
+    assert "torch" not in mapped
+    assert "rerun" not in mapped
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(pid, number)
+    t_s = time.monotonic()
+    until(lambda: len(serial_firmware.log.motor(t_s)) > 20)
+
+
+def test_import_is_light() -> None:
+    code = (
+        "import sys, drivers; bad = {'torch','serial','can','rerun','cantools'} & set(sys.modules); sys.exit(bool(bad))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,248 @@
+"""HardwareCar: the contract over a fake firmware and a pose source played by hand."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+
+from carlab.core.car import Car
+from carlab.core.errors import (
+    ActionOutOfRangeError,
+    ActuatorFaultError,
+    NotArmedError,
+    NotOpenError,
+    NotReadyError,
+    PoseLostError,
+)
+from carlab.core.pose_source import PoseSource
+from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, PoseSample, Reality
+from carlab.core.state_estimator import StateEstimator
+from drivers.actuator import Actuator
+from drivers.config import ActuatorConfig, HardwareConfig
+from drivers.dry_run_car import DryRunCar
+from drivers.emulators.serial_firmware import SerialFirmware
+from drivers.hardware_car import HardwareCar
+from drivers.vesc_payloads import MotorValues
+
+
+class HandPoses:
+    """A pose source whose samples the test makes."""
+
+    def __init__(self) -> None:
+        self.samples: list[PoseSample] = []
+        self.failure: NotReadyError | None = None
+        self.closes = 0
+
+    def show(self, x_m: float = 0.0, *, age_s: float = 0.0, tracked: bool = True, sequence: int | None = None) -> None:
+        now_s = time.monotonic() - age_s
+        number = len(self.samples) + 1 if sequence is None else sequence
+        self.samples.append(PoseSample(number, now_s - 0.005, now_s, x_m, 1.0, 0.5, tracked=tracked))
+
+    def open(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+
+    def latest(self) -> PoseSample | None:
+        return self.samples[-1] if self.samples else None
+
+    def since(self, sequence: int) -> tuple[PoseSample, ...]:
+        return tuple(s for s in self.samples if s.sequence > sequence)
+
+    def wait_for(self, sequence: int, timeout_s: float) -> PoseSample | None:
+        newest = self.latest()
+        return newest if newest is not None and newest.sequence > sequence else None
+
+    def statistics(self) -> Mapping[str, float]:
+        return {"rate_hz": 120.0}
+
+    def close(self) -> None:
+        self.closes += 1
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+
+@pytest.fixture
+def poses() -> HandPoses:
+    return HandPoses()
+
+
+def make_car(port: str, poses: HandPoses, **options: Any) -> HardwareCar:
+    config = ActuatorConfig(port=port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0)
+    hardware = HardwareConfig(config, arm_max_pose_age_s=2.0)
+    return HardwareCar(
+        "test car",
+        Actuator(config, hardware.calibration),
+        poses,
+        StateEstimator(),
+        config=hardware,
+        limits=ActionLimits(max_throttle=0.5),
+        **options,
+    )
+
+
+@pytest.fixture
+def car(serial_firmware: SerialFirmware, poses: HandPoses) -> Iterator[HardwareCar]:
+    assert isinstance(poses, PoseSource)
+    with make_car(serial_firmware.port, poses) as opened:
+        yield opened
+
+
+def test_observation_before_and_after_the_first_pose(car: HardwareCar, poses: HandPoses) -> None:
+    with pytest.raises(PoseLostError, match="not seen the body yet"):
+        car.observe()
+    poses.show(1.0, tracked=False)
+    with pytest.raises(PoseLostError):
+        car.observe()
+    poses.show(2.0)
+    first = car.observe()
+    assert (first.state.x_m, first.state.y_m, first.state.yaw_rad) == (2.0, 1.0, 0.5)
+    assert [p.sequence for p in first.poses] == [1, 2]
+    assert first.tracked
+    poses.show(9.0, tracked=False)
+    lost = car.observe()
+    assert not lost.tracked
+    assert (lost.state.x_m, lost.sequence, lost.t_receive_s) == (2.0, 2, first.t_receive_s), "age of what is known"
+    assert [p.sequence for p in lost.poses] == [3]
+    assert car.observe().poses == ()
+
+
+def test_a_source_that_counts_anew_is_followed(car: HardwareCar, poses: HandPoses) -> None:
+    poses.show(1.0, sequence=5000)
+    car.observe()
+    poses.samples.clear()
+    poses.show(3.0, sequence=2)
+    assert car.observe().state.x_m == 3.0
+
+
+def test_arming_gathers_every_reason(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
+    serial_firmware.firmware.readings = lambda t_s: MotorValues(erpm=3000.0, input_v=11.0)
+    end_s = time.monotonic() + 20.0
+    while not car.actuator.status().erpm > 200.0:
+        assert time.monotonic() < end_s
+        time.sleep(0.002)
+    with pytest.raises(NotReadyError) as caught:
+        car.arm()
+    assert len(caught.value.reasons) == 2
+    assert "no pose yet" in str(caught.value)
+    assert "3000 eRPM" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("samples", "reason"),
+    [
+        ([(0.0, 5.0, True)], "old"),
+        ([(0.0, 0.0, False)], "does not see the body"),
+        ([(0.04 * k, 0.04 - 0.01 * k, True) for k in range(5)], "moves at"),
+    ],
+)
+def test_arming_needs_a_fresh_tracked_pose_at_rest(
+    car: HardwareCar, poses: HandPoses, samples: list[tuple[float, float, bool]], reason: str
+) -> None:
+    for x_m, age_s, tracked in samples:
+        poses.show(x_m, age_s=age_s, tracked=tracked)
+    with pytest.raises(NotReadyError, match=reason):
+        car.arm()
+
+
+def test_the_way_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
+    assert car.reality is Reality.REAL
+    assert car.command(NEUTRAL) == NEUTRAL
+    with pytest.raises(NotArmedError):
+        car.command(Action(0.1, 0.1))
+    poses.show()
+    car.arm()
+    assert car.command(Action(0.1, 0.2)).throttle == pytest.approx(0.2)
+    with pytest.raises(ActionOutOfRangeError, match="beyond the car's limit"):
+        car.command(Action(0.0, 0.6))
+    with pytest.raises(ActionOutOfRangeError, match="not a number"):
+        car.command(Action(float("nan"), 0.0))
+    health = car.health()
+    assert health.ready
+    assert health.readings["mocap_rate_hz"] == 120.0
+    car.stop(planned=True)
+    with pytest.raises(NotArmedError):
+        car.command(Action(0.1, 0.1))
+    poses.show()
+    car.arm()
+    car.stop(planned=False)
+    with pytest.raises(ActuatorFaultError):
+        car.arm()
+    assert not car.health().ready
+    car.reset_fault()
+    poses.show()
+    car.arm()
+    assert not car.place(CarState())
+
+
+def test_opening_gathers_the_reasons_of_actuator_and_mocap(tmp_path: Path, poses: HandPoses) -> None:
+    poses.failure = NotReadyError("Motion capture is not ready", ("nobody answers at 10.0.0.1; start it.",))
+    car = make_car(str(tmp_path / "missing"), poses)
+    with pytest.raises(NotReadyError) as caught:
+        car.open()
+    assert len(caught.value.reasons) == 2
+    assert "10.0.0.1" in str(caught.value)
+    assert "does not exist" in str(caught.value)
+    assert poses.closes >= 1
+    car.close()
+
+
+def test_closed_car(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
+    car: Car = make_car(serial_firmware.port, poses)
+    car.stop(planned=False)
+    for use in (car.observe, car.arm, car.reset_fault, lambda: car.command(NEUTRAL)):
+        with pytest.raises(NotOpenError):
+            use()
+    assert not car.health().ready
+    car.close()
+    car.close()
+
+
+def test_place_asks_the_emulator(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
+    placed: list[CarState] = []
+    with make_car(serial_firmware.port, poses, place=lambda s: not placed.append(s), reality=Reality.EMULATED) as car:
+        poses.show(1.0)
+        car.observe()
+        assert car.place(CarState(x_m=2.0))
+        assert placed == [CarState(x_m=2.0)]
+        with pytest.raises(PoseLostError):
+            car.observe()
+        poses.show(1.0, age_s=0.001)
+        with pytest.raises(PoseLostError):
+            car.observe()  # taken before the car was placed, and late
+        poses.show(2.0, age_s=-0.1)
+        assert car.observe().state == CarState(2.0, 1.0, 0.5)
+
+
+def test_dry_run_sees_and_swallows(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
+    inner = make_car(serial_firmware.port, poses)
+    calibration = replace(inner.config.calibration)
+    with DryRunCar(inner, lambda a: calibration.from_device(calibration.to_device(a))) as car:
+        assert car.reality is Reality.DRY_RUN
+        poses.show(1.5)
+        assert car.observe().state.x_m == 1.5
+        with pytest.raises(NotArmedError):
+            car.command(Action(0.1, 0.1))
+        car.arm()
+        t_s = time.monotonic()
+        assert car.command(Action(0.12345, 0.1)).steering == pytest.approx(37 / 300)
+        with pytest.raises(ActionOutOfRangeError):
+            car.command(Action(0.0, 0.9))
+        assert serial_firmware.log.wait_for("current", 20.0, t_s) is not None
+        car.stop(planned=False)
+        with pytest.raises(ActuatorFaultError):
+            car.arm()
+        car.reset_fault()
+        car.arm()
+    assert all(e.value == 0.0 for e in serial_firmware.log.motor())
+    with pytest.raises(NotOpenError):
+        car.command(NEUTRAL)

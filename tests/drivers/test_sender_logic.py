@@ -1,0 +1,355 @@
+"""The sender's state machine with a fake clock, down to the bytes on the wire."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from carlab.core.errors import ActionOutOfRangeError
+from carlab.core.quantities import Action
+from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
+from drivers.config import ActuatorConfig
+from drivers.link import LinkStatistics
+from drivers.sender_logic import Order, SenderLogic, SenderState, Wish
+from drivers.vesc_device import VescSerialDevice
+from drivers.vesc_payloads import FirmwareVersion, MotorValues
+from drivers.vesc_serial_codec import VescFrameDecoder
+
+CONFIG = ActuatorConfig(rate_hz=100.0, watchdog_s=0.15, latch_s=0.5)
+CALIBRATION = ActuatorCalibration(max_current_a=10.0, servo_min=0.2, servo_max=0.8)
+NEUTRAL = DeviceCommand(MotorKind.CURRENT, 0, 500)
+MOVING = DeviceCommand(MotorKind.CURRENT, 3000, 600)
+HEALTHY = MotorValues(erpm=0.0, input_v=11.1, fault_code=0, status_bits=0)
+VERSION = FirmwareVersion(6, 5, "TEST", b"u" * 12)
+
+
+class Bench:
+    """A sender's logic with a fake clock and a main process played by hand."""
+
+    def __init__(self, config: ActuatorConfig = CONFIG, calibration: ActuatorCalibration = CALIBRATION) -> None:
+        self.logic = SenderLogic(config, calibration)
+        self.now_s = 100.0
+        self.epoch = 0
+        self.number = 0
+        self.wish = Wish.NONE
+        self.is_answering = True
+
+    def connect(self) -> Bench:
+        self.logic.link_up()
+        self.logic.firmware(VERSION)
+        self.logic.telemetry(self.now_s, HEALTHY)
+        assert self.logic.state == SenderState.CONNECTED
+        return self
+
+    def say(self, wish: Wish) -> None:
+        self.epoch, self.number, self.wish = self.epoch + 1, 0, wish
+        self.logic.order(self.now_s, Order(self.epoch, wish, 0, self.now_s, NEUTRAL))
+
+    def command(self, command: DeviceCommand = MOVING, t_issued_s: float | None = None) -> None:
+        self.number += 1
+        issued_s = self.now_s if t_issued_s is None else t_issued_s
+        self.logic.order(self.now_s, Order(self.epoch, self.wish, self.number, issued_s, command))
+
+    def tick(self, dt_s: float = 0.01) -> DeviceCommand | None:
+        self.now_s += dt_s
+        if self.is_answering:
+            self.logic.telemetry(self.now_s, HEALTHY)
+        return self.logic.tick(self.now_s)
+
+
+def armed() -> Bench:
+    bench = Bench().connect()
+    bench.say(Wish.ARM)
+    assert bench.logic.state == SenderState.ARMED
+    return bench
+
+
+def test_silent_until_the_firmware_is_known_and_neutral_until_armed() -> None:
+    bench = Bench()
+    assert bench.tick() is None
+    bench.logic.link_up()
+    assert bench.tick() is None
+    bench.logic.firmware(VERSION)
+    assert bench.tick() == NEUTRAL
+    bench.command()
+    assert bench.tick() == NEUTRAL
+    bench.say(Wish.ARM)
+    assert bench.tick() == NEUTRAL, "armed, and no command yet"
+    bench.command()
+    assert bench.tick() == MOVING
+
+
+def test_old_firmware_gets_no_command_at_all() -> None:
+    bench = Bench()
+    bench.logic.link_up()
+    bench.logic.firmware(FirmwareVersion(2, 18))
+    bench.say(Wish.ARM)
+    bench.command()
+    assert bench.tick() is None
+    assert bench.logic.state == SenderState.FAULT
+    assert "older than 3.07" in bench.logic.fault
+
+
+def test_watchdog_at_its_boundary_then_recovery_then_latch() -> None:
+    bench = armed()
+    bench.command()
+    assert bench.tick(0.149) == MOVING
+    assert bench.tick(0.002) == NEUTRAL
+    assert (bench.logic.state, bench.logic.watchdog_trips) == (SenderState.ARMED, 1)
+    bench.command()
+    assert bench.tick() == MOVING, "late once, not latched"
+    assert bench.tick(0.48) == NEUTRAL
+    assert bench.logic.state == SenderState.ARMED
+    assert bench.tick(0.03) == NEUTRAL
+    assert bench.logic.state == SenderState.FAULT
+    assert bench.logic.watchdog_trips == 2
+    bench.command()
+    assert bench.tick() == NEUTRAL, "latched"
+    bench.say(Wish.ARM)
+    bench.command()
+    assert bench.tick() == NEUTRAL, "arming does not clear a fault"
+    assert bench.logic.refusal == bench.logic.fault
+    bench.say(Wish.RESET_FAULT)
+    assert bench.logic.state == SenderState.CONNECTED
+    bench.command()
+    assert bench.tick() == NEUTRAL, "reset does not arm"
+    bench.say(Wish.ARM)
+    assert bench.tick() == NEUTRAL, "the old command is gone"
+    bench.command()
+    assert bench.tick() == MOVING
+
+
+def test_a_command_that_waited_somewhere_is_never_sent() -> None:
+    bench = armed()
+    bench.command(t_issued_s=bench.now_s - 0.2)
+    assert bench.tick() == NEUTRAL
+    bench.command(t_issued_s=bench.now_s + 10.0)
+    assert bench.tick() == NEUTRAL, "from the future: a clock that lies"
+
+
+def test_an_order_of_an_older_epoch_is_void() -> None:
+    bench = armed()
+    stale = Order(bench.epoch, Wish.ARM, 7, bench.now_s, MOVING)
+    bench.say(Wish.STOP)
+    bench.logic.order(bench.now_s, stale)
+    assert bench.tick() == NEUTRAL
+    assert bench.logic.state == SenderState.STOPPING
+    while bench.logic.state == SenderState.STOPPING:
+        bench.tick()
+    bench.say(Wish.ARM)
+    bench.logic.order(bench.now_s, replace(stale, t_issued_s=bench.now_s))
+    assert bench.tick() == NEUTRAL, "armed anew, but not by that order"
+
+
+@pytest.mark.parametrize("is_faulty", [False, True])
+def test_no_order_counts_once_leaving(is_faulty: bool) -> None:
+    bench = armed()
+    if is_faulty:
+        bench.say(Wish.STOP_AND_LATCH)
+    bench.logic.main_lost()
+    for wish in (Wish.RESET_FAULT, Wish.ARM):
+        bench.say(wish)
+        bench.command()
+        assert bench.tick() == NEUTRAL
+
+
+def test_stop_settles_after_three_neutrals_over_sixty_milliseconds() -> None:
+    for rate_hz in (10.0, 30.0, 100.0, 400.0):
+        bench = armed()
+        bench.command()
+        bench.tick()
+        bench.say(Wish.STOP)
+        times = []
+        while bench.logic.state == SenderState.STOPPING:
+            assert bench.tick(1.0 / rate_hz) == NEUTRAL
+            times.append(bench.now_s)
+        assert len(times) >= 3
+        assert times[-1] - times[0] >= 0.06 - 1e-9
+        assert bench.logic.state == SenderState.CONNECTED
+        assert bench.logic.is_neutral_settled
+
+
+@pytest.mark.parametrize("way", ["wish", "main lost"])
+def test_leaving_takes_three_neutrals_over_sixty_milliseconds(way: str) -> None:
+    bench = armed()
+    bench.command()
+    assert bench.tick() == MOVING
+    if way == "wish":
+        bench.say(Wish.SHUT_DOWN)
+    else:
+        bench.logic.main_lost()
+    times = []
+    while not bench.logic.is_finished:
+        bench.command()
+        assert bench.tick() == NEUTRAL
+        times.append(bench.now_s)
+    assert len(times) >= 3
+    assert times[-1] - times[0] >= 0.06 - 1e-9
+
+
+def test_unplanned_stop_latches_and_planned_stop_keeps_a_fault() -> None:
+    bench = armed()
+    bench.say(Wish.STOP_AND_LATCH)
+    assert bench.logic.state == SenderState.FAULT
+    bench.say(Wish.STOP)
+    bench.tick()
+    assert bench.logic.state == SenderState.FAULT
+
+
+def test_stale_telemetry_gives_neutral_and_lost_telemetry_a_fault() -> None:
+    bench = armed()
+    bench.is_answering = False
+    seen = []
+    for _ in range(110):
+        bench.command()
+        seen.append(bench.tick())
+    assert seen[:24] == [MOVING] * 24
+    assert seen[26:] == [NEUTRAL] * 84
+    assert bench.logic.state == SenderState.FAULT
+    assert "stopped answering" in bench.logic.fault
+    bench.say(Wish.RESET_FAULT)
+    assert bench.logic.state == SenderState.FAULT
+    assert "does not answer" in bench.logic.refusal
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [(MotorValues(fault_code=2), "under-voltage"), (MotorValues(status_bits=2), "kill switch")],
+)
+def test_the_firmwares_own_faults_latch(values: MotorValues, text: str) -> None:
+    bench = armed()
+    bench.command()
+    bench.logic.telemetry(bench.now_s, values)
+    assert bench.logic.state == SenderState.FAULT
+    assert text in bench.logic.fault
+    bench.say(Wish.RESET_FAULT)
+    assert bench.logic.state == SenderState.FAULT, "the cause persists"
+    bench.tick()
+    bench.say(Wish.RESET_FAULT)
+    assert bench.logic.state == SenderState.CONNECTED
+
+
+def test_another_board_after_a_lost_link_stays_a_fault() -> None:
+    bench = armed()
+    bench.logic.link_failed("unplugged")
+    assert bench.tick() is None
+    bench.logic.link_up()
+    bench.logic.firmware(FirmwareVersion(6, 5, "TEST", b"v" * 12))
+    bench.logic.telemetry(bench.now_s, HEALTHY)
+    bench.say(Wish.RESET_FAULT)
+    assert bench.logic.state == SenderState.FAULT
+    assert bench.tick() is None
+
+
+def test_the_same_board_after_a_lost_link_gets_neutral_until_reset_and_armed() -> None:
+    bench = armed()
+    bench.command()
+    bench.logic.link_failed("unplugged")
+    bench.logic.link_up()
+    bench.logic.firmware(VERSION)
+    bench.command()
+    assert bench.tick() == NEUTRAL
+    bench.say(Wish.RESET_FAULT)
+    assert bench.logic.state == SenderState.CONNECTED
+    assert bench.logic.fault == ""
+
+
+class RecordingLink:
+    """A byte link that keeps what is written."""
+
+    def __init__(self) -> None:
+        self.statistics = LinkStatistics()
+        self.written = b""
+
+    def open(self) -> None: ...
+
+    def write(self, data: bytes) -> None:
+        self.written += data
+
+    def read(self) -> bytes:
+        return b""
+
+    def fileno(self) -> None:
+        return None
+
+    def close(self) -> None: ...
+
+
+def motor_and_servo(data: bytes) -> tuple[int, int, int]:
+    """Command id, motor number and servo number of what was written, decoded by the layout in the protocol's table."""
+    motor, servo = VescFrameDecoder().feed(data, 0.0)
+    (position,) = struct.unpack(">h", servo[1:])
+    assert servo[0] == 12
+    return motor[0], struct.unpack(">i", motor[1:])[0], position
+
+
+STEP = st.one_of(
+    st.tuples(st.just("action"), st.floats(width=32), st.floats(width=32)),
+    st.tuples(st.just("hostile"), st.integers(-(2**31), 2**31 - 1), st.integers(-(2**15), 2**15 - 1)),
+    st.tuples(st.just("late"), st.floats(-1.0, 1.0), st.floats(0.0, 2.0)),
+    st.sampled_from([(w.name, 0.0, 0.0) for w in (Wish.ARM, Wish.STOP, Wish.STOP_AND_LATCH, Wish.RESET_FAULT)]),
+    st.tuples(st.just("wait"), st.floats(0.0, 0.7), st.just(0.0)),
+    st.just(("silence", 0.0, 0.0)),
+    st.just(("fault code", 0.0, 0.0)),
+)
+
+
+@given(st.lists(STEP, max_size=40), st.sampled_from(["current", "duty"]))
+@settings(max_examples=250, deadline=None)
+def test_whatever_is_asked_every_frame_is_bounded_and_nothing_moves_unless_armed(
+    steps: list[tuple[str, float, float]], mode: str
+) -> None:
+    calibration = ActuatorCalibration(
+        throttle_mode=mode,  # type: ignore[arg-type]
+        max_current_a=10.0,
+        max_duty=0.3,
+        servo_min=0.2,
+        servo_max=0.8,
+    )
+    bench = Bench(CONFIG, calibration).connect()
+    link = RecordingLink()
+    device = VescSerialDevice(link)
+    full = {6: 10_000, 5: 30_000}
+    may_move = False  # kept by hand: armed by an ARM that was accepted, taken away by any stop or fault
+    newest: tuple[float, DeviceCommand] | None = None
+    for (kind, a, b), _ in zip(steps, itertools.count(), strict=False):
+        if kind in ("action", "late"):
+            action = Action(a, b) if kind == "action" else Action(a, a)
+            if math.isfinite(action.steering) and math.isfinite(action.throttle):
+                issued_s = bench.now_s - (b if kind == "late" else 0.0)
+                newest = (issued_s, calibration.to_device(action))
+                bench.command(newest[1], issued_s)
+            else:
+                with pytest.raises(ActionOutOfRangeError):
+                    calibration.to_device(action)
+        elif kind == "hostile":
+            newest = (bench.now_s, DeviceCommand(MotorKind.CURRENT, int(a), int(b)))
+            bench.command(newest[1])
+        elif kind in Wish.__members__:
+            was_faulty = bench.logic.state == SenderState.FAULT
+            bench.say(Wish[kind])
+            may_move = kind == "ARM" and not was_faulty and (may_move or bench.logic.state == SenderState.ARMED)
+            newest = None
+        elif kind == "silence":
+            bench.is_answering = not bench.is_answering
+        elif kind == "fault code":
+            bench.logic.telemetry(bench.now_s, MotorValues(fault_code=4))
+        command = bench.tick(a if kind == "wait" else 0.01)
+        may_move = may_move and bench.logic.state != SenderState.FAULT
+        assert command is not None
+        link.written = b""
+        device.send(command)
+        identifier, motor, servo = motor_and_servo(link.written)
+        assert abs(motor) <= full[identifier]
+        assert 200 <= servo <= 800
+        if (motor, servo) != (0, 500):
+            assert may_move
+            assert newest is not None
+            assert command == newest[1]
+            assert bench.now_s - newest[0] <= CONFIG.watchdog_s

@@ -1,0 +1,85 @@
+"""Newest-value slots: whole values or none, whatever the writer is doing."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivers.slots import Slot
+
+ROOT = Path(__file__).resolve().parents[2]
+WRITER = """
+import sys, struct, zlib
+from drivers.slots import Slot
+slot = Slot.attach(int(sys.argv[1]), 2048)
+n = 0
+while True:
+    n += 1
+    slot.write(struct.pack("<Q", n) * 256)
+"""
+
+
+def test_newest_value_wins_and_is_read_again() -> None:
+    slot = Slot.create(16)
+    assert slot.read() is None
+    for n in range(1, 6):
+        slot.write(bytes((n,)) * n)
+        assert slot.read() == slot.read() == (n, bytes((n,)) * n)
+    with pytest.raises(ValueError, match="does not fit"):
+        slot.write(bytes(17))
+    slot.close()
+    slot.close()
+    with pytest.raises(ValueError, match="closed"):
+        slot.write(b"")
+
+
+@pytest.mark.parametrize("offset", [0, 8, 12, 20, 27])
+def test_a_torn_copy_leaves_the_one_before(offset: int) -> None:
+    """Break any part of the newest copy by hand, as a writer that died in the middle would leave it."""
+    slot = Slot.create(16)
+    slot.write(b"first value 0000")
+    slot.write(b"second value 111")
+    start = 0  # the second value lies in the first half: its sequence number is even
+    before = os.pread(slot.descriptor, 1, start + offset)
+    os.pwrite(slot.descriptor, bytes((before[0] ^ 0xFF,)), start + offset)
+    assert slot.read() == (1, b"first value 0000")
+    assert slot.torn_reads >= 1
+    slot.close()
+
+
+def test_a_writer_that_attaches_goes_on_counting() -> None:
+    slot = Slot.create(16)
+    slot.write(b"a")
+    other = Slot.attach(os.dup(slot.descriptor), 16)
+    other.write(b"b")
+    assert slot.read() == (2, b"b")
+    other.close()
+    slot.close()
+
+
+def test_no_mixed_value_under_a_racing_writer_and_after_its_sudden_death() -> None:
+    slot = Slot.create(2048)
+    command = [sys.executable, "-c", WRITER, str(slot.descriptor)]
+    process = subprocess.Popen(command, cwd=ROOT, pass_fds=(slot.descriptor,))
+    try:
+        seen = [0]
+        while len(seen) < 2000:
+            newest = slot.read()
+            if newest is None:
+                continue
+            numbers = struct.unpack("<256Q", newest[1])
+            assert set(numbers) == {newest[0]}
+            if newest[0] > seen[-1]:
+                seen.append(newest[0])
+    finally:
+        process.kill()
+        process.wait()
+    last = slot.read()
+    assert last is not None
+    assert set(struct.unpack("<256Q", last[1])) == {last[0]}
+    slot.close()
