@@ -9,6 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
+import carlab.experiment.gym_registration  # noqa: F401
 from carlab.experiment.gym_env import CarEnv
 
 

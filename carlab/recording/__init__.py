@@ -1,0 +1,60 @@
+"""Recordings of episodes: written while they run, read back afterwards, drawn and exported."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from carlab.recording.episode_builder import episode_from_documents
+    from carlab.recording.export import write_csv, write_parquet
+    from carlab.recording.mcap_sink import McapSink, write_episode
+    from carlab.recording.mcap_source import read_documents, read_episode, read_recording
+    from carlab.recording.picture import save_summary
+    from carlab.recording.recorder import Recorder
+    from carlab.recording.rerun_sink import RerunSink, episode_to_rrd
+    from carlab.recording.run_directory import RunDirectory
+    from carlab.recording.screenshot import save_screenshot
+    from carlab.recording.sink import Sink
+
+_HOMES = {
+    "McapSink": "mcap_sink",
+    "Recorder": "recorder",
+    "RerunSink": "rerun_sink",
+    "RunDirectory": "run_directory",
+    "Sink": "sink",
+    "episode_from_documents": "episode_builder",
+    "episode_to_rrd": "rerun_sink",
+    "read_documents": "mcap_source",
+    "read_episode": "mcap_source",
+    "read_recording": "mcap_source",
+    "save_screenshot": "screenshot",
+    "save_summary": "picture",
+    "write_csv": "export",
+    "write_episode": "mcap_sink",
+    "write_parquet": "export",
+}
+__all__ = [
+    "McapSink",
+    "Recorder",
+    "RerunSink",
+    "RunDirectory",
+    "Sink",
+    "episode_from_documents",
+    "episode_to_rrd",
+    "read_documents",
+    "read_episode",
+    "read_recording",
+    "save_screenshot",
+    "save_summary",
+    "write_csv",
+    "write_episode",
+    "write_parquet",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used: rerun, pyarrow and matplotlib are heavy."""
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"carlab.recording.{_HOMES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

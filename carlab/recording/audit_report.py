@@ -1,0 +1,100 @@
+"""What an audit of a recording says: findings with evidence, and the option that would act on each."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from carlab.core.errors import DataError
+
+
+class Severity(enum.IntEnum):
+    """How much a finding matters, in rising order."""
+
+    INFO = 0
+    """A property worth knowing; nothing is wrong."""
+    REPAIRED = 1
+    """A fault that the mapping declares how to repair, and that was repaired."""
+    WARNING = 2
+    """Degrades what is learnt from the recording."""
+    FAULT = 3
+    """Very likely wrong as imported; the option says what would change it."""
+    ERROR = 4
+    """The recording cannot be imported as it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One observation about a recording.
+
+    ``rows`` are the first data rows concerned (row 1 follows the header), ``count`` is how many there are; ``option``
+    is the ``carlab import`` option that would act on it.
+    """
+
+    id: str
+    channel: str
+    severity: Severity
+    sentence: str
+    count: int = 0
+    rows: tuple[int, ...] = ()
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    option: str | None = None
+
+
+def first_rows(indices: Sequence[int] | Iterable[int], most: int = 20) -> tuple[int, ...]:
+    """Data row numbers (from 1) of array indices (from 0), the first ``most`` of them."""
+    return tuple(int(k) + 1 for k in list(indices)[:most])
+
+
+@dataclass(frozen=True, slots=True)
+class AuditReport:
+    """All findings about one recording, in the order of the checks."""
+
+    source: str
+    layout: str
+    findings: tuple[Finding, ...]
+
+    def of(self, identity: str, channel: str | None = None) -> tuple[Finding, ...]:
+        """Findings with this id, and this channel if one is given."""
+        return tuple(f for f in self.findings if f.id == identity and channel in (None, f.channel))
+
+    @property
+    def worst(self) -> Severity:
+        """The highest severity; INFO for an empty report."""
+        return max((f.severity for f in self.findings), default=Severity.INFO)
+
+    def rows(self) -> list[tuple[str, str, str, int, str, str]]:
+        """Table rows: severity, id, channel, count, sentence, option; the gravest first."""
+        ordered = sorted(self.findings, key=lambda f: -f.severity)
+        return [(f.severity.name.lower(), f.id, f.channel, f.count, f.sentence, f.option or "") for f in ordered]
+
+    def to_dict(self) -> dict[str, object]:
+        """The report as plain data for JSON."""
+        return {
+            "schema": "carlab.audit/1",
+            "source": self.source,
+            "layout": self.layout,
+            "findings": [
+                {
+                    "id": f.id,
+                    "channel": f.channel,
+                    "severity": f.severity.name.lower(),
+                    "sentence": f.sentence,
+                    "count": f.count,
+                    "rows": list(f.rows),
+                    "evidence": dict(f.evidence),
+                    "option": f.option,
+                }
+                for f in self.findings
+            ],
+        }
+
+
+def raise_errors(source: str, findings: Iterable[Finding]) -> None:
+    """Raise one DataError with the sentence of every finding that is an ERROR."""
+    sentences = [f.sentence for f in findings if f.severity is Severity.ERROR]
+    if len(sentences) == 1:
+        raise DataError(f"{source}: {sentences[0]}")
+    if sentences:
+        raise DataError(f"{source} has {len(sentences)} faults:" + "".join(f"\n  - {s}" for s in sentences))

@@ -1,0 +1,244 @@
+"""What the columns of a foreign CSV mean: declared in TOML, or known of a layout that its header gives away.
+
+A mapping declares; the audit (``data_audit``) detects. Only what is declared is converted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from carlab.core.errors import ConfigError, DataError
+from carlab.core.tables import check_keys, from_table
+
+CHANNELS = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
+POSE_CHANNELS = ("x", "y", "yaw")
+VELOCITY_CHANNELS = ("vx", "vy", "yaw_rate")
+COMMAND_CHANNELS = ("steering", "throttle")
+REQUIRED_CHANNELS = ("t", *POSE_CHANNELS, *COMMAND_CHANNELS)
+
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_ANGLE = {"rad": 1.0, "deg": 3.141592653589793 / 180.0}
+_SPEED = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6}
+_RATE = {"rad/s": 1.0, "deg/s": 3.141592653589793 / 180.0}
+_SHARE = {"1": 1.0, "%": 1e-2}
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "t": _TIME,
+    "x": _LENGTH,
+    "y": _LENGTH,
+    "yaw": _ANGLE,
+    "vx": _SPEED,
+    "vy": _SPEED,
+    "yaw_rate": _RATE,
+    "steering": _SHARE,
+    "throttle": _SHARE,
+}
+"""Factor to the SI unit of each unit that a channel may come in; the first of each is the SI unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnSource:
+    """Where one channel comes from: value = sign * scale * (factor of ``unit``) * column."""
+
+    name: str
+    """Column name in the file's header."""
+    unit: str | None = None
+    """Unit in the file; left out, the SI unit is taken and the audit refuses what plainly is not SI."""
+    sign: Literal[1, -1] = 1
+    """-1 where the file counts the other way (yaw clockwise, steering positive to the right)."""
+    scale: float = 1.0
+    """Any further factor, for example 0.04 for steering in [-25, 25]."""
+
+    def factor(self, channel: str) -> float:
+        """Factor from the column to the channel's SI unit. Raises ConfigError for an unknown unit."""
+        units = UNITS[channel]
+        if self.unit is None:
+            return self.sign * self.scale
+        if self.unit not in units:
+            raise ConfigError(f"Unit '{self.unit}' of {channel} is not known; use one of {', '.join(units)}.")
+        return self.sign * self.scale * units[self.unit]
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnMapping:
+    """How a CSV becomes an episode. ``columns`` names the source of each channel in ``CHANNELS``."""
+
+    columns: Mapping[str, ColumnSource]
+    layout: str = "custom"
+    """Name of the layout, for messages and metadata."""
+    velocity_frame: Literal["body", "world"] = "body"
+    """Frame of the vx, vy columns."""
+    velocity_lag_s: float = 0.0
+    """Known delay of the velocity columns behind the pose [s]; world velocities are rotated by the yaw of that "
+    "moment."""
+    velocities: Literal["columns", "pose"] = "columns"
+    """``pose``: estimate velocities from the pose, centred, without delay; their columns are kept as extra."""
+    swap_xy: bool = False
+    """Exchange x and y (and vx and vy in the world frame)."""
+    yaw_offset_rad: float = 0.0
+    """Added to yaw after unit and sign."""
+    repair_yaw_rate: bool = False
+    """Replace rows of yaw_rate that hold a wrapped-angle spike by the turn rate of the pose."""
+    throttle_gate: str | None = None
+    """Column that multiplied the throttle on the car: ``requested`` keeps the column, ``sent`` is the product."""
+    references: Mapping[str, str] = field(default_factory=dict)
+    """Further sensor columns that measure a state channel again, for example ``{"vel encoder" = "vx"}``: only "
+    "compared."""
+    dead_reckoning: bool = False
+    """There is no pose: integrate vx and yaw_rate from the origin, with vy = 0."""
+    clock: Literal["column", "velocity"] = "column"
+    """``velocity``: rebuild each period from distance over speed, where the time column was constructed "
+    "afterwards."""
+    rate_hz: float | None = None
+    """Row rate of a file without a time column."""
+    missing: Literal["error", "drop"] = "error"
+    """Rows with a value missing: refuse, or leave them out (the command before is then held across them)."""
+    gaps: Literal["error", "split", "keep"] = "error"
+    """Gaps in time: refuse, split into episodes there and where the pose jumps, or keep one episode."""
+    stamps: Literal["error", "drop"] = "error"
+    """Stamps that do not increase: refuse, or leave those rows out."""
+
+    def __post_init__(self) -> None:
+        check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
+        for channel, source in self.columns.items():
+            source.factor(channel)
+        check_keys(dict.fromkeys(self.references.values()), CHANNELS, f"the references of mapping '{self.layout}'")
+
+    def with_options(self, *, columns: Mapping[str, Mapping[str, Any]] | None = None, **options: Any) -> ColumnMapping:
+        """Return a copy with other options; ``columns={"steering": {"sign": -1}}`` changes parts of a source.
+
+        Raises ConfigError for a channel, an option or a unit that does not exist.
+        """
+        known = [f.name for f in dataclasses.fields(self) if f.name != "columns"]
+        check_keys(options, known, "the mapping's options")
+        sources = dict(self.columns)
+        for channel, changes in (columns or {}).items():
+            check_keys({channel: None}, CHANNELS, "the mapping's columns")
+            check_keys(changes, [f.name for f in dataclasses.fields(ColumnSource)], f"the changes to {channel}")
+            sources[channel] = dataclasses.replace(sources.get(channel, ColumnSource(channel)), **changes)
+        return dataclasses.replace(self, columns=sources, **options)
+
+
+def load_mapping(path: Path | str) -> ColumnMapping:
+    """Read a mapping from TOML: options of ColumnMapping at the top, one table ``[columns.CHANNEL]`` a channel.
+
+    Raises ConfigError for a file that is not TOML, an unknown key or an unknown unit.
+    """
+    path = Path(path)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"Cannot read the mapping {path}: {error.strerror}; check the path.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}.") from error
+    columns = table.pop("columns", None)
+    if not isinstance(columns, dict) or not columns:
+        raise ConfigError(f'{path} names no columns; add tables such as [columns.x] with name = "pos_x".')
+    check_keys(columns, CHANNELS, f"[columns] of {path}")
+    sources = {
+        channel: from_table(
+            ColumnSource, {"name": entry} if isinstance(entry, str) else entry, f"[columns.{channel}] of {path}"
+        )
+        for channel, entry in columns.items()
+    }
+    return from_table(ColumnMapping, {"columns": {}, **table}, str(path)).with_options(
+        columns={name: dataclasses.asdict(source) for name, source in sources.items()}
+    )
+
+
+CANONICAL = ColumnMapping({name: ColumnSource(name) for name in CHANNELS}, layout="canonical")
+"""carlab's own CSV: SI units, velocities in the body frame, steering positive to the left."""
+
+# lasgroup/simulation_transfer, recordings_rc_car_v0. Declared, each checked on both files:
+# - vx_world, vy_world are in the world frame: median difference to the differentiated pose 0.004 m/s there, against
+#   0.5 to 1 m/s if read as body velocities.
+# - all velocities are backward differences of the pose (they match those half a period better than any other shift),
+#   so they are half of the nominal 1/30 s late.
+# - yaw_rate: a negative spike of 85 to 245 rad/s in each of the 14 + 9 rows where yaw passes 0 counter-clockwise, none
+#   clockwise: a difference of an angle in [0, 2 pi) whose wrap was handled on one side only. The pose there is clean.
+# - steering is positive to the left and throttle positive forward already: nothing to flip.
+ETH = ColumnMapping(
+    {
+        **CANONICAL.columns,
+        "vx": ColumnSource("vx_world"),
+        "vy": ColumnSource("vy_world"),
+    },
+    layout="eth",
+    velocity_frame="world",
+    velocity_lag_s=0.5 / 30.0,
+    repair_yaw_rate=True,
+)
+
+# Lorenzo-Lyons/DART. Declared:
+# - the pose is Vicon's, stamped by "vicon time"; sensors and commands come at 10 Hz and are repeated in these rows.
+# - the car multiplies the throttle by the dead-man's safety value (their ROS_packages/racecar_pkg/src/
+#   racecar_universal.py: car.throttle = throttle * safety_value); the steering acts regardless. In 70_racetrack_lap
+#   the logged throttle is 0.25 for 676 rows in which the car stands still and safety_value is 0.
+# - "vel encoder" and "W (IMU)" measure vx and yaw rate again, through filters: kept for comparison only.
+_DART_COMMANDS = {"steering": ColumnSource("steering"), "throttle": ColumnSource("throttle")}
+DART = ColumnMapping(
+    {
+        "t": ColumnSource("vicon time", unit="s"),
+        "x": ColumnSource("vicon x", unit="m"),
+        "y": ColumnSource("vicon y", unit="m"),
+        "yaw": ColumnSource("vicon yaw", unit="rad"),
+        **_DART_COMMANDS,
+    },
+    layout="dart",
+    throttle_gate="safety_value",
+    references={"vel encoder": "vx", "W (IMU)": "yaw_rate"},
+)
+DART_ONBOARD = ColumnMapping(
+    {
+        "t": ColumnSource("elapsed time sensors", unit="s"),
+        "vx": ColumnSource("vel encoder", unit="m/s"),
+        "yaw_rate": ColumnSource("W (IMU)", unit="rad/s"),
+        **_DART_COMMANDS,
+    },
+    layout="dart on-board",
+    throttle_gate="safety_value",
+    dead_reckoning=True,
+)
+PRESETS: Mapping[str, ColumnMapping] = {m.layout: m for m in (CANONICAL, ETH, DART, DART_ONBOARD)}
+_ORDER = (ETH, CANONICAL, DART, DART_ONBOARD)  # an export of DART data is canonical and keeps its sensors beside
+
+
+def missing_columns(mapping: ColumnMapping, header: Sequence[str]) -> list[str]:
+    """Columns that ``mapping`` needs and ``header`` lacks, as texts ``channel 'column'``."""
+    needed = ["t", *COMMAND_CHANNELS]
+    needed += ["vx", "yaw_rate"] if mapping.dead_reckoning else list(POSE_CHANNELS)
+    if mapping.rate_hz is not None:
+        needed.remove("t")
+    lacking = []
+    for channel in needed:
+        source = mapping.columns.get(channel)
+        if source is None:
+            lacking.append(f"{channel} (not mapped)")
+        elif source.name not in header:
+            lacking.append(source.name if source.name == channel else f"{source.name} (for {channel})")
+    named = [mapping.throttle_gate] if mapping.throttle_gate else []
+    return lacking + [name for name in named if name not in header]
+
+
+def recognise_layout(header: Sequence[str], where: str) -> ColumnMapping:
+    """The preset whose columns ``header`` holds. Raises DataError that names what is missing and the remedy."""
+    for preset in _ORDER:
+        particular = [preset.columns[c].name for c in ("vx", "vy") if preset is ETH]
+        if not missing_columns(preset, header) and all(name in header for name in particular):
+            return preset
+    nearest = min(_ORDER, key=lambda preset: len(missing_columns(preset, header)))
+    lacking = missing_columns(nearest, header)
+    names = [nearest.columns[c].name for c in nearest.columns]
+    spare = [name for name in header if name not in names]
+    near = difflib.get_close_matches(lacking[0].split(" (")[0], spare, n=1, cutoff=0.4)
+    hint = f" (is it '{near[0]}'?)" if near else ""
+    raise DataError(
+        f"{where} has no column {', '.join(lacking)}{hint}; it holds {', '.join(header)}; "
+        f"say which column is which with a mapping file, or add the column."
+    )

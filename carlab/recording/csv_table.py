@@ -1,0 +1,110 @@
+"""Reading .csv and .csv.gz into named columns, with errors that name the row and the column."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+
+_MISSING = frozenset({"", "none", "null", "na", "n/a"})
+
+
+@dataclass(frozen=True, slots=True)
+class CsvTable:
+    """Columns of numbers by name, each (N,), NaN where a cell is empty. Row k of the arrays is data row k + 1.
+
+    ``texts`` holds, of each column with cells that are not numbers, the first of them; ``columns`` has the others.
+    """
+
+    path: Path
+    header: tuple[str, ...]
+    columns: dict[str, FloatArray]
+    texts: dict[str, tuple[int, str]]
+
+    @property
+    def rows(self) -> int:
+        """Number of data rows N."""
+        return len(next(iter(self.columns.values()))) if self.columns else 0
+
+    def column(self, name: str) -> FloatArray:
+        """Return a column of numbers, shape (N,). Raises DataError where it holds text."""
+        if name in self.texts:
+            row, cell = self.texts[name]
+            raise DataError(
+                f"Row {row} of column '{name}' in {self.path.name} holds {cell!r}, which is not a number; "
+                "correct or empty that cell."
+            )
+        return self.columns[name]
+
+
+def read_csv(path: Path | str) -> CsvTable:
+    """Read a comma- or semicolon-separated file with one header line; ``.gz`` is decompressed.
+
+    Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Raises DataError for a file that is not there, is
+    empty, is cut short, is not text, or has a row of another length than its header.
+    """
+    path = Path(path)
+    text = _read_text(path)
+    first = text.split("\n", 1)[0]
+    delimiter = ";" if first.count(";") > first.count(",") else ","
+    try:
+        lines = [row for row in csv.reader(io.StringIO(text, newline=""), delimiter=delimiter) if row]
+    except csv.Error as error:
+        raise DataError(f"{path.name} is not a CSV file: {error}.") from error
+    if not lines:
+        raise DataError(f"{path.name} is empty; a recording has a header and at least two rows.")
+    header = tuple(name.strip().lstrip("\ufeff") for name in lines[0])
+    if all(_is_number(cell) for cell in header):
+        raise DataError(f"{path.name} begins with numbers; add a header line with the column names.")
+    doubled = sorted({name for name in header if header.count(name) > 1})
+    if doubled:
+        raise DataError(f"{path.name} has two columns named '{doubled[0]}'; rename one in the header.")
+    for number, row in enumerate(lines[1:], start=1):
+        if len(row) != len(header):
+            raise DataError(
+                f"Row {number} of {path.name} has {len(row)} cells where the header has {len(header)}; "
+                "the file may be cut short there: correct or remove that row."
+            )
+    if len(lines) < 3:
+        raise DataError(f"{path.name} has {len(lines) - 1} rows; a recording needs at least two.")
+    columns, texts = {}, {}
+    for index, name in enumerate(header):
+        cells = ["nan" if row[index].strip().lower() in _MISSING else row[index] for row in lines[1:]]
+        try:
+            columns[name] = np.array(cells, dtype=np.float64)
+        except ValueError:
+            bad = next(k for k, cell in enumerate(cells) if not _is_number(cell))
+            texts[name] = (bad + 1, cells[bad])
+    return CsvTable(path, header, columns, texts)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        content = path.read_bytes()
+        if path.suffix == ".gz" or content[:2] == b"\x1f\x8b":
+            content = gzip.decompress(content)
+        return content.decode("utf-8-sig")
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise DataError(f"{path.name} is not a whole gzip file ({error}); fetch it again.") from error
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"{path.name} is not a text file: byte {error.start} is not UTF-8; export it as CSV."
+        ) from error
+    except OSError as error:
+        raise DataError(f"Cannot read {path}: {error.strerror}; check the path.") from error
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

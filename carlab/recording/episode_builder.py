@@ -1,0 +1,213 @@
+"""Documents to arrays and back: pure, and the one place that says which state belongs to which command."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, Tick, Transition
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import Action, CarState, FloatArray, Observation, PoseSample, Reality
+
+POSE_AGE = "pose_age_s"
+VELOCITY_DELAY = "velocity_delay_s"
+LATE = "late_s"
+POLICY_TIME = "policy_s"
+TRACKED = "tracked"
+OWN_COLUMNS = (POSE_AGE, VELOCITY_DELAY, LATE, POLICY_TIME, TRACKED)
+
+
+def episode_from_documents(
+    documents: Sequence[Document],
+    extra: Mapping[int, Mapping[str, float]] | None = None,
+    run_metadata: Mapping[str, str] | None = None,
+) -> EpisodeData:
+    """Arrays of one episode, finished or not.
+
+    ``times_s`` are the times of the ticks on the car's clock, the last one that of the last transition. Where there
+    is no observation after the last command (the program was killed, or the car failed in the middle of a tick) that
+    command is left out, because nobody saw what came of it.
+    ``extra`` gets the columns ``pose_age_s``, ``velocity_delay_s``, ``late_s`` and ``policy_s`` (NaN in the last row,
+    where there was no tick; a column without any number is left out), ``tracked`` (0 or 1) if it was ever lost, and
+    the further columns given by step in the argument ``extra``.
+
+    Raises:
+        DataError: There is no tick with an observation after it.
+    """
+    started = next((d for d in documents if isinstance(d, EpisodeStarted)), None)
+    ended = next((d for d in documents if isinstance(d, EpisodeEnded)), None)
+    ticks = [d for d in documents if isinstance(d, Tick)]
+    transitions = {d.step: d for d in documents if isinstance(d, Transition)}
+    rows = [(tick.t_s, tick.step, tick.observation) for tick in ticks]
+    if ended is not None and ended.last is not None and ticks and ended.steps > ticks[-1].step:
+        arrival = transitions.get(ticks[-1].step)
+        rows.append((ended.t_s if arrival is None else arrival.t_s, ended.steps, ended.last))
+    else:
+        ticks = ticks[:-1]
+    if not ticks:
+        how = f"it ended as {ended.reason.name}. {ended.detail}".rstrip() if ended else "its writer was stopped"
+        raise DataError(f"The recording holds no complete tick ({how}); record it anew.")
+    seen = [observation for _, _, observation in rows]
+    poses = [
+        (pose.t_capture_s, pose.x_m, pose.y_m, pose.yaw_rad)
+        for observation in seen
+        for pose in observation.poses
+        if pose.tracked
+    ]
+    columns = {
+        POSE_AGE: [t_s - observation.t_capture_s for t_s, _, observation in rows],
+        VELOCITY_DELAY: [observation.velocity_delay_s for observation in seen],
+        LATE: [*(tick.late_s for tick in ticks), math.nan],
+        POLICY_TIME: [*(tick.policy_s for tick in ticks), math.nan],
+        **_extra_columns(extra or {}, [step for _, step, _ in rows]),
+    }
+    arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
+    kept = {name: values for name, values in arrays.items() if not np.isnan(values).all()}
+    if not all(observation.tracked for observation in seen):
+        kept[TRACKED] = np.array([observation.tracked for observation in seen], dtype=np.float64)
+    missing = ticks[-1].step + 1 - ticks[0].step - len(ticks)
+    return EpisodeData(
+        times_s=np.array([t_s for t_s, _, _ in rows], dtype=np.float64),
+        states=np.array([observation.state.to_array() for observation in seen]),
+        requested=np.array([tick.requested.to_array() for tick in ticks]),
+        sent=np.array([tick.sent.to_array() for tick in ticks]),
+        rewards=np.array([_reward(transitions.get(tick.step)) for tick in ticks], dtype=np.float64),
+        poses=np.array(poses, dtype=np.float64).reshape(-1, 4),
+        metadata={
+            **(run_metadata or {}),
+            **(_started_texts(started) if started else {}),
+            **_ended_texts(ended),
+            **({"missing_ticks": str(missing)} if missing else {}),
+        },
+        extra=kept,
+    )
+
+
+def _reward(transition: Transition | None) -> float:
+    return math.nan if transition is None else transition.reward
+
+
+def _extra_columns(extra: Mapping[int, Mapping[str, float]], steps: Sequence[int]) -> dict[str, list[float]]:
+    names = dict.fromkeys(name for values in extra.values() for name in values)
+    return {name: [extra.get(step, {}).get(name, math.nan) for step in steps] for name in names}
+
+
+def _started_texts(started: EpisodeStarted) -> dict[str, str]:
+    return {
+        **started.metadata,
+        "episode": str(started.episode),
+        "car": started.car,
+        "reality": started.reality.value,
+        "policy": started.policy,
+        "task": started.task,
+        "seed": str(started.seed),
+        "period_s": repr(started.period_s),
+        "history_length": str(started.history_length),
+        "goal": json.dumps(started.goal),
+        "arena_m": json.dumps(started.arena_m),
+        "path_m": json.dumps(started.path_m),
+        "start_t_s": repr(started.t_s),
+        "start_wall_ns": str(started.wall_ns),
+        "config_toml": started.config_toml,
+    }
+
+
+def _ended_texts(ended: EpisodeEnded | None) -> dict[str, str]:
+    reason = ended.reason if ended else EndReason.CRASHED
+    texts = {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": ended.detail if ended else ""}
+    if ended:
+        texts |= {"steps": str(ended.steps), "total_reward": repr(ended.total_reward)}
+        texts |= {f"statistics.{name}": repr(value) for name, value in ended.statistics.items()}
+    return texts
+
+
+def goal_of(metadata: Mapping[str, str]) -> tuple[float, float, float] | None:
+    """The goal (x [m], y [m], yaw [rad]) in an episode's metadata; None where there is none."""
+    goal = json.loads(metadata.get("goal", "null"))
+    return None if goal is None else (float(goal[0]), float(goal[1]), float(goal[2]))
+
+
+def polygon_of(metadata: Mapping[str, str], key: str) -> FloatArray:
+    """The points under ``arena_m`` or ``path_m`` in an episode's metadata, shape (n, 2) [m]; n may be 0."""
+    return np.array(json.loads(metadata.get(key, "[]")), dtype=np.float64).reshape(-1, 2)
+
+
+def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
+    """The documents that an episode of arrays would have emitted, so that every sink can write it.
+
+    What the arrays do not hold (times of capture, lateness) is NaN. ``features`` are empty.
+    """
+    texts = episode.metadata
+    yield started_from_arrays(episode)
+    late_s, policy_s = (episode.extra.get(name, np.full(episode.ticks + 1, np.nan)) for name in (LATE, POLICY_TIME))
+    seen = list(_observations(episode))
+    nothing = np.zeros(0)
+    total_reward = 0.0
+    for k in range(episode.ticks):
+        t_s = float(episode.times_s[k])
+        requested, sent = Action.from_array(episode.requested[k]), Action.from_array(episode.sent[k])
+        yield Tick(k, t_s, float(late_s[k]), seen[k], nothing, requested, sent, float(policy_s[k]), "")
+        if not math.isnan(reward := float(episode.rewards[k])):
+            total_reward += reward
+            arrival_s = float(episode.times_s[k + 1])
+            yield Transition(k, arrival_s, nothing, sent, reward, nothing, terminated=False, truncated=False)
+    prefix = "statistics."
+    yield EpisodeEnded(
+        t_s=float(episode.times_s[-1]),
+        reason=EndReason[texts.get("end_reason", EndReason.COMPLETED.name)],
+        detail=texts.get("end_detail", ""),
+        steps=episode.ticks,
+        total_reward=float(texts.get("total_reward", total_reward)),
+        last=seen[-1],
+        statistics={k.removeprefix(prefix): float(v) for k, v in texts.items() if k.startswith(prefix)},
+    )
+
+
+def started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
+    """The EpisodeStarted of an episode of arrays; a recording that does not say counts as one of a real car."""
+    texts = episode.metadata
+    known = _started_texts(EpisodeStarted(0, 0.0, 0, "", Reality.REAL, "", "", 0, 0.0, 0))
+    known |= _ended_texts(EpisodeEnded(0.0, EndReason.COMPLETED, "", 0, 0.0))
+    period_s = float(texts.get("period_s", episode.period_s))
+    return EpisodeStarted(
+        episode=int(texts.get("episode", 1)),
+        t_s=float(texts.get("start_t_s", episode.times_s[0])),
+        wall_ns=int(texts.get("start_wall_ns", 0)),
+        car=texts.get("car", "unknown"),
+        reality=Reality(texts.get("reality", Reality.REAL.value)),
+        policy=texts.get("policy", "unknown"),
+        task=texts.get("task", "unknown"),
+        seed=int(texts.get("seed", 0)),
+        period_s=period_s,
+        history_length=int(texts.get("history_length", 0)),
+        goal=goal_of(texts),
+        arena_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "arena_m")),
+        path_m=tuple((float(x), float(y)) for x, y in polygon_of(texts, "path_m")),
+        config_toml=texts.get("config_toml", ""),
+        metadata={k: v for k, v in texts.items() if k not in known and not k.startswith("statistics.")},
+    )
+
+
+def _observations(episode: EpisodeData) -> Iterator[Observation]:
+    unknown = np.full(episode.ticks + 1, np.nan)
+    age_s, delay_s = (episode.extra.get(name, unknown) for name in (POSE_AGE, VELOCITY_DELAY))
+    tracked = episode.extra.get(TRACKED, np.ones(episode.ticks + 1))
+    # Each raw pose belongs to the first observation that is not older; those of equal time keep their order.
+    owner = np.minimum(np.searchsorted(episode.times_s, episode.poses[:, 0], side="left"), episode.ticks)
+    by_owner = np.argsort(owner, kind="stable")
+    first = np.searchsorted(owner[by_owner], np.arange(episode.ticks + 2))
+    for k, (t_s, state) in enumerate(zip(episode.times_s, episode.states, strict=True)):
+        capture_s = float(t_s - age_s[k])
+        rows = by_owner[first[k] : first[k + 1]]
+        poses = tuple(
+            PoseSample(n, t, t, x, y, yaw)
+            for n, (t, x, y, yaw) in zip(rows.tolist(), episode.poses[rows].tolist(), strict=True)
+        )
+        yield Observation(
+            CarState.from_array(state), capture_s, capture_s, k, bool(tracked[k]), float(delay_s[k]), poses
+        )

@@ -1,0 +1,204 @@
+"""Takes the documents of an episode from the control loop and writes them in a thread of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import queue
+import threading
+from collections.abc import Sequence
+from typing import Self, cast
+
+from carlab.core.clock import monotonic_ns, wall_clock_ns
+from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, SafetyEvent
+from carlab.core.errors import NotOpenError
+from carlab.core.outcome import EndReason
+from carlab.recording.sink import Item, LogLine, Sink, describe_os_error
+
+logger = logging.getLogger(__name__)
+
+_NEVER_DROPPED = (EpisodeStarted, EpisodeEnded, SafetyEvent)
+_CLOSE = object()
+
+
+class Recorder:
+    """Fans the documents of one episode out to sinks without ever blocking who emits them.
+
+    A full queue drops ticks, transitions, health readings and log lines (``dropped`` counts them; the EpisodeEnded
+    carries the count as ``recorder_dropped``), never the start, the end or a safety event. A sink that raises is
+    closed and left out, ``failed`` says why, and the others go on. ``emit`` and ``close`` may be called from any
+    thread, also while the one that opened the recorder hangs.
+
+    Args:
+        sinks: Where to write; this recorder opens and closes them.
+        capacity: Documents that may wait before the droppable ones are dropped.
+        flush_interval_s: At most this much is lost when the process is killed [s].
+    """
+
+    def __init__(self, sinks: Sequence[Sink], *, capacity: int = 100_000, flush_interval_s: float = 0.25) -> None:
+        self._sinks = list(sinks)
+        self._capacity = capacity
+        self._flush_interval_s = flush_interval_s
+        self._queue: queue.SimpleQueue[object] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._closing = False
+        self._dropped = 0
+        self._progress = 0
+        self._failed: str | None = None
+
+    @property
+    def failed(self) -> str | None:
+        """Why the first sink that failed did, in one sentence; None while all is well."""
+        return self._failed
+
+    @property
+    def dropped(self) -> int:
+        """How many documents were dropped because the sinks were too slow."""
+        return self._dropped
+
+    def open(self) -> None:
+        """Open every sink and start the writer. Raises DataError where a file cannot be made; then none stays open."""
+        with self._lock:
+            if self._thread is not None:
+                return
+            for sink in self._sinks:
+                try:
+                    sink.open()
+                except BaseException:
+                    for opened in self._sinks:
+                        opened.abandon()
+                    raise
+            self._thread = threading.Thread(target=self._run, name="carlab-recorder", daemon=True)
+            self._thread.start()
+
+    def emit(self, document: Document | LogLine) -> None:
+        """Hand over one document; returns at once. Raises NotOpenError before ``open``; ignored after ``close``."""
+        if self._thread is None:
+            raise NotOpenError("The recorder was used before it was opened; use it in a with statement.")
+        if self._closing:
+            return
+        if not isinstance(document, _NEVER_DROPPED) and self._queue.qsize() >= self._capacity:
+            self._dropped += 1
+            return
+        self._queue.put(document)
+
+    def log_handler(self, level: int = logging.INFO) -> logging.Handler:
+        """A logging handler that writes the program's log into the recording; the caller adds and removes it."""
+        return _RecorderHandler(self, level)
+
+    def close(self, timeout_s: float = 5.0) -> None:
+        """Write what is waiting, finish the files and join the writer. Idempotent, from any thread.
+
+        Waits as long as the writer gets on, and gives up when it has not for ``timeout_s`` (a disk that hangs). An
+        episode that never got its EpisodeEnded is finished as CRASHED. Does not raise for a file that could not be
+        finished: ``failed`` says so.
+        """
+        with self._lock:
+            if self._thread is None:
+                self._closing = True
+                return
+            if not self._closing:
+                self._closing = True
+                self._queue.put(_CLOSE)
+        progress, give_up_s = -1, 0.0
+        while self._thread.is_alive():
+            if progress != self._progress:
+                progress, give_up_s = self._progress, monotonic_ns() * 1e-9 + timeout_s
+            elif monotonic_ns() * 1e-9 >= give_up_s:
+                self._remember(
+                    f"The recording was not finished because its writer stood still for {timeout_s:g} s; its .partial "
+                    "file holds what was written, check the disk."
+                )
+                return
+            self._thread.join(min(0.05, timeout_s))
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        sinks = list(self._sinks)
+        next_flush_s = monotonic_ns() * 1e-9 + self._flush_interval_s
+        unflushed = False
+        while True:
+            try:
+                item = self._queue.get(timeout=max(0.0, next_flush_s - monotonic_ns() * 1e-9))
+            except queue.Empty:
+                item = None
+            if item is _CLOSE:
+                break
+            if item is not None:
+                unflushed = True
+                self._write(sinks, cast(Item, item))
+                self._progress += 1
+            if (now_s := monotonic_ns() * 1e-9) >= next_flush_s:
+                next_flush_s = now_s + self._flush_interval_s
+                if unflushed:
+                    self._flush(sinks)
+                    unflushed = False
+        for sink in sinks:
+            try:
+                sink.close()
+            except Exception as error:
+                self._fail(sink, error)
+            self._progress += 1
+
+    def _write(self, sinks: list[Sink], item: Item) -> None:
+        if isinstance(item, EpisodeEnded) and self._dropped:
+            item = dataclasses.replace(item, statistics={**item.statistics, "recorder_dropped": float(self._dropped)})
+        for sink in tuple(sinks):
+            try:
+                sink.write(item)
+            except Exception as error:
+                sinks.remove(sink)
+                self._fail(sink, error)
+
+    def _flush(self, sinks: list[Sink]) -> None:
+        for sink in tuple(sinks):
+            if sink.finished:
+                continue
+            try:
+                sink.flush()
+            except Exception as error:
+                sinks.remove(sink)
+                self._fail(sink, error)
+
+    def _fail(self, sink: Sink, error: Exception) -> None:
+        """Close a sink that raised, as well as that can be done, and remember why.
+
+        After an error of the disk the file stays ``.partial``: bytes may be missing in the middle. After any other
+        error it is finished, and marked as what it is.
+        """
+        name = getattr(sink, "path", type(sink).__name__)
+        sentence = describe_os_error(error, name) if isinstance(error, OSError) else f"{name}: {error}"
+        self._remember(sentence)
+        logger.error("Recording failed: %s", sentence, exc_info=None if isinstance(error, OSError) else error)
+        try:
+            if not isinstance(error, OSError):
+                sink.close(EndReason.RECORDER_ERROR, sentence)
+        except Exception as second:
+            logger.warning("%s could not be finished either: %s", name, second)
+        finally:
+            sink.abandon()
+
+    def _remember(self, sentence: str) -> None:
+        if self._failed is None:
+            self._failed = sentence
+
+
+class _RecorderHandler(logging.Handler):
+    """Sends log records to a recorder, except its own (they would come back for ever)."""
+
+    def __init__(self, recorder: Recorder, level: int) -> None:
+        super().__init__(level)
+        self._recorder = recorder
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue one line."""
+        if record.name == __name__ or self._recorder._thread is None:
+            return
+        self._recorder.emit(LogLine(wall_clock_ns(), record.levelno, record.name, record.getMessage()))

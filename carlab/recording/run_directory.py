@@ -1,0 +1,209 @@
+"""The folder of one run: what is in it, where, and in which surroundings it was made.
+
+runs/2026-11-21_134500_<name>/
+    config.toml          the resolved configuration
+    environment.json     program, git, packages, host, start
+    episodes/0001.mcap   one recording an episode, with 0001.rrd beside it
+    models/  policy/     what was learned
+    log.jsonl            the program's log, one JSON object a line
+    result.json          how the run ended
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import logging
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Self
+
+import carlab
+from carlab.core.clock import wall_clock_ns
+from carlab.core.errors import DataError
+from carlab.recording.sink import describe_os_error
+
+_PACKAGES = (
+    *("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "rerun-sdk", "mcap", "protobuf", "pyarrow"),
+    *("python-can", "pyserial", "cantools"),
+)
+_EPISODE_FILE = re.compile(r"(\d+)\.(?:mcap|rrd)(?:\.partial)?")
+
+
+@dataclass(frozen=True, slots=True)
+class RunDirectory:
+    """A run's folder. Make one with ``create`` or take one up again with ``open_existing``."""
+
+    path: Path
+
+    @classmethod
+    def create(
+        cls, root: Path | str, name: str, *, config_toml: str = "", metadata: Mapping[str, str] | None = None
+    ) -> Self:
+        """Make ``root/<date>_<time>_<name>`` with its folders, configuration and environment.
+
+        Args:
+            root: Where runs are kept, usually ``runs``.
+            name: What the run is called; characters that do not belong into a file name become ``-``.
+            config_toml: The resolved configuration.
+            metadata: Further facts for environment.json.
+
+        Raises:
+            DataError: The folder cannot be written, in one sentence.
+        """
+        stamp = datetime.fromtimestamp(wall_clock_ns() * 1e-9).strftime("%Y-%m-%d_%H%M%S")
+        slug = re.sub(r"[^\w.-]+", "-", name, flags=re.ASCII).strip("-.") or "run"
+        base = Path(root) / f"{stamp}_{slug}"
+        try:
+            base.parent.mkdir(parents=True, exist_ok=True)
+            path, number = base, 1
+            while not _made(path):
+                number += 1
+                path = base.with_name(f"{base.name}-{number}")
+            run = cls(path)
+            for folder in (run.episodes, run.models, run.policy):
+                folder.mkdir()
+            (path / "config.toml").write_text(config_toml, encoding="utf-8")
+            run.write_json("environment.json", {**environment(), **(metadata or {})})
+        except OSError as error:
+            raise DataError(describe_os_error(error, base)) from error
+        return run
+
+    @classmethod
+    def open_existing(cls, path: Path | str) -> Self:
+        """Take up a run again. Raises DataError where ``path`` is no run's folder."""
+        path = Path(path)
+        if not (path / "environment.json").is_file():
+            raise DataError(f"{path} is not a run's folder (no environment.json in it); name one such as runs/2026-...")
+        run = cls(path)
+        try:
+            for folder in (run.episodes, run.models, run.policy):
+                folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise DataError(describe_os_error(error, path)) from error
+        return run
+
+    @property
+    def episodes(self) -> Path:
+        """Folder of the recordings."""
+        return self.path / "episodes"
+
+    @property
+    def models(self) -> Path:
+        """Folder of the dynamics models."""
+        return self.path / "models"
+
+    @property
+    def policy(self) -> Path:
+        """Folder of the policies."""
+        return self.path / "policy"
+
+    @property
+    def config_toml(self) -> str:
+        """The resolved configuration as text."""
+        return (self.path / "config.toml").read_text(encoding="utf-8")
+
+    def next_episode(self) -> int:
+        """The number after the highest that any file has, finished or not; numbers start at 1."""
+        names = (_EPISODE_FILE.fullmatch(entry.name) for entry in self.episodes.iterdir())
+        return 1 + max((int(match[1]) for match in names if match), default=0)
+
+    def episode_path(self, number: int, suffix: str = ".mcap") -> Path:
+        """Where a file of an episode lies: ``episodes/0001.mcap``."""
+        return self.episodes / f"{number:04d}{suffix}"
+
+    def recordings(self, *, partial: bool = False) -> list[Path]:
+        """The finished MCAP recordings in order; with ``partial`` the unfinished ones too."""
+        ends = (".mcap", ".mcap.partial") if partial else (".mcap",)
+        return sorted(entry for entry in self.episodes.iterdir() if entry.name.endswith(ends))
+
+    def log_handler(self, level: int = logging.INFO) -> logging.Handler:
+        """A logging handler that appends to log.jsonl; the caller adds, removes and closes it."""
+        try:
+            handler = logging.FileHandler(self.path / "log.jsonl", encoding="utf-8", errors="backslashreplace")
+        except OSError as error:
+            raise DataError(describe_os_error(error, self.path / "log.jsonl")) from error
+        handler.setLevel(level)
+        handler.setFormatter(JsonFormatter())
+        return handler
+
+    def write_result(self, result: Mapping[str, Any]) -> None:
+        """Write result.json: how the run ended. Raises DataError where that fails."""
+        try:
+            self.write_json("result.json", result)
+        except OSError as error:
+            raise DataError(describe_os_error(error, self.path / "result.json")) from error
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a JSON file whole or not at all."""
+        path = self.path / name
+        unfinished = path.with_name(f"{name}.partial")
+        unfinished.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
+        os.replace(unfinished, path)
+
+
+def _made(path: Path) -> bool:
+    try:
+        path.mkdir()
+    except FileExistsError:
+        return False
+    return True
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: time, level, logger, message, and the traceback where there is one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as one line of JSON."""
+        line: dict[str, object] = {
+            "time": datetime.fromtimestamp(record.created).astimezone().isoformat(timespec="milliseconds"),
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+            "thread": record.threadName,
+        }
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+def environment() -> dict[str, Any]:
+    """What a run depends on beside its configuration: versions, host, and the state of the sources in git."""
+    packages = {}
+    for name in _PACKAGES:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "carlab": carlab.__version__,
+        "python": platform.python_version(),
+        "host": platform.node(),
+        "platform": platform.platform(),
+        "cpu_count": os.cpu_count(),
+        "command": sys.argv,
+        "start": datetime.fromtimestamp(wall_clock_ns() * 1e-9).astimezone().isoformat(),
+        "git": git_state(Path(carlab.__file__).parent),
+        "packages": packages,
+    }
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:
+    """Commit and whether tracked files differ from it (``dirty``); None outside a repository or without git."""
+
+    def git(*arguments: str) -> str:
+        command = ("git", "-C", str(folder), *arguments)
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+        return done.stdout.strip()
+
+    try:
+        return {"sha": git("rev-parse", "HEAD"), "dirty": bool(git("status", "--porcelain", "--untracked-files=no"))}
+    except (OSError, subprocess.SubprocessError):
+        return None

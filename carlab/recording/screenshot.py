@@ -1,0 +1,134 @@
+"""A picture of a recording as the rerun viewer shows it, made without a window."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+from carlab.core.clock import monotonic_ns
+from carlab.core.errors import DataError, NotReadyError
+from carlab.recording.sink import describe_os_error
+
+_DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+_CANNOT = "The rerun viewer cannot draw here"
+_SETTLE_NS = 5 * 10**9
+_NO_DRIVER = (
+    "no Vulkan driver is installed; install one that needs no graphics card with "
+    "'apt-get install mesa-vulkan-drivers libvulkan1', or take a picture drawn by matplotlib instead"
+)
+
+
+def vulkan_is_there() -> bool:
+    """Whether a Vulkan driver is registered on this computer (on macOS and Windows the system brings its own)."""
+    if sys.platform != "linux":
+        return True
+    named = (os.environ.get(name, "") for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"))
+    if any(Path(part).is_file() for names in named for part in names.split(os.pathsep) if part):
+        return True
+    return any(next(Path(folder).glob("*.json"), None) is not None for folder in _DRIVER_FOLDERS)
+
+
+def rerun_program() -> Path | None:
+    """The rerun program that belongs to this Python, or one on the search path."""
+    beside = Path(sys.executable).with_name("rerun")
+    if beside.exists():
+        return beside
+    found = shutil.which("rerun")
+    return Path(found) if found else None
+
+
+def save_screenshot(
+    rrd_path: Path | str, png_path: Path | str, *, size: tuple[int, int] = (1600, 1000), timeout_s: float = 60.0
+) -> None:
+    """Open an .rrd in the headless viewer and save what it shows once the picture stands still.
+
+    Args:
+        rrd_path: The recording.
+        png_path: The picture; overwritten.
+        size: Width and height of the picture in pixels.
+        timeout_s: Give up after this long [s]; drawing on a processor takes about eight seconds.
+
+    Raises:
+        DataError: The recording is not there, or the picture cannot be written.
+        NotReadyError: The viewer cannot run here; the message says what to install.
+    """
+    rrd_path, png_path = Path(rrd_path), Path(png_path)
+    if not rrd_path.is_file():
+        raise DataError(f"{rrd_path} is not there; make it with carlab view RECORDING --save {rrd_path.name}.")
+    program = rerun_program()
+    if program is None:
+        raise NotReadyError(_CANNOT, ["the program 'rerun' is not installed; install rerun-sdk with pip"])
+    if not vulkan_is_there():
+        raise NotReadyError(_CANNOT, [_NO_DRIVER])
+    port = _free_port()
+    with tempfile.TemporaryDirectory(prefix="carlab-") as folder, (Path(folder) / "log").open("w+") as log:
+        command = [
+            *(str(program), str(rrd_path.resolve()), "--headless", "--bind", "127.0.0.1", "--port", str(port)),
+            *("--window-size", f"{size[0]}x{size[1]}"),
+        ]
+        surroundings = {**os.environ, "XDG_RUNTIME_DIR": os.environ.get("XDG_RUNTIME_DIR", folder)}
+        viewer = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=log, env=surroundings, start_new_session=True
+        )
+        try:
+            picture = _settled_picture(viewer, port, Path(folder), monotonic_ns() + int(timeout_s * 1e9))
+        except (RuntimeError, OSError, ConnectionError) as error:
+            log.seek(0)
+            lines = [line.strip() for line in log if line.strip()]
+            reason = f"{error}; the viewer says: {lines[-1]}" if lines else str(error)
+            raise NotReadyError(_CANNOT, [f"{reason}; if that is about graphics: {_NO_DRIVER}"]) from error
+        finally:
+            _end(viewer)
+        try:
+            png_path.write_bytes(picture)
+        except OSError as error:
+            raise DataError(describe_os_error(error, png_path)) from error
+
+
+def _end(viewer: subprocess.Popen[bytes]) -> None:
+    """End the viewer with its children: the program on the path is a script that starts the real one."""
+    if sys.platform == "win32":
+        viewer.kill()
+    else:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(viewer.pid, signal.SIGKILL)
+    viewer.wait()
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _settled_picture(viewer: subprocess.Popen[bytes], port: int, folder: Path, give_up_ns: int) -> bytes:
+    """Bytes of the first picture that equals the one before: the axes have found their ranges, messages are gone."""
+    from rerun.experimental import ViewerClient
+
+    pause = threading.Event()
+    while True:
+        if viewer.poll() is not None:
+            raise RuntimeError(f"the viewer ended with code {viewer.returncode}")
+        if monotonic_ns() > give_up_ns:
+            raise RuntimeError("the viewer did not start in time")
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
+            break
+        pause.wait(0.1)
+    client = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
+    path = folder / "picture.png"
+    began_ns, before = monotonic_ns(), b""
+    while True:
+        pause.wait(1.5)
+        client.save_screenshot(str(path))
+        picture = path.read_bytes()
+        if (picture == before and monotonic_ns() - began_ns > _SETTLE_NS) or monotonic_ns() > give_up_ns:
+            return picture
+        before = picture

@@ -1,0 +1,149 @@
+"""What receives the documents of one episode: the common part of every file writer."""
+
+from __future__ import annotations
+
+import errno
+import math
+import shutil
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, Tick, Transition
+from carlab.core.errors import DataError
+from carlab.core.outcome import EndReason
+
+PARTIAL_SUFFIX = ".partial"
+MIN_FREE_BYTES = 20_000_000
+"""A recording is not begun on a disk with less room than this."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogLine:
+    """One line of the program's log. ``level`` is the number of the standard library's logging (20 is INFO)."""
+
+    wall_ns: int
+    level: int
+    name: str
+    message: str
+
+
+Item = Document | LogLine
+
+
+def partial_path(path: Path) -> Path:
+    """Where a file is written until it is finished: ``0001.mcap`` -> ``0001.mcap.partial``."""
+    return path.with_name(path.name + PARTIAL_SUFFIX)
+
+
+def claim(path: Path) -> Path:
+    """Make the folder of a new file and return its ``.partial`` name.
+
+    Raises OSError where the file is there already or the disk is as good as full: better told before the car moves.
+    """
+    if path.exists():
+        raise FileExistsError(errno.EEXIST, "is already there", str(path))
+    make_folder(path.parent)
+    if shutil.disk_usage(path.parent).free < MIN_FREE_BYTES:
+        raise OSError(errno.ENOSPC, "less than 20 MB are free", str(path))
+    return partial_path(path)
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it. Raises OSError where a file stands in its place."""
+    if folder.exists() and not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "is a file", str(folder))
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def describe_os_error(error: OSError, path: Path | str) -> str:
+    """One sentence with the next step for a file that could not be written."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{path} could not be written because the disk is full; free some space and start again."
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{path} may not be written; check the permissions of its folder or choose another one."
+    if isinstance(error, FileExistsError):
+        return f"{path} is already there and recordings are never overwritten; choose another name."
+    if isinstance(error, NotADirectoryError):
+        return f"{path} cannot be made because a file stands where its folder belongs; choose another folder."
+    return f"{path} could not be written: {error.strerror or error}; check the disk, then start again."
+
+
+class Sink(ABC):
+    """Writes the documents of one episode to one place.
+
+    Constructing does nothing. ``open`` makes the file; ``write`` takes documents in order, and the EpisodeEnded
+    finishes the file at once. What comes after it is ignored, so that the first EpisodeEnded wins whichever thread
+    sent it. ``close`` before an EpisodeEnded finishes the file as CRASHED. All calls come from one thread at a time.
+    """
+
+    def __init__(self) -> None:
+        self._started: EpisodeStarted | None = None
+        self._early: list[Item] = []
+        self._finished = False
+        self._last_t_s = math.nan
+        self._steps = 0
+        self._total_reward = 0.0
+
+    @abstractmethod
+    def open(self) -> None:
+        """Make the file. Raises DataError, in one sentence, where that cannot be done."""
+
+    @abstractmethod
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system, so that it outlives this process."""
+
+    @abstractmethod
+    def abandon(self) -> None:
+        """Let go of everything and leave what was written as it is; never raises."""
+
+    @abstractmethod
+    def _write(self, item: Item) -> None:
+        """Write one document; the EpisodeStarted comes first."""
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Complete the file and give it its final name; an EpisodeEnded was written before."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether the file is complete or was abandoned: nothing more will be written."""
+        return self._finished
+
+    def write(self, item: Item) -> None:
+        """Write one document or log line. Raises OSError or DataError where that fails."""
+        if self._finished:
+            return
+        if isinstance(item, EpisodeStarted):
+            if self._started is not None:
+                raise DataError("A second episode was sent to a file of one; make a new recorder for each episode.")
+            self._started = item
+            self._last_t_s = item.t_s
+            self._write(item)
+            early, self._early = self._early, []
+            for waiting in early:
+                self.write(waiting)
+            return
+        if self._started is None:
+            self._early.append(item)
+            return
+        if isinstance(item, Tick):
+            self._steps = item.step + 1
+        elif isinstance(item, Transition):
+            self._total_reward += item.reward
+        if not isinstance(item, LogLine):
+            self._last_t_s = item.t_s
+        self._write(item)
+        if isinstance(item, EpisodeEnded):
+            self._finish()
+            self._finished = True
+
+    def close(self, reason: EndReason = EndReason.CRASHED, detail: str = "") -> None:
+        """Finish the file. An episode that has not ended is marked with ``reason``. Idempotent."""
+        if self._finished:
+            return
+        if self._started is None:
+            self.abandon()
+            self._finished = True
+            return
+        self.write(EpisodeEnded(self._last_t_s, reason, detail, self._steps, self._total_reward))

@@ -1,0 +1,115 @@
+import csv
+import dataclasses
+import gzip
+import json
+import math
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from matplotlib.image import imread
+
+from carlab.core.errors import DataError
+from carlab.recording.episode_builder import episode_from_documents, goal_of, polygon_of
+from carlab.recording.export import table_of, write_csv, write_parquet
+from carlab.recording.picture import outline, save_summary
+
+
+@pytest.fixture
+def episode(make_documents):
+    return episode_from_documents(make_documents(60))
+
+
+def test_the_outline_is_a_car_that_points_where_it_drives():
+    shape = outline(1.0, 2.0, math.pi / 2)
+    nose = shape[np.argmax(shape[:, 1])]
+    np.testing.assert_allclose(nose, (1.0, 2.21), atol=1e-12)
+    np.testing.assert_allclose(np.ptp(shape, axis=0), (0.19, 0.42), atol=1e-12)
+    np.testing.assert_array_equal(shape[0], shape[-1])
+
+
+def test_the_picture_shows_goal_and_car_where_they_are(tmp_path, episode):
+    save_summary([episode], tmp_path / "one.png")
+    pixels = imread(tmp_path / "one.png")[:, :, :3]
+    assert pixels.shape[1] > 1200
+    goal_green = (np.abs(pixels - np.array([0, 158, 115]) / 255) < 0.06).all(axis=2)
+    assert goal_green.sum() > 100
+    bare = dataclasses.replace(episode, metadata={})
+    save_summary([bare], tmp_path / "bare.png", "No surroundings")
+    left = imread(tmp_path / "bare.png")[:, : pixels.shape[1] // 2, :3]
+    assert not (np.abs(left - np.array([0, 158, 115]) / 255) < 0.02).all(axis=2).sum() > 100
+
+
+@pytest.mark.parametrize("count", [2, 12])
+def test_several_episodes_and_awkward_ones_make_one_picture(tmp_path, episode, count):
+    odd = dataclasses.replace(
+        episode,
+        rewards=np.full(episode.ticks, np.nan),
+        requested=np.full_like(episode.requested, np.nan),
+        metadata={},
+        extra={},
+    )
+    save_summary([episode] * (count - 1) + [odd], tmp_path / "many.svg", "Many")
+    assert (tmp_path / "many.svg").read_text().startswith("<?xml")
+    save_summary([odd], tmp_path / "odd.png")
+
+
+def test_what_cannot_be_drawn_or_written_says_why(tmp_path, episode):
+    with pytest.raises(DataError, match="no episode"):
+        save_summary([], tmp_path / "x.png")
+    with pytest.raises(DataError, match=r"use \.png"):
+        save_summary([episode], tmp_path / "x.docx")
+    with pytest.raises(DataError, match="could not be written"):
+        save_summary([episode], tmp_path / "nowhere" / "x.png")
+    (tmp_path / "file").touch()
+    for write in (write_csv, write_parquet):
+        with pytest.raises(DataError, match="a file stands where its folder belongs"):
+            write(episode, tmp_path / "file" / "x")
+
+
+def test_goal_and_arena_come_back_from_the_metadata(episode):
+    assert goal_of(episode.metadata) == (0.0, 0.0, math.pi)
+    np.testing.assert_array_equal(polygon_of(episode.metadata, "arena_m")[2], (2.8, 1.5))
+    assert goal_of({}) is None
+    assert polygon_of({}, "path_m").shape == (0, 2)
+
+
+def test_csv_has_the_agreed_columns_and_every_bit_of_every_number(tmp_path, episode):
+    write_csv(episode, tmp_path / "episode.csv")
+    with (tmp_path / "episode.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header[:9] == ["t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle"]
+    assert {"requested_steering", "reward", "pose_age_s", "late_s"} <= set(header)
+    assert len(rows) == 61
+    columns = {name: [row[k] for row in rows] for k, name in enumerate(header)}
+    np.testing.assert_array_equal([float(v) for v in columns["t"]], episode.times_s)
+    np.testing.assert_array_equal([float(v) for v in columns["yaw_rate"]], episode.states[:, 5])
+    np.testing.assert_array_equal([float(v) for v in columns["steering"][:-1]], episode.sent[:, 0])
+    assert columns["steering"][-1] == columns["steering"][-2]  # nothing was sent after the last row
+    assert columns["reward"][-1] == ""
+    assert columns["requested_throttle"][2] == ""
+    assert list(tmp_path.iterdir()) == [tmp_path / "episode.csv"]
+
+
+def test_a_packed_csv_is_the_same_text_and_always_the_same_bytes(tmp_path, episode):
+    write_csv(episode, tmp_path / "plain.csv")
+    write_csv(episode, tmp_path / "a.csv.gz")
+    write_csv(episode, tmp_path / "b.csv.gz")
+    assert gzip.decompress((tmp_path / "a.csv.gz").read_bytes()) == (tmp_path / "plain.csv").read_bytes()
+    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
+
+
+def test_parquet_carries_units_and_metadata(tmp_path, episode):
+    write_parquet(episode, tmp_path / "episode.parquet")
+    table = pq.read_table(tmp_path / "episode.parquet")
+    units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
+    assert (units["t"], units["yaw_rate"], units["throttle"], units["pose_age_s"]) == ("s", "rad/s", "1", "s")
+    assert json.loads(table.schema.metadata[b"carlab"]) == dict(episode.metadata)
+    np.testing.assert_array_equal(table["vy"].to_numpy(), episode.states[:, 4])
+    assert table.column_names == list(table_of(episode))
+
+
+def test_an_extra_column_never_hides_a_standard_one(episode):
+    table = table_of(dataclasses.replace(episode, extra={"yaw": np.ones(61)}))
+    np.testing.assert_array_equal(table["yaw"], episode.states[:, 2])
+    np.testing.assert_array_equal(table["extra_yaw"], np.ones(61))

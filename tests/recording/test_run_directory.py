@@ -1,0 +1,94 @@
+import json
+import logging
+import re
+import subprocess
+
+import pytest
+
+from carlab.core.errors import DataError
+from carlab.recording.run_directory import RunDirectory, environment, git_state
+
+
+def test_a_new_run_has_its_folders_configuration_and_environment(tmp_path):
+    run = RunDirectory.create(
+        tmp_path / "runs", "Parking in the lab!", config_toml="seed = 3\n", metadata={"note": "n"}
+    )
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d{6}_Parking-in-the-lab", run.path.name)
+    assert {p.name for p in run.path.iterdir()} == {"config.toml", "environment.json", "episodes", "models", "policy"}
+    assert run.config_toml == "seed = 3\n"
+    found = json.loads((run.path / "environment.json").read_text())
+    assert found["note"] == "n"
+    assert found["packages"].keys() >= {"numpy", "mcap"}
+    assert found["python"].startswith("3.")
+    assert RunDirectory.open_existing(run.path).path == run.path
+
+
+def test_two_runs_of_the_same_second_do_not_share_a_folder(tmp_path):
+    runs = [RunDirectory.create(tmp_path, "again").path for _ in range(4)]
+    assert len(set(runs)) == 4
+
+
+def test_episodes_are_counted_from_the_files_unfinished_ones_too(tmp_path):
+    run = RunDirectory.create(tmp_path, "count")
+    assert run.next_episode() == 1
+    for name in ("0001.mcap", "0001.rrd", "0003.mcap.partial", "0007.rrd.partial", "notes.txt", "0099.txt"):
+        (run.episodes / name).touch()
+    assert run.next_episode() == 8
+    assert run.episode_path(8) == run.episodes / "0008.mcap"
+    assert run.episode_path(12345, ".rrd").name == "12345.rrd"
+    assert [p.name for p in run.recordings()] == ["0001.mcap"]
+    assert [p.name for p in run.recordings(partial=True)] == ["0001.mcap", "0003.mcap.partial"]
+
+
+def test_the_log_is_one_json_object_a_line(tmp_path):
+    run = RunDirectory.create(tmp_path, "log")
+    handler = run.log_handler()
+    logger = logging.getLogger("carlab.test_run_directory")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        logger.info("two\nlines and %d", 3)
+        try:
+            raise RuntimeError("why")
+        except RuntimeError:
+            logger.exception("it broke")
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
+    lines = [json.loads(line) for line in (run.path / "log.jsonl").read_text().splitlines()]
+    assert [(line["level"], line["message"]) for line in lines] == [("INFO", "two\nlines and 3"), ("ERROR", "it broke")]
+    assert "RuntimeError: why" in lines[1]["traceback"]
+
+
+def test_the_result_is_written_whole(tmp_path):
+    run = RunDirectory.create(tmp_path, "result")
+    run.write_result({"episodes": 3, "path": tmp_path})
+    assert json.loads((run.path / "result.json").read_text()) == {"episodes": 3, "path": str(tmp_path)}
+    assert not list(run.path.glob("*.partial"))
+
+
+def test_a_folder_that_cannot_be_made_gives_one_sentence(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="a file stands where its folder belongs") as caught:
+        RunDirectory.create(tmp_path / "file" / "runs", "x")
+    assert "\n" not in str(caught.value)
+    with pytest.raises(DataError, match="not a run's folder"):
+        RunDirectory.open_existing(tmp_path)
+
+
+def test_git_state_tells_a_changed_tree_from_a_clean_one(tmp_path):
+    def git(*arguments):
+        identity = ("-c", "user.name=n", "-c", "user.email=e@example.org")
+        subprocess.run(["git", *identity, "-C", tmp_path, *arguments], check=True, capture_output=True)
+
+    assert git_state(tmp_path) is None
+    git("init")
+    (tmp_path / "a").write_text("1")
+    git("add", "a")
+    git("commit", "-m", "one")
+    clean = git_state(tmp_path)
+    assert len(clean["sha"]) == 40
+    assert clean["dirty"] is False
+    (tmp_path / "a").write_text("2")
+    assert git_state(tmp_path) == {**clean, "dirty": True}
+    assert environment()["carlab"]
