@@ -78,7 +78,11 @@ class Actuator:
         """Let commands through. Raises NotReadyError, or ActuatorFaultError while a fault is latched."""
         self.require_no_fault()
         self._await(lambda s: s.state != SenderState.STOPPING, ANSWER_TIMEOUT_S)
-        epoch = self._post_wish(Wish.ARM)
+        with self._lock:
+            # A stop of another thread, posted since, must not be overwritten in the sender's slot.
+            if self._latched:
+                raise ActuatorFaultError(self._latched)
+            epoch = self._post_wish(Wish.ARM)
         status = self._await_epoch(epoch)
         if status.state == SenderState.FAULT:
             raise ActuatorFaultError(status.fault)
@@ -91,7 +95,8 @@ class Actuator:
     def command(self, action: Action) -> Action:
         """Post the newest command and return it as it will be on the wire, clamped and rounded by the calibration.
 
-        Neutral is accepted, and changes nothing, while disarmed. Raises NotOpenError, ActuatorFaultError,
+        That is neutral while the VESC's telemetry is stale: the sender holds everything else back then. Neutral is
+        accepted, and changes nothing, while disarmed. Raises NotOpenError, ActuatorFaultError,
         ActionOutOfRangeError (not a number) and NotArmedError.
         """
         sender = self._opened()
@@ -108,21 +113,28 @@ class Actuator:
             if action.is_neutral:
                 return NEUTRAL
             raise NotArmedError("The actuator is not armed; arm it before the first moving command.")
+        if not time.monotonic() - status.t_telemetry_s <= self.config.telemetry_stale_s:
+            return NEUTRAL
         return self.calibration.from_device(device)
 
     def stop(self, *, planned: bool) -> None:
         """Neutral and disarm; ``planned=False`` latches a fault. Returns when neutral was sent three times.
 
-        Does nothing for an actuator that is closed or whose sender is gone, and never waits longer than two seconds.
+        Does nothing for an actuator that is closed or whose sender is gone. Never waits longer than two seconds, and
+        not for a sender that hangs: it finds the order when it goes on.
         """
         if not self.is_open or not self._is_sender_alive():
             return
-        if not planned and not self._latched:
-            self._latched = SAFETY_STOP
-        epoch = self._post_wish(Wish.STOP if planned else Wish.STOP_AND_LATCH)
-        self._await(
-            lambda s: s.is_ended or (s.epoch >= epoch and (s.is_neutral_settled or not s.is_sending)), ANSWER_TIMEOUT_S
-        )
+        with self._lock:
+            if not planned:
+                self._latched = self._latched or SAFETY_STOP
+            epoch = self._post_wish(Wish.STOP if planned else Wish.STOP_AND_LATCH)
+
+        def is_over(status: SenderStatus) -> bool:
+            is_neutral = status.epoch >= epoch and (status.is_neutral_settled or not status.is_sending)
+            return status.is_ended or is_neutral or _hangs(status)
+
+        self._await(is_over, ANSWER_TIMEOUT_S)
 
     def reset_fault(self) -> None:
         """Clear a latched fault, staying disarmed. Raises ActuatorFaultError where its cause persists."""
@@ -230,7 +242,7 @@ class Actuator:
                 status.fault
                 or "The sender process has ended; the VESC's own time-out stops the motor. Open the car anew."
             )
-        if time.monotonic() - status.t_published_s > SILENT_SENDER_S:
+        if _hangs(status):
             raise self._latch("The sender process hangs; the VESC's own time-out stops the motor. Open the car anew.")
         return status
 
@@ -300,3 +312,8 @@ class Actuator:
                 f"what answers is no VESC ({heard} bytes of garbage); check 'port' and 'baud' in [hardware.actuator]."
             )
         return "the port opens but nothing answers; switch the VESC on and check that 'port' is the VESC's."
+
+
+def _hangs(status: SenderStatus) -> bool:
+    """Whether a sender has published nothing for so long that it must hang."""
+    return time.monotonic() - status.t_published_s > SILENT_SENDER_S

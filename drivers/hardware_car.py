@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 
@@ -96,7 +97,16 @@ class HardwareCar(Car):
         state, delay_s = estimate
         poses = tuple(self._unseen)
         self._unseen.clear()
-        return Observation(state, seen.t_capture_s, seen.t_receive_s, seen.sequence, newest.tracked, delay_s, poses)
+        return Observation(
+            state,
+            seen.t_capture_s,
+            seen.t_receive_s,
+            seen.sequence,
+            newest.tracked,
+            delay_s,
+            poses,
+            self.estimator.velocity_valid,
+        )
 
     def arm(self) -> None:
         """Arm the actuator if it, motion capture and the standstill of the car allow it."""
@@ -105,11 +115,14 @@ class HardwareCar(Car):
         self._take_poses()
         reasons = [*self.actuator.problems(), *self._pose_problems()]
         estimate = self.estimator.estimate()
-        speed_mps = 0.0 if estimate is None else estimate[0].speed_mps
-        if speed_mps > self.config.arm_max_speed_mps:
+        if estimate is not None and not self.estimator.velocity_valid:
+            reasons.append("too few poses have come to know whether the car stands; try again at once.")
+        elif estimate is not None and not (speed_mps := estimate[0].speed_mps) <= self.config.arm_max_speed_mps:
             reasons.append(f"the car moves at {speed_mps:.2f} m/s; wait until it stands still.")
         erpm = abs(self.actuator.status().erpm)
-        if erpm > self.config.arm_max_erpm:
+        if math.isnan(erpm):
+            reasons.append("the VESC has not said how fast the motor turns; check its app settings in VESC Tool.")
+        elif erpm > self.config.arm_max_erpm:
             reasons.append(f"the motor turns at {erpm:.0f} eRPM; wait until it stands still.")
         if reasons:
             raise NotReadyError(f"{self.name} cannot be armed", reasons)

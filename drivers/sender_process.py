@@ -63,16 +63,17 @@ class _Channel:
         self._last = SenderStatus()
 
     def post(self, order: Order) -> None:
-        """Write, then wake; a full line or a sender that is gone is noticed elsewhere."""
-        self.orders.write(order.pack())
-        with contextlib.suppress(OSError):
+        """Write, then wake; a full line, a sender that is gone or a channel closed meanwhile is noticed elsewhere."""
+        with contextlib.suppress(OSError, ValueError):
+            self.orders.write(order.pack())
             self.wake.send(b"\1")
 
     def status(self) -> SenderStatus:
-        """Newest status, or the last one read where the slot is being written."""
-        newest = self.statuses.read()
-        if newest is not None:
-            self._last = SenderStatus.unpack(newest[1])
+        """Newest status, or the last one read where the slot is being written or was closed by another thread."""
+        with contextlib.suppress(ValueError):
+            newest = self.statuses.read()
+            if newest is not None:
+                self._last = SenderStatus.unpack(newest[1])
         return self._last
 
     def hang_up(self) -> None:

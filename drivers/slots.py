@@ -53,7 +53,8 @@ class Slot:
 
     def write(self, value: bytes) -> None:
         """Publish ``value``; readers see it whole or not at all."""
-        if self._memory is None:
+        memory = self._memory
+        if memory is None:
             raise ValueError("The slot is closed.")
         if len(value) > self.capacity:
             raise ValueError(f"A value of {len(value)} bytes does not fit into a slot of {self.capacity}.")
@@ -61,7 +62,7 @@ class Slot:
         body = _HEAD.pack(sequence, len(value)) + value
         start = sequence % 2 * self._stride
         record = body + _CRC.pack(zlib.crc32(body))
-        self._memory[start : start + len(record)] = record
+        memory[start : start + len(record)] = record
         self._sequence = sequence
 
     def read(self) -> tuple[int, bytes] | None:
@@ -74,16 +75,17 @@ class Slot:
 
     def close(self) -> None:
         """Unmap and close the descriptor; idempotent."""
-        if self._memory is not None:
-            self._memory.close()
-            self._memory = None
+        memory, self._memory = self._memory, None
+        if memory is not None:
+            memory.close()
             os.close(self.descriptor)
 
     def _read_half(self, half: int) -> tuple[int, bytes] | None:
-        if self._memory is None:
+        memory = self._memory  # another thread may close the slot meanwhile
+        if memory is None:
             raise ValueError("The slot is closed.")
         start = half * self._stride
-        record = self._memory[start : start + self._stride]
+        record = memory[start : start + self._stride]
         sequence, length = _HEAD.unpack_from(record)
         if sequence == 0 and length == 0:
             return None

@@ -43,6 +43,14 @@ class ActuatorChain:
                 signals[effect.channel] = effect.apply(self._ops, signal, values)
         return tuple(memory)
 
+    def settled_output(self, commands: tuple[Value, Value]) -> tuple[Value, Value]:
+        """Wheel angle [rad] and throttle [1] after ``commands`` have acted for ever."""
+        signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
+        for effect, values in self._links:
+            if not effect.has_state:
+                signals[effect.channel] = effect.apply(self._ops, signals[effect.channel], values)
+        return signals["steering"], signals["throttle"]
+
     def held(self, commands: tuple[Value, Value]) -> tuple[Value, Value]:
         """Wheel angle [rad] and throttle [1] of a chain without memory."""
         signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}

@@ -31,6 +31,7 @@ class Ops(Protocol):
     def exp(self, x: Value, /) -> Value: ...  # noqa: D102
     def sqrt(self, x: Value, /) -> Value: ...  # noqa: D102
     def hypot(self, x: Value, y: Value, /) -> Value: ...  # noqa: D102
+    def pow(self, x: Value, exponent: Value, /) -> Value: ...  # noqa: D102
     def abs(self, x: Value, /) -> Value: ...  # noqa: D102
     def sign(self, x: Value, /) -> Value: ...  # noqa: D102
     def floor(self, x: Value, low: float, /) -> Value:
@@ -56,6 +57,7 @@ class FloatOps:
     exp = staticmethod(math.exp)
     sqrt = staticmethod(math.sqrt)
     hypot = staticmethod(math.hypot)
+    pow = staticmethod(math.pow)
     abs = staticmethod(abs)
 
     @staticmethod
@@ -66,7 +68,7 @@ class FloatOps:
     @staticmethod
     def sign(x: Value) -> Value:
         """-1, 0 or 1."""
-        return (x > 0) - (x < 0)
+        return math.copysign(1.0, x) if x else 0.0
 
     @staticmethod
     def floor(x: Value, low: float) -> Value:
@@ -105,6 +107,7 @@ class NumpyOps:
     exp = staticmethod(np.exp)
     sqrt = staticmethod(np.sqrt)
     hypot = staticmethod(np.hypot)
+    pow = staticmethod(np.power)
     abs = staticmethod(np.abs)
     sign = staticmethod(np.sign)
     floor = staticmethod(np.maximum)

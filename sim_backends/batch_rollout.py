@@ -10,7 +10,7 @@ second derivatives, torch's operators run.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -20,9 +20,18 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.core.tables import check_keys
 from sim_backends.actuators import ActuatorChain, ActuatorState
 from sim_backends.array_ops import ARRAYS, Ops, Value, has_wide_vectors
+from sim_backends.batch_inputs import (
+    Past,
+    check_shapes,
+    plain_number,
+    total_delays_s,
+    total_latency_s,
+    with_effects_of,
+)
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled_stepper import CompiledStepper
-from sim_backends.effects import EFFECTS, DelayEffect, ObservationEffect
+from sim_backends.effects import EFFECTS, ObservationEffect
+from sim_backends.effects.first_order import lag_weights
 from sim_backends.integrate import MAX_STEP_S, Stepper, integrate_held
 from sim_backends.registry import REGISTRY
 from sim_backends.schedule import Number, PeriodPlan, Piece, plan_period
@@ -55,7 +64,9 @@ def rollout(
     commands: torch.Tensor,
     *,
     history: torch.Tensor | None = None,
+    history_states: torch.Tensor | None = None,
     values: Mapping[str, Number] | None = None,
+    t0_s: Number = 0.0,
     measured: bool = False,
     max_step_s: float = MAX_STEP_S,
     engine: Literal["fastest", "operators"] = "fastest",
@@ -66,10 +77,15 @@ def rollout(
         config: The simulator.
         start: States at the first tick, shape (N, 6), float32 or float64, on any device; all else follows it.
         commands: Steering and throttle in [-1, 1] at ticks 0 to T - 1, shape (N, T, 2).
-        history: Commands before the first tick, oldest first, shape (N, H, 2); what is older is neutral. Delays and
-            lags are carried through it.
+        history: Commands before the first tick, oldest first, shape (N, H, 2). What is older is like its first row, or
+            neutral where there is none. Delays and hidden states of effects are carried through it, from where
+            they have settled on that row.
+        history_states: States of the body at the ticks of ``history``, shape (N, H, 6), for hidden states that depend
+            on its motion (tyre relaxation, wheel slip, roll); at the start's velocities unless given.
         values: Numbers that replace those of ``config``, by dotted name (``tyre.front.mu``), each a number or a
             tensor of shape () or (N,). Naming an effect switches it on. Not ``timing.control_period``.
+        t0_s: Time of the first tick since the first row of the recording [s], a number or a tensor of shape () or (N,),
+            for effects that depend on time.
         measured: Also return what motion capture would say.
         max_step_s: Longest Runge-Kutta step [s].
         engine: "operators" runs on torch's operators alone, for ``torch.func`` and for second derivatives; "fastest"
@@ -82,23 +98,25 @@ def rollout(
         DataError: A shape does not fit.
         ConfigError: An unknown name, or delays that add up to less than zero.
     """
-    cars = _check_shapes(start, commands, history)
+    cars = check_shapes(start, commands, history, history_states)
     commands = commands.to(start)
-    history = None if history is None else history.to(start)
+    past = None
+    if history is not None and history.shape[1]:
+        past = Past(history.to(start), None if history_states is None else history_states.to(start))
     given = dict(values or {})
     check_keys(given, REGISTRY, "the values of a rollout")
     if "timing.control_period" in given:
         raise ConfigError("timing.control_period is shared by all cars; change it in the simulator instead.")
-    for name, value in given.items():
+    for name, value in {**given, "t0_s": t0_s}.items():
         if isinstance(value, torch.Tensor) and value.shape not in ((), (cars,)):
             raise DataError(f"{name} has shape {tuple(value.shape)}; it must be () or ({cars},).")
-    config = _with_effects_of(config, given)
-    tensors = [start, commands, *([history] if history is not None else []), *given.values()]
+    config = with_effects_of(config, given)
+    tensors = [start, commands, t0_s, *(past or ()), *given.values()]
     needs_gradient = torch.is_grad_enabled() and any(isinstance(t, torch.Tensor) and t.requires_grad for t in tensors)
     fastest, on_cpu = engine == "fastest", start.device.type == "cpu" and start.dtype in _COMPILED_TYPES
     if needs_gradient:
         compiled = fastest and on_cpu
-        return _Batch(config, start, commands, history, given, max_step_s, None, compiled).run(measured)
+        return _Batch(config, start, commands, past, given, t0_s, max_step_s, None, compiled).run(measured)
     arrays = ARRAYS if fastest and on_cpu and _arrays_are_faster(start) else None
     at_once = CARS_AT_ONCE if start.device.type == "cpu" else cars
     parts = []
@@ -106,12 +124,10 @@ def rollout(
         for first in range(0, cars, at_once):
             cut = slice(first, first + at_once)
             own = {k: v[cut] if isinstance(v, torch.Tensor) and v.ndim else v for k, v in given.items()}
-            past = None if history is None else history[cut]
-            parts.append(
-                _Batch(config, start[cut], commands[cut], past, own, max_step_s, arrays, arrays is not None).run(
-                    measured
-                )
-            )
+            earlier = None if past is None else past.cut(cut)
+            begin_s = t0_s[cut] if isinstance(t0_s, torch.Tensor) and t0_s.ndim else t0_s
+            chunk = (start[cut], commands[cut], earlier, own, begin_s, max_step_s, arrays, arrays is not None)
+            parts.append(_Batch(config, *chunk).run(measured))
     if len(parts) == 1:
         return parts[0]
     seen = torch.cat([p.measured for p in parts if p.measured is not None]) if measured else None
@@ -151,8 +167,9 @@ class _Batch:
         config: SimulatorConfig,
         start: torch.Tensor,
         commands: torch.Tensor,
-        history: torch.Tensor | None,
+        past: Past | None,
         given: Mapping[str, Number],
+        t0_s: Number,
         max_step_s: float,
         arrays: Ops | None,
         compiled: bool,
@@ -171,11 +188,14 @@ class _Batch:
         self.stepper: Stepper | None = None
         if compiled:
             self.stepper = CompiledStepper(self.ops, config.kind, config.effects, full)
-        self.past = 0 if history is None else int(history.shape[1])
+        self.t0_s = self._local(self._row(t0_s, like)) if isinstance(t0_s, torch.Tensor) else t0_s
+        self.past = 0 if past is None else int(past.commands.shape[1])
+        self.past_rows: list[State] = []
+        if past is not None and past.states is not None:
+            self.past_rows = [tuple(map(self._local, tick.contiguous())) for tick in past.states.permute(1, 2, 0)]
         self.ticks = int(commands.shape[1])
-        parts = [torch.zeros_like(commands[:, :1]) if self.ticks else commands.new_zeros(len(like), 1, 2)]
-        parts += [history] if history is not None else []
-        # (2, ticks, cars): a neutral row, the history, the commands.
+        parts = [commands.new_zeros(len(like), 1, 2)] if past is None else [past.commands[:, :1], past.commands]
+        # (2, ticks, cars): what came before all that is known, the history, the commands.
         self.issued = torch.cat([*parts, commands], dim=1).permute(2, 1, 0).contiguous()
 
     @staticmethod
@@ -194,28 +214,23 @@ class _Batch:
 
     def run(self, measured: bool) -> Rollout:
         observers = self._observers()
-        latency_s = _latency_s(self.numbers, observers) if measured else 0.0
-        delays_s = _delays_s(self.numbers, self.config.effects)
-        plan = plan_period(self.period_s, delays_s, _plain(latency_s), self.max_step_s)
-        before = self.past if self.chain.has_memory else 0
+        latency_s = total_latency_s(self.numbers, observers) if measured else 0.0
+        delays_s = total_delays_s(self.numbers, self.config.effects)
+        plan = plan_period(self.period_s, delays_s, plain_number(latency_s), self.max_step_s)
+        before = self.past if self.chain.has_memory or self.model.extra_states else 0
         acting = [tuple(map(self._local, pair)) for pair in self._acting(plan, before)]
         pieces = [_Stretch.of(piece, self._local) for piece in plan.pieces]
 
         lag_s = self._velocity_lag_s(observers) if measured else None
-        zero = self._local(torch.zeros_like(self.rows[0]))
-        memory = self.chain.settled((zero, zero))
-        for k in range(before):
-            for piece, commands in zip(pieces, acting, strict=True):
-                _, memory = self.chain.step((commands[0][k], commands[1][k]), memory, piece.length_s)
-
-        state: State = (*map(self._local, self.rows), *((zero,) * len(self.model.extra_states)))
-        now = _Moment(state, memory, state[3:6])
-        trajectory, captured = [state[:6]], []
+        body: State = tuple(map(self._local, self.rows))
+        extra, memory = self._before_the_start(body, pieces, acting, before)
+        now = _Moment((*body, *extra), memory, body[3:6])
+        trajectory, captured = [body], []
         for k in range(self.ticks):
             seen = now.state[:6]
             for piece, commands in zip(pieces, acting, strict=True):
                 held = (commands[0][before + k], commands[1][before + k])
-                t_s = k * self.period_s + piece.start_s
+                t_s = self.t0_s + k * self.period_s + piece.start_s
                 after = self._advance(t_s, now, held, piece.step_s, piece.steps, lag_s)
                 if measured and piece.looks is not False:
                     look_s, steps = piece.look_step_s, piece.look_steps
@@ -233,6 +248,35 @@ class _Batch:
         for effect, values in observers:
             looked = effect.observe(ops, looked, {n: self._row(v, self.rows[0]) for n, v in values.items()})
         return Rollout(states, torch.stack(looked).permute(2, 1, 0))
+
+    def _before_the_start(
+        self, start: State, pieces: list[_Stretch], acting: list[tuple[Value, ...]], before: int
+    ) -> tuple[State, ActuatorState]:
+        """Hidden states of the body and of the actuators at the first tick, carried through the history.
+
+        They begin settled. The body moves as ``past_rows`` say, or at the velocities of the start.
+        """
+        oldest = tuple(self._local(row) for row in self.issued[:, 0])
+        memory = self.chain.settled((oldest[0], oldest[1]))
+        if not self.model.extra_states:
+            for k in range(before):
+                for piece, commands in zip(pieces, acting, strict=True):
+                    _, memory = self.chain.step((commands[0][k], commands[1][k]), memory, piece.length_s)
+            return (), memory
+        ticks = [*self.past_rows[-before:], start] if self.past_rows and before else [start] * (before + 1)
+        t_s = self.t0_s - before * self.period_s
+        actuation = self.model.actuation(*self.chain.settled_output((oldest[0], oldest[1])))
+        extra = self.model.settled(t_s, ticks[0], actuation)
+        for k in range(before):
+            for piece, commands in zip(pieces, acting, strict=True):
+                share = piece.start_s * (1.0 / self.period_s)
+                body = tuple(a + (b - a) * share for a, b in zip(ticks[k], ticks[k + 1], strict=True))
+                moment = _Moment((*body, *extra), memory, body[3:6])
+                held = (commands[0][k], commands[1][k])
+                begin_s = t_s + k * self.period_s + piece.start_s
+                moment = self._advance(begin_s, moment, held, piece.step_s, piece.steps, None)
+                extra, memory = moment.state[6:], moment.memory
+        return extra, memory
 
     def _advance(
         self, t_s: Value, now: _Moment, held: tuple[Value, Value], step_s: Value, steps: int, lag_s: Value | None
@@ -307,12 +351,8 @@ class _Batch:
 
 def filter_velocities(ops: Ops, output: State, first: State, last: State, step_s: Value, lag_s: Value) -> State:
     """First-order filter over one step, exact for an input that goes from ``first`` to ``last`` in a straight line."""
-    span = step_s / ops.floor(lag_s, 1e-15)
-    decay = ops.exp(-span)
-    ramp = 1.0 - (1.0 - decay) / ops.floor(span, 1e-15)
-    return tuple(
-        y * decay + (1.0 - decay) * u0 + ramp * (u1 - u0) for y, u0, u1 in zip(output, first, last, strict=True)
-    )
+    weights = lag_weights(ops, lag_s, 2.0 * step_s)
+    return tuple(weights.after_half(y, u0, u1) for y, u0, u1 in zip(output, first, last, strict=True))
 
 
 def _arrays_are_faster(start: torch.Tensor) -> bool:
@@ -324,51 +364,3 @@ def _either(which: bool | torch.Tensor, yes: torch.Tensor, no: torch.Tensor) -> 
     if isinstance(which, bool):
         return yes if which else no
     return torch.where(which, yes, no)
-
-
-def _plain(value: Number) -> Number:
-    """A number where a tensor holds one without a gradient, or the same for all cars."""
-    if isinstance(value, torch.Tensor) and not value.requires_grad:
-        first = value.reshape(-1)[0] if value.numel() else value.new_zeros(())
-        if bool((value == first).all()):
-            return float(first)
-    return value
-
-
-def _delays_s(numbers: Mapping[str, Number], effects: Iterable[str]) -> tuple[Number, Number]:
-    steering = throttle = numbers["timing.command_delay"]
-    for effect in (EFFECTS[name] for name in effects):
-        if isinstance(effect, DelayEffect):
-            own = {p.name: numbers[f"effects.{effect.id}.{p.name}"] for p in effect.parameters}
-            extra_steering, extra_throttle = effect.extra_delays_s(own)
-            steering, throttle = steering + extra_steering, throttle + extra_throttle
-    for channel, delay in (("steering", steering), ("throttle", throttle)):
-        if bool((delay < 0).any()) if isinstance(delay, torch.Tensor) else delay < 0:
-            raise ConfigError(f"The delay of {channel} adds up to less than 0 s; raise command_delay or extra_delay.")
-    return _plain(steering), _plain(throttle)
-
-
-def _latency_s(
-    numbers: Mapping[str, Number], observers: Iterable[tuple[ObservationEffect, dict[str, Number]]]
-) -> Number:
-    latency = numbers["mocap.latency"]
-    for effect, values in observers:
-        if (instead := effect.latency_s(values)) is not None:
-            latency = instead
-    return latency
-
-
-def _with_effects_of(config: SimulatorConfig, given: Mapping[str, Number]) -> SimulatorConfig:
-    named = {name.split(".")[1] for name in given if name.startswith("effects.")}
-    missing = named - set(config.effects)
-    return replace(config, effects={**config.effects, **{name: {} for name in sorted(missing)}}) if missing else config
-
-
-def _check_shapes(start: torch.Tensor, commands: torch.Tensor, history: torch.Tensor | None) -> int:
-    cars = int(start.shape[0])
-    if start.ndim != 2 or start.shape[1] != 6:
-        raise DataError(f"start has shape {tuple(start.shape)}; it must be (cars, 6).")
-    for name, sequence in (("commands", commands), ("history", history)):
-        if sequence is not None and (sequence.ndim != 3 or sequence.shape[0] != cars or sequence.shape[2] != 2):
-            raise DataError(f"{name} has shape {tuple(sequence.shape)}; it must be ({cars}, ticks, 2).")
-    return cars

@@ -12,10 +12,10 @@ from typing import Any, Literal, Self, get_args
 from carlab.core.errors import ConfigError
 from carlab.core.tables import check_keys
 from sim_backends.effects import EFFECTS, DelayEffect
-from sim_backends.registry import REGISTRY, section
+from sim_backends.effects.base import GRAVITY_MPS2
+from sim_backends.registry import REGISTRY, ParameterInfo, section
 
 ModelKind = Literal["dynamic", "linear_tyre", "kinematic", "blend"]
-GRAVITY_MPS2 = 9.81
 TABLES = ("vehicle", "tyre", "motor", "steering", "timing", "model", "mocap", "effects")
 """Tables of a car file that describe the simulator; a real car's ``[hardware]`` is not among them."""
 
@@ -61,7 +61,8 @@ class MocapParameters:
 class SimulatorConfig:
     """A whole simulator: parameters, timing, kind of model, motion capture, effects, and what is known of each.
 
-    ``effects`` maps ids of the catalogue to their parameters (all of them, in SI units); ``priors`` maps dotted
+    ``effects`` maps ids of the catalogue to their parameters (all of them, in SI units; a choice may be given by its
+    word and is kept as its position); ``priors`` maps dotted
     names to (low, high) where the car file gives a range. Building one checks it: ConfigError says what is wrong.
     """
 
@@ -83,7 +84,7 @@ class SimulatorConfig:
             known = section(f"effects.{effect_id}")
             check_keys(given, known, f"[effects.{effect_id}]")
             complete[effect_id] = {
-                name: float(given[name]) if name in given else self._default_of(info.name, info.default)
+                name: info.number(given[name]) if name in given else self._default_of(info)
                 for name, info in known.items()
             }
         object.__setattr__(self, "effects", complete)
@@ -97,8 +98,10 @@ class SimulatorConfig:
             if delay_s < 0.0:
                 raise ConfigError(f"The delay of {channel} adds up to {delay_s:g} s; raise command_delay to 0 or more.")
 
-    def _default_of(self, name: str, default: float | None) -> float:
-        return self.mocap.latency_s if default is None else default
+    def _default_of(self, info: ParameterInfo) -> float:
+        if info.default is not None:
+            return info.default
+        return float(getattr(self._owner(info.same_as), _FIELD_OF[info.same_as]))
 
     def values(self) -> dict[str, float]:
         """Every number of this simulator by its dotted name: the base ones, and those of the effects it has."""
@@ -158,6 +161,8 @@ class SimulatorConfig:
             known = section(prefix)
             check_keys(table, known, f"[{prefix}] of {where}")
             for key, entry in table.items():
+                if known[key].choices:
+                    entry = known[key].number(entry, where)
                 values[f"{prefix}.{key}"], prior = _number(entry, f"'{key}' in [{prefix}] of {where}")
                 if prior is not None:
                     priors[f"{prefix}.{key}"] = prior
@@ -182,6 +187,8 @@ class SimulatorConfig:
             if name in self.priors:
                 low, high = self.priors[name]
                 table[key] = {"value": value, "low": low, "high": high}
+            elif choices := REGISTRY[name].choices:
+                table[key] = choices[int(value)]
             else:
                 table[key] = value
         tables["model"] = {"kind": self.kind}

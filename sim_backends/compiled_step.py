@@ -20,7 +20,7 @@ from sim_backends.car_parameters import ModelKind
 from sim_backends.integrate import rk4_step
 from sim_backends.registry import REGISTRY
 from sim_backends.single_track import Actuation, SingleTrack
-from sim_backends.tracing import Node, Tracer, gradients
+from sim_backends.tracing import Node, Tracer, fold, gradients
 
 FloatRow = NDArray[np.floating[Any]]
 _NUMPY = {
@@ -74,6 +74,8 @@ class Graph:
 
 
 def _apply(ops: Ops, operation: str, arguments: list[Value]) -> Value:
+    if all(isinstance(a, float) for a in arguments):  # of the step's length alone
+        return fold(operation, *arguments)
     match operation:
         case "add":
             return arguments[0] + arguments[1]
@@ -87,11 +89,17 @@ def _apply(ops: Ops, operation: str, arguments: list[Value]) -> Value:
             return -arguments[0]
         case "maximum":
             return ops.floor(arguments[0], arguments[1])
+        case "minimum":
+            return -ops.floor(-arguments[0], -arguments[1])
+        case "less":
+            return arguments[0] < arguments[1]
+        case "less_equal":
+            return arguments[0] <= arguments[1]
         case _:
             return getattr(ops, operation)(*arguments)
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=256)
 def trace_step(kind: ModelKind, effects: tuple[str, ...], held: bool) -> Graph:
     """Trace one step. With ``held`` the actuation is the same at its start, middle and end.
 
@@ -128,6 +136,21 @@ Step = Callable[[Sequence[Value], Sequence[FloatRow], Sequence[FloatRow], Sequen
 """Inputs, buffers, outputs and constants of a generated function."""
 
 
+_SHARED = threading.local()
+_SIZES_KEPT = 4
+
+
+def _shared_buffers(count: int, cars: int, dtype: np.dtype[Any]) -> list[FloatRow]:
+    """Scratch rows of this thread, the same for every function: only one of them runs at a time."""
+    pools: dict[tuple[int, np.dtype[Any]], list[FloatRow]] = _SHARED.__dict__.setdefault("pools", {})
+    pool = pools.pop((cars, dtype), [])
+    pool += [np.empty(cars, dtype) for _ in range(count - len(pool))]
+    pools[cars, dtype] = pool
+    while len(pools) > _SIZES_KEPT:
+        del pools[next(iter(pools))]
+    return pool[:count]
+
+
 @dataclass(frozen=True, slots=True)
 class Code:
     """Generated functions for few and for many cars, and the scratch memory that they work in."""
@@ -148,22 +171,21 @@ class Code:
         in_place = cars > FEW_CARS
         kept = getattr(self._scratch, "kept", None)
         if kept is None or kept[0] != (cars, dtype, in_place):
-            count = self.buffers_many if in_place else self.buffers_few
-            buffers = [np.empty(cars, dtype) for _ in range(count)]
+            buffers = _shared_buffers(self.buffers_many if in_place else self.buffers_few, cars, dtype)
             constants = [np.full(cars if row else (), value, dtype) for value, row in self.constants]
             kept = ((cars, dtype, in_place), buffers, constants)
             self._scratch.kept = kept
         (self.many if in_place else self.few)(inputs, kept[1], outputs, kept[2])
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=256)
 def compile_step(kind: ModelKind, effects: tuple[str, ...], held: bool) -> Code:
     """The step: inputs are those that are fixed and those that vary, outputs the rows of the new state."""
     graph = trace_step(kind, effects, held)
     return _generate([*graph.fixed, *graph.varying], graph.outputs)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=512)
 def compile_gradient(kind: ModelKind, effects: tuple[str, ...], held: bool, wanted: tuple[bool, ...]) -> Code:
     """The derivative of the step: inputs are those of the step, then one seed for each of its outputs.
 

@@ -9,6 +9,7 @@ from typing import Protocol
 from sim_backends.actuators import ActuatorChain, ActuatorState
 from sim_backends.array_ops import Value
 from sim_backends.single_track import Actuation, SingleTrack, State
+from sim_backends.stiff_step import StiffStep
 
 MAX_STEP_S = 0.01
 """Longest Runge-Kutta step [s]: the model's fastest eigenvalue at rest is about -76 1/s."""
@@ -25,7 +26,7 @@ def rk4_step(
     """One classical fourth-order Runge-Kutta step with the actuation given at its start, middle and end.
 
     ``step_s`` is a number or one per car. Where no effect depends on the place, x and y are not carried through the
-    stages: they are pure integrals.
+    stages: they are pure integrals. Stiff states of effects are stepped by ``StiffStep``.
     """
     ops = model.ops
     half_s = 0.5 * step_s
@@ -35,14 +36,16 @@ def rk4_step(
     def ahead(rates: State, by_s: Value) -> State:
         return (*fixed, *(ops.fma(by_s, k, s) for s, k in zip(state[first:], rates[first:], strict=True)))
 
-    k1 = model.derivative(t_s, state, start)
-    k2 = model.derivative(t_s + half_s, ahead(k1, half_s), middle)
-    k3 = model.derivative(t_s + half_s, ahead(k2, half_s), middle)
-    k4 = model.derivative(t_s + step_s, ahead(k3, step_s), end)
+    stiff = StiffStep(model, t_s, state, step_s, (start, middle, end)) if model.hooks.stiff else None
+    k1 = model.derivative(t_s, state, start, stiff)
+    k2 = model.derivative(t_s + half_s, ahead(k1, half_s), middle, stiff)
+    k3 = model.derivative(t_s + half_s, ahead(k2, half_s), middle, stiff)
+    k4 = model.derivative(t_s + step_s, ahead(k3, step_s), end, stiff)
     sixth_s = step_s / 6.0
-    return tuple(
+    after = tuple(
         ops.fma(sixth_s, ops.fma(2.0, b + c, a + d), s) for s, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
     )
+    return after if stiff is None else stiff.finish(after)
 
 
 class Stepper(Protocol):

@@ -54,11 +54,8 @@ class Plant:
         self._model = SingleTrack(FLOATS, config.kind, values, config.effects)
         self._chain = ActuatorChain(FLOATS, values, config.effects)
         self._delays_s = config.delays_s()
-        self._observers = [
-            (effect, config.effects[effect.id])
-            for effect in (EFFECTS[name] for name in config.effects)
-            if isinstance(effect, ObservationEffect)
-        ]
+        observers = (e for e in (EFFECTS[name] for name in config.effects) if isinstance(e, ObservationEffect))
+        self._observers = [(e, config.effects[e.id]) for e in sorted(observers, key=lambda e: (e.order, e.id))]
         self._t_s = self._start_s = 0.0
         self._state: State = (0.0,) * 6
         self._memory: ActuatorState = ()
@@ -68,9 +65,11 @@ class Plant:
         self.reset(CarState(), 0.0)
 
     def reset(self, state: CarState, t_s: float) -> None:
-        """Put the car at ``state`` at ``t_s`` with neutral commands acting and none on its way."""
+        """Put the car at ``state`` at ``t_s`` with neutral commands acting, none on its way, all else settled."""
         self._t_s = self._start_s = t_s
-        self._state = (*(float(v) for v in astuple(state)), *((0.0,) * len(self._model.extra_states)))
+        body = tuple(float(v) for v in astuple(state))
+        neutral = self._model.actuation(*self._chain.settled_output((0.0, 0.0)))
+        self._state = (*body, *self._model.settled(0.0, body, neutral))
         self._acting = [0.0, 0.0]
         self._memory = self._chain.settled((0.0, 0.0))
         for queue in self._pending:

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from carlab.core.errors import ConfigError
 from sim_backends.effects import EFFECTS
 
 
@@ -17,8 +18,8 @@ from sim_backends.effects import EFFECTS
 class ParameterInfo:
     """One number of the car file.
 
-    ``default`` is what a file without it means; None for a latency that the car file gives elsewhere. ``positive``
-    says that ``low`` itself is not allowed.
+    ``default`` is what a file without it means; None where that is the number named by ``same_as``. ``positive`` says
+    that ``low`` itself is not allowed. A choice among ``choices`` is a word in car files and its position elsewhere.
     """
 
     name: str
@@ -28,9 +29,22 @@ class ParameterInfo:
     high: float
     positive: bool = False
     field: str = ""
+    same_as: str = ""
+    choices: tuple[str, ...] = ()
+
+    def number(self, value: object, where: str = "the simulator") -> float:
+        """The number for what a car file says: itself, or the position of a choice. Raises ConfigError."""
+        if isinstance(value, str) and value in self.choices:
+            return float(self.choices.index(value))
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            expected = f"one of {', '.join(map(repr, self.choices))}" if self.choices else "a number"
+            raise ConfigError(f"{self.name} of {where} must be {expected}, not {value!r}.")
+        return float(value)
 
     def problem(self, value: float) -> str | None:
         """What is impossible about ``value`` and what to do; None where nothing is."""
+        if self.choices and value not in range(len(self.choices)):
+            return f"{self.name} is {value:g}; it must be one of {', '.join(self.choices)}, by position from 0."
         if math.isnan(value) or (math.isinf(value) and not self.name.startswith("effects.")):
             return f"{self.name} is {value}; give a finite number in {self.unit}."
         if value < self.low or (self.positive and value <= self.low):
@@ -69,7 +83,16 @@ _BASE = (
 def _effect_parameters() -> Iterator[ParameterInfo]:
     for effect in EFFECTS.values():
         for p in effect.parameters:
-            yield ParameterInfo(f"effects.{effect.id}.{p.name}", p.unit, p.identity, p.low, p.high)
+            yield ParameterInfo(
+                f"effects.{effect.id}.{p.name}",
+                p.unit,
+                p.identity,
+                p.low,
+                p.high,
+                p.positive,
+                same_as=p.same_as,
+                choices=p.choices,
+            )
 
 
 REGISTRY: dict[str, ParameterInfo] = {info.name: info for info in (*_BASE, *_effect_parameters())}

@@ -95,6 +95,7 @@ def _split(delay_s: float, period_s: float) -> tuple[int, float]:
 
 
 def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: Number, max_step_s: float) -> PeriodPlan:
+    shared = delays_s[0] is delays_s[1]
     like = next(v for v in (*delays_s, latency_s) if isinstance(v, torch.Tensor))
     steering, throttle, latency = (
         torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in (*delays_s, latency_s)
@@ -105,24 +106,29 @@ def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: N
     phases = [steering - whole[0] * period_s, throttle - whole[1] * period_s]
     look = period_s - (latency - whole[2] * period_s)
     distinct = [phases[0]]
-    if not torch.equal(phases[0].detach(), phases[1].detach()) or phases[1].requires_grad != phases[0].requires_grad:
+    # Two delays that are equal now may still depend on different numbers.
+    differentiable = phases[0].requires_grad or phases[1].requires_grad
+    if not shared and (differentiable or not torch.equal(phases[0], phases[1])):
         distinct.append(phases[1])
-    ends = torch.cat([torch.stack(distinct).sort(dim=0).values, torch.full_like(look, period_s)[None]])
+    sorted_phases, order = torch.stack(distinct).sort(dim=0, stable=True)
+    # Which command is taken over first; two that are taken over together still have a piece of no length between.
+    places = [order.argsort(dim=0)[channel % len(distinct)] for channel in range(2)]
+    ends = torch.cat([sorted_phases, torch.full_like(look, period_s)[None]])
     starts = torch.cat([torch.zeros_like(look)[None], ends[:-1]])
     pieces = []
-    for start, end in zip(starts, ends, strict=True):
+    for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
         length = end - start
         longest_s = float(length.detach().max())
-        if longest_s <= 0.0:
+        if longest_s <= 0.0 and not length.requires_grad:
             continue
         looks = (look.detach() > start.detach()) & (look.detach() <= end.detach())
         after = torch.where(looks, look - start, torch.zeros_like(look)) if bool(looks.any()) else None
         pieces.append(
             Piece(
-                start.detach(),
+                start,
                 length,
                 substeps_for(longest_s, max_step_s),
-                (phases[0].detach() <= start.detach(), phases[1].detach() <= start.detach()),
+                (places[0] < index, places[1] < index),
                 looks if after is not None else False,
                 after,
                 0 if after is None else substeps_for(float(after.detach().max()), max_step_s),

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from sim_backends.array_ops import Ops, Value
 from sim_backends.car_parameters import GRAVITY_MPS2, ModelKind
-from sim_backends.effects import EFFECTS
-from sim_backends.effects.base import DynamicsEffect, Forces, Parameters
+from sim_backends.effect_hooks import EffectHooks
+from sim_backends.effects.base import Forces, StiffValues
 
 SLIP_FLOOR_MPS = 0.3
 """Least speed in the denominator of the slip angle [m/s]."""
@@ -24,6 +24,8 @@ RELAXATION_S = 0.05
 """Time constant with which the kinematic car's side speed and yaw rate settle [s]."""
 BLEND_FROM_MPS, BLEND_OVER_MPS = 0.3, 0.2
 """The blend is kinematic below the first speed and dynamic above their sum, by speed over ground [m/s]."""
+
+AXLES = ("front", "rear")
 
 State = tuple[Value, ...]
 """x, y, yaw, vx, vy, yaw rate, then the extra states of effects; each shape () or (cars,)."""
@@ -49,26 +51,23 @@ class SingleTrack:
     """
 
     def __init__(self, ops: Ops, kind: ModelKind, values: Mapping[str, Value], effects: Iterable[str] = ()) -> None:
-        chosen = [EFFECTS[effect_id] for effect_id in effects]
-        dynamics = sorted((e for e in chosen if isinstance(e, DynamicsEffect)), key=lambda e: (e.order, e.id))
-        own: dict[str, Parameters] = {
-            e.id: {p.name: values[f"effects.{e.id}.{p.name}"] for p in e.parameters} for e in dynamics
-        }
-        self._hooks = {
-            name: [(getattr(e, name), own[e.id]) for e in dynamics if _overrides(e, name)]
-            for name in ("on_load", "on_grip", "on_drive", "on_tyre", "on_body")
-        }
-        self._has_hooks = any(self._hooks.values())
-        self._changes_tyre_input = bool(self._hooks["on_load"] or self._hooks["on_grip"])
+        self.hooks = EffectHooks(ops, values, effects)
+        self._has_hooks = self.hooks.any
+        self.extra_states = self.hooks.states
+        self.needs_position = self.hooks.needs_position
+        tyre = {f"{axle}.{name}": values[f"tyre.{axle}.{name}"] for axle in AXLES for name in ("mu", "B", "C")}
+        if kind in ("kinematic", "linear_tyre") and "tyre_saturation" in self.hooks.values:
+            kind, own = "dynamic", self.hooks.values["tyre_saturation"]
+            tyre = {f"{axle}.{name}": own[f"{name}_{axle}"] for axle in AXLES for name in ("mu", "B", "C")}
         self.ops = ops
-        self.kind = kind
+        self.kind: ModelKind = kind
         self.mass = values["vehicle.mass"]
         self.inertia = values["vehicle.yaw_inertia"]
         self.front_axle, self.rear_axle = values["vehicle.front_axle"], values["vehicle.rear_axle"]
         self.drive_gain, self.damping = values["motor.drive_gain"], values["motor.damping"]
-        self.front_b, self.front_c = values["tyre.front.B"], values["tyre.front.C"]
-        self.rear_b, self.rear_c = values["tyre.rear.B"], values["tyre.rear.C"]
-        self.front_mu, self.rear_mu = values["tyre.front.mu"], values["tyre.rear.mu"]
+        self.front_b, self.front_c = tyre["front.B"], tyre["front.C"]
+        self.rear_b, self.rear_c = tyre["rear.B"], tyre["rear.C"]
+        self.front_mu, self.rear_mu = tyre["front.mu"], tyre["rear.mu"]
         wheelbase = self.front_axle + self.rear_axle
         self.front_load = self.mass * GRAVITY_MPS2 * self.rear_axle / wheelbase
         self.rear_load = self.mass * GRAVITY_MPS2 * self.front_axle / wheelbase
@@ -84,46 +83,69 @@ class SingleTrack:
             self.per_mass = 1.0
         self.front_stiffness = self.front_b * self.front_c
         self.rear_stiffness = self.rear_b * self.rear_c
-        self.needs_position = any(e.needs_position for e in dynamics)
-        self.extra_states: tuple[str, ...] = tuple(f"{e.id}.{name}" for e in dynamics for name in e.states)
 
     def actuation(self, angle: Value, throttle: Value) -> Actuation:
         """Bundle a wheel angle [rad] and a throttle with the angle's sine and cosine."""
         return Actuation(angle, self.ops.sin(angle), self.ops.cos(angle), throttle)
 
-    def derivative(self, t_s: Value, state: State, actuation: Actuation) -> State:
+    def derivative(self, t_s: Value, state: State, actuation: Actuation, stiff: StiffValues | None = None) -> State:
         """Time derivative of ``state``, in the same order and shapes."""
+        return self.evaluate(t_s, state, actuation, stiff)[0]
+
+    def settled(self, t_s: Value, body: State, actuation: Actuation) -> State:
+        """The extra states after the body has moved at its first six values, driven as given, for ever."""
+        if not self.extra_states:
+            return ()
+        _, forces = self.evaluate(t_s, body, actuation, settle=True)
+        found = {} if forces is None else forces.states
+        return tuple(found.get(name, 0.0 * body[3]) for name in self.extra_states)
+
+    def evaluate(
+        self,
+        t_s: Value,
+        state: State,
+        actuation: Actuation,
+        stiff: StiffValues | None = None,
+        settle: bool = False,
+    ) -> tuple[State, Forces | None]:
+        """The derivative and, where there are effects of the dynamics, all forces.
+
+        Args:
+            t_s: Time [s].
+            state: State; with ``settle`` its first six values.
+            actuation: What drives the car.
+            stiff: Within a step that treats stiff states: what stands in their place.
+            settle: Find the extra states at which they stay, instead of reading them.
+        """
         ops = self.ops
         _, _, yaw, vx, vy, r = state[:6]
-        angle, sin_d, cos_d, throttle = actuation
+        _, sin_d, cos_d, throttle = actuation
         drive = self.drive_gain * throttle
         forces: Forces | None = None
-        if self._has_hooks:
-            forces = self._forces(t_s, state, angle, throttle, drive)
-            drive = forces.drive
-        force_x = ops.fms(self.damping, vx, drive)
-        side_front: Value = 0.0
-        side_rear: Value = 0.0
+        front_shape: Value = 0.0
+        rear_shape: Value = 0.0
         if self.kind != "kinematic":
-            side_front, side_rear = self._side_forces(vx, vy, r, sin_d, cos_d, forces)
-        push: Forces | None = None
-        if forces is not None and self._hooks["on_body"]:
-            push = forces
-            push.side_front, push.side_rear, push.force_x = side_front, side_rear, force_x
-            for hook, values in self._hooks["on_body"]:
-                hook(ops, push, values)
-            force_x = push.force_x
+            front_shape, rear_shape = self._side_shapes(vx, vy, r, sin_d, cos_d)
+        if self._has_hooks:
+            forces = self._forces(t_s, state, actuation, drive, stiff)
+            if self.kind != "kinematic" and self.hooks.has_transfer:
+                forces.front_per_load = front_shape
+            self.hooks.before_tyres(forces, self.damping, settle)
+            force_x = forces.force_x
+        else:
+            force_x = ops.fms(self.damping, vx, drive)
 
         accelerations: State
         if self.kind == "kinematic":
             accelerations = self._kinematic(force_x, vx, vy, r, sin_d, cos_d)
         else:
+            side_front, side_rear = self._side_forces(front_shape, rear_shape, forces, settle)
             front_across = side_front * cos_d
             force_y = front_across + side_rear
             yaw_acceleration = ops.fms(self.rear_arm, side_rear, self.front_arm * front_across)
-            if push is not None:
-                force_y = force_y + push.force_y
-                yaw_acceleration = yaw_acceleration + self.per_inertia * push.moment
+            if forces is not None:
+                force_y = force_y + forces.force_y
+                yaw_acceleration = yaw_acceleration + self.per_inertia * forces.moment
             accelerations = (
                 ops.fma(vy, r, ops.fms(side_front, sin_d, force_x) * self.per_mass),
                 ops.fms(vx, r, force_y * self.per_mass),
@@ -141,14 +163,14 @@ class SingleTrack:
             r,
             *accelerations,
         )
-        if forces is not None and self.extra_states:
-            return (*rates, *(forces.rates[name] for name in self.extra_states))
-        return rates
+        if forces is None or not self.extra_states:
+            return rates, forces
+        self.hooks.on_motion(forces, accelerations[0])
+        still = 0.0 * vx  # a state that nothing moves: a kinematic car's tyres, or one that is stepped elsewhere
+        return (*rates, *(forces.rates.get(name, still) for name in self.extra_states)), forces
 
-    def _side_forces(
-        self, vx: Value, vy: Value, r: Value, sin_d: Value, cos_d: Value, forces: Forces | None
-    ) -> tuple[Value, Value]:
-        """Lateral force of each axle [N] in its wheels' frame, positive left."""
+    def _side_shapes(self, vx: Value, vy: Value, r: Value, sin_d: Value, cos_d: Value) -> tuple[Value, Value]:
+        """Lateral force of each axle as a share of the most that it can be, positive to the right."""
         ops = self.ops
         front = ops.fma(self.front_axle, r, vy)
         rear = ops.fms(self.rear_axle, r, vy)
@@ -156,22 +178,26 @@ class SingleTrack:
         across = ops.fms(vx, sin_d, front * cos_d)
         front_slip = ops.slope_angle(across, ops.floor(ops.abs(along), SLIP_FLOOR_MPS))
         rear_slip = ops.slope_angle(rear, ops.floor(ops.abs(vx), SLIP_FLOOR_MPS))
+        if self.kind == "linear_tyre":
+            return self.front_stiffness * front_slip, self.rear_stiffness * rear_slip
+        return (
+            ops.sin(self.front_c * ops.atan(self.front_b * front_slip)),
+            ops.sin(self.rear_c * ops.atan(self.rear_b * rear_slip)),
+        )
+
+    def _side_forces(
+        self, front_shape: Value, rear_shape: Value, forces: Forces | None, settle: bool
+    ) -> tuple[Value, Value]:
+        """Lateral force of each axle [N] in its wheels' frame, positive left."""
+        if forces is None:
+            return self.front_peak * front_shape, self.rear_peak * rear_shape
         front_peak, rear_peak = self.front_peak, self.rear_peak
-        if forces is not None and self._changes_tyre_input:
+        if self.hooks.changes_tyre_input:
             front_peak = -forces.grip_front * forces.load_front
             rear_peak = -forces.grip_rear * forces.load_rear
-        if self.kind == "linear_tyre":
-            side_front = front_peak * (self.front_stiffness * front_slip)
-            side_rear = rear_peak * (self.rear_stiffness * rear_slip)
-        else:
-            side_front = front_peak * ops.sin(self.front_c * ops.atan(self.front_b * front_slip))
-            side_rear = rear_peak * ops.sin(self.rear_c * ops.atan(self.rear_b * rear_slip))
-        if forces is not None and self._hooks["on_tyre"]:
-            forces.side_front, forces.side_rear = side_front, side_rear
-            for hook, values in self._hooks["on_tyre"]:
-                hook(ops, forces, values)
-            side_front, side_rear = forces.side_front, forces.side_rear
-        return side_front, side_rear
+        forces.side_front, forces.side_rear = front_peak * front_shape, rear_peak * rear_shape
+        self.hooks.on_tyres(forces, settle)
+        return forces.side_front, forces.side_rear
 
     def _kinematic(
         self, force_x: Value, vx: Value, vy: Value, r: Value, sin_d: Value, cos_d: Value
@@ -189,9 +215,11 @@ class SingleTrack:
             (yaw_rate - r) * (1.0 / RELAXATION_S),
         )
 
-    def _forces(self, t_s: Value, state: State, angle: Value, throttle: Value, drive: Value) -> Forces:
+    def _forces(
+        self, t_s: Value, state: State, actuation: Actuation, drive: Value, stiff: StiffValues | None
+    ) -> Forces:
         x, y, yaw, vx, vy, r = state[:6]
-        forces = Forces(
+        return Forces(
             t_s=t_s,
             x=x,
             y=y,
@@ -199,8 +227,10 @@ class SingleTrack:
             vx=vx,
             vy=vy,
             yaw_rate=r,
-            wheel_angle=angle,
-            throttle=throttle,
+            wheel_angle=actuation.angle,
+            wheel_sin=actuation.sin,
+            wheel_cos=actuation.cos,
+            throttle=actuation.throttle,
             mass=self.mass,
             front_axle=self.front_axle,
             rear_axle=self.rear_axle,
@@ -209,13 +239,6 @@ class SingleTrack:
             grip_front=self.front_mu,
             grip_rear=self.rear_mu,
             drive=drive,
-            states=dict(zip(self.extra_states, state[6:], strict=True)),
+            states=dict(zip(self.extra_states, state[6:], strict=False)),
+            stiff=stiff,
         )
-        for name in ("on_load", "on_grip", "on_drive"):
-            for hook, values in self._hooks[name]:
-                hook(self.ops, forces, values)
-        return forces
-
-
-def _overrides(effect: DynamicsEffect, hook: str) -> bool:
-    return getattr(type(effect), hook) is not getattr(DynamicsEffect, hook)

@@ -17,6 +17,7 @@ class TorchOps:
     tanh = staticmethod(torch.tanh)
     sqrt = staticmethod(torch.sqrt)
     hypot = staticmethod(torch.hypot)
+    pow = staticmethod(torch.pow)
     abs = staticmethod(torch.abs)
     sign = staticmethod(torch.sign)
     exp = staticmethod(torch.exp)

@@ -88,6 +88,11 @@ _FOLD: dict[str, Callable[..., float]] = {
 }
 
 
+def fold(operation: str, *arguments: float) -> float:
+    """An operation on plain numbers."""
+    return _FOLD[operation](*arguments)
+
+
 @dataclass(eq=False, slots=True)
 class Tracer:
     """A graph under construction, and the functions that add to it (it is an ``Ops``)."""
@@ -108,7 +113,7 @@ class Tracer:
     def make(self, operation: str, *arguments: Any) -> Any:
         """The node of an operation: an equal one where there is, a number where all arguments are."""
         if not any(isinstance(a, Node) for a in arguments):
-            return _FOLD[operation](*arguments)
+            return fold(operation, *arguments)
         if (same := _neutral(operation, arguments)) is not None:
             return same
         if operation in ("add", "mul"):

@@ -43,6 +43,7 @@ class EmulatedWorld:
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
         self._pending = b""
+        self._asked = 0
 
     def open(self) -> None:
         """Start the process. Raises NotReadyError where it does not come up."""
@@ -64,7 +65,8 @@ class EmulatedWorld:
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """Send a request and return its answer. Raises NotOpenError, or NotReadyError where no answer comes."""
-        return self._ask(request, ANSWER_TIMEOUT_S)
+        self._asked += 1
+        return self._ask({**request, "id": self._asked}, ANSWER_TIMEOUT_S)
 
     def close(self) -> None:
         """Tell the process to leave, and wait for it. Idempotent."""
@@ -92,10 +94,13 @@ class EmulatedWorld:
             assert self._process.stdout is not None
             try:
                 self._process.stdin.write(json.dumps(request).encode() + b"\n")
-                line = self._read_line(self._process.stdout.fileno(), timeout_s)
-            except OSError as error:
+                answer = json.loads(self._read_line(self._process.stdout.fileno(), timeout_s))
+                while answer.pop("id", None) != request.get("id"):  # an earlier one that came too late
+                    answer = json.loads(self._read_line(self._process.stdout.fileno(), timeout_s))
+            except NotReadyError:
+                raise
+            except (OSError, ValueError) as error:
                 raise NotReadyError("The emulated car's world has ended", [str(error)]) from error
-        answer = json.loads(line)
         if "error" in answer:
             raise NotReadyError("The emulated car's world", [answer["error"]])
         return dict(answer)
@@ -169,10 +174,17 @@ class EmulatedCar(Car):
             return
         if self._actuator == "can" and not self._config.can_channel:
             self._config = dataclasses.replace(self._config, can_channel=f"{MULTICAST_GROUP}:{free_udp_port()}")
-        world = EmulatedWorld(self._config)
-        world.open()
-        self._world = world
-        there = world.addresses
+        self._world = EmulatedWorld(self._config)
+        try:
+            self._world.open()
+            self._car = self._driver(self._world.addresses)
+            self._car.open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _driver(self, there: Mapping[str, Any]) -> HardwareCar:
+        """The car as the driver of a real one would be, at the addresses of the world."""
         options: dict[str, Any] = {"kind": "vesc_serial", "port": there["port"]}
         if self._actuator == "can":
             options = {"kind": "vesc_can", "interface": "udp_multicast", "channel": there["can_channel"]}
@@ -183,7 +195,7 @@ class EmulatedCar(Car):
             bitstream=self._config.bitstream,
             body=BODY_NAME,
         )
-        self._car = HardwareCar(
+        return HardwareCar(
             self.name,
             Actuator(ActuatorConfig(**(options | self._actuator_options)), ActuatorCalibration()),
             RigidBodyPoseSource(mocap),
@@ -191,11 +203,6 @@ class EmulatedCar(Car):
             reality=Reality.EMULATED,
             place=self._place,
         )
-        try:
-            self._car.open()
-        except BaseException:
-            self.close()
-            raise
 
     def observe(self) -> Observation:
         """The driver's."""

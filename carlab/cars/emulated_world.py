@@ -3,9 +3,9 @@
     actuator bytes (pty or CAN) ──> fake VESC ──> plant (physics, delays) ──> NatNet server ──> UDP frames
 
 Run as ``python -m carlab.cars.emulated_world``. The first line of standard input is the configuration, each further
-line a request; each gets one line of answer, all JSON, but for "leave", which ends the process. When standard input
-ends without it (its owner died), or the motor is still powered, the world stays until the firmware's own motor
-time-out has been seen, then leaves. It ignores ^C: its owner decides.
+line a request; each gets one line of answer with its "id", all JSON, but for "leave", which ends the process. When
+standard input ends without it (its owner died), or the motor is still powered, the world stays until the firmware's
+own motor time-out has been seen, then leaves. It ignores ^C: its owner decides.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ def main() -> int:
                     world.linger()
                 return 0
             for request in requests:
-                _say(world.answer(request))
+                _say({**world.answer(request), "id": request.get("id")})
         world.linger()
     finally:
         world.__exit__()

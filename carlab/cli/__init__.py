@@ -24,9 +24,13 @@ def run(argv: Sequence[str]) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "2")
     import tyro
 
-    from carlab.cli.console import fail, log_to_console
+    from carlab import __version__
+    from carlab.cli.console import console, fail, log_to_console
     from carlab.core.errors import CarlabError
 
+    if list(argv) == ["--version"]:
+        console.print(f"carlab {__version__}")
+        return 0
     verb = tyro.extras.subcommand_cli_from_dict(_verbs(), args=list(argv), prog="carlab", description=_DESCRIPTION)
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))
     try:
@@ -42,7 +46,8 @@ def run(argv: Sequence[str]) -> int:
         return 1
     except OSError as error:
         named = f"{error.filename}: " if error.filename else ""
-        fail(f"{named}{error.strerror or error}; check the path, its permissions and the disk.")
+        what = "the path, its permissions and the disk" if error.filename else "addresses, cables and permissions"
+        fail(f"{named}{error.strerror or error}; check {what}.")
         return 1
 
 

@@ -10,6 +10,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from carlab.cli.console import console, table
+from carlab.cli.options import above_zero
 
 
 @dataclass
@@ -32,6 +33,7 @@ class Bench:
         """Measure and print."""
         from carlab.experiment.speed import measure_speed
 
+        above_zero(seconds=self.seconds)
         figures = measure_speed(seconds=self.seconds, note=lambda text: console.print(text))
         rows = [[part, name, f"{value:.4g}"] for part, values in figures.items() for name, value in _flat(values)]
         table("Speed", ["part", "figure", "value"], rows)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from tyro.conf import OmitArgPrefixes
 
 from carlab.cli.console import banner, console, fail, table
-from carlab.cli.options import CarOptions
+from carlab.cli.options import CarOptions, above_zero
 from carlab.core.errors import NotReadyError
 
 UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM", "count": "", "flag": ""}
@@ -36,8 +36,9 @@ class Check:
         from carlab.cars.emulated_car import EmulatedCar
         from carlab.cars.latency import LatencyParts, measure_latency, measure_pose_latency
 
+        above_zero(seconds=self.seconds)
         choice = self.which_car.choose(seed=0)
-        banner(choice.car.reality, choice.car.name)
+        banner(choice.car.reality, choice.car.name, moves=False)
         with choice.car as car:
             latency: LatencyParts | None = None
             try:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from rich import box
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.panel import Panel
@@ -36,10 +37,12 @@ SENTENCES = {
 }
 
 
-def banner(reality: Reality, car: str) -> None:
-    """Say in capitals what is about to be driven."""
+def banner(reality: Reality, car: str, *, moves: bool = True) -> None:
+    """Say in capitals what is about to be driven, or (``moves`` off) only looked at."""
     word = "LIVE" if reality is Reality.REAL else reality.value.upper()
-    console.print(Panel(f"[bold]{word}[/bold]  {car}: {SENTENCES[reality]}", style=STYLES[reality], expand=False))
+    sentence = SENTENCES[reality] if moves or reality is not Reality.REAL else "opened and looked at; nothing will move"
+    text = Text.assemble((word, "bold"), f"  {car}: {sentence}")
+    console.print(Panel(text, style=STYLES[reality], expand=False))
 
 
 def fail(message: str) -> None:
@@ -48,13 +51,22 @@ def fail(message: str) -> None:
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: bool = True) -> None:
-    """Print a table; columns after the first are right-aligned where they are numbers."""
+    """Print a table, narrow enough for 80 columns; those after the first are right-aligned where they are numbers."""
     # Text, not str: "[m]" is a unit here and no mark-up.
-    made = Table(title=Text(title) if title else None, title_justify="left", header_style="bold")
+    made = Table(
+        title=Text(title, "bold") if title else None,
+        title_justify="left",
+        header_style="bold",
+        box=box.SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
+    )
     for index, column in enumerate(columns):
-        made.add_column(Text(column), justify="left" if index == 0 or not numeric else "right")
+        made.add_column(Text(column), justify="left" if index == 0 or not numeric else "right", overflow="fold")
     for row in rows:
         made.add_row(*(Text(cell) for cell in row))
+    if title:
+        console.print()
     console.print(made)
 
 

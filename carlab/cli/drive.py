@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
+import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
-from carlab.cli.console import banner, console, fail, progress, table
-from carlab.cli.options import CarOptions
-from carlab.core.errors import ConfigError
+from carlab.cli.console import console, fail, progress, table
+from carlab.cli.options import CarOptions, has_screen
+from carlab.cli.runs import ask_to_place, new_run, write_result
+from carlab.core.errors import ConfigError, NotReadyError
 
 if TYPE_CHECKING:
+    from carlab.core.clock import Clock
     from carlab.core.outcome import EndReason
     from carlab.core.policy import Policy
-    from carlab.core.quantities import CarState
     from carlab.experiment.session import EpisodeResult, SessionHooks
     from carlab.experiment.teleop_policy import TeleopPolicy
     from carlab.recording.run_directory import RunDirectory
@@ -38,6 +40,7 @@ PolicyName = Literal[
     "slow_circle",
 ]
 EXIT_SAFETY_STOP = 4
+KEY_THROTTLE = 0.4
 
 
 @dataclass
@@ -90,12 +93,8 @@ class Drive:
         """Drive and say how it went."""
         from carlab.core.task import TASKS
         from carlab.experiment.session import Session
-        from carlab.recording.run_directory import RunDirectory
 
-        if self.episodes < 1:
-            raise ConfigError(f"--episodes {self.episodes}: at least one.")
-        if self.ticks is not None and self.ticks < 1:
-            raise ConfigError(f"--ticks {self.ticks}: at least one.")
+        self._refuse_nonsense()
         choice = self.which_car.choose(seed=self.seed)
         envelope = choice.envelope
         task = TASKS[self.task]()
@@ -104,15 +103,12 @@ class Drive:
         if self.max_throttle is not None:
             envelope = replace(envelope, max_throttle=self.max_throttle)
         policy, teleop = self._policy(choice.simulator)
-        run = RunDirectory.create(self.out, self.name, config_toml=choice.config_toml)
-        choice.log_to(run.path)
-        banner(choice.car.reality, choice.car.name)
         with contextlib.ExitStack() as stack:
+            run = stack.enter_context(new_run(self.out, self.name, choice))
             if teleop is not None:
                 stack.enter_context(teleop)
             stack.enter_context(choice.car)
             bar = stack.enter_context(progress())
-            hooks = self._hooks(bar, run, teleop)
             session = Session(
                 choice.car,
                 policy,
@@ -123,12 +119,23 @@ class Drive:
                 seed=self.seed,
                 max_ticks=self.ticks if self.ticks is not None else (10**6 if teleop else None),
                 config_toml=choice.config_toml,
-                hooks=hooks,
+                hooks=self._hooks(bar, run, teleop, choice.car.clock),
                 place=self.place,
                 record_rerun=self.rerun,
             )
             results = session.drive(self.episodes)
         return self._report(results, run)
+
+    def _refuse_nonsense(self) -> None:
+        for name, value, least in (("episodes", self.episodes, 1), ("ticks", self.ticks, 1), ("seed", self.seed, 0)):
+            if value is not None and value < least:
+                raise ConfigError(f"--{name} {value}: at least {least}.")
+        if self.max_throttle is not None and not 0.0 < self.max_throttle <= 1.0:
+            raise ConfigError(f"--max-throttle {self.max_throttle:g}: above 0, at most 1.")
+        if self.task == "path" and self.policy == "parking":
+            raise ConfigError("The parking policy follows no path; choose another --policy for --task path.")
+        if self.policy == "keyboard" and not has_screen():
+            raise NotReadyError("Keyboard", ["its window needs a screen and there is none; use --policy gamepad."])
 
     def _policy(self, simulator: SimulatorConfig) -> tuple[Policy, TeleopPolicy | None]:
         from carlab.core.manoeuvres import MANOEUVRES
@@ -136,8 +143,10 @@ class Drive:
         from carlab.experiment.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
 
         if self.policy in ("keyboard", "gamepad"):
-            source = KeyboardSource() if self.policy == "keyboard" else GamepadSource()
-            teleop = TeleopPolicy(source, self.max_throttle or 1.0)
+            # A gamepad at full travel means the largest throttle; a key never means more than that either.
+            top = self.max_throttle or 1.0
+            source = KeyboardSource(min(KEY_THROTTLE / top, 1.0)) if self.policy == "keyboard" else GamepadSource()
+            teleop = TeleopPolicy(source, top)
             return teleop, teleop
         if self.policy == "neutral":
             return NeutralPolicy(), None
@@ -145,37 +154,34 @@ class Drive:
             return ReverseParkingPolicy.for_car(simulator), None
         return ManoeuvrePolicy(MANOEUVRES[self.policy]()), None
 
-    def _hooks(self, bar: object, run: RunDirectory, teleop: TeleopPolicy | None) -> SessionHooks:
-        from rich.progress import Progress, TaskID
-
+    def _hooks(self, bar: Progress, run: RunDirectory, teleop: TeleopPolicy | None, clock: Clock) -> SessionHooks:
+        from carlab.core.clock import MonotonicClock
         from carlab.core.documents import Tick
         from carlab.experiment.session import SessionHooks
 
-        assert isinstance(bar, Progress)
         rows: list[TaskID] = []
+        wall = MonotonicClock()
+        # A simulated car waits for nobody; one that is driven by hand must.
+        waits = teleop is not None and not isinstance(clock, MonotonicClock)
+        began_s = [0.0]
 
         def on_episode(number: int, ticks: int) -> None:
             rows.append(bar.add_task(f"episode {number}", total=ticks, note=""))
+            began_s[0] = wall.now_s() - clock.now_s()
 
         def on_tick(tick: Tick) -> None:
             state = tick.observation.state
             note = f"({state.x_m:+.2f}, {state.y_m:+.2f}) m  {state.speed_mps:.2f} m/s"
             bar.update(rows[-1], completed=tick.step + 1, note=note)
-
-        def place_by_hand(start: CarState) -> None:
-            text = f"Put the car at x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad"
-            if not sys.stdin.isatty():
-                raise ConfigError(f"{text}: nobody is at the keyboard to confirm it; use --no-place or a terminal.")
-            bar.stop()
-            console.input(f"{text}, step back and press Enter. ")
-            bar.start()
+            if waits:
+                wall.sleep_until(began_s[0] + tick.t_s)
 
         def on_abandon(reason: EndReason, detail: str) -> None:
             fail(f"{reason.value} {detail} The recording is in {run.path}.")
             os._exit(EXIT_SAFETY_STOP)
 
         return SessionHooks(
-            place_by_hand=place_by_hand,
+            place_by_hand=ask_to_place(bar, "use --no-place or a terminal"),
             on_episode=on_episode,
             on_tick=on_tick,
             on_abandon=on_abandon,
@@ -189,6 +195,7 @@ class Drive:
         if not results:
             console.print("No episode was driven.")
             return EXIT_INTERRUPTED
+        write_result(run, results)
         names = list(results[0].summary)
         rows = [
             [
@@ -210,8 +217,9 @@ class Drive:
 
             save_summary([read_episode(r.path) for r in results if r.path.exists()], run.path / "summary.png")
         first = results[0].path
-        console.print(f"Recorded in {run.path} (summary.png shows it). Look at an episode with:", soft_wrap=True)
-        console.print(f"  carlab view {first}", soft_wrap=True)
+        shown = " (summary.png shows it)" if self.picture else ""
+        console.print(f"Recorded in {run.path}{shown}. Look at an episode with:", soft_wrap=True, markup=False)
+        console.print(f"  carlab view {shlex.quote(str(first))}", soft_wrap=True, markup=False)
         last = results[-1].reason
         if last is EndReason.STOP_REQUESTED:
             return EXIT_INTERRUPTED
@@ -223,7 +231,7 @@ class Drive:
 def _heading(name: str) -> str:
     stem, _, unit = name.rpartition("_")
     units = {"m": "m", "rad": "rad", "mps": "m/s"}
-    return f"{stem.replace('_', ' ')} [{units[unit]}]" if unit in units else name.replace("_", " ")
+    return f"{stem.replace('_', ' ')}\n[{units[unit]}]" if unit in units else name.replace("_", " ")
 
 
 def _figure(name: str, value: float) -> str:

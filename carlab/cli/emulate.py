@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ipaddress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from carlab.cli.console import console
+from carlab.core.errors import ConfigError, NotReadyError
 
 
 @dataclass
@@ -54,18 +56,16 @@ class Emulate:
         """Serve until interrupted."""
         from carlab.cars import default_car, load_car_file
         from carlab.cars.emulated_world import World, WorldConfig
-        from carlab.core.errors import NotReadyError
         from carlab.experiment.interrupts import Interrupts
 
+        self._refuse_nonsense()
         file = default_car() if self.vehicle is None else load_car_file(self.vehicle)
-        if self.actuator == "serial" and self.port.exists() and not self.port.is_symlink():
-            raise NotReadyError(f"{self.port}", ["a file of that name is there already; choose another --port."])
         config = WorldConfig(
             simulator=file.simulator.to_tables(),
             actuator=self.actuator,
             seed=self.seed,
             log="" if self.log is None else str(self.log),
-            serial_link=str(self.port) if self.actuator == "serial" else "",
+            serial_link=str(self.port.absolute()) if self.actuator == "serial" else "",
             can_channel=self.can_channel,
             command_port=self.command_port,
             data_port=self.data_port,
@@ -83,8 +83,28 @@ class Emulate:
                 lines += ['kind = "vesc_can"', 'interface = "udp_multicast"', f'channel = "{there["can_channel"]}"']
             lines += ["[hardware.mocap]", 'server_address = "127.0.0.1"', 'local_interface = "127.0.0.1"']
             lines += [f'mode = "{self.mode}"', f"command_port = {there['command_port']}", f'body = "{config.body}"']
-            console.print("\n".join(lines), markup=False)
+            console.print("\n".join(lines), markup=False, soft_wrap=True)
             console.print("^C ends it.")
             while not interrupts.requested.wait(0.2):
                 pass
         return 0
+
+    def _refuse_nonsense(self) -> None:
+        for name, port in (("command-port", self.command_port), ("data-port", self.data_port)):
+            if not 0 <= port <= 65535:
+                raise ConfigError(f"--{name} {port}: 0 to 65535.")
+        if self.actuator == "can":
+            group, _, number = self.can_channel.partition(":")
+            try:
+                known = ipaddress.IPv4Address(group).is_multicast and 0 < int(number or 1) <= 65535
+            except ValueError:
+                known = False
+            if not known:
+                raise ConfigError(f"--can-channel {self.can_channel}: GROUP or GROUP:PORT such as 239.74.163.2:43113.")
+        elif not self.port.absolute().parent.is_dir():
+            raise ConfigError(f"--port {self.port}: its folder does not exist; make it or choose another one.")
+        elif self.port.exists():
+            # The link of one that was killed points nowhere and is replaced.
+            raise NotReadyError(
+                f"--port {self.port}", ["it is there already, of another carlab emulate perhaps; choose another name."]
+            )

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from carlab.cli.console import console
-from carlab.cli.options import required_file
+from carlab.cli.options import new_file, required_file
 from carlab.cli.recordings import is_csv, print_findings
-from carlab.core.errors import ConfigError, DataError
+from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.recording.csv_mapping import ColumnMapping
@@ -141,20 +141,25 @@ class Import:
         required_file(self.recording, "The recording")
         if not is_csv(self.recording):
             raise ConfigError(f"{self.recording} is not a .csv or .csv.gz; carlab import reads those.")
+        stem = self.recording.name.removesuffix(".gz").removesuffix(".csv")
+        out = self.out if self.out is not None else self.recording.with_name(f"{stem}.mcap")
+        new_file(out, "--out", ".mcap")
         imported = import_csv(self.recording, mapping=self._mapping())
         console.print(imported.announcement)
         print_findings(imported.report)
         if self.report is not None:
             self.report.write_text(json.dumps(imported.report.to_dict(), indent=2) + "\n", encoding="utf-8")
-        stem = self.recording.name.removesuffix(".gz").removesuffix(".csv")
-        out = self.out if self.out is not None else self.recording.with_name(f"{stem}.mcap")
         many = len(imported.episodes) > 1
         for index, episode in enumerate(imported.episodes, start=1):
             path = out.with_name(f"{out.stem}-{index}{out.suffix}") if many else out
-            if path.exists():
-                raise DataError(f"{path} is there already; remove it or choose another --out.")
+            new_file(path, "--out", ".mcap")
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_episode(episode, path)
+            try:
+                write_episode(episode, path)
+            except KeyboardInterrupt:
+                # Half an import is worth nothing: the CSV is still there.
+                path.with_name(f"{path.name}.partial").unlink(missing_ok=True)
+                raise
             seconds = episode.times_s[-1] - episode.times_s[0]
             console.print(f"{path}: {episode.ticks} commands, {seconds:.1f} s")
         return 0

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from carlab.cli.console import console, table
+from carlab.cli.options import above_zero
 from carlab.core.errors import ConfigError
 
 
@@ -55,6 +56,7 @@ class Listen:
         from mocap.mocap_config import MocapConfig
         from mocap.rigid_body import RigidBodyPoseSource
 
+        above_zero(seconds=self.seconds)
         config = MocapConfig(
             server_address=self.server,
             local_interface=self.interface,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.core.errors import ConfigError
+from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice
@@ -17,12 +19,10 @@ class CarOptions:
     """Which car."""
 
     car: str = "sim"
-    """sim (physics in this process), emulated (the whole hardware path over a pty and UDP, with fake firmware and fake
-    motion capture), emulated-can (the same over a CAN bus), or a FILE.toml: with [hardware] a real car, else that
-    simulated one."""
+    """sim, emulated (serial), emulated-can, or FILE.toml: with [hardware] that real car, else that simulated one."""
 
     vehicle: Path | None = None
-    """A car file whose physics and motion capture sim and emulated use instead of the default car's."""
+    """Car file whose physics and motion capture sim and emulated use in place of the default car's."""
 
     dry_run: bool = False
     """Real inputs, but no command is sent."""
@@ -32,6 +32,27 @@ class CarOptions:
         from carlab.cars import choose_car
 
         return choose_car(self.car, vehicle=self.vehicle, dry_run=self.dry_run, seed=seed, log_folder=log_folder)
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def new_file(path: Path, option: str, suffix: str) -> Path:
+    """The path, where it has that suffix and nothing is there; ConfigError or DataError otherwise."""
+    if path.suffix != suffix:
+        raise ConfigError(f"{option} {path}: name a file that ends in {suffix}.")
+    if path.exists():
+        raise DataError(f"{path} is there already; remove it or choose another {option}.")
+    return path
+
+
+def above_zero(**values: float | None) -> None:
+    """Raise ConfigError for an option that is not a finite number above zero; None is none given."""
+    for name, value in values.items():
+        if value is not None and not 0.0 < value < float("inf"):
+            raise ConfigError(f"--{name} {value:g}: a number above zero.")
 
 
 def required_file(path: Path, what: str) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,16 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional
 
-from carlab.cli.console import banner, console, fail, progress, table
-from carlab.cli.options import CarOptions
+from carlab.cli.console import console, fail, progress, table
+from carlab.cli.options import CarOptions, above_zero, new_file
 from carlab.cli.recordings import load_episodes
+from carlab.cli.runs import ask_to_place, new_run, write_result
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice
-    from carlab.core.quantities import CarState
     from sim_backends.car_parameters import SimulatorConfig
 
 
@@ -64,8 +63,11 @@ class Replay:
 
     def run(self) -> int:
         """Predict or drive, and print."""
-        if not (self.horizon > 0 and self.stride > 0):
-            raise ConfigError("--horizon and --stride must be above zero.")
+        above_zero(horizon=self.horizon, stride=self.stride, seconds=self.seconds)
+        if self.seed < 0:
+            raise ConfigError(f"--seed {self.seed}: at least 0.")
+        if self.save is not None:
+            new_file(self.save, "--save", ".rrd")
         choice = self.which_car.choose(seed=self.seed)
         episodes = load_episodes(self.recording)
         if choice.car.reality is Reality.SIMULATED and not self.drive:
@@ -99,12 +101,13 @@ class Replay:
             console.print(f"{path}")
 
     def _drive(self, episode: EpisodeData, choice: CarChoice) -> int:
+        from carlab.cli import EXIT_INTERRUPTED
         from carlab.cli.drive import EXIT_SAFETY_STOP
+        from carlab.core.outcome import EndReason
         from carlab.core.quantities import CarState
         from carlab.core.task import RecordedTask
         from carlab.experiment.scripted_policies import ReplayPolicy
         from carlab.experiment.session import Session, SessionHooks
-        from carlab.recording.run_directory import RunDirectory
 
         period_s = choice.control_period_s
         duration_s = float(episode.times_s[-1] - episode.times_s[0])
@@ -116,22 +119,14 @@ class Replay:
             from carlab.core.geofence import rectangle
 
             envelope = replace(envelope, arena_m=rectangle(x.min() - 20, x.max() + 20, y.min() - 20, y.max() + 20))
-        run = RunDirectory.create(self.out, "replay", config_toml=choice.config_toml)
-        choice.log_to(run.path)
-        banner(choice.car.reality, choice.car.name)
         with contextlib.ExitStack() as stack:
+            run = stack.enter_context(new_run(self.out, "replay", choice))
             car = stack.enter_context(choice.car)
             bar = stack.enter_context(progress())
             row = bar.add_task("replay", total=task.max_ticks, note="")
-
-            def place_by_hand(start: CarState) -> None:
-                text = f"Put the car at x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad"
-                if not sys.stdin.isatty():
-                    raise ConfigError(f"{text}: nobody is at the keyboard to confirm it; use a terminal.")
-                console.input(f"{text}, step back and press Enter. ")
-
             hooks = SessionHooks(
-                place_by_hand=place_by_hand, on_tick=lambda tick: bar.update(row, completed=tick.step + 1)
+                place_by_hand=ask_to_place(bar, "use a terminal"),
+                on_tick=lambda tick: bar.update(row, completed=tick.step + 1),
             )
             policy = ReplayPolicy(episode.times_s[:-1], episode.sent)
             session = Session(
@@ -139,7 +134,9 @@ class Replay:
             )
             results = session.drive(1)
         if not results:
-            return EXIT_SAFETY_STOP
+            console.print("Nothing was driven.")
+            return EXIT_INTERRUPTED
+        write_result(run, results)
         driven = results[0].data
         elapsed_s = driven.times_s - driven.times_s[0]
         recorded = np.stack(
@@ -159,7 +156,7 @@ class Replay:
         if results[0].reason.is_safety_stop:
             fail(f"{results[0].reason.value} {driven.metadata['end_detail']}".rstrip())
             return EXIT_SAFETY_STOP
-        return 0
+        return EXIT_INTERRUPTED if results[0].reason is EndReason.STOP_REQUESTED else 0
 
 
 def _unwrapped(episode: EpisodeData) -> FloatArray:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +10,10 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from carlab.cli.console import console
-from carlab.cli.options import required_file
+from carlab.cli.options import has_screen, new_file, required_file
 from carlab.cli.recordings import load_episodes
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import ConfigError, DataError, NotReadyError
+from carlab.core.errors import ConfigError, NotReadyError
 
 
 @dataclass
@@ -29,8 +27,7 @@ class View:
     """Write FILE.rrd instead of opening the viewer."""
 
     screenshot: Path | None = None
-    """Write FILE.png instead of opening the viewer: the viewer's own picture where this computer can draw it without a
-    screen (a Vulkan driver), else a plot."""
+    """Write FILE.png instead: the viewer's own picture where a Vulkan driver draws it without a screen, else a plot."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -38,15 +35,13 @@ class View:
     def run(self) -> int:
         """View or save."""
         required_file(self.recording, "The recording")
-        if self.save is not None and self.save.suffix != ".rrd":
-            raise ConfigError(f"--save {self.save}: name a file that ends in .rrd.")
+        if self.save is not None:
+            new_file(self.save, "--save", ".rrd")
         if self.screenshot is not None and self.screenshot.suffix != ".png":
             raise ConfigError(f"--screenshot {self.screenshot}: name a file that ends in .png.")
         ready = self.recording if self.recording.suffix == ".rrd" else None
         episode = None if ready is not None else self._episode()
         if self.save is not None:
-            if self.save.exists():
-                raise DataError(f"{self.save} is there already; remove it or choose another name.")
             ready = self._rrd(ready, episode, self.save)
             console.print(f"{ready}")
         if self.screenshot is not None:
@@ -91,8 +86,10 @@ class View:
         program = rerun_program()
         if program is None:
             raise NotReadyError("The viewer", ["the program 'rerun' is not installed; install rerun-sdk with pip."])
-        if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise NotReadyError("The viewer", ["this computer has no screen; use --save FILE.rrd or --screenshot."])
+        if not has_screen():
+            raise NotReadyError(
+                "The viewer", ["this computer has no screen; use --save FILE.rrd or --screenshot FILE.png."]
+            )
         with tempfile.TemporaryDirectory(prefix="carlab-view-") as folder:
             path = ready or self._rrd(ready, episode, Path(folder) / f"{self.recording.stem}.rrd")
             return subprocess.run([str(program), str(path), "--bind", "127.0.0.1"], check=False).returncode

@@ -65,11 +65,10 @@ def can_stop_inside(corners_m: Polygon, state: CarState, reaction_s: float, dece
     if not contains(corners_m, state.x_m, state.y_m):
         return False
     speed = state.speed_mps
-    if speed < 1e-3:
-        return True
     course_rad = state.yaw_rad + math.atan2(state.vy_mps, state.vx_mps)
     needed = stopping_distance_m(speed, reaction_s, deceleration_mps2)
-    return free_distance_m(corners_m, state.x_m, state.y_m, course_rad) > needed
+    # From inside, every way meets an edge somewhere: infinity means a course that is none, or an edge just touched.
+    return needed < free_distance_m(corners_m, state.x_m, state.y_m, course_rad) < math.inf
 
 
 def rectangle(x_low_m: float, x_high_m: float, y_low_m: float, y_high_m: float) -> tuple[tuple[float, float], ...]:

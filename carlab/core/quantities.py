@@ -102,6 +102,7 @@ class Observation:
     State, times and sequence are those of the newest *tracked* pose; ``tracked`` says whether the very newest frame
     saw the body, so that an unseen body shows as a state that grows old. ``velocity_delay_s`` is the known delay of
     the velocity filter; ``poses`` are the raw samples that arrived since the previous observation, oldest first.
+    ``velocity_valid`` is False where too few poses have come for velocities, which are zero then.
     """
 
     state: CarState
@@ -111,6 +112,7 @@ class Observation:
     tracked: bool = True
     velocity_delay_s: float = 0.0
     poses: tuple[PoseSample, ...] = ()
+    velocity_valid: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ observe ──> encode ──> policy ──> SafeCar (the gate) ──> Car.com
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 from collections import deque
@@ -20,7 +21,6 @@ from carlab.core.clock import Pacer, TickTiming, wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, HealthReading, Tick, Transition
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import (
-    ActionOutOfRangeError,
     ActuatorFaultError,
     CarlabError,
     NotReadyError,
@@ -29,8 +29,8 @@ from carlab.core.errors import (
 from carlab.core.observation import ActionHistory, encode
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy, PolicyInput
-from carlab.core.quantities import NEUTRAL, Action, FloatArray, Observation
-from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyStop
+from carlab.core.quantities import Action, FloatArray, Observation
+from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyState, SafetyStop
 from carlab.core.task import Task
 
 log = logging.getLogger(__name__)
@@ -99,20 +99,25 @@ class _End(Exception):
         super().__init__(reason.name)
 
 
-def first_observation(car: Car) -> Observation:
-    """Wait for the first pose. Raises PoseLostError after two seconds of the car's clock."""
+def first_observation(car: Car, heartbeat: Callable[[str], None] = lambda where: None) -> Observation:
+    """Wait for the first pose with a speed. Raises PoseLostError after two seconds of the car's clock."""
     give_up_s = car.clock.now_s() + FIRST_POSE_TIMEOUT_S
     while True:
+        heartbeat("waiting for the first pose")
         try:
             observation = car.observe()
-            if observation.tracked:
+            if observation.tracked and observation.velocity_valid:
                 return observation
         except PoseLostError:
             if car.clock.now_s() > give_up_s:
                 raise
         else:
             if car.clock.now_s() > give_up_s:
-                raise PoseLostError("Motion capture runs but does not see the car; check its markers and the volume.")
+                raise PoseLostError(
+                    "Motion capture comes too rarely to know the car's speed; raise its frame rate."
+                    if observation.tracked
+                    else "Motion capture runs but does not see the car; check its markers and the volume."
+                )
         car.clock.sleep_until(car.clock.now_s() + 0.01)
 
 
@@ -197,11 +202,10 @@ def run_episode(
     )
     next_health_s = -math.inf
     try:
-        hooks.heartbeat("waiting for the first pose")
-        first_observation(car)
+        policy.reset()
+        first_observation(car, hooks.heartbeat)
         hooks.heartbeat("arming")
         safe.arm()
-        policy.reset()
         start_s = pacer.start()
         now_s, observation = observe("observing")
         rows.observed(now_s, observation)
@@ -215,6 +219,8 @@ def run_episode(
             if failed is not None:
                 raise _End(EndReason.RECORDER_ERROR, failed)
             requested, policy_s = _ask(policy, PolicyInput(features, observation, step, now_s - start_s), car, hooks)
+            if policy_s > envelope.lost_pose_s:
+                raise _End(EndReason.LATE_LOOP, f"The policy '{policy.name}' took {policy_s:.1f} s for one tick.")
             hooks.heartbeat("commanding")
             sent = safe.command(requested, observation, period_s)
             history.push(sent)
@@ -255,26 +261,36 @@ def run_episode(
         reason, detail = EndReason.ACTUATOR_FAULT, str(error)
         if not rows.rewards:
             raise
-    except (NotReadyError, ActionOutOfRangeError) as error:
+    except NotReadyError as error:
+        if safe.state is SafetyState.DISARMED:
+            reason = EndReason.NOT_READY
         detail = str(error)
         raise
     except BaseException as error:
         detail = f"{type(error).__name__}: {error}"
         raise
     finally:
-        safe.stop(planned=not reason.is_safety_stop)
-        texts |= {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
-        hooks.emit(
-            EpisodeEnded(
-                t_s=car.clock.now_s(),
-                reason=reason,
-                detail=detail,
-                steps=len(rows.rewards),
-                total_reward=float(np.sum(rows.rewards)),
-                last=observation,
-                statistics=pacer.statistics_ms(),
+        # A car that was never armed has done nothing that a fault would have to remember.
+        planned = safe.state is SafetyState.DISARMED or not reason.is_safety_stop
+
+        def tell() -> None:
+            hooks.emit(
+                EpisodeEnded(
+                    t_s=car.clock.now_s(),
+                    reason=reason,
+                    detail=detail,
+                    steps=len(rows.rewards),
+                    total_reward=float(np.sum(rows.rewards)),
+                    last=observation,
+                    statistics=pacer.statistics_ms(),
+                )
             )
-        )
+
+        with contextlib.ExitStack() as last:  # From the bottom up, each whatever became of the one before.
+            last.callback(tell)
+            last.callback(safe.stop, planned=planned)
+            last.callback(hooks.heartbeat, "stopping the car")
+    texts |= {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
     return rows.finish(texts)
 
 
@@ -291,4 +307,6 @@ def _ask(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks) -> tu
         raise _End(EndReason.POLICY_ERROR, f"{type(error).__name__}: {error}") from error
     if action is None:
         raise _End(EndReason.POLICY_FINISHED)
-    return (action if isinstance(action, Action) else NEUTRAL), car.clock.now_s() - began_s
+    if not isinstance(action, Action):
+        raise _End(EndReason.POLICY_ERROR, f"It returned a {type(action).__name__} where an Action is wanted.")
+    return action, car.clock.now_s() - began_s

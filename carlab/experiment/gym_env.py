@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from carlab.core.car import Car
 from carlab.core.clock import Pacer
+from carlab.core.errors import ConfigError
 from carlab.core.geofence import contains
 from carlab.core.observation import STATE_FEATURES, ActionHistory, encode, feature_size
 from carlab.core.outcome import EndReason
-from carlab.core.quantities import Action, Observation
+from carlab.core.quantities import Action, Observation, Reality
 from carlab.core.task import TASKS, Task
 
 # Finite bounds that no car of this size reaches; what is measured is clipped to them.
@@ -56,7 +57,12 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         super().reset(seed=seed)
         if self._car is None or seed is not None:
             self.close()
-            self._car = self._car_of_seed(int(self.np_random.integers(2**31)))
+            car = self._car_of_seed(int(self.np_random.integers(2**31)))
+            if car.reality is not Reality.SIMULATED:
+                raise ConfigError(
+                    f"'{car.name}' is no simulated car; drive it with run_episode, which has a safety gate."
+                )
+            self._car = car
             self._car.open()
         self._car.stop(planned=True)
         self._car.place(self._task.sample_start(self.np_random))

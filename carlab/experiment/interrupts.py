@@ -6,7 +6,6 @@ A watch thread acts when the loop has hung, or has not obeyed: it stops the car,
 
 from __future__ import annotations
 
-import logging
 import signal
 import sys
 import threading
@@ -18,9 +17,34 @@ from typing import Any, Self
 from carlab.core.clock import MonotonicClock
 from carlab.core.outcome import EndReason
 
-log = logging.getLogger(__name__)
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+POLL_S = 0.02
+
+
+class Flag:
+    """Like ``threading.Event``, for signal handlers: without a lock.
+
+    The handler of a second signal, coming while that of the first one holds the lock, would wait for ever.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+
+    def set(self) -> None:
+        """Set it, for good."""
+        self._is_set = True
+
+    def is_set(self) -> bool:
+        """Whether it is set."""
+        return self._is_set
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until it is set, or for ``timeout_s``; whether it is set."""
+        clock = MonotonicClock()
+        end_s = clock.now_s() + timeout_s
+        while not self._is_set and (now_s := clock.now_s()) < end_s:
+            clock.sleep_until(min(now_s + POLL_S, end_s))
+        return self._is_set
 
 
 class Interrupts:
@@ -28,8 +52,9 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.count = 0
-        self.urgent = threading.Event()
-        self.requested = threading.Event()
+        self.urgent = Flag()
+        self.requested = Flag()
+        self._breaks = False
         self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -46,17 +71,36 @@ class Interrupts:
         """The reason to end the episode, for ``EpisodeHooks.stop_requested``."""
         return EndReason.STOP_REQUESTED if self.requested.is_set() else None
 
+    def ask(self, question: Callable[[], None]) -> None:
+        """Call what waits for a person while nothing is driven; a signal leaves it at once, and nothing else.
+
+        Otherwise a signal during ``input()`` would be heard only after Enter was pressed.
+        """
+        try:
+            self._breaks = True
+            if not self.requested.is_set():
+                question()
+        except KeyboardInterrupt:
+            if not self.requested.is_set():
+                raise
+        finally:
+            self._breaks = False
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
         self.requested.set()
         if self.count > 1:
             self.urgent.set()
+        if self._breaks:
+            self._breaks = False
+            raise KeyboardInterrupt
 
 
 class LoopWatch:
     """Calls ``on_hang(where, stack)`` from a thread of its own when no heartbeat came for ``timeout_s``.
 
-    Also when ``urgent`` is set and the loop did not end within ``grace_s``. It acts once.
+    Also when ``urgent`` is set and the loop did not end within ``grace_s``. It acts once, and does nothing before:
+    a log handler or a terminal may be what the loop hangs in.
     """
 
     def __init__(
@@ -64,12 +108,12 @@ class LoopWatch:
         on_hang: Callable[[str, str], None],
         *,
         timeout_s: float = 2.0,
-        urgent: threading.Event | None = None,
+        urgent: Flag | None = None,
         grace_s: float = 0.5,
     ) -> None:
         self._on_hang = on_hang
         self._timeout_s = timeout_s
-        self._urgent = urgent or threading.Event()
+        self._urgent = urgent or Flag()
         self._grace_s = grace_s
         self._clock = MonotonicClock()
         self._beat_s = 0.0
@@ -113,6 +157,5 @@ class LoopWatch:
             if hung or ignored:
                 frame = sys._current_frames().get(self._watched.ident or 0)
                 stack = "".join(traceback.format_stack(frame)) if frame is not None else ""
-                log.critical("The control loop hangs while %s:\n%s", self._where, stack)
                 self._on_hang(self._where, stack)
                 return

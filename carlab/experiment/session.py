@@ -7,7 +7,9 @@ does not obey: it stops the car, tells the recording why, finishes the files and
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,8 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from carlab.core.car import Car
+from carlab.core.clock import wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import PoseLostError
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy
 from carlab.core.quantities import CarState
@@ -28,6 +32,7 @@ from carlab.recording.mcap_sink import McapSink
 from carlab.recording.recorder import Recorder
 from carlab.recording.rerun_sink import RerunSink
 from carlab.recording.run_directory import RunDirectory
+from carlab.recording.sink import LogLine
 
 log = logging.getLogger(__name__)
 
@@ -91,8 +96,11 @@ class Session:
         with Interrupts() as interrupts:
             for index in range(episodes):
                 start = self.task.sample_start(np.random.default_rng(starts[index]))
-                if self.place and not self.car.place(start):
-                    self.hooks.place_by_hand(start)
+                if not (self.place and self.car.place(start)):
+                    if self.place:
+                        interrupts.ask(functools.partial(self.hooks.place_by_hand, start))
+                    if not interrupts.requested.is_set():
+                        wait_until_still(self.car)
                 if interrupts.requested.is_set():
                     break
                 result = self._drive_one(self.run.next_episode(), interrupts)
@@ -109,9 +117,17 @@ class Session:
             sinks.append(RerunSink(self.run.episode_path(number, ".rrd")))
         recorder = Recorder(sinks)
         last_tick: list[Tick] = []
+        # Whoever tells the end first, the loop or the watch, has the last word: a loop that comes back says no more.
+        turn, told = threading.Lock(), [False]
+
+        def take_last_word() -> bool:
+            with turn:
+                first, told[0] = not told[0], True
+            return first
 
         def emit(document: Document) -> None:
-            recorder.emit(document)
+            if take_last_word() if isinstance(document, EpisodeEnded) else not told[0]:
+                recorder.emit(document)
             if isinstance(document, Tick):
                 last_tick[:] = [document]
                 self.hooks.on_tick(document)
@@ -120,14 +136,19 @@ class Session:
             urgent = interrupts.urgent.is_set()
             reason = EndReason.STOP_REQUESTED if urgent else EndReason.LOOP_HUNG
             detail = f"The loop hung while {where}."
+            stood = f"The control loop hangs while {where}:\n{stack}"
+            has_last_word = take_last_word()
             with contextlib.suppress(Exception):
                 self.car.stop(planned=False)
             t_s = last_tick[0].t_s if last_tick else self.car.clock.now_s()
             steps = last_tick[0].step if last_tick else 0
-            recorder.emit(EpisodeEnded(t_s, reason, detail, steps, float("nan")))
+            if has_last_word:
+                recorder.emit(LogLine(wall_clock_ns(), logging.CRITICAL, __name__, stood))
+                recorder.emit(EpisodeEnded(t_s, reason, detail, steps, float("nan")))
             recorder.close()
             with contextlib.suppress(Exception):
                 self.car.close()
+            log.critical("%s", stood)
             self.hooks.on_abandon(reason, detail)
 
         watch = LoopWatch(abandon, timeout_s=self.hang_timeout_s, urgent=interrupts.urgent)
@@ -173,10 +194,12 @@ def _logged(recorder: Recorder) -> Iterator[None]:
 
 
 def wait_until_still(car: Car, timeout_s: float = 3.0, speed_mps: float = 0.05) -> bool:
-    """Wait, in neutral, until the car stands; False where it still rolls after ``timeout_s`` of the car's clock."""
+    """Wait, in neutral, until the car is seen to stand; False where it is not within ``timeout_s`` of its clock."""
     give_up_s = car.clock.now_s() + timeout_s
-    while car.observe().state.speed_mps > speed_mps:
-        if car.clock.now_s() > give_up_s:
-            return False
+    while car.clock.now_s() <= give_up_s:
+        with contextlib.suppress(PoseLostError):
+            seen = car.observe()
+            if seen.velocity_valid and seen.state.speed_mps <= speed_mps:
+                return True
         car.clock.sleep_until(car.clock.now_s() + 0.02)
-    return True
+    return False

@@ -137,6 +137,7 @@ class GamepadSource:
     def close(self) -> None:
         """Let go of the gamepad."""
         self._stick = None
+        self._touched.clear()
         if self._pygame is not None:
             self._pygame.quit()
             self._pygame = None

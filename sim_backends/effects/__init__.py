@@ -1,4 +1,11 @@
-"""Physics beyond the base model, by the ids of the catalogue. To add an effect, write its class and list it here."""
+"""Physics beyond the base model, by the ids of the catalogue. To add an effect, write its class and list it here.
+
+What acts before what: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity,
+offset) and throttle (dead band, nonlinearity, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake
+asymmetry, saturation) -> driven axle (traction limit, wheel slip) -> body (resistances, slope, bias, moments) -> load
+transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is measured (marker offset, yaw misalignment,
+velocity filter, latency). Within a group: by ``order``, then by id.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +18,72 @@ from sim_backends.effects.base import (
     Forces,
     ObservationEffect,
 )
-from sim_backends.effects.delays import CommandDelay, SteeringDelay
+from sim_backends.effects.body import LateralBias, RoadSlope, TorqueSteer, YawDamping
+from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
+from sim_backends.effects.drive import BatterySag, BrakeAsymmetry, MotorSaturation, TractionLimit
 from sim_backends.effects.lags import MotorLag, SteeringLag
-from sim_backends.effects.observations import MarkerOffset, MocapLatency, VelocityFilterLag
-from sim_backends.effects.resistances import AerodynamicDrag, RollingResistance
+from sim_backends.effects.loads import AerodynamicDownforce, LoadTransfer, RollDynamics
+from sim_backends.effects.observations import MarkerOffset, MocapLatency, MocapYawMisalignment, VelocityFilterLag
+from sim_backends.effects.resistances import AerodynamicDrag, CorneringDrag, RollingResistance
+from sim_backends.effects.steering import (
+    SteeringAsymmetry,
+    SteeringBacklash,
+    SteeringDeadband,
+    SteeringNonlinearity,
+    SteeringOffset,
+    SteeringRateLimit,
+)
+from sim_backends.effects.throttle import ThrottleDeadband, ThrottleNonlinearity
+from sim_backends.effects.tyres import (
+    FrictionDrift,
+    FrictionEllipse,
+    LowFrictionPatch,
+    TyreRelaxation,
+    TyreSaturation,
+)
+from sim_backends.effects.wheel_slip import LongitudinalSlip
 
 _ALL: tuple[Effect, ...] = (
     CommandDelay(),
     SteeringDelay(),
+    ThrottleDelay(),
     SteeringLag(),
+    SteeringRateLimit(),
+    SteeringDeadband(),
+    SteeringBacklash(),
+    SteeringOffset(),
+    SteeringAsymmetry(),
+    SteeringNonlinearity(),
+    ThrottleDeadband(),
+    ThrottleNonlinearity(),
     MotorLag(),
+    MotorSaturation(),
+    TractionLimit(),
+    BrakeAsymmetry(),
+    BatterySag(),
     RollingResistance(),
     AerodynamicDrag(),
+    CorneringDrag(),
+    TyreSaturation(),
+    FrictionEllipse(),
+    LongitudinalSlip(),
+    TyreRelaxation(),
+    LoadTransfer(),
+    RollDynamics(),
+    FrictionDrift(),
+    LowFrictionPatch(),
+    AerodynamicDownforce(),
+    YawDamping(),
+    TorqueSteer(),
+    LateralBias(),
+    RoadSlope(),
     MocapLatency(),
     MarkerOffset(),
+    MocapYawMisalignment(),
     VelocityFilterLag(),
 )
 EFFECTS: dict[str, Effect] = {effect.id: effect for effect in _ALL}
+"""Every effect by its id, in the order of the catalogue."""
 
 __all__ = [
     "EFFECTS",

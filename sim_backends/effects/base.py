@@ -14,9 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Protocol
 
 from sim_backends.array_ops import Ops, Value
+
+GRAVITY_MPS2 = 9.81
 
 Parameters = Mapping[str, Value]
 Triple = tuple[Value, Value, Value]
@@ -28,8 +30,9 @@ Kind = Literal["input", "dynamics", "observation"]
 class EffectParameter:
     """One number of an effect.
 
-    ``identity`` is the value at which the effect does nothing; None means the car file's own figure for the same
-    thing. ``low`` and ``high`` are the physical bounds, ``typical`` a size that a small race car may have.
+    ``identity`` is the value at which the effect does nothing; None means the number of the car file named by
+    ``same_as``. ``low`` and ``high`` are the physical bounds (``positive``: above ``low``), ``typical`` a size that a
+    small race car may have. A choice among ``choices`` is their position, 0.0 for the first; car files spell it out.
     """
 
     name: str
@@ -38,6 +41,9 @@ class EffectParameter:
     low: float
     high: float
     typical: float
+    positive: bool = False
+    same_as: str = ""
+    choices: tuple[str, ...] = ()
 
 
 class Effect:
@@ -91,9 +97,13 @@ class ActuatorEffect(Effect):
 class Forces:
     """Everything that acts on a car at one instant; dynamics effects read and change it.
 
-    Units: t_s [s] since the start, positions [m], velocities [m/s, rad/s] in the body frame, forces [N] in the body
-    frame (side forces in the wheel frame, positive left), moment [N m] about the centre of mass, wheel_angle [rad].
-    ``states`` are the extra states of effects by name; an effect puts their time derivatives into ``rates``.
+    Units: t_s [s] since the first row of the recording, positions [m], velocities [m/s, rad/s] in the body frame,
+    forces [N] in the body frame (side forces in the wheel frame, positive left), moment [N m] about the centre of
+    mass, wheel_angle [rad]. ``drive`` is the motor's force, ``axle_force`` the F_x of the driven axle (drive less
+    damping), ``demand`` the same before wheel slip, ``force_x`` all longitudinal forces but the tyres' side forces.
+    ``front_per_load`` is the steady side force of the front axle for each newton of its load. ``states`` are the extra
+    states of effects by name; an effect puts their time derivatives into ``rates``. ``stiff`` is there within a
+    Runge-Kutta step that treats stiff states.
     """
 
     t_s: Value
@@ -104,6 +114,8 @@ class Forces:
     vy: Value
     yaw_rate: Value
     wheel_angle: Value
+    wheel_sin: Value
+    wheel_cos: Value
     throttle: Value
     mass: Value
     front_axle: Value
@@ -113,6 +125,9 @@ class Forces:
     grip_front: Value
     grip_rear: Value
     drive: Value = 0.0
+    demand: Value = 0.0
+    axle_force: Value = 0.0
+    front_per_load: Value = 0.0
     side_front: Value = 0.0
     side_rear: Value = 0.0
     force_x: Value = 0.0
@@ -120,18 +135,33 @@ class Forces:
     moment: Value = 0.0
     states: dict[str, Value] = field(default_factory=dict)
     rates: dict[str, Value] = field(default_factory=dict)
+    stiff: StiffValues | None = None
+
+
+class StiffValues(Protocol):
+    """What a Runge-Kutta step with stiff states puts in the place of their differential equations."""
+
+    axle_force: Value | None
+    """Mean force of the driven wheels over the step [N]."""
+
+    def lagging_sides(self, vx: Value, steady_front: Value, steady_rear: Value) -> tuple[Value, Value]:
+        """Side forces of the axles at a stage [N], from vx and the steady ones of that stage."""
 
 
 class DynamicsEffect(Effect):
     """Changes the forces. Override the hooks that are needed; the others cost nothing.
 
-    Order of the hooks: ``on_load`` (axle loads), ``on_grip`` (friction coefficients), ``on_drive`` (drive force),
-    ``on_tyre`` (side forces of both axles, after the tyre model), ``on_body`` (``force_x``, ``force_y`` and
-    ``moment`` are added at the centre of mass).
+    The hooks run in this order: ``on_load`` (axle loads), ``on_grip`` (friction coefficients), ``on_drive`` (the
+    motor's force), ``on_traction`` (F_x of the driven axle, after damping), ``on_body`` (``force_x``, ``force_y`` and
+    ``moment`` at the centre of mass), ``on_transfer`` (loads that depend on the acceleration), ``on_tyre`` (side forces
+    of both axles, after the tyre model), ``on_motion`` (rates of states that depend on the acceleration). Where load
+    transfer and a limit of the driven axle depend on one another, ``on_traction`` and ``on_transfer`` are repeated.
     """
 
     kind: ClassVar[Kind] = "dynamics"
     states: ClassVar[tuple[str, ...]] = ()
+    stiff: ClassVar[bool] = False
+    """Whether its states are stepped by ``stiff_step`` instead of Runge-Kutta."""
     needs_position: ClassVar[bool] = False
 
     def on_load(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -143,11 +173,24 @@ class DynamicsEffect(Effect):
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Change ``drive``."""
 
-    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Change ``side_front`` and ``side_rear``."""
+    def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Change ``axle_force``."""
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add to ``force_x``, ``force_y`` and ``moment``."""
+
+    def on_transfer(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Change ``load_front`` and ``load_rear`` by what ``force_x`` and ``front_per_load`` do to them."""
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Change ``side_front`` and ``side_rear``."""
+
+    def on_motion(self, ops: Ops, forces: Forces, acceleration_mps2: Value, values: Parameters) -> None:
+        """Set rates that depend on dvx/dt."""
+
+    def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
+        """States after the car has driven on as in ``forces`` (all forces found) for ever, by name."""
+        return {}
 
 
 class ObservationEffect(Effect):

@@ -30,3 +30,16 @@ class SteeringDelay(DelayEffect):
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
         """Steering alone."""
         return values["delay"], 0.0
+
+
+class ThrottleDelay(DelayEffect):
+    """The throttle command acts ``delay`` later."""
+
+    id = "throttle_delay"
+    sentence = "The throttle command acts later than the steering command."
+    parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03),)
+    look_alikes = ("motor_lag",)
+
+    def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
+        """Throttle alone."""
+        return 0.0, values["delay"]

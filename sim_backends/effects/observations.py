@@ -13,6 +13,7 @@ class MarkerOffset(ObservationEffect):
     """
 
     id = "marker_offset"
+    order = 40
     sentence = "Motion capture tracks a point that is not the centre of mass."
     parameters = (
         EffectParameter("ahead", "m", 0.0, -1.0, 1.0, 0.03),
@@ -34,12 +35,32 @@ class MarkerOffset(ObservationEffect):
         )
 
 
+class MocapYawMisalignment(ObservationEffect):
+    """``yaw_meas = yaw + angle``: the tracked body's axes are turned against the car's.
+
+    So ``vx_meas = vx cos(angle) + vy sin(angle)`` and ``vy_meas = vy cos(angle) - vx sin(angle)``, for small angles
+    ``vx + angle vy`` and ``vy - angle vx``. Acts after ``marker_offset``, which is given in the car's own axes.
+    """
+
+    id = "mocap_yaw_misalignment"
+    sentence = "Motion capture's forward axis of the car is not the car's."
+    order = 60
+    parameters = (EffectParameter("angle", "rad", 0.0, -3.2, 3.2, 0.03),)
+    look_alikes = ("steering_offset",)
+
+    def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
+        """Turn the axes."""
+        x, y, yaw, vx, vy, yaw_rate = state
+        sin, cos = ops.sin(values["angle"]), ops.cos(values["angle"])
+        return x, y, yaw + values["angle"], vx * cos + vy * sin, vy * cos - vx * sin, yaw_rate
+
+
 class MocapLatency(ObservationEffect):
     """Every measured channel is ``latency`` old."""
 
     id = "mocap_latency"
     sentence = "Motion capture is older than the car file says."
-    parameters = (EffectParameter("latency", "s", None, 0.0, 1.0, 0.03),)
+    parameters = (EffectParameter("latency", "s", None, 0.0, 1.0, 0.03, same_as="mocap.latency"),)
     look_alikes = ("command_delay",)
 
     def latency_s(self, values: Parameters) -> Value | None:

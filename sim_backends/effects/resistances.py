@@ -33,3 +33,16 @@ class AerodynamicDrag(DynamicsEffect):
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Brake."""
         forces.force_x = ops.fms(values["coefficient"], forces.vx * ops.abs(forces.vx), forces.force_x)
+
+
+class CorneringDrag(DynamicsEffect):
+    """``F_x -= coefficient |d| tanh(vx / 0.05 m/s)``."""
+
+    id = "cornering_drag"
+    sentence = "Steered wheels slow the car down more than their side force does."
+    parameters = (EffectParameter("coefficient", "N/rad", 0.0, 0.0, 100.0, 3.0),)
+
+    def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Brake."""
+        size = values["coefficient"] * ops.abs(forces.wheel_angle)
+        forces.force_x = ops.fms(size, ops.tanh(forces.vx * (1.0 / ROLLING_SPEED_MPS)), forces.force_x)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from carlab.cars.emulated_world import World, WorldConfig
-from carlab.cli import run
 from carlab.core.clock import MonotonicClock
 from mocap.emulator_faults import ServerFaults
 from mocap.natnet_models import BitstreamVersion
@@ -33,21 +32,6 @@ timeout_s = 0.6
 [hardware.arena]
 corners_m = [[-3, -3], [3, -3], [3, 3], [-3, 3]]
 """
-
-
-@pytest.fixture
-def carlab(capfd: pytest.CaptureFixture[str]) -> Carlab:
-    def call(*argv: object) -> Outcome:
-        try:
-            code = run([str(a) for a in argv])
-        except SystemExit as end:
-            code = int(end.code or 0)
-        out, err = capfd.readouterr()
-        text = " ".join((out + err).split())
-        assert "Traceback" not in text
-        return code, text
-
-    return call
 
 
 @pytest.fixture
@@ -232,6 +216,48 @@ def test_usage_errors_suggest(carlab: Carlab) -> None:
     assert "--episodes" in text
     code, _ = carlab("drive", "--episodes", "0")
     assert code == 2
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("drive --seed -1", ["--seed"]),
+        ("drive --ticks 0", ["--ticks"]),
+        ("drive --max-throttle 2", ["--max-throttle"]),
+        ("drive --max-throttle nan", ["--max-throttle"]),
+        ("drive --task path", ["--policy"]),
+        ("check --seconds 0", ["--seconds"]),
+        ("listen --seconds -1", ["--seconds"]),
+        ("emulate --command-port 70000", ["--command-port", "65535"]),
+        ("emulate --data-port -1", ["--data-port"]),
+        ("emulate --actuator can --can-channel vcan0", ["--can-channel", "GROUP:PORT"]),
+        ("emulate --port nowhere/vesc", ["--port", "folder"]),
+        ("import drive.csv --out drive.txt", [".mcap"]),
+        ("replay drive.csv --save drive.png", [".rrd"]),
+    ],
+)
+def test_an_impossible_option_is_refused_before_anything_happens(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, words: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(*canonical_csv(tmp_path))
+    code, text = carlab(*command.split())
+    assert code == 2
+    for word in words:
+        assert word in text
+    assert [entry.name for entry in tmp_path.iterdir()] == ["drive.csv"]
+
+
+def test_a_second_emulator_leaves_the_port_of_the_first_alone(carlab: Carlab, tmp_path: Path) -> None:
+    link = tmp_path / "carlab-vesc"
+    config = WorldConfig(simulator=SimulatorConfig().to_tables(), serial_link=str(link))
+    with World(config):
+        terminal = link.readlink()
+        code, text = carlab("emulate", "--port", link, "--command-port", "0", "--data-port", "0")
+        assert code == 3
+        assert "carlab-vesc" in text
+        assert link.readlink() == terminal
+        assert terminal.exists()
 
 
 def test_driving_without_a_folder_to_write_to(carlab: Carlab, tmp_path: Path) -> None:

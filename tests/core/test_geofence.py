@@ -7,7 +7,15 @@ import pytest
 from matplotlib.path import Path as MplPath
 
 from carlab.core.errors import ConfigError
-from carlab.core.geofence import as_polygon, contains, free_distance_m, rectangle, stopping_distance_m
+from carlab.core.geofence import (
+    as_polygon,
+    can_stop_inside,
+    contains,
+    free_distance_m,
+    rectangle,
+    stopping_distance_m,
+)
+from carlab.core.quantities import CarState
 
 CONCAVE = ((0.0, 0.0), (4.0, 0.0), (4.0, 3.0), (2.0, 1.0), (0.0, 3.0))
 
@@ -25,6 +33,35 @@ def test_contains_agrees_with_matplotlib(rng: np.random.Generator) -> None:
 )
 def test_free_distance_inside_a_concave_polygon(heading_rad: float, distance_m: float) -> None:
     assert free_distance_m(CONCAVE, 2.0, 0.5, heading_rad) == pytest.approx(distance_m)
+
+
+def test_the_nearest_of_several_edges_on_the_way_counts_in_either_sense() -> None:
+    # From the left arm of the W towards the right one the ray leaves through the notch and enters again.
+    for corners in (CONCAVE, CONCAVE[::-1]):
+        assert free_distance_m(corners, 0.5, 2.0, 0.0) == pytest.approx(0.5)
+        assert free_distance_m(corners, 3.5, 2.0, math.pi) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("state", "can"),
+    [
+        # 0.1 s of reaction and 2 m/s^2: 1 m/s takes 0.1 + 0.25 = 0.35 m.
+        (CarState(0.64, 0.0, 0.0, 1.0), True),
+        (CarState(0.66, 0.0, 0.0, 1.0), False),
+        (CarState(0.66, 0.0, math.pi, 1.0), True),
+        (CarState(0.66, 0.0, math.pi, -1.0), False),
+        (CarState(0.0, 0.66, 0.0, 0.0, 1.0), False),
+        (CarState(0.66, 0.0, -math.pi / 2, 0.0, 1.0), False),
+        (CarState(0.999, 0.0), True),
+        (CarState(1.001, 0.0), False),
+        (CarState(1.5, 0.0, math.pi, 1.0), False),
+        (CarState(math.nan, 0.0), False),
+        (CarState(0.0, 0.0, math.nan, 1.0), False),
+        (CarState(0.0, 0.0, 0.0, math.nan), False),
+    ],
+)
+def test_a_car_can_stop_inside_where_its_way_over_ground_is_long_enough(state: CarState, can: bool) -> None:
+    assert can_stop_inside(rectangle(-1.0, 1.0, -1.0, 1.0), state, 0.1, 2.0) is can
 
 
 def test_stopping_distance_is_the_closed_form() -> None:

@@ -1,6 +1,7 @@
 """The safety gate: dense around its bounds, and driven through a car that only writes down what it is told."""
 
 import math
+from dataclasses import fields, replace
 
 import pytest
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from carlab.core.car import Car
 from carlab.core.clock import SimulatedClock
 from carlab.core.documents import SafetyEvent
-from carlab.core.errors import ConfigError, NotArmedError
+from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, ConfigError, NotArmedError
 from carlab.core.geofence import rectangle
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action, ActionLimits, CarState, Health, Observation, Reality
@@ -17,18 +18,15 @@ from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyState, SafetyStop,
 
 ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True)
 PERIOD_S = 1.0 / 30.0
+NUMBERS = [f.name for f in fields(SafetyEnvelope) if f.name != "arena_m"]
 
 
 class LoggingCar(Car):
     """Writes down every command; has no physics."""
 
     def __init__(self) -> None:
-        self.name, self.reality, self.limits, self.clock = (
-            "log",
-            Reality.SIMULATED,
-            ActionLimits(),
-            SimulatedClock(10.0),
-        )
+        self.name, self.reality = "log", Reality.SIMULATED
+        self.limits, self.clock = ActionLimits(), SimulatedClock(10.0)
         self.log: list[Action] = []
         self.stops: list[bool] = []
 
@@ -95,8 +93,7 @@ def test_no_command_sequence_gets_past_the_bounds(commands: list[tuple[float, fl
                 assert abs(now - start) <= rate * PERIOD_S * (1 + 1e-9)
         previous = sent
         car.clock.sleep_until(car.clock.now_s() + PERIOD_S)
-    with_fault = safe.state is SafetyState.FAULT
-    if with_fault:
+    if safe.state is SafetyState.FAULT:
         before = len(car.log)
         with pytest.raises(NotArmedError):
             safe.command(Action(), car.observe(), PERIOD_S)
@@ -131,6 +128,8 @@ def test_overspeed_and_geofence() -> None:
     arena = rectangle(-1.0, 1.0, -1.0, 1.0)
     for state, reason in [
         (CarState(vx_mps=2.01), EndReason.OVERSPEED),
+        (CarState(vx_mps=-2.01), EndReason.OVERSPEED),
+        (CarState(vx_mps=1.5, vy_mps=1.5), EndReason.OVERSPEED),
         (CarState(x_m=1.01), EndReason.GEOFENCE),
         # 0.15 s reaction and 3 m/s^2: 1.5 m/s needs 0.225 + 0.375 = 0.6 m.
         (CarState(x_m=0.41, vx_mps=1.5), EndReason.GEOFENCE),
@@ -169,8 +168,230 @@ def test_limit_is_the_identity_inside_the_envelope() -> None:
 
 @pytest.mark.parametrize(
     "bad",
-    [{"max_speed_mps": 0.0}, {"max_throttle": 1.2}, {"lost_pose_s": 0.05}, {"deceleration_mps2": -1.0}],
+    [
+        {"max_throttle": 1.2},
+        {"lost_pose_s": 0.05},
+        {"deceleration_mps2": -1.0},
+        {"reaction_s": -0.1},
+        *({name: 0.0} for name in NUMBERS if name != "reaction_s"),
+        *({name: math.nan} for name in NUMBERS),
+    ],
+    ids=str,
 )
 def test_an_impossible_envelope_is_refused(bad: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
         SafetyEnvelope(**bad)  # type: ignore[arg-type]
+
+
+STATE_FIELDS = [f.name for f in fields(CarState)]
+
+
+@pytest.mark.parametrize("name", STATE_FIELDS)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("arena", [(), rectangle(-9.0, 9.0, -9.0, 9.0)], ids=["no arena", "arena"])
+def test_a_state_that_is_not_a_number_ends_the_episode(
+    name: str, value: float, arena: tuple[tuple[float, float], ...]
+) -> None:
+    safe, car, _ = gate(arena_m=arena)
+    safe.arm()
+    with pytest.raises(SafetyStop) as caught:
+        safe.command(Action(0.1, 0.1), seen(10.0, replace(CarState(), **{name: value})), PERIOD_S)
+    assert caught.value.reason is EndReason.TRACKING_LOST
+    assert (car.log, car.stops) == ([], [False])
+
+
+@pytest.mark.parametrize(
+    ("t_capture_s", "t_receive_s", "why"),
+    [
+        (10.0, math.nan, "came nan ms ago"),
+        (math.nan, 10.0, "taken nan ms ago"),
+        (10.0, 3610.0, "has another"),
+        (9.499, 10.0, "taken 501 ms ago"),
+        (9.501, 9.95, None),
+        (10.005, 10.005, None),
+    ],
+)
+def test_a_pose_of_another_time_ends_the_episode(t_capture_s: float, t_receive_s: float, why: str | None) -> None:
+    safe, car, _ = gate()
+    safe.arm()
+    observation = Observation(CarState(), t_capture_s, t_receive_s, 1)
+    if why is None:
+        assert not safe.command(Action(0.1, 0.1), observation, PERIOD_S).is_neutral
+        return
+    with pytest.raises(SafetyStop, match=why) as caught:
+        safe.command(Action(0.1, 0.1), observation, PERIOD_S)
+    assert caught.value.reason is EndReason.POSE_STALE
+    assert car.log == []
+
+
+@pytest.mark.parametrize(
+    ("state", "dt_capture_s", "dt_receive_s", "leaps"),
+    [
+        # 2 m/s and 20 rad/s for 0.05 s, and the margins of 0.1 m and 0.5 rad: 0.2 m and 1.5 rad.
+        (CarState(x_m=0.199), 0.05, 0.05, False),
+        (CarState(x_m=0.201), 0.05, 0.05, True),
+        (CarState(x_m=-0.15, y_m=0.15), 0.05, 0.05, True),
+        (CarState(yaw_rad=3.0 - 1.49), 0.05, 0.05, False),
+        (CarState(yaw_rad=3.0 - 1.51), 0.05, 0.05, True),
+        (CarState(yaw_rad=3.0 + 1.49 - 2 * math.pi), 0.05, 0.05, False),
+        (CarState(yaw_rad=3.0 - math.pi), 0.05, 0.05, True),
+        # Frames that were held up and came in a burst; a camera's clock that was set back.
+        (CarState(x_m=0.19), 0.05, 0.001, False),
+        (CarState(x_m=0.19), -100.0, 0.05, False),
+        (CarState(x_m=0.21), -100.0, 0.05, True),
+    ],
+)
+def test_a_pose_that_jumps_further_than_a_car_drives_ends_the_episode(
+    state: CarState, dt_capture_s: float, dt_receive_s: float, leaps: bool
+) -> None:
+    if state.yaw_rad == 0.0:
+        state = replace(state, yaw_rad=3.0)
+    safe, car, events = gate(max_speed_mps=2.0, lost_pose_s=200.0)
+    safe.arm()
+    car.clock.sleep_until(10.0 + 1.0)
+    safe.command(Action(0.1, 0.1), Observation(CarState(yaw_rad=3.0), 10.95, 10.95, 1), PERIOD_S)
+    later = Observation(state, 10.95 + dt_capture_s, 10.95 + dt_receive_s, 2)
+    if not leaps:
+        safe.command(Action(0.1, 0.1), later, PERIOD_S)
+        assert len(car.log) == 2
+        return
+    with pytest.raises(SafetyStop, match="It moved by") as caught:
+        safe.command(Action(0.1, 0.1), later, PERIOD_S)
+    assert caught.value.reason is EndReason.POSE_JUMP
+    assert car.stops == [False]
+    assert events[-1].kind == "pose_jump"
+    # The next episode may begin anywhere.
+    safe.arm()
+    safe.command(Action(0.1, 0.1), later, PERIOD_S)
+
+
+def test_another_body_after_a_gap_is_a_jump_though_it_stands_still() -> None:
+    safe, car, _ = gate(max_speed_mps=2.0)
+    safe.arm()
+    safe.command(Action(0.1, 0.1), seen(10.0), PERIOD_S)
+    car.clock.sleep_until(10.4)
+    with pytest.raises(SafetyStop) as caught:
+        safe.command(Action(0.1, 0.1), seen(10.4, CarState(x_m=1.5)), PERIOD_S)
+    assert caught.value.reason is EndReason.POSE_JUMP
+
+
+def test_an_unknown_speed_gives_neutral_until_it_is_known() -> None:
+    safe, car, events = gate()
+    safe.arm()
+    assert safe.command(Action(0.5, 0.5), replace(seen(10.0), velocity_valid=False), PERIOD_S).is_neutral
+    assert safe.state is SafetyState.PAUSED
+    assert [e.kind for e in events] == ["unknown_speed"]
+    car.clock.sleep_until(10.0 + PERIOD_S)
+    assert not safe.command(Action(0.5, 0.5), seen(10.0 + PERIOD_S), PERIOD_S).is_neutral
+    assert safe.state is SafetyState.ARMED
+
+
+def test_events_tell_the_begin_of_an_intervention_and_not_each_tick_of_it() -> None:
+    safe, car, events = gate(max_throttle=0.2)
+    safe.arm()
+    for throttle in (0.1, 0.5, 0.6, 0.1, 0.5):
+        safe.command(Action(0.0, throttle), seen(car.clock.now_s()), PERIOD_S)
+        car.clock.sleep_until(car.clock.now_s() + PERIOD_S)
+    assert [e.kind for e in events] == ["limited", "limited"]
+    assert [a.throttle for a in car.log] == [0.1, 0.2, 0.2, 0.1, 0.2]
+
+
+def test_the_narrower_of_envelope_and_car_limits() -> None:
+    for steering, throttle in ((0.3, 0.9), (0.9, 0.3)):
+        car = LoggingCar()
+        car.limits = ActionLimits(max_steering=0.5, max_throttle=0.5)
+        envelope = SafetyEnvelope(
+            max_steering=steering, max_throttle=throttle, steering_rate_per_s=1e3, throttle_rate_per_s=1e3
+        )
+        safe = SafeCar(car, envelope, lambda event: None)
+        safe.arm()
+        sent = safe.command(Action(1.0, -1.0), seen(10.0), PERIOD_S)
+        assert sent == Action(min(steering, 0.5), -min(throttle, 0.5))
+
+
+@pytest.mark.parametrize("bad", [Action(math.nan, 0.0), Action(0.0, math.inf), Action(-math.inf, math.nan)])
+def test_what_is_not_a_number_does_not_even_reach_the_car(bad: Action) -> None:
+    safe, car, _ = gate()
+    car.check = lambda action: None  # type: ignore[method-assign]
+    safe.arm()
+    with pytest.raises(SafetyStop) as caught:
+        safe.command(bad, seen(10.0), PERIOD_S)
+    assert caught.value.reason is EndReason.BAD_COMMAND
+    assert (car.log, car.stops) == ([], [False])
+
+
+def test_what_is_said_to_be_sent_is_what_the_car_says() -> None:
+    safe, car, _ = gate()
+    car.command = lambda action: Action(0.123, round(action.throttle, 1))  # type: ignore[method-assign]
+    safe.arm()
+    assert safe.command(Action(0.12345, 0.26), seen(10.0), PERIOD_S) == Action(0.123, 0.3)
+
+
+def test_a_long_gap_does_not_save_up_slew() -> None:
+    safe, car, _ = gate(throttle_rate_per_s=1.0, lost_pose_s=9.0)
+    safe.arm()
+    assert safe.command(Action(0.0, 1.0), seen(10.0), PERIOD_S).throttle == pytest.approx(PERIOD_S)
+    car.clock.sleep_until(15.0)
+    assert safe.command(Action(0.0, 1.0), seen(15.0), PERIOD_S).throttle == pytest.approx(3 * PERIOD_S)
+    # And the rate is that of real time, whatever the period says.
+    car.clock.sleep_until(15.01)
+    assert safe.command(Action(0.0, 1.0), seen(15.01), PERIOD_S).throttle == pytest.approx(3 * PERIOD_S + 0.01)
+
+
+def test_slew_begins_at_neutral_after_arming_and_after_a_pause() -> None:
+    safe, car, _ = gate(throttle_rate_per_s=1.0)
+    safe.arm()
+    for k in range(20):
+        safe.command(Action(0.0, 1.0), seen(10.0 + k * PERIOD_S), PERIOD_S)
+        car.clock.sleep_until(10.0 + (k + 1) * PERIOD_S)
+    assert car.log[-1].throttle > 0.5
+    now_s = car.clock.now_s()
+    assert safe.command(Action(0.0, 1.0), seen(now_s - 0.2, CarState()), PERIOD_S).is_neutral
+    car.clock.sleep_until(now_s + PERIOD_S)
+    assert safe.command(Action(0.0, 1.0), seen(now_s + PERIOD_S), PERIOD_S).throttle == pytest.approx(PERIOD_S)
+    safe.stop(planned=True)
+    safe.arm()
+    assert safe.command(Action(0.0, 1.0), seen(now_s + PERIOD_S), PERIOD_S).throttle == pytest.approx(PERIOD_S)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ActuatorFaultError("the link is gone"), EndReason.ACTUATOR_FAULT),
+        (NotArmedError("stopped from elsewhere"), EndReason.ACTUATOR_FAULT),
+        (ActionOutOfRangeError("beyond the car's limit"), EndReason.BAD_COMMAND),
+    ],
+)
+def test_a_car_that_refuses_ends_the_episode(error: Exception, reason: EndReason) -> None:
+    safe, car, _ = gate()
+    safe.arm()
+
+    def refuse(action: Action) -> Action:
+        raise error
+
+    car.command = refuse  # type: ignore[method-assign]
+    with pytest.raises(SafetyStop, match=str(error)) as caught:
+        safe.command(Action(0.1, 0.1), seen(10.0), PERIOD_S)
+    assert caught.value.reason is reason
+    assert car.stops == [False]
+    with pytest.raises(NotArmedError):
+        safe.command(Action(), seen(10.0), PERIOD_S)
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-2, 0))
+def test_time_that_does_not_pass_moves_no_command_away_from_zero(target: float, previous: float, dt_s: float) -> None:
+    value = limit(Action(0.0, target), Action(0.0, previous), dt_s, SafetyEnvelope()).throttle
+    assert abs(value) <= abs(previous)
+    assert value * previous >= 0.0
+
+
+@pytest.mark.parametrize("planned", [True, False])
+def test_after_a_stop_nothing_passes(planned: bool) -> None:
+    safe, car, _ = gate()
+    safe.arm()
+    safe.stop(planned=planned)
+    assert car.stops == [planned]
+    assert safe.state is (SafetyState.DISARMED if planned else SafetyState.FAULT)
+    with pytest.raises(NotArmedError):
+        safe.command(Action(), seen(10.0), PERIOD_S)
+    assert car.log == []

@@ -174,10 +174,12 @@ def test_silence_becomes_neutral_then_a_fault(serial_firmware: SerialFirmware) -
     config = config_for(serial_firmware, telemetry_stale_s=0.25, telemetry_lost_s=1.0)
     with Actuator(config, CALIBRATION) as actuator:
         actuator.arm()
+        until(lambda: not actuator.command(MOVING).is_neutral)
         serial_firmware.faults.is_silent = True
+        said: list[tuple[float, bool]] = []
         while actuator.status().state == SenderState.ARMED:
             try:
-                actuator.command(MOVING)
+                said.append((time.monotonic(), actuator.command(MOVING).is_neutral))
             except ActuatorFaultError:
                 break
             time.sleep(0.01)
@@ -186,6 +188,9 @@ def test_silence_becomes_neutral_then_a_fault(serial_firmware: SerialFirmware) -
         moving = [e.t_s for e in serial_firmware.log.motor() if e.value == 3.0]
         neutral = [e for e in serial_firmware.log.motor() if e.t_s > moving[-1]]
         assert neutral[-1].t_s - neutral[0].t_s > 0.4, "neutral long before the fault"
+        told_from_s = next(t_s for t_s, is_neutral in said if is_neutral)
+        assert all(is_neutral for t_s, is_neutral in said if t_s > told_from_s)
+        assert abs(told_from_s - moving[-1]) < 0.25, "and what is said to be sent is neutral from then on, too"
 
 
 def test_unplugged_then_plugged_in_again(serial_firmware: SerialFirmware) -> None:
@@ -331,3 +336,21 @@ def test_import_is_light() -> None:
         "import sys, drivers; bad = {'torch','serial','can','rerun','cantools'} & set(sys.modules); sys.exit(bool(bad))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_stop_does_not_wait_for_a_sender_that_hangs(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+    """Else the stop itself would look like a hung loop, and hide the reason of the end."""
+    actuator.arm()
+    assert actuator._sender is not None
+    actuator.command(MOVING)
+    os.kill(actuator._sender.pid, signal.SIGSTOP)  # type: ignore[attr-defined]
+    try:
+        until(lambda: time.monotonic() - actuator.status().t_published_s > 0.6)
+        begin_s = time.monotonic()
+        actuator.stop(planned=False)
+        assert time.monotonic() - begin_s < 1.0
+    finally:
+        t_resumed_s = time.monotonic()
+        os.kill(actuator._sender.pid, signal.SIGCONT)  # type: ignore[attr-defined]
+    until(lambda: actuator.status().state == SenderState.FAULT)
+    assert all(e.value == 0.0 for e in serial_firmware.log.motor(t_resumed_s)[1:]), "one frame may have been under way"

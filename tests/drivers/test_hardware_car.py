@@ -43,6 +43,11 @@ class HandPoses:
         number = len(self.samples) + 1 if sequence is None else sequence
         self.samples.append(PoseSample(number, now_s - 0.005, now_s, x_m, 1.0, 0.5, tracked=tracked))
 
+    def stand(self) -> None:
+        """Three poses of a car at rest: as many as a speed takes."""
+        for age_s in (0.02, 0.01, 0.0):
+            self.show(age_s=age_s)
+
     def open(self) -> None:
         if self.failure is not None:
             raise self.failure
@@ -142,6 +147,7 @@ def test_arming_gathers_every_reason(car: HardwareCar, poses: HandPoses, serial_
     [
         ([(0.0, 5.0, True)], "old"),
         ([(0.0, 0.0, False)], "does not see the body"),
+        ([(0.0, 0.01, True), (0.0, 0.0, True)], "too few poses"),
         ([(0.04 * k, 0.04 - 0.01 * k, True) for k in range(5)], "moves at"),
     ],
 )
@@ -154,12 +160,30 @@ def test_arming_needs_a_fresh_tracked_pose_at_rest(
         car.arm()
 
 
+def test_a_car_whose_motor_does_not_say_how_fast_it_turns_is_not_armed(
+    car: HardwareCar, poses: HandPoses, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses.stand()
+    silent = replace(car.actuator.status(), erpm=float("nan"))
+    monkeypatch.setattr(car.actuator, "status", lambda: silent)
+    with pytest.raises(NotReadyError, match="has not said how fast the motor turns"):
+        car.arm()
+
+
+def test_velocities_are_marked_as_unknown_until_there_are_three_poses(car: HardwareCar, poses: HandPoses) -> None:
+    for age_s, known in ((0.02, False), (0.01, False), (0.0, True)):
+        poses.show(1.0, age_s=age_s)
+        assert car.observe().velocity_valid is known
+    poses.show(1.0, age_s=-1.0)  # After a gap of a second the speed is anybody's guess.
+    assert not car.observe().velocity_valid
+
+
 def test_the_way_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
     assert car.reality is Reality.REAL
     assert car.command(NEUTRAL) == NEUTRAL
     with pytest.raises(NotArmedError):
         car.command(Action(0.1, 0.1))
-    poses.show()
+    poses.stand()
     car.arm()
     assert car.command(Action(0.1, 0.2)).throttle == pytest.approx(0.2)
     with pytest.raises(ActionOutOfRangeError, match="beyond the car's limit"):
@@ -172,14 +196,14 @@ def test_the_way_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmwa
     car.stop(planned=True)
     with pytest.raises(NotArmedError):
         car.command(Action(0.1, 0.1))
-    poses.show()
+    poses.stand()
     car.arm()
     car.stop(planned=False)
     with pytest.raises(ActuatorFaultError):
         car.arm()
     assert not car.health().ready
     car.reset_fault()
-    poses.show()
+    poses.stand()
     car.arm()
     assert not car.place(CarState())
 

@@ -6,6 +6,7 @@ Prints one JSON line with its process ids and run folder, then ``tick N`` per ti
 
 import json
 import os
+import signal
 import sys
 import time
 from dataclasses import replace
@@ -77,6 +78,10 @@ def main(folder: str, how: str) -> int:
                 car.world.ask(do="mocap", faults={"silent": True})
             if how == "mocap_hidden":
                 car.world.ask(do="mocap", faults={"occlusion": 1.0})
+            if how == "mocap_jump":
+                car.world.ask(do="place", state=[1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+            if how == "world_dies":
+                os.kill(car.world.addresses["pid"], signal.SIGKILL)
             if how == "mocap_error":
                 car.hardware.pose_source.since = None  # type: ignore[assignment,method-assign]
 

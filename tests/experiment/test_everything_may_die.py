@@ -130,6 +130,7 @@ def test_a_signal_ends_the_episode_in_order(tmp_path: Path, number: signal.Signa
         ("recorder_error", "RECORDER_ERROR"),
         ("mocap_silent", "POSE_STALE"),
         ("mocap_hidden", "TRACKING_LOST"),
+        ("mocap_jump", "POSE_JUMP"),
     ],
 )
 def test_an_error_ends_the_episode_in_neutral_with_its_reason(tmp_path: Path, how: str, reason: str) -> None:
@@ -224,6 +225,37 @@ def test_killing_the_sender_brings_the_firmware_s_time_out(tmp_path: Path) -> No
         assert timeouts[0].t_s - killed_s < 2.0
         assert not [e for e in log if e.name == "current" and e.t_s > killed_s + 0.1]
         assert program.recording.metadata["end_reason"] == "ACTUATOR_FAULT"
+
+
+def test_a_sender_that_hangs_is_a_fault_and_not_a_hung_loop(tmp_path: Path) -> None:
+    with driving(tmp_path, "well_behaved") as program:
+        program.until(f"tick {BREAK_AT_TICK}")
+        os.kill(program.sender, signal.SIGSTOP)
+        stopped_s = time.monotonic()
+        assert program.end() == 4
+        assert program.last_line == "ended ACTUATOR_FAULT"
+        assert "sender process hangs" in program.recording.metadata["end_detail"]
+        log = program.firmware_log()
+        assert any(e.name == "motor_timeout" for e in log)
+        assert not [e for e in log if e.name == "current" and e.value != 0.0 and e.t_s > stopped_s + 0.1]
+    assert not is_there(program.sender)
+
+
+def test_a_world_that_dies_ends_the_episode_and_leaves_no_process(tmp_path: Path) -> None:
+    with driving(tmp_path, "world_dies") as program:
+        assert program.end() == 4
+        assert program.last_line in ("ended ACTUATOR_FAULT", "ended POSE_STALE")
+        assert program.recording.ticks >= 15
+    assert not is_there(program.sender)
+
+
+def is_there(pid: int) -> bool:
+    """Whether a process is there, zombies included."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
 
 
 def test_a_stopped_program_is_braked_by_its_sender(tmp_path: Path) -> None:

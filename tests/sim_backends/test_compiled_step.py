@@ -10,7 +10,9 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.tracing import Tracer, gradients
 
-EVERYTHING = {name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items()}
+EVERYTHING = {  # all but the one that turns a kinematic or linear-tyre car into a dynamic one
+    name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items() if name != "tyre_saturation"
+}
 
 
 def some(cars, ticks):

@@ -235,4 +235,5 @@ def test_every_effect_declares_what_the_catalogue_needs():
         for p in effect.parameters:
             assert p.low <= p.typical <= p.high
             assert p.identity is None or p.low <= p.identity <= p.high
-            assert p.typical != p.identity
+            assert p.typical != p.identity or p.choices
+            assert (p.identity is None) == bool(p.same_as)

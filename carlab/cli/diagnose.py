@@ -1,0 +1,151 @@
+"""``carlab diagnose``."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from carlab.cli.console import console, fail, progress, table
+from carlab.cli.options import required_file
+from carlab.cli.recordings import is_csv
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.core.episode_data import EpisodeData
+    from carlab.diagnosis.findings import DataFault, Diagnosis, RecordingUse
+
+EXIT_INCONCLUSIVE = 5
+DATA_FAULTS = (
+    *("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples", "clock_drift", "column_shift", "column_scale"),
+    *("wrong_unit", "wrong_sign", "wrong_frame", "integration_error"),
+)
+
+
+@dataclass
+class Diagnose:
+    """Find what a simulator leaves out of recordings: locate it, name it, model it, and show the held-out fit improve.
+
+    Writes report.html, report.json, report.rrd and model.toml (the car file with what was found). ^C ends the search
+    and reports what was found until then. Exit code 0 with a verdict, 5 where the recordings cannot tell.
+    """
+
+    recordings: Positional[tuple[Path, ...]]
+    """MCAP or CSV files to fit."""
+
+    car: str = "sim"
+    """Car file of the simulator to question; sim for the default car."""
+
+    holdout: tuple[Path, ...] = ()
+    """Recordings that only judge; without any, the last 30 % of each recording is held out."""
+
+    out: Path = Path("diagnosis")
+    """Folder for the report."""
+
+    effects: tuple[str, ...] = ()
+    """Try only these effects of the catalogue."""
+
+    seed: int = 0
+    """Written into the report; a diagnosis draws no random numbers."""
+
+    verbose: bool = False
+    """Show the whole log."""
+
+    def run(self) -> int:
+        """Diagnose and print the verdict."""
+        from carlab.cars import default_car, load_car_file
+        from carlab.diagnosis.diagnose import Inconclusive, diagnose
+        from carlab.diagnosis.judge import Texts
+        from carlab.diagnosis.report import write_report
+        from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separating_drive
+        from carlab.experiment.interrupts import Interrupts
+        from sim_backends.effects import EFFECTS
+
+        if not self.recordings:
+            raise ConfigError("Name at least one recording to fit, for example carlab diagnose drive.mcap.")
+        for name in self.effects:
+            if name not in EFFECTS:
+                raise ConfigError(f"There is no effect '{name}'; there are: {', '.join(EFFECTS)}.")
+        same = {p.resolve() for p in self.recordings} & {p.resolve() for p in self.holdout}
+        if same:
+            raise ConfigError(f"{min(same).name} is both fitted and held out; a judge must not be a witness.")
+        car = default_car() if self.car == "sim" else load_car_file(Path(self.car))
+        fit, faults, uses = self._load(self.recordings, "fit")
+        held, more, others = self._load(self.holdout, "held out")
+        texts = Texts(effect_sentence, separating_drive, LOOK_ALIKES)
+        with Interrupts() as interrupts, progress() as bar:
+            row = bar.add_task("diagnosis", total=100, note="")
+            try:
+                outcome = diagnose(
+                    fit,
+                    held,
+                    car.simulator,
+                    texts,
+                    uses=(*uses, *others),
+                    data_faults=(*faults, *more),
+                    effects=self.effects or None,
+                    seed=self.seed,
+                    progress=lambda what, share: bar.update(row, completed=round(100 * share), note=what),
+                    stop=interrupts.requested.is_set,
+                )
+            except Inconclusive as error:
+                fail(str(error))
+                self._write_inconclusive(str(error), (*faults, *more), (*uses, *others), car.simulator)
+                return EXIT_INCONCLUSIVE
+        write_report(outcome.diagnosis, outcome.exhibits, self.out, outcome.model)
+        self._print(outcome.diagnosis)
+        return 0
+
+    def _load(
+        self, paths: tuple[Path, ...], role: str
+    ) -> tuple[list[EpisodeData], list[DataFault], list[RecordingUse]]:
+        from carlab.diagnosis.findings import DataFault, RecordingUse
+        from carlab.recording.audit_report import Severity
+        from carlab.recording.foreign_csv import import_csv
+        from carlab.recording.mcap_source import read_episode
+
+        episodes, faults, uses = [], [], []
+        for path in paths:
+            required_file(path, "The recording")
+            if is_csv(path):
+                imported = import_csv(path)
+                episodes += list(imported.episodes)
+                for finding in imported.report.findings:
+                    if finding.id in DATA_FAULTS and finding.severity >= Severity.REPAIRED:
+                        action = "repaired" if finding.severity is Severity.REPAIRED else "reported"
+                        faults.append(
+                            DataFault(finding.id, finding.channel, finding.count, f"{action}: {finding.sentence}")
+                        )
+            else:
+                episodes.append(read_episode(path))
+            uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))
+        return episodes, faults, uses
+
+    def _write_inconclusive(
+        self, why: str, faults: tuple[DataFault, ...], uses: tuple[RecordingUse, ...], simulator: object
+    ) -> None:
+        from carlab.diagnosis.findings import Diagnosis, Exhibits
+        from carlab.diagnosis.report import write_report
+        from sim_backends.car_parameters import SimulatorConfig
+
+        assert isinstance(simulator, SimulatorConfig)
+        diagnosis = Diagnosis("inconclusive", why, (), {}, 1.0, {}, None, faults, uses, self.seed, 0.0, why)
+        write_report(diagnosis, Exhibits(), self.out, simulator)
+
+    def _print(self, diagnosis: Diagnosis) -> None:
+        from carlab.diagnosis.report_text import verdict_sentence
+
+        console.print(verdict_sentence(diagnosis))
+        for effect in diagnosis.effects:
+            console.print(f"  {effect.sentence}", markup=False)
+        figures = ("position_m", "yaw_rad", "vx", "vy", "yaw_rate")
+        rows = [
+            [name.replace("_", " "), *(f"{getattr(e, k):.4f}" for k in figures), f"{e.score:.2f}"]
+            for name, e in diagnosis.held_out.items()
+        ]
+        columns = ["held out", "position [m]", "yaw [rad]", "vx [m/s]", "vy [m/s]", "yaw rate [rad/s]", "score"]
+        table(f"Error after {diagnosis.horizon_s:.1f} s", columns, rows)
+        console.print(f"Read {self.out / 'report.html'}; drive what was found with --car {self.out / 'model.toml'}.")

@@ -1,0 +1,42 @@
+"""A seal over the answers: a hash that is made known before the first diagnosis and checked before scoring."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from carlab.core.errors import DataError
+
+
+def new_nonce() -> str:
+    """32 random bytes as hex."""
+    return secrets.token_hex(32)
+
+
+def new_name() -> str:
+    """A random name for a case's folder."""
+    return secrets.token_hex(8)
+
+
+def digest(answers: Mapping[str, Any], nonce: str) -> str:
+    """sha256 over the nonce and the answers as canonical JSON (sorted keys, no spaces), as hex."""
+    text = json.dumps({"nonce": nonce, "answers": answers}, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a file, as hex."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def check(answers: Mapping[str, Any], nonce: str, seal: str) -> None:
+    """Raise DataError where the answers are not the ones that were sealed."""
+    found = digest(answers, nonce)
+    if not secrets.compare_digest(found, seal):
+        raise DataError(
+            f"The seal is broken: the answers hash to {found[:16]}... but {seal[:16]}... was sealed; the run is void."
+        )

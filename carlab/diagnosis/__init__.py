@@ -1,0 +1,1 @@
+"""Locate, name, model and prove what a simulator leaves out."""

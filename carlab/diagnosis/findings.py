@@ -1,0 +1,194 @@
+"""What a diagnosis says, as data: the schema ``carlab.diagnosis/1`` to the letter, and what its pictures need."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from carlab.core.quantities import FloatArray
+
+SCHEMA = "carlab.diagnosis/1"
+Verdict = Literal["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A fitted number with its standard deviation and 90 % interval, in ``unit``."""
+
+    value: float
+    std: float
+    low90: float
+    high90: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Where an effect shows. ``time`` is (start, end) [s] and ``place`` (x, y, radius) [m] where it has one."""
+
+    channels: tuple[str, ...]
+    regime: str
+    lag_s: float | None = None
+    time: tuple[float, float] | None = None
+    place: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Why an effect is believed.
+
+    Relative fall of the held-out score when it is added last; held-out log-likelihood gain over its clustered
+    standard error; the share of it that base parameters cannot absorb; relative rise of each channel's error when it
+    is taken out.
+    """
+
+    held_out_error_reduction: float
+    standard_errors: float
+    visibility: float
+    deletion_fingerprint: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class EffectFinding:
+    """One named effect. ``separating_drive`` names a manoeuvre that would tell its set apart."""
+
+    id: str
+    confidence: float
+    parameters: Mapping[str, Estimate]
+    where: Where
+    evidence: Evidence
+    sentence: str
+    indistinguishable_from: tuple[str, ...] = ()
+    separating_drive: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FitErrors:
+    """Root mean square held-out errors after the horizon, and the score (in noise floors)."""
+
+    position_m: float
+    yaw_rad: float
+    vx: float
+    vy: float
+    yaw_rate: float
+    score: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unexplained:
+    """What is left when every named effect is in: share of the squared excess, where, and of what class."""
+
+    share: float
+    channels: tuple[str, ...]
+    regime: str
+    kind: str
+    formula: str
+
+
+@dataclass(frozen=True, slots=True)
+class DataFault:
+    """A fault of the recording rather than of the simulator."""
+
+    id: str
+    channel: str
+    rows: int
+    action: str
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingUse:
+    """A recording and what it was used for: ``fit`` or ``held out``."""
+
+    path: str
+    sha256: str
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """The whole answer. ``held_out`` has nominal, refit, with_effects and noise_floor."""
+
+    verdict: Verdict
+    sentence: str
+    effects: tuple[EffectFinding, ...]
+    parameters: Mapping[str, Estimate]
+    horizon_s: float
+    held_out: Mapping[str, FitErrors]
+    unexplained: Unexplained | None
+    data_faults: tuple[DataFault, ...]
+    recordings: tuple[RecordingUse, ...]
+    seed: int
+    seconds: float
+    advice: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
+        effects = []
+        for e in self.effects:
+            found = asdict(e)
+            found["indistinguishable_from"] = list(e.indistinguishable_from)
+            effects.append(found)
+        unexplained = None
+        if self.unexplained is not None and self.unexplained.share >= 0.1:
+            unexplained = asdict(self.unexplained)
+            unexplained["class"] = unexplained.pop("kind")
+        made = {
+            "schema": SCHEMA,
+            "verdict": self.verdict,
+            "sentence": self.sentence,
+            "advice": self.advice,
+            "effects": effects,
+            "parameters": {name: asdict(e) for name, e in self.parameters.items()},
+            "fit": {"horizon_s": self.horizon_s, "held_out": {k: asdict(v) for k, v in self.held_out.items()}},
+            "unexplained": unexplained,
+            "data_faults": [asdict(f) for f in self.data_faults],
+            "recordings": [asdict(r) for r in self.recordings],
+            "seed": self.seed,
+            "seconds": self.seconds,
+        }
+        return dict(_plain(made))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """One held-out recording beside its predictions, each restarted every horizon.
+
+    times_s (T + 1,); recorded (T + 1, 6); predicted by name (nominal, refit, with_effects), each (T + 1, 6) with NaN
+    where there is none; marked are the stretches (start, end) [s] where the refit is worst.
+    """
+
+    name: str
+    times_s: FloatArray
+    recorded: FloatArray
+    predicted: Mapping[str, FloatArray]
+    marked: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Exhibits:
+    """Material for the report's pictures.
+
+    ladder: scores from nominal over refit and each added effect to the noise floor, with labels
+    regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
+    correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
+                 and the 99 % bound
+    candidates: every effect tried first: id, held-out gain in standard errors, score with it
+    """
+
+    traces: tuple[Trace, ...] = ()
+    ladder: tuple[tuple[str, float], ...] = ()
+    regimes: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
+    correlation: Mapping[str, tuple[FloatArray, FloatArray, float]] = field(default_factory=dict)
+    candidates: tuple[tuple[str, float, float], ...] = ()

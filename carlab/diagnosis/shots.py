@@ -1,0 +1,234 @@
+"""Recordings cut into shots: short stretches that a simulator is asked to predict from an estimated start.
+
+The start of a shot is a local cubic through the poses about it (Savitzky and Golay 1964), not the noisy velocity
+columns; the commands before it go along, so that delays and hidden states of servo and motor are right at its start.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_coeffs, savgol_filter
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+
+IndexArray = NDArray[np.int64]
+
+START_SPAN_S = 0.27
+"""Poses that the start of a shot is estimated from: nine at 30 Hz."""
+HISTORY_S = 0.6
+MIN_MOTION_MPS = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """One unbroken stretch of a recording on an even grid of ``period_s``.
+
+    t_s        (n,)     since the first row of the recording
+    states     (n, 6)   as measured, yaw unwrapped
+    smooth     (n, 6)   local cubic through the poses: pose, and body velocities from it
+    commands   (n, 2)   mean over each cell of the commands held as recorded
+    """
+
+    recording: int
+    period_s: float
+    t_s: FloatArray
+    states: FloatArray
+    smooth: FloatArray
+    commands: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviations of what was measured, by channel x, y, yaw, vx, vy, yaw rate (6,), and of shot starts."""
+
+    measured: FloatArray
+    start: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Shots:
+    """S shots of K steps with H commands of history.
+
+    start (S, 6); history (S, H, 2); commands (S, K, 2); measured (S, K + 1, 6) with the yaw unwrapped; velocities
+    before the start (S, H, 3); t0_s (S,); recording (S,) and block (S,), stretches of a few seconds that are treated
+    as independent of one another; row (S,) into the recording's grid.
+    """
+
+    period_s: float
+    start: FloatArray
+    history: FloatArray
+    commands: FloatArray
+    measured: FloatArray
+    velocities_before: FloatArray
+    t0_s: FloatArray
+    recording: IndexArray
+    block: IndexArray
+    row: IndexArray
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    @property
+    def steps(self) -> int:
+        """Steps K of each shot."""
+        return int(self.commands.shape[1])
+
+    def take(self, which: NDArray[np.bool_] | IndexArray) -> Shots:
+        """Some of the shots."""
+        return Shots(
+            self.period_s,
+            self.start[which],
+            self.history[which],
+            self.commands[which],
+            self.measured[which],
+            self.velocities_before[which],
+            self.t0_s[which],
+            self.recording[which],
+            self.block[which],
+            self.row[which],
+        )
+
+
+def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) -> list[Track]:
+    """Put recordings onto an even grid, cut at gaps and where a value is missing.
+
+    Args:
+        episodes: recordings; the column ``segment`` in ``extra`` numbers stretches that must not be joined.
+        period_s: grid; the median period of the first recording where None.
+
+    Raises:
+        DataError: a recording has no two rows.
+    """
+    found = []
+    for index, episode in enumerate(episodes):
+        if episode.ticks < 2:
+            raise DataError(f"Recording {index + 1} has {episode.ticks} commands; record at least some seconds.")
+        grid_s = episode.period_s if period_s is None else period_s
+        period_s = grid_s
+        for rows in _unbroken(episode, grid_s):
+            track = _track(index, episode, rows, grid_s)
+            if track is not None:
+                found.append(track)
+    return found
+
+
+def _unbroken(episode: EpisodeData, period_s: float) -> Iterable[slice]:
+    t = episode.times_s
+    whole = np.asarray(np.isfinite(episode.states).all(axis=1))
+    broken = np.asarray(np.diff(t) > max(3.0 * period_s, 0.1)) | ~(whole[1:] & whole[:-1])
+    if "segment" in episode.extra:
+        broken = broken | np.asarray(np.diff(episode.extra["segment"]) != 0)
+    edges = [0, *(np.flatnonzero(broken) + 1), len(t)]
+    for first, last in itertools.pairwise(edges):
+        if last - first > 2:
+            yield slice(int(first), int(last))
+
+
+def _track(index: int, episode: EpisodeData, rows: slice, period_s: float) -> Track | None:
+    t = episode.times_s[rows]
+    states = episode.states[rows].copy()
+    states[:, 2] = np.unwrap(states[:, 2])
+    commands = np.vstack([episode.sent, episode.sent[-1:]])[rows]
+    count = int(np.floor((t[-1] - t[0]) / period_s + 1e-6)) + 1
+    grid = t[0] + period_s * np.arange(count)
+    width = _odd(START_SPAN_S / period_s)
+    if count < width + 2:
+        return None
+    if np.abs(np.diff(t) - period_s).max() > 0.02 * period_s or count != len(t):
+        states = np.stack([np.interp(grid, t, column) for column in states.T], axis=1)
+        commands = _cell_means(t, commands, grid, period_s)
+    pose = savgol_filter(states[:, :3], width, 3, axis=0)
+    rate = savgol_filter(states[:, :3], width, 3, deriv=1, delta=period_s, axis=0)
+    sin, cos = np.sin(pose[:, 2]), np.cos(pose[:, 2])
+    forward, left = cos * rate[:, 0] + sin * rate[:, 1], cos * rate[:, 1] - sin * rate[:, 0]
+    smooth = np.column_stack([pose, forward, left, rate[:, 2]])
+    return Track(index, period_s, grid - episode.times_s[0], states, smooth, commands)
+
+
+def _cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: float) -> FloatArray:
+    """Mean over [grid, grid + period) of values held from each t on."""
+    integral = np.vstack([np.zeros(2), np.cumsum(held[:-1] * np.diff(t)[:, None], axis=0)])
+
+    def upto(moments: FloatArray) -> FloatArray:
+        inside = np.clip(moments, t[0], t[-1])
+        index = np.clip(np.searchsorted(t, inside, side="right") - 1, 0, len(t) - 1)
+        past = np.clip(moments - t[-1], 0.0, None)[:, None] * held[-1]
+        return np.asarray(integral[index] + (inside - t[index])[:, None] * held[index] + past)
+
+    return (upto(grid + period_s) - upto(grid)) / period_s
+
+
+def _odd(samples: float) -> int:
+    return max(2 * round((samples - 1) / 2) + 1, 5)
+
+
+def estimate_noise(tracks: Sequence[Track]) -> Noise:
+    """Noise of each channel from what a local cubic leaves of it (a median, so that hard manoeuvres count little).
+
+    An estimate: whatever in the recording is faster than the cubic counts as noise.
+    """
+    period_s = tracks[0].period_s
+    width = _odd(START_SPAN_S / period_s)
+    value = savgol_coeffs(width, 3)
+    slope = savgol_coeffs(width, 3, deriv=1, delta=period_s)
+    left = []
+    for track in tracks:
+        states = track.states
+        residual = states - savgol_filter(states, width, 3, axis=0)
+        left.append(residual[np.hypot(track.smooth[:, 3], track.smooth[:, 4]) > MIN_MOTION_MPS])
+    residual = np.concatenate(left) if left else np.zeros((0, 6))
+    if len(residual) < 20:
+        residual = np.concatenate([t.states - savgol_filter(t.states, width, 3, axis=0) for t in tracks])
+    spread = 1.4826 * np.median(np.abs(residual), axis=0)
+    measured = spread / np.sqrt(max(1.0 - value[width // 2], 0.1))
+    measured[:2] = np.sqrt(np.mean(measured[:2] ** 2))
+    measured = np.maximum(measured, [1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4])
+    pose, rate = np.linalg.norm(value), np.linalg.norm(slope)
+    return Noise(measured, np.concatenate([pose * measured[:3], rate * measured[:3]]))
+
+
+def cut(tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: float = 5.0) -> Shots:
+    """Cut tracks into shots that move. Raises DataError where there is none."""
+    period_s = tracks[0].period_s
+    steps = max(round(horizon_s / period_s), 1)
+    stride = max(round(stride_s / period_s), 1)
+    past = max(round(HISTORY_S / period_s), 1)
+    parts: dict[str, list[FloatArray]] = {name: [] for name in ("start", "history", "commands", "measured", "before")}
+    t0, recordings, blocks, rows = [], [], [], []
+    for track in tracks:
+        speed = np.hypot(track.smooth[:, 3], track.smooth[:, 4])
+        for row in range(past, len(track.t_s) - steps, stride):
+            if speed[row : row + steps + 1].max() < MIN_MOTION_MPS:
+                continue
+            parts["start"].append(track.smooth[row])
+            parts["history"].append(track.commands[row - past : row])
+            parts["commands"].append(track.commands[row : row + steps])
+            parts["measured"].append(track.states[row : row + steps + 1])
+            parts["before"].append(track.smooth[row - past : row, 3:])
+            t0.append(track.t_s[row])
+            recordings.append(track.recording)
+            blocks.append(track.recording * 1_000_000 + int(track.t_s[row] / block_s))
+            rows.append(row)
+    if not t0:
+        raise DataError(
+            f"The recording holds no moving stretch of {horizon_s + HISTORY_S:.1f} s; record a longer drive."
+        )
+    return Shots(
+        period_s=period_s,
+        start=np.stack(parts["start"]),
+        history=np.stack(parts["history"]),
+        commands=np.stack(parts["commands"]),
+        measured=np.stack(parts["measured"]),
+        velocities_before=np.stack(parts["before"]),
+        t0_s=np.array(t0),
+        recording=np.array(recordings),
+        block=np.array(blocks),
+        row=np.array(rows),
+    )

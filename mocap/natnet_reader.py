@@ -1,0 +1,106 @@
+"""Bounds-checked reading of NatNet payloads: whatever the bytes, either a value or a ProtocolError that says where."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from struct import Struct
+from typing import Any
+
+from carlab.core.errors import ProtocolError
+
+INT32 = Struct("<i")
+UINT16_PAIR = Struct("<HH")
+
+
+class Reader:
+    """A position in a payload. ``section`` is what is being read, for messages; all offsets are into the payload."""
+
+    __slots__ = ("data", "end", "pos", "section", "sized", "what")
+
+    def __init__(self, data: bytes, what: str, *, sized: bool = False) -> None:
+        self.data = data
+        self.pos = 0
+        self.end = len(data)
+        self.section = "start"
+        self.sized = sized
+        self.what = what
+
+    def error(self, problem: str) -> ProtocolError:
+        """A ProtocolError that names the message, the byte and the section."""
+        return ProtocolError(f"{self.what}: {problem} at byte {self.pos} of {len(self.data)}, in {self.section}.")
+
+    def take(self, layout: Struct) -> tuple[Any, ...]:
+        """Read one record."""
+        start = self.pos
+        if start + layout.size > self.end:
+            raise self.error(
+                f"{layout.size} bytes belong where {self.end - start} are left; it is cut short or garbled,"
+            )
+        self.pos = start + layout.size
+        return layout.unpack_from(self.data, start)
+
+    def integer(self) -> int:
+        """Read one int32."""
+        value: int = self.take(INT32)[0]
+        return value
+
+    def count(self, smallest_bytes: int) -> int:
+        """Read a count of things of at least ``smallest_bytes`` each, and refuse one that cannot be true."""
+        number = self.integer()
+        if number < 0 or number * smallest_bytes > self.end - self.pos:
+            self.pos -= INT32.size
+            raise self.error(f"a count of {number} does not fit into the {self.end - self.pos - 4} bytes that follow")
+        return number
+
+    def section_count(self, section: str, smallest_bytes: int) -> int:
+        """Read the head of a frame's section: a count and, where sections are sized (4.1), the size in bytes.
+
+        A size that leads beyond the payload is refused. Otherwise the content decides where the section ends; the
+        end-of-data tag and the payload's length check the sum.
+        """
+        self.section = section
+        number = self.count(smallest_bytes)
+        if self.sized:
+            size = self.integer()
+            if size < 0 or size > self.end - self.pos:
+                self.pos -= INT32.size
+                raise self.error(f"a section of {size} bytes does not fit into the {self.end - self.pos - 4} left")
+            if number * smallest_bytes > self.end - self.pos:
+                raise self.error(f"{number} entries do not fit into the {self.end - self.pos} bytes left")
+        return number
+
+    def records(self, layout: Struct, number: int) -> Iterator[tuple[Any, ...]]:
+        """Read ``number`` records in one go."""
+        start = self.pos
+        stop = start + number * layout.size
+        if stop > self.end:
+            raise self.error(
+                f"{number} entries of {layout.size} bytes do not fit into the {self.end - start} bytes left"
+            )
+        self.pos = stop
+        return layout.iter_unpack(self.data[start:stop])
+
+    def text(self) -> str:
+        """Read a NUL-terminated UTF-8 string; bytes that are no UTF-8 become U+FFFD, a name must not cost the pose."""
+        stop = self.data.find(b"\0", self.pos, self.end)
+        if stop < 0:
+            raise self.error("a name has no end")
+        value = self.data[self.pos : stop].decode("utf-8", "replace")
+        self.pos = stop + 1
+        return value
+
+    def texts(self, number: int) -> tuple[str, ...]:
+        """Read ``number`` strings."""
+        return tuple([self.text() for _ in range(number)])
+
+    def finish(self) -> None:
+        """Raise ProtocolError where bytes are left over."""
+        if self.pos != self.end:
+            raise self.error(f"{self.end - self.pos} bytes are left over")
+
+
+def encode_text(text: str) -> bytes:
+    """A NUL-terminated UTF-8 string. Raises ProtocolError for a NUL inside."""
+    if "\0" in text:
+        raise ProtocolError(f"The name {text!r} holds a NUL, which ends a name on the wire; choose another one.")
+    return text.encode("utf-8") + b"\0"

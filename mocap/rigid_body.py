@@ -1,0 +1,246 @@
+"""One rigid body of a NatNet server as a PoseSource: ``base_link`` in ``map``, on the host's monotonic clock."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from itertools import takewhile
+from typing import Self
+
+from carlab.core.errors import NotReadyError
+from carlab.core.quantities import PoseSample
+from mocap.axes import base_link_pose, tilt_rad, z_up_quaternion, z_up_vector
+from mocap.mocap_config import MocapConfig
+from mocap.natnet_client import NatNetClient
+from mocap.natnet_models import Description, Frame, Quaternion, RigidBody, RigidBodyDescription
+
+SAMPLES_KEPT = 1024
+NORM_TOLERANCE = 0.01
+TILT_LIMIT_RAD = math.radians(40.0)
+TILTED_SHARE = 0.2
+HEIGHT_LIMIT_M = 0.3
+
+
+class RigidBodyPoseSource:
+    """Poses of one rigid body, received in a thread of its own.
+
+    A frame in which the body is not tracked, is missing, or has a pose that is no pose gives a sample with
+    ``tracked=False`` and the last good pose; before there was one, such frames give a sample only where they bring
+    numbers. ``t_capture_s`` is the exposure on the host's clock (see ``mocap.time_alignment``); from a server
+    without clock stamps it is the time of arrival.
+    """
+
+    def __init__(self, config: MocapConfig, samples_kept: int = SAMPLES_KEPT) -> None:
+        self.config = config
+        self._client = NatNetClient(config, on_frame=self._on_frame, on_models=self._on_models)
+        self._new_sample = threading.Condition()
+        self._samples: deque[PoseSample] = deque(maxlen=samples_kept)
+        self._body: RigidBodyDescription | None = None
+        self._is_open = False
+        self._clear_counts()
+
+    def _clear_counts(self) -> None:
+        self._tracked = self._untracked = self._missing = self._unusable = self._tilted = 0
+        self._low_m = [math.inf] * 3
+        self._high_m = [-math.inf] * 3
+
+    def open(self) -> None:
+        """Connect, find the body and wait for a first frame with it. Idempotent.
+
+        Raises NotReadyError where the server is not there, streams nothing or does not know the body; then the
+        message lists the bodies it does know.
+        """
+        if self._is_open:
+            return
+        self._samples.clear()
+        self._body = None
+        self._clear_counts()
+        try:
+            self._client.open()
+            self._body = select_body(self._client.models or (), self.config)
+            if self.wait_for(-(2**62), self.config.timeout_s) is None:
+                raise NotReadyError("No motion capture", [self._why_silent()])
+        except BaseException:
+            self._client.close()
+            raise
+        self._is_open = True
+
+    def _why_silent(self) -> str:
+        numbers = self._client.statistics()
+        if numbers["frames"]:
+            return f"frames arrive without the body '{self._body_name}'; enable it in Motive's Assets pane."
+        if self._client.failure is not None or numbers["malformed"]:
+            return f"no frame can be read: {self._client.last_error}"
+        if numbers["foreign"]:
+            return (
+                f"datagrams come from {self._client.foreign_address} and none from the server's own address: set "
+                "server_address in [hardware.mocap] to the Local Interface in Motive's Data Streaming pane."
+            )
+        return (
+            f"the server answers, but no frame came within {self.config.timeout_s:g} s: is Motive live (or playing a "
+            "take) and does the firewall of this computer let UDP in?"
+        )
+
+    def latest(self) -> PoseSample | None:
+        """The newest sample, tracked or not; None before the first."""
+        with self._new_sample:
+            return self._samples[-1] if self._samples else None
+
+    def since(self, sequence: int) -> tuple[PoseSample, ...]:
+        """Samples newer than ``sequence``, oldest first; at most the last ``samples_kept``."""
+        with self._new_sample:
+            newest_first = list(takewhile(lambda sample: sample.sequence > sequence, reversed(self._samples)))
+        return tuple(reversed(newest_first))
+
+    def wait_for(self, sequence: int, timeout_s: float) -> PoseSample | None:
+        """Block until there is a sample newer than ``sequence`` and return the newest; None after ``timeout_s``."""
+
+        def newer() -> bool:
+            return bool(self._samples) and self._samples[-1].sequence > sequence
+
+        with self._new_sample:
+            return self._samples[-1] if self._new_sample.wait_for(newer, timeout_s) else None
+
+    def statistics(self) -> Mapping[str, float]:
+        """The client's statistics, and how many frames had the body tracked, untracked, missing or unusable."""
+        numbers = dict(self._client.statistics())
+        with self._new_sample:
+            numbers["tracked"] = float(self._tracked)
+            numbers["untracked"] = float(self._untracked)
+            numbers["missing"] = float(self._missing)
+            numbers["unusable"] = float(self._unusable)
+        return numbers
+
+    def problems(self) -> tuple[str, ...]:
+        """What looks wrong though poses arrive, as sentences; empty where all looks well."""
+        found = []
+        if self._client.failure is not None:
+            found.append(f"motion capture stopped, {self._client.last_error}; close it and open it again.")
+        with self._new_sample:
+            spans_m = [high - low for low, high in zip(self._low_m, self._high_m, strict=True)]
+            other = "z" if self.config.up_axis == "y" else "y"
+            if self._tracked and self._tilted > TILTED_SHARE * self._tracked:
+                found.append(
+                    f"the body '{self._body_name}' is tilted by more than {math.degrees(TILT_LIMIT_RAD):.0f} degrees "
+                    f'in {self._tilted} of {self._tracked} frames: up_axis = "{other}" may be right in '
+                    "[hardware.mocap], or the body was not level when it was created in Motive."
+                )
+            elif self._tracked and spans_m[2] > HEIGHT_LIMIT_M and min(spans_m[:2]) < 0.1 * spans_m[2]:
+                found.append(
+                    f"the body '{self._body_name}' moves up and down by {spans_m[2]:.2f} m and hardly sideways: "
+                    f'up_axis = "{other}" may be right in [hardware.mocap].'
+                )
+            if self._body is None and self._is_open:
+                found.append("the server no longer knows the body; define it again in Motive under the same name.")
+            if self._unusable:
+                found.append(
+                    f"{self._unusable} frames had a pose of the body that is no pose (NaN or no unit quaternion)."
+                )
+        if self._is_open and not self._client.alignment.is_aligned:
+            found.append("the server answers no clock echo, so times of capture are times of arrival.")
+        return tuple(found)
+
+    def close(self) -> None:
+        """Disconnect; samples stay readable. Idempotent, safe after a failed open."""
+        self._client.close()
+        self._is_open = False
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self.close()
+
+    @property
+    def client(self) -> NatNetClient:
+        """The connection underneath: server info, models, bitstream version, last error."""
+        return self._client
+
+    @property
+    def _body_name(self) -> str:
+        return self._body.name if self._body is not None else self.config.body or str(self.config.body_id)
+
+    def _on_models(self, models: tuple[Description, ...]) -> None:
+        if not self._is_open:
+            return
+        try:
+            body = select_body(models, self.config)
+        except NotReadyError:
+            body = None
+        with self._new_sample:
+            self._body = body
+
+    def _on_frame(self, frame: Frame, sequence: int, capture_s: float, received_s: float) -> None:
+        with self._new_sample:
+            if self._body is None and not self._is_open:
+                return
+            body = next((b for b in frame.rigid_bodies if self._body is not None and b.id == self._body.id), None)
+            sample = self._sample(body, sequence, capture_s, received_s)
+            if sample is not None:
+                self._samples.append(sample)
+                self._new_sample.notify_all()
+
+    def _sample(self, body: RigidBody | None, sequence: int, capture_s: float, received_s: float) -> PoseSample | None:
+        pose = None if body is None else self._pose(body)
+        if body is None:
+            self._missing += 1
+        elif not body.is_tracked:
+            self._untracked += 1
+        elif pose is None:
+            self._unusable += 1
+        else:
+            self._tracked += 1
+            (x_m, y_m, z_m), yaw_rad = pose
+            for axis, value in enumerate((x_m, y_m, z_m)):
+                self._low_m[axis] = min(self._low_m[axis], value)
+                self._high_m[axis] = max(self._high_m[axis], value)
+            return PoseSample(sequence, capture_s, received_s, x_m, y_m, yaw_rad, z_m)
+        if self._samples:
+            last = self._samples[-1]
+            held = (last.x_m, last.y_m, last.yaw_rad, last.z_m)
+        elif pose is not None:
+            (x_m, y_m, z_m), yaw_rad = pose
+            held = (x_m, y_m, yaw_rad, z_m)
+        else:
+            return None
+        return PoseSample(sequence, capture_s, received_s, *held, tracked=False)
+
+    def _pose(self, body: RigidBody) -> tuple[tuple[float, float, float], float] | None:
+        """Pose of base_link, or None where the numbers are no pose."""
+        norm = math.sqrt(body.qx**2 + body.qy**2 + body.qz**2 + body.qw**2)
+        position = (body.x_m, body.y_m, body.z_m)
+        if not abs(norm - 1.0) < NORM_TOLERANCE or not all(map(math.isfinite, position)):
+            return None
+        quaternion: Quaternion = (body.qx / norm, body.qy / norm, body.qz / norm, body.qw / norm)
+        if self.config.up_axis == "y":
+            position, quaternion = z_up_vector(position), z_up_quaternion(quaternion)
+        if body.is_tracked and tilt_rad(quaternion) > TILT_LIMIT_RAD:
+            self._tilted += 1
+        return base_link_pose(position, quaternion, self.config.yaw_offset_rad, self.config.pivot_in_base_link_m)
+
+
+def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBodyDescription:
+    """The rigid body that ``config`` names. Raises NotReadyError listing those that are there."""
+    bodies = [model for model in models if isinstance(model, RigidBodyDescription)]
+    if config.body_id is not None:
+        wanted, chosen = f"with id {config.body_id}", [b for b in bodies if b.id == config.body_id]
+    elif config.body:
+        wanted, chosen = f"'{config.body}'", [b for b in bodies if b.name == config.body]
+    else:
+        wanted, chosen = "to choose by itself", bodies if len(bodies) == 1 else []
+    if len(chosen) == 1:
+        return chosen[0]
+    there = ", ".join(f"'{b.name}' (id {b.id})" for b in bodies)
+    if not bodies:
+        remedy = "it streams none: create one in Motive and switch Rigid Bodies on in the Data Streaming pane."
+    elif len(chosen) > 1:
+        remedy = f"several have that name: set body_id in [hardware.mocap]; there are {there}."
+    else:
+        remedy = f"set body in [hardware.mocap] to one of those there are: {there}."
+    raise NotReadyError("No motion capture", [f"the server has no rigid body {wanted}; {remedy}"])
+
+
+__all__ = ["MocapConfig", "RigidBodyPoseSource", "select_body"]

@@ -1,0 +1,170 @@
+"""Friction and side force of the tyres."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sim_backends.array_ops import Ops, Value
+from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, Parameters
+from sim_backends.effects.first_order import LagWeights, lag_weights
+
+EDGE_M = 0.05
+"""Width over which a patch begins, centred on its radius, so that its place and size have derivatives [m]."""
+RELAXATION_FLOOR_MPS = 0.3
+SHORTEST_M = 1e-9
+"""A relaxation length below this is none."""
+LARGEST_SHARE = 0.98
+"""Most of the friction that a longitudinal force may use up in the ellipse."""
+
+
+class TyreSaturation(DynamicsEffect):
+    """Pacejka tyres where the car file says kinematic or linear_tyre: then the car is of kind "dynamic".
+
+    ``F = -mu F_z sin(C atan(B a))`` with these numbers; each is the car file's own where it is not given. There is no
+    value that switches it off; in a car file that has Pacejka tyres already it does nothing.
+    """
+
+    id = "tyre_saturation"
+    sentence = "The tyres' side force saturates: grip is limited."
+    parameters = (
+        EffectParameter("mu_front", "1", None, 0.0, 5.0, 0.43, same_as="tyre.front.mu"),
+        EffectParameter("B_front", "1", None, 0.0, 100.0, 2.75, positive=True, same_as="tyre.front.B"),
+        EffectParameter("C_front", "1", None, 0.0, 10.0, 1.45, positive=True, same_as="tyre.front.C"),
+        EffectParameter("mu_rear", "1", None, 0.0, 5.0, 0.42, same_as="tyre.rear.mu"),
+        EffectParameter("B_rear", "1", None, 0.0, 100.0, 5.0, positive=True, same_as="tyre.rear.B"),
+        EffectParameter("C_rear", "1", None, 0.0, 10.0, 1.3, positive=True, same_as="tyre.rear.C"),
+    )
+    look_alikes = ("steering_nonlinearity",)
+
+
+class FrictionDrift(DynamicsEffect):
+    """``mu (1 + rate t)`` of both axles, t since the first row of the recording; not below zero."""
+
+    id = "friction_drift"
+    sentence = "Grip changes with time, as tyres warm up or wear."
+    order = 10
+    parameters = (EffectParameter("rate", "1/s", 0.0, -1.0, 1.0, -0.003),)
+    look_alikes = ("battery_sag",)
+
+    def on_grip(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Scale."""
+        factor = ops.floor(1.0 + values["rate"] * forces.t_s, 0.0)
+        forces.grip_front, forces.grip_rear = forces.grip_front * factor, forces.grip_rear * factor
+
+
+class LowFrictionPatch(DynamicsEffect):
+    """``mu (1 - loss)`` of both axles while the centre of mass is inside a disc around (x, y).
+
+    The loss grows in a straight line over ``EDGE_M`` across the rim.
+    """
+
+    id = "low_friction_patch"
+    sentence = "There is a place on the floor where grip is low."
+    order = 20
+    needs_position = True
+    parameters = (
+        EffectParameter("x", "m", 0.0, -1e4, 1e4, 1.0),
+        EffectParameter("y", "m", 0.0, -1e4, 1e4, 0.5),
+        EffectParameter("radius", "m", 0.5, 0.0, 1e4, 0.8),
+        EffectParameter("loss", "1", 0.0, 0.0, 1.0, 0.5),
+    )
+
+    def on_grip(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Scale inside."""
+        distance = ops.hypot(forces.x - values["x"], forces.y - values["y"])
+        inside = ops.clip((values["radius"] - distance) * (1.0 / EDGE_M) + 0.5, 0.0, 1.0)
+        factor = 1.0 - values["loss"] * inside
+        forces.grip_front, forces.grip_rear = forces.grip_front * factor, forces.grip_rear * factor
+
+
+class FrictionEllipse(DynamicsEffect):
+    """``F_rear *= sqrt(1 - clip(scale F_x / (mu F_z,rear), -0.98, 0.98)^2)``.
+
+    F_x is that of the driven axle (drive less damping, after a traction limit or wheel slip). Source: the friction
+    ellipse, Pacejka 2012, "Tire and Vehicle Dynamics", ch. 1.
+    """
+
+    id = "friction_ellipse"
+    sentence = "Driving and braking take side force from the rear tyres."
+    order = 10
+    parameters = (EffectParameter("scale", "1", 0.0, 0.0, 10.0, 0.6),)
+    look_alikes = ("load_transfer",)
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Scale the rear's side force."""
+        peak = ops.floor(forces.grip_rear * forces.load_rear, 1e-6)
+        share = ops.clip(values["scale"] * forces.axle_force / peak, -LARGEST_SHARE, LARGEST_SHARE)
+        forces.side_rear = forces.side_rear * ops.sqrt(1.0 - share * share)
+
+
+class TyreRelaxation(DynamicsEffect):
+    """``(length / max(|vx|, 0.3 m/s)) dF/dt = F_steady - F`` for the side force of each axle, in its wheels' frame.
+
+    Source: Pacejka 2012, "Tire and Vehicle Dynamics", ch. 7 (first-order relaxation in distance travelled). A step
+    takes the pole by its closed form (``RelaxedSides``): stable for every length, and the base model at length 0.
+    """
+
+    id = "tyre_relaxation"
+    sentence = "The tyres must roll some way before their side force has built up."
+    order = 90
+    states = ("front", "rear")
+    stiff = True
+    parameters = (EffectParameter("length", "m", 0.0, 0.0, 5.0, 0.15),)
+    look_alikes = ("steering_lag",)
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """The lagging forces instead of the steady ones."""
+        front, rear = forces.side_front, forces.side_rear
+        if forces.stiff is not None:
+            forces.side_front, forces.side_rear = forces.stiff.lagging_sides(forces.vx, front, rear)
+            return
+        rate = ops.floor(ops.abs(forces.vx), RELAXATION_FLOOR_MPS) / ops.floor(values["length"], SHORTEST_M)
+        lags = values["length"] >= SHORTEST_M
+        for name, steady in (("front", front), ("rear", rear)):
+            force = forces.states[f"tyre_relaxation.{name}"]
+            forces.rates[f"tyre_relaxation.{name}"] = (steady - force) * rate
+            setattr(forces, f"side_{name}", ops.where(lags, force, steady))
+
+    def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
+        """The steady forces."""
+        return {"tyre_relaxation.front": forces.side_front, "tyre_relaxation.rear": forces.side_rear}
+
+
+class RelaxedSides:
+    """Side forces at the four stages of one Runge-Kutta step, from the steady ones that each stage finds.
+
+    Between stages the steady force goes in straight lines and the lag is exact (an exponential integrator: Hochbruck
+    and Ostermann 2010, "Exponential integrators"), at the speed of the start and then of the middle of the step.
+    """
+
+    def __init__(self, ops: Ops, before: tuple[Value, Value], length: Value, step_s: Value) -> None:
+        self._ops, self._length, self._step_s = ops, length, step_s
+        self._before = self._steady = before
+        self._stage = 0
+        self._weights: LagWeights | None = None
+        self.last = before
+        """Forces at the latest stage; after the fourth, at the end of the step."""
+
+    def at_stage(self, vx: Value, front: Value, rear: Value) -> tuple[Value, Value]:
+        """Forces at the next stage, from vx and the steady forces there."""
+        now = (front, rear)
+        if self._weights is None or self._stage == 1:
+            speed = self._ops.floor(self._ops.abs(vx), RELAXATION_FLOOR_MPS)
+            self._weights = lag_weights(self._ops, self._length / speed, self._step_s)
+        weights = self._weights
+        if self._stage == 0:
+            self.last = _both(lambda k: now[k] + (self._before[k] - now[k]) * weights.start)
+            self._steady = now
+        elif self._stage < 3:
+            self.last = _both(lambda k: weights.after_half(self._before[k], self._steady[k], now[k]))
+            if self._stage == 2:
+                self._steady = now
+        else:
+            central = self.last
+            self.last = _both(lambda k: weights.after_half(central[k], self._steady[k], now[k]))
+        self._stage += 1
+        return self.last
+
+
+def _both(of: Callable[[int], Value]) -> tuple[Value, Value]:
+    return of(0), of(1)

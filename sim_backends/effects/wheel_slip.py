@@ -1,0 +1,140 @@
+"""Spin of the driven wheels: a state of its own, much faster than the car, stepped implicitly."""
+
+from __future__ import annotations
+
+import math
+
+from sim_backends.array_ops import Ops, Value
+from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, Parameters
+
+WHEEL_RADIUS_M = 0.033
+"""Radius of a wheel of a 1:10 touring car; the catalogue has no parameter for it. Inertia scales with its square."""
+SLIP_FLOOR_MPS = 0.3
+"""Least speed in the denominator of the slip, as for the slip angle [m/s]."""
+LEAST_INERTIA_KGM2 = 1e-9
+"""An inertia below this is none: then the wheels pass the drive force on, as in the base model."""
+SUBSTEPS = 4
+_NEWTON_STEPS = 6
+_STIFFEST_N = 1e5
+_LEAST_GRIP_N = 1e-6
+
+
+class LongitudinalSlip(DynamicsEffect):
+    """``J dw/dt = T - R F_x(slip)`` with ``slip = (R w - vx) / max(|vx|, 0.3 m/s)`` and ``T = R (drive - damping vx)``.
+
+    ``F_x = mu F_z,rear tanh(stiffness slip / (mu F_z,rear))``: ``stiffness`` [N] is the slope at zero slip, the rear
+    axle's friction the limit (slope and limit are those of the brush model, Pacejka 2012, "Tire and Vehicle Dynamics",
+    ch. 3; the tanh between them is our choice). ``inertia`` [kg m2] is that of all driven wheels and what turns with
+    them. Without inertia it is the base model: the force of the motor arrives whole and at once.
+
+    The state is the slip speed ``s = R w - vx``. Its eigenvalue, ``(R^2/J + 1/m) stiffness / max(|vx|, 0.3)``, is
+    thousands per second, so each Runge-Kutta step takes the pair (s, vx), all other forces held, by the implicit Euler
+    rule in four substeps and drives the car with the mean force: stable for every inertia, and momentum is kept.
+    """
+
+    id = "longitudinal_slip"
+    sentence = "The driven wheels slip: they spin up before the car does, and pass on no more than their grip."
+    order = 50
+    states = ("slip_speed",)
+    stiff = True
+    parameters = (
+        EffectParameter("inertia", "kg m2", 0.0, 0.0, 1.0, 1e-4),
+        EffectParameter("stiffness", "N", math.inf, 0.0, math.inf, 40.0, positive=True),
+    )
+    look_alikes = ("motor_lag", "traction_limit")
+
+    def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """The tyres' force instead of the motor's."""
+        rolls = values["inertia"] >= LEAST_INERTIA_KGM2
+        if forces.stiff is not None and forces.stiff.axle_force is not None:
+            forces.axle_force = ops.where(rolls, forces.stiff.axle_force, forces.axle_force)
+            return
+        force = _force(ops, forces, values, forces.states["longitudinal_slip.slip_speed"])
+        per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], LEAST_INERTIA_KGM2)
+        rate = per_inertia * (forces.axle_force - force)
+        forces.rates["longitudinal_slip.rim_acceleration"] = rate
+        forces.axle_force = ops.where(rolls, force, forces.axle_force)
+
+    def on_motion(self, ops: Ops, forces: Forces, acceleration_mps2: Value, values: Parameters) -> None:
+        """Rate of the slip speed."""
+        if forces.stiff is None:
+            rim = forces.rates["longitudinal_slip.rim_acceleration"]
+            forces.rates["longitudinal_slip.slip_speed"] = rim - acceleration_mps2
+
+    def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
+        """Slip speed at which wheels and car speed up alike; 0.95 of the limit where the wheels would spin up."""
+        _, peak = _limits(ops, forces, values)
+        wheels = ops.floor(values["inertia"], LEAST_INERTIA_KGM2) / WHEEL_RADIUS_M**2
+        share = ops.clip(forces.axle_force * forces.mass / ((forces.mass + wheels) * peak), -0.95, 0.95)
+        return {"longitudinal_slip.slip_speed": _atanh(ops, share) / _per_speed(ops, forces.vx, forces, values)}
+
+
+def _limits(ops: Ops, forces: Forces, values: Parameters) -> tuple[Value, Value]:
+    stiffness = ops.where(values["stiffness"] < _STIFFEST_N, values["stiffness"], _STIFFEST_N)
+    return stiffness, ops.floor(forces.grip_rear * forces.load_rear, _LEAST_GRIP_N)
+
+
+def _per_speed(ops: Ops, vx: Value, forces: Forces, values: Parameters) -> Value:
+    """Slip of 1 in the argument of the tanh, for each m/s of slip speed."""
+    stiffness, peak = _limits(ops, forces, values)
+    return stiffness / (ops.floor(ops.abs(vx), SLIP_FLOOR_MPS) * peak)
+
+
+def _force(ops: Ops, forces: Forces, values: Parameters, slip_mps: Value) -> Value:
+    _, peak = _limits(ops, forces, values)
+    return peak * ops.tanh(slip_mps * _per_speed(ops, forces.vx, forces, values))
+
+
+def _atanh(ops: Ops, x: Value) -> Value:
+    """Newton's method from the series; for |x| <= 0.95."""
+    y = x * (1.0 + x * x * (1.0 / 3.0 + x * x * 0.2))
+    for _ in range(_NEWTON_STEPS):
+        t = ops.tanh(y)
+        y = y + (x - t) / (1.0 - t * t)
+    return y
+
+
+def step_wheels(
+    ops: Ops, forces: Forces, values: Parameters, demand: Value, damping: Value, rest: Value, step_s: Value
+) -> tuple[Value, Value]:
+    """Mean force of the tyres over a step [N] and the slip speed at its end [m/s].
+
+    Args:
+        ops: Functions of the array library.
+        forces: All forces at the start of the step.
+        values: ``inertia`` and ``stiffness``.
+        demand: Force that the motor asks of the axle at the start, less damping [N].
+        damping: How much less it asks for each m/s more [N s/m].
+        rest: All other forces along x, ``m vy r`` included [N].
+        step_s: Length of the step.
+    """
+    _, peak = _limits(ops, forces, values)
+    per_mass = 1.0 / forces.mass
+    per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], LEAST_INERTIA_KGM2)
+    both = per_inertia + per_mass
+    short_s = step_s * (1.0 / SUBSTEPS)
+    slip, vx = forces.states["longitudinal_slip.slip_speed"], forces.vx
+    force = _force(ops, forces, values, slip)
+    total = 0.0 * force
+    for _ in range(SUBSTEPS):
+        vx_half = vx + 0.5 * short_s * per_mass * (force + rest)
+        gain = _per_speed(ops, vx_half, forces, values)
+        push = (demand + damping * (forces.vx - vx_half)) * per_inertia - rest * per_mass
+        # z + q tanh z = c with z = gain * slip: monotone, one root.
+        q = short_s * both * peak * gain
+        c = gain * (slip + short_s * push)
+        z = _root(ops, q, c)
+        force = peak * ops.tanh(z)
+        slip = z / gain
+        vx = vx + short_s * per_mass * (force + rest)
+        total = total + force
+    return total * (1.0 / SUBSTEPS), slip
+
+
+def _root(ops: Ops, q: Value, c: Value) -> Value:
+    """Solve ``z + q tanh z = c`` for z by Newton's method, which comes from one side from this start."""
+    z = ops.where(ops.abs(c) < 1.0 + q, c / (1.0 + q), c - ops.sign(c) * q)
+    for _ in range(_NEWTON_STEPS):
+        t = ops.tanh(z)
+        z = z - (z + q * t - c) / (1.0 + q * (1.0 - t * t))
+    return z

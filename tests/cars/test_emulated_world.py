@@ -1,0 +1,149 @@
+"""The process behind an emulated car: its answers belong to their questions, and it never stays behind."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from carlab.cars import default_car
+from carlab.cars import emulated_car as emulated_car_module
+from carlab.cars.emulated_car import EmulatedCar, EmulatedWorld
+from carlab.cars.emulated_world import WorldConfig
+from carlab.core.errors import NotOpenError, NotReadyError
+from carlab.core.quantities import CarState
+
+PATIENT_S = 20.0
+
+
+def config() -> WorldConfig:
+    return WorldConfig(simulator=default_car().simulator.to_tables())
+
+
+@pytest.fixture
+def world() -> Iterator[EmulatedWorld]:
+    opened = EmulatedWorld(config())
+    opened.open()
+    yield opened
+    opened.close()
+
+
+def test_an_answer_that_comes_too_late_is_not_taken_for_the_next(
+    world: EmulatedWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pid = world.addresses["pid"]
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        monkeypatch.setattr(emulated_car_module, "ANSWER_TIMEOUT_S", 0.2)
+        with pytest.raises(NotReadyError, match="no answer within") as caught:
+            world.ask(do="log")
+        assert len(caught.value.reasons) == 1
+    finally:
+        os.kill(pid, signal.SIGCONT)
+        monkeypatch.undo()
+    assert "state" in world.ask(do="state")
+    with pytest.raises(NotReadyError, match="cannot do 'somersault'"):
+        world.ask(do="somersault")
+    assert "entries" in world.ask(do="log")
+
+
+def test_a_world_that_was_killed_is_a_sentence_and_closes(world: EmulatedWorld) -> None:
+    os.kill(world.addresses["pid"], signal.SIGKILL)
+    for _ in range(2):
+        with pytest.raises(NotReadyError, match="world"):
+            world.ask(do="state")
+    world.close()
+    with pytest.raises(NotOpenError):
+        world.ask(do="state")
+
+
+def test_a_car_whose_world_dies_closes_and_opens_again() -> None:
+    car = EmulatedCar(default_car())
+    try:
+        car.open()
+        first = car.world.addresses["pid"]
+        os.kill(first, signal.SIGKILL)
+        with pytest.raises(NotReadyError):
+            car.place(CarState())
+        car.stop(planned=False)
+        car.close()
+        assert_gone(first)
+        car.open()
+        assert car.world.addresses["pid"] != first
+        car.arm()
+    finally:
+        car.close()
+
+
+def test_opening_that_fails_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    pids: list[int] = []
+
+    def broken(self: EmulatedCar, there: dict[str, int]) -> None:
+        pids.append(there["pid"])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(EmulatedCar, "_driver", broken)
+    with pytest.raises(KeyboardInterrupt):
+        EmulatedCar(default_car()).open()
+    assert_gone(pids[0])
+
+
+OPENER = """
+import os
+from carlab.cars import default_car
+from carlab.cars.emulated_car import EmulatedCar
+from carlab.core.quantities import CarState
+car = EmulatedCar(default_car())
+print(os.getpid(), flush=True)
+with car:
+    print("open", flush=True)
+    while True:
+        car.place(CarState())
+"""
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("after_s", [0.05, 0.3, 0.6, 1.0, None])
+def test_killed_at_any_moment_of_opening_or_placing_it_leaves_no_process(after_s: float | None) -> None:
+    """Processes of a session of their own are found by the marker in their environment."""
+    marker = f"CARLAB_TEST_MARKER_{os.getpid()}_{after_s}"
+    process = subprocess.Popen(
+        [sys.executable, "-c", OPENER], stdout=subprocess.PIPE, text=True, env={**os.environ, marker: "1"}
+    )
+    try:
+        assert process.stdout is not None
+        assert int(process.stdout.readline()) == process.pid
+        if after_s is None:
+            assert process.stdout.readline() == "open\n"
+            time.sleep(0.1)
+        else:
+            time.sleep(after_s)
+    finally:
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+    end_s = time.monotonic() + PATIENT_S
+    while left := marked(marker):
+        assert time.monotonic() < end_s, f"left behind: {left}"
+        time.sleep(0.05)
+
+
+def marked(marker: str) -> list[int]:
+    """Processes with a variable in their environment."""
+    found = []
+    for environment in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):
+            if marker.encode() in environment.read_bytes():
+                found.append(int(environment.parent.name))
+    return found
+
+
+def assert_gone(pid: int) -> None:
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)

@@ -1,0 +1,132 @@
+"""What a run leaves behind: everything when it drove, nothing when it did not; and what an interruption is worth."""
+
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from carlab.cli.runs import ask_to_place
+from carlab.core.clock import MonotonicClock
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import NEUTRAL, Action, CarState
+from carlab.experiment.interrupts import Interrupts
+from carlab.experiment.scripted_policies import ReplayPolicy
+from carlab.experiment.teleop_policy import KeyboardSource, TeleopInput
+from carlab.recording.mcap_source import read_episode
+
+Carlab = Callable[..., tuple[int, str]]
+
+
+def test_a_run_keeps_its_results_and_its_log(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def act(self: object, view: PolicyInput) -> Action:
+        logging.getLogger("test").warning("tick %d", view.step)
+        return NEUTRAL
+
+    monkeypatch.setattr("carlab.experiment.scripted_policies.NeutralPolicy.act", act)
+    handlers = list(logging.getLogger().handlers)
+    folder = tmp_path / "with space ü"
+    argv = ("--policy", "neutral", "--episodes", "2", "--ticks", "5", "--out", folder, "--no-rerun", "--no-picture")
+    code, text = carlab("drive", *argv)
+    assert code == 0
+    (run,) = folder.iterdir()
+    assert f"'{run}/episodes/0001.mcap'" in text, "the printed command can be pasted into a shell"
+    result = json.loads((run / "result.json").read_text())
+    assert result["end_reason"] == "COMPLETED"
+    assert [(e["episode"], e["ticks"]) for e in result["episodes"]] == [(1, 5), (2, 5)]
+    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    assert [line["message"] for line in lines if line["logger"] == "test"] == [f"tick {n}" for n in range(5)] * 2
+    assert [h for h in logging.getLogger().handlers if isinstance(h, logging.FileHandler)] == [
+        h for h in handlers if isinstance(h, logging.FileHandler)
+    ]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(5, "no such thing")])
+def test_a_car_that_does_not_open_leaves_no_folder(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    def refuse(self: object) -> None:
+        raise error
+
+    monkeypatch.setattr("sim_backends.simulated_car.SimulatedCar.open", refuse)
+    code, _ = carlab("drive", "--ticks", "5", "--out", tmp_path)
+    assert code == (130 if isinstance(error, KeyboardInterrupt) else 1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_replay_says_so(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, _ = carlab("drive", "--ticks", "20", "--out", tmp_path, "--name", "first", "--no-rerun", "--no-picture")
+    assert code == 0
+    (recording,) = tmp_path.glob("*first/episodes/*.mcap")
+    act = ReplayPolicy.act
+
+    def interrupted(self: ReplayPolicy, view: PolicyInput) -> Action | None:
+        if view.step == 5:
+            signal.raise_signal(signal.SIGINT)
+        return act(self, view)
+
+    monkeypatch.setattr(ReplayPolicy, "act", interrupted)
+    code, _ = carlab("replay", recording, "--drive", "--out", tmp_path)
+    assert code == 130
+    (result,) = tmp_path.glob("*replay/result.json")
+    assert json.loads(result.read_text())["end_reason"] == "STOP_REQUESTED"
+
+
+def test_an_interrupted_import_leaves_no_half_file(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = "".join(f"{n / 30},{n / 30},0,0,1,0,0,0,0.2\n" for n in range(100))
+    (tmp_path / "drive.csv").write_text(f"t,x,y,yaw,vx,vy,yaw_rate,steering,throttle\n{rows}")
+
+    def interrupted(self: object, item: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("carlab.recording.mcap_sink.McapSink.write", interrupted)
+    assert carlab("import", tmp_path / "drive.csv")[0] == 130
+    assert [entry.name for entry in tmp_path.iterdir()] == ["drive.csv"]
+
+
+def test_interrupting_the_question_ends_the_run_like_interrupting_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rich.progress import Progress
+
+    def at_the_keyboard(*args: object, **kwargs: object) -> str:
+        os.kill(os.getpid(), signal.SIGINT)
+        signal.sigtimedwait([], 5.0)
+        pytest.fail("the question was not interrupted")
+
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr("carlab.cli.runs.console.input", at_the_keyboard)
+    with Interrupts() as interrupts:
+        ask_to_place(Progress(disable=True), "")(CarState())
+        assert interrupts.count == 1
+        assert interrupts.requested.is_set()
+
+
+def test_a_simulated_car_driven_by_hand_runs_in_real_time(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DISPLAY", ":carlab")
+    monkeypatch.setattr(KeyboardSource, "open", lambda self: None)
+    monkeypatch.setattr(KeyboardSource, "poll", lambda self: TeleopInput())
+    argv = ("--policy", "keyboard", "--ticks", "45", "--out", tmp_path, "--no-rerun", "--no-picture")
+    start_s = MonotonicClock().now_s()
+    code, _ = carlab("drive", *argv)
+    assert code == 0
+    assert MonotonicClock().now_s() - start_s > 44 / 30.0
+
+
+@pytest.mark.parametrize(("option", "throttle"), [((), 0.4), (("--max-throttle", "0.1"), 0.1)])
+def test_a_key_gives_the_throttle_that_was_allowed(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: tuple[str, ...], throttle: float
+) -> None:
+    monkeypatch.setenv("DISPLAY", ":carlab")
+    monkeypatch.setattr(KeyboardSource, "open", lambda self: None)
+    monkeypatch.setattr(KeyboardSource, "poll", lambda self: TeleopInput(throttle=self.throttle, deadman=True))
+    argv = ("--policy", "keyboard", "--ticks", "12", "--out", tmp_path, "--no-rerun", "--no-picture", *option)
+    assert carlab("drive", *argv)[0] == 0
+    (path,) = tmp_path.glob("*/episodes/*.mcap")
+    assert read_episode(path).sent[-1, 1] == pytest.approx(throttle)

@@ -1,0 +1,23 @@
+"""Stands in for the tool: reads what it is handed, notes what it can see, writes a report."""
+
+import json
+import os
+import sys
+from pathlib import Path
+
+arguments = sys.argv[1:]
+out = Path(arguments[arguments.index("--out") + 1])
+told = arguments[arguments.index("--effects") + 1 :] if "--effects" in arguments else []
+out.mkdir()
+held_out = {"refit": {"score": 3.0}, "with_effects": {"score": 1.2 if told else 1.6}}
+report = {
+    "schema": "carlab.diagnosis/1",
+    "verdict": "mismatch",
+    "effects": [
+        {"id": told[0] if told else "steering_lag", "parameters": {}, "indistinguishable_from": [], "where": {}}
+    ],
+    "fit": {"held_out": held_out},
+    "data_faults": [],
+    "seen": {"folder": str(Path.cwd()), "files": sorted(os.listdir()), "arguments": arguments},
+}
+(out / "report.json").write_text(json.dumps(report))

@@ -1,0 +1,229 @@
+"""Every effect, look-alike and verdict has words, and they never say more than the numbers."""
+
+import math
+import re
+from dataclasses import replace
+
+import pytest
+
+from carlab.core.manoeuvres import MANOEUVRES
+from carlab.diagnosis.findings import (
+    DataFault,
+    Diagnosis,
+    EffectFinding,
+    Estimate,
+    Evidence,
+    FitErrors,
+    Unexplained,
+    Where,
+)
+from carlab.diagnosis.report_text import (
+    LOOK_ALIKES,
+    attained,
+    confidence_words,
+    drive_command,
+    effect_sentence,
+    next_drive,
+    number,
+    percent,
+    separating_drive,
+    separating_reason,
+    unit_text,
+    verdict_sentence,
+    verdict_title,
+    wrong_sentence,
+)
+from sim_backends.effects import EFFECTS
+
+PAIRS = [(a, b) for a in LOOK_ALIKES for b in LOOK_ALIKES[a]]
+INSEPARABLE = {"command_delay", "mocap_latency"}
+
+
+def around(value: float, unit: str) -> Estimate:
+    return Estimate(value, 0.1 * abs(value), value - 0.2 * abs(value), value + 0.2 * abs(value), unit)
+
+
+def finding(effect_id: str, others: tuple[str, ...] = ()) -> EffectFinding:
+    parameters = {p.name: around(p.typical, p.unit) for p in EFFECTS[effect_id].parameters}
+    evidence = Evidence(0.3, 9.0, 0.6, {"vx": 0.2})
+    return EffectFinding(effect_id, 0.9, parameters, Where(("vx",), "speed > 1 m/s"), evidence, "", others)
+
+
+def diagnosis(verdict: str, *effects: EffectFinding, refit: float = 4.0, with_effects: float = 2.5) -> Diagnosis:
+    scores = {"nominal": 6.0, "refit": refit, "with_effects": with_effects, "noise_floor": 1.0}
+    held = {name: FitErrors(0.1, 0.1, 0.1, 0.1, 0.1, score) for name, score in scores.items()}
+    return Diagnosis(verdict, "", effects, {}, 1.0, held, None, (), (), 0, 1.0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("effect_id", EFFECTS)
+def test_every_effect_says_each_of_its_numbers_with_its_unit(effect_id: str) -> None:
+    parameters = {p.name: around(p.typical, p.unit) for p in EFFECTS[effect_id].parameters}
+    sentence = effect_sentence(effect_id, parameters)
+    assert sentence.startswith("Left out: ")
+    assert sentence.endswith(".")
+    assert sentence.count(" at 90 %") == 1
+    assert not re.search(r"[{}_]|nan|unknown|  ", sentence)
+    hidden = {"B_front", "C_front", "B_rear", "C_rear", "axle"}  # shape factors say nothing to most readers
+    for p in EFFECTS[effect_id].parameters:
+        if p.name in hidden:
+            continue
+        shown = {number(abs(p.typical)), number(100 * abs(p.typical)), number(6000 * abs(p.typical))}
+        assert any(re.search(rf"(?<![\d.]){re.escape(n)} ", sentence) for n in shown), (p.name, sentence)
+        unit = unit_text(p.unit)
+        assert unit in sentence or "%" in sentence
+
+
+@pytest.mark.parametrize("effect_id", EFFECTS)
+def test_every_effect_says_what_would_prove_it_wrong(effect_id: str) -> None:
+    assert re.fullmatch(r"This would be wrong if .{20,}\.", wrong_sentence(effect_id))
+
+
+@pytest.mark.parametrize("effect_id", EFFECTS)
+def test_a_sentence_survives_missing_and_infinite_numbers(effect_id: str) -> None:
+    assert effect_sentence(effect_id, {}).startswith("Left out: ")
+    odd = {p.name: Estimate(math.inf, math.nan, math.nan, math.inf, p.unit) for p in EFFECTS[effect_id].parameters}
+    assert "inf" not in effect_sentence(effect_id, odd).replace("infl", "")
+
+
+def test_the_servo_lag_reads_as_a_person_would_say_it() -> None:
+    lag = Estimate(0.11, 0.0091, 0.095, 0.125, "s")
+    wanted = "Left out: the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)."
+    assert effect_sentence("steering_lag", {"time_constant": lag}) == wanted
+
+
+@pytest.mark.parametrize(("angle", "side"), [(0.05, "left"), (-0.05, "right")])
+def test_a_sign_becomes_a_side_and_the_interval_turns_with_it(angle: float, side: str) -> None:
+    sentence = effect_sentence("steering_offset", {"angle": around(angle, "rad")})
+    assert f"0.05 rad (0.04 to 0.06 at 90 %) to the {side}" in sentence
+
+
+def test_an_interval_across_zero_says_that_the_sign_is_not_certain() -> None:
+    sentence = effect_sentence("lateral_bias", {"force": Estimate(-0.2, 0.3, -0.7, 0.3, "N")})
+    assert "0.2 N (−0.3 to 0.7 at 90 %; its sign is not certain) pushes the car to the right." in sentence
+
+
+def test_an_effect_beyond_the_catalogue_stands_for_itself() -> None:
+    assert "wind gust" in effect_sentence("wind_gust", {"force": around(1.0, "N")})
+    assert wrong_sentence("wind_gust").startswith("This would be wrong if")
+
+
+def test_look_alikes_hold_the_catalogue_both_ways() -> None:
+    assert set(LOOK_ALIKES) == set(EFFECTS)
+    assert all(a in LOOK_ALIKES[b] for a, b in PAIRS)
+    assert set(LOOK_ALIKES["steering_lag"]) == {
+        *("steering_delay", "steering_rate_limit", "tyre_relaxation", "velocity_filter_lag"),
+    }
+    assert set(LOOK_ALIKES["rolling_resistance"]) == {"throttle_deadband"}
+    assert LOOK_ALIKES["low_friction_patch"] == ()
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS)
+def test_every_pair_of_look_alikes_has_a_drive_that_can_be_driven_or_says_that_none_can(one: str, other: str) -> None:
+    drive = separating_drive(one, (other,))
+    assert drive == separating_drive(other, (one,))
+    assert len(separating_reason(one, (other,))) > 20
+    if {one, other} == INSEPARABLE:
+        assert drive == ""
+        assert "No drive tells" in separating_reason(one, (other,))
+    else:
+        assert drive in MANOEUVRES
+
+
+def test_of_three_the_drive_that_separates_most_pairs_is_chosen() -> None:
+    assert separating_drive("throttle_nonlinearity", ("motor_saturation", "throttle_deadband")) == "throttle_ramp"
+    assert separating_drive("motor_saturation", ("aerodynamic_drag", "throttle_nonlinearity")) in MANOEUVRES
+    assert separating_drive("yaw_damping", ()) == ""
+
+
+def test_a_mismatch_names_its_effects_and_its_sets() -> None:
+    text = verdict_sentence(diagnosis("mismatch", finding("motor_lag", ("throttle_delay",)), finding("yaw_damping")))
+    assert (
+        "leaves out two things: a lag of the motor (or a delay of the throttle: these recordings cannot tell)" in text
+    )
+    assert "and a moment against turning" in text
+    assert "from 4 to 2.5 noise floors, 50 % of what there was to gain" in text
+    assert "cannot tell" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
+
+
+def test_the_share_of_what_was_attainable() -> None:
+    assert attained(diagnosis("mismatch", refit=4.0, with_effects=1.0)) == pytest.approx(1.0)
+    assert math.isnan(attained(diagnosis("none", refit=1.0, with_effects=1.0)))
+    text = verdict_sentence(diagnosis("mismatch", finding("motor_lag"), refit=4.0, with_effects=0.97))
+    assert "100 % of what there was to gain" in text
+
+
+@pytest.mark.parametrize("verdict", ["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"])
+def test_every_verdict_has_a_sentence_even_with_nothing_to_go_by(verdict: str) -> None:
+    bare = replace(diagnosis(verdict), held_out={})
+    assert verdict_sentence(bare)[0].isupper()
+    assert verdict_sentence(bare).endswith(".")
+    assert not re.search(r"nan|None|  ", verdict_sentence(bare))
+    assert len(verdict_title(bare)) > 10
+    drive, why = next_drive(bare)
+    assert drive == "" or drive in MANOEUVRES
+    assert why
+
+
+def test_verdicts_tell_faults_rests_and_reasons() -> None:
+    fault = DataFault("wrong_unit", "yaw", 3, "unusable")
+    assert "(wrong unit)" in verdict_sentence(replace(diagnosis("data"), data_faults=(fault,)))
+    rest = Unexplained(0.7, ("vx",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
+    nameless = replace(diagnosis("unexplained"), unexplained=rest)
+    assert "speed ahead, mostly where speed > 1 m/s; its kind: even in steering" in verdict_sentence(nameless)
+    assert next_drive(nameless)[0] == "coast_down"
+    why = "Too short; drive throttle_ramp."
+    unsure = replace(diagnosis("inconclusive"), sentence=why, advice=why)
+    assert verdict_sentence(unsure) == f"No verdict. {why}"
+    assert next_drive(unsure)[0] == "throttle_ramp"
+
+
+@pytest.mark.parametrize(("verdict", "which"), [("none", "nominal"), ("parameters", "refit")])
+def test_an_error_above_the_noise_is_not_passed_over(verdict: str, which: str) -> None:
+    far, near = diagnosis(verdict), diagnosis(verdict)
+    near = replace(near, held_out={k: replace(v, score=1.02) for k, v in near.held_out.items()})
+    assert far.held_out[which].score > 3.0
+    assert "something is left that was not found" in verdict_sentence(far)
+    assert "something is left" not in verdict_sentence(near)
+
+
+def test_the_next_drive_separates_the_strongest_set() -> None:
+    drive, why = next_drive(diagnosis("mismatch", finding("yaw_damping"), finding("motor_lag", ("throttle_delay",))))
+    assert drive == "throttle_steps"
+    assert "a lag of the motor or a delay of the throttle" in why
+    assert drive_command(drive) == "carlab drive --policy throttle_steps"
+    drive, why = next_drive(diagnosis("mismatch", finding("command_delay", ("mocap_latency",))))
+    assert drive == ""
+    assert "No drive tells" in why
+
+
+def test_confidence_words_are_no_stronger_than_the_number() -> None:
+    assert confidence_words(0.99) == "almost certain"
+    assert confidence_words(0.6) == "more likely than not"
+    assert confidence_words(0.4).startswith("a guess")
+    assert confidence_words(0.49, 1) == "one of 2 that look alike"
+
+
+@pytest.mark.parametrize(
+    ("value", "wanted"),
+    [
+        (0.0, "0"),
+        (0.11, "0.11"),
+        (-0.4761, "−0.476"),
+        (123.4, "123"),
+        (98765.4, "98765"),
+        (0.00008, "0.00008"),
+        (1.0, "1"),
+        (math.inf, "no limit"),
+        (math.nan, "unknown"),
+    ],
+)
+def test_numbers_are_short(value: float, wanted: str) -> None:
+    assert number(value) == wanted
+
+
+@pytest.mark.parametrize(
+    ("share", "wanted"),
+    [(0.31, "31 %"), (0.021, "2.1 %"), (0.0, "0 %"), (0.0002, "0.02 %"), (0.998, "more than 99 %"), (1.0, "100 %")],
+)
+def test_shares_are_not_rounded_into_certainty(share: float, wanted: str) -> None:
+    assert percent(share) == wanted

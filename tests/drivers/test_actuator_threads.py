@@ -1,0 +1,79 @@
+"""One actuator in the hands of two threads: the loop that drives, and the watch that stops it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from carlab.core.errors import ActuatorFaultError, CarlabError
+from carlab.core.quantities import Action
+from drivers.actuator import Actuator
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from drivers.emulators.serial_firmware import SerialFirmware
+from drivers.sender_logic import SenderState
+
+MOVING = Action(0.5, 0.3)
+PATIENT_S = 20.0
+
+
+def make(firmware: SerialFirmware) -> Actuator:
+    config = ActuatorConfig(
+        port=firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0
+    )
+    return Actuator(config, ActuatorCalibration())
+
+
+@pytest.fixture
+def actuator(serial_firmware: SerialFirmware) -> Iterator[Actuator]:
+    with make(serial_firmware) as opened:
+        yield opened
+
+
+def test_arming_does_not_overwrite_a_stop_of_another_thread(actuator: Actuator) -> None:
+    """The stop comes between arm()'s check and its order; in the slot of the sender only the newest order stands."""
+    waited = actuator._await
+
+    def stopped_meanwhile(*arguments: object) -> object:
+        found = waited(*arguments)  # type: ignore[arg-type]
+        actuator._await = waited  # type: ignore[method-assign]
+        thread = threading.Thread(target=actuator.stop, kwargs={"planned": False})
+        thread.start()
+        thread.join()
+        return found
+
+    actuator._await = stopped_meanwhile  # type: ignore[method-assign,assignment]
+    with pytest.raises(ActuatorFaultError, match="stopped for safety"):
+        actuator.arm()
+    assert actuator.status().state == SenderState.FAULT
+
+
+def test_closing_while_another_thread_uses_it_raises_nothing_strange(serial_firmware: SerialFirmware) -> None:
+    for _ in range(3):
+        actuator = make(serial_firmware)
+        actuator.open()
+        actuator.arm()
+        strange: list[BaseException] = []
+
+        def use(actuator: Actuator = actuator, strange: list[BaseException] = strange) -> None:
+            try:
+                while True:
+                    actuator.command(MOVING)
+                    actuator.stop(planned=True)
+                    actuator.arm()
+            except CarlabError:
+                return
+            except BaseException as error:
+                strange.append(error)
+
+        thread = threading.Thread(target=use)
+        thread.start()
+        time.sleep(0.3)
+        actuator.close()
+        thread.join(PATIENT_S)
+        assert not thread.is_alive()
+        assert strange == []
+        assert serial_firmware.log.motor()[-1].value == 0.0

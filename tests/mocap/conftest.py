@@ -1,0 +1,65 @@
+"""Servers on free ports of the loopback interface, closed after each test."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from mocap.emulated_scene import RigidBodySample
+from mocap.emulator import NatNetServer
+from mocap.mocap_config import MocapConfig
+
+Serve = Callable[..., NatNetServer]
+Configure = Callable[..., MocapConfig]
+Until = Callable[[Callable[[], bool]], None]
+
+
+def clock_poses(t_s: float) -> list[RigidBodySample | None]:
+    """One body whose x [m] tells the time of exposure [s] modulo 16 s, 3 ms before the frame is due."""
+    t_capture_s = t_s - 0.003
+    return [RigidBodySample.planar(t_capture_s, t_capture_s % 16.0, -0.5, 0.75, 0.25)]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """Opens a server; by default on free ports, with one body that ``clock_poses`` moves."""
+    with ExitStack() as stack:
+
+        def open_server(poses: Any = clock_poses, *, kind: type[NatNetServer] = NatNetServer, **options: Any) -> Any:
+            ports = {"command_port": 0, "data_port": 0}
+            return stack.enter_context(kind(poses, **(ports | options)))
+
+        yield open_server
+
+
+@pytest.fixture
+def configure() -> Configure:
+    """The configuration that fits a server."""
+
+    def config(server: NatNetServer, **changes: Any) -> MocapConfig:
+        common = {
+            "server_address": "127.0.0.1",
+            "command_port": server.command_port,
+            "mode": server.mode,
+            "timeout_s": 10.0,
+        }
+        return MocapConfig(**(common | changes))
+
+    return config
+
+
+@pytest.fixture
+def until() -> Until:
+    """Waits for something to become true and fails where it does not for very long."""
+
+    def wait(condition: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + 30.0
+        while not condition():
+            assert time.monotonic() < deadline_s, "what the test waits for did not happen"
+            time.sleep(0.01)
+
+    return wait

@@ -1,0 +1,135 @@
+"""What client, server, configuration and discovery say when something is not there or not possible."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from carlab.core.errors import ConfigError, NotReadyError
+from mocap.discovery import discover
+from mocap.emulator import NatNetServer
+from mocap.emulator_faults import ServerFaults
+from mocap.mocap_config import MocapConfig
+from mocap.natnet_client import NatNetClient
+from mocap.natnet_models import BitstreamVersion
+
+Serve = Callable[..., NatNetServer]
+Configure = Callable[..., MocapConfig]
+Until = Callable[[Callable[[], bool]], None]
+V40, V42 = BitstreamVersion(4, 0), BitstreamVersion(4, 2)
+
+
+def reason(config: MocapConfig) -> str:
+    with pytest.raises(NotReadyError) as caught:
+        NatNetClient(config).open()
+    assert len(caught.value.reasons) == 1
+    return caught.value.reasons[0]
+
+
+def test_why_there_is_no_connection(serve: Serve, configure: Configure) -> None:
+    deaf = serve(faults=ServerFaults(deaf=True))
+    text = reason(configure(deaf, timeout_s=0.3))
+    assert f"127.0.0.1:{deaf.command_port}" in text
+    assert "Motive" in text
+    text = reason(configure(serve(mode="multicast"), mode="unicast"))
+    assert 'mode = "multicast"' in text
+    text = reason(configure(serve(mode="unicast"), mode="multicast"))
+    assert 'mode = "unicast"' in text
+    newer = serve(mode="multicast", faults=ServerFaults(silent=True))
+    newer.version = V42
+    text = reason(configure(newer))
+    for word in ("4.2", "2.6 to 4.1", "Transmission Type", "Unicast"):
+        assert word in text
+    for host in ("no-such-host.invalid", "two..dots", "::1"):
+        text = reason(MocapConfig(server_address=host))
+        assert host in text
+        assert "server_address" in text
+    text = reason(MocapConfig(server_address="127.0.0.1", local_interface="203.0.113.7"))
+    assert "203.0.113.7" in text
+    assert "local_interface" in text
+
+
+def test_host_names_are_resolved(serve: Serve, configure: Configure, until: Until) -> None:
+    server = serve(host="localhost", mode="multicast")
+    config = configure(server, server_address="localhost", local_interface="localhost")
+    with NatNetClient(config) as client:
+        until(lambda: client.statistics()["frames"] > 0.0)
+
+
+def test_a_request_the_server_does_not_know(serve: Serve, configure: Configure) -> None:
+    server = serve()
+    with NatNetClient(configure(server)) as client:
+        with pytest.raises(NotReadyError, match="does not know the request 'FrameRat'"):
+            client.request("FrameRat")
+        server.faults = ServerFaults(deaf=True)
+        with pytest.raises(NotReadyError, match="did not answer the request 'FrameRate'"):
+            client.request("FrameRate", timeout_s=0.2)
+
+
+def test_a_port_in_use(serve: Serve) -> None:
+    taken = serve().command_port
+    with pytest.raises(NotReadyError, match=f"{taken} cannot be used .*close the program"):
+        serve(command_port=taken)
+
+
+def test_an_error_in_the_poses_ends_the_server_and_is_kept(serve: Serve, until: Until) -> None:
+    def poses(t_s: float) -> list[None]:
+        raise RuntimeError("no physics")
+
+    server = serve(poses)
+    until(lambda: server.failure is not None)
+    assert str(server.failure) == "no physics"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"version": "2.9"}, "bitstream 2.9"),
+        ({"rate_hz": 0.0}, "rate"),
+        ({"mode": "broadcast"}, "unicast or multicast"),
+        ({"multicast_group": "10.0.0.1"}, "224.0.0.0"),
+    ],
+)
+def test_a_server_that_cannot_be(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        NatNetServer(lambda t_s: [None], **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"server_address": " "}, "server_address"),
+        ({"command_port": 0}, "command_port"),
+        ({"data_port": 70000}, "data_port"),
+        ({"mode": "broadcast"}, "unicast or multicast"),
+        ({"up_axis": "x"}, "y or z"),
+        ({"timeout_s": 0.0}, "timeout_s"),
+        ({"body": "car", "body_id": 1}, "body_id"),
+        ({"multicast_group": "127.0.0.1"}, "224.0.0.0"),
+        ({"multicast_group": "group"}, "224.0.0.0"),
+        ({"bitstream": "four"}, "4.1"),
+        ({"bitstream": "4.3"}, "2.6 to 4.1"),
+        ({"yaw_offset_rad": float("inf")}, "yaw_offset_rad"),
+        ({"pivot_in_base_link_m": (0.0, float("nan"), 0.0)}, "pivot_in_base_link_m"),
+    ],
+)
+def test_a_configuration_that_cannot_be(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        MocapConfig(**options)
+
+
+# -- discovery ------------------------------------------------------------------------------------------------------
+
+
+def test_servers_name_themselves(serve: Serve) -> None:
+    server = serve(mode="multicast", version="4.0")
+    (found,) = discover("127.0.0.1", command_port=server.command_port, timeout_s=1.0)
+    assert found.address == "127.0.0.1"
+    assert (found.info.name, found.info.bitstream, found.info.data_port) == ("carlab emulator", V40, server.data_port)
+    assert found.info.is_multicast
+    server.faults = ServerFaults(deaf=True)
+    assert discover("127.0.0.1", command_port=server.command_port, timeout_s=0.1) == ()
+    with pytest.raises(NotReadyError, match="network"):
+        discover("no-such-host.invalid")

@@ -1,0 +1,111 @@
+"""Another client, ``natnet`` 0.3.0 from PyPI, receives what the emulated server sends.
+
+Limits of that client, which shape these tests:
+
+* It cannot ask for a version when it connects. Its ``protocol_version`` setter reads frames in flight with the new
+  decoder at once, and raises in its receiving thread when it meets an old one; so each version is the server's own.
+* In 4.1 it does not know the precision timestamp before the frame's parameters and reads those from it, so its
+  ``is_recording`` and ``tracked_models_changed`` mean nothing there; everything before is read.
+* It does not check lengths or the end-of-data tag, and measures no latency.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+from natnet import DataDescriptions, DataFrame
+from natnet import NatNetClient as OtherClient
+from scipy.spatial.transform import Rotation
+
+from mocap.emulated_scene import EmulatedBody, RigidBodySample
+from mocap.emulator import NatNetServer
+from mocap.natnet_models import SERVED_BITSTREAMS, BitstreamVersion
+
+FRAMES = 240
+BODIES = (EmulatedBody("car", 7), EmulatedBody("trailer", 9))
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("mode", ["unicast", "multicast"])
+@pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
+def test_another_client_receives_our_frames(
+    serve: Callable[..., NatNetServer], mode: str, version: BitstreamVersion
+) -> None:
+    sent: dict[int, list[RigidBodySample | None]] = {}
+
+    def poses(t_s: float) -> list[RigidBodySample | None]:
+        number = server.frames
+        car = RigidBodySample.planar(t_s - 0.004, 0.001 * number, -1.5, 0.01 * (number % 300), 0.125)
+        trailer = None if number % 5 == 0 else RigidBodySample.planar(t_s - 0.004, 2.0, 0.5, -0.5)
+        sent[number] = [car, trailer]
+        return sent[number]
+
+    opened = threading.Event()
+    server: NatNetServer
+
+    def first(t_s: float) -> list[RigidBodySample | None]:
+        opened.wait()
+        return poses(t_s)
+
+    server = serve(first, bodies=BODIES, rate_hz=240.0, mode=mode, version=version)
+    opened.set()
+    frames: list[DataFrame] = []
+    models: list[DataDescriptions] = []
+    done, described = threading.Event(), threading.Event()
+
+    def on_frame(frame: DataFrame) -> None:
+        frames.append(frame)
+        if len(frames) >= FRAMES:
+            done.set()
+
+    def on_models(descriptions: DataDescriptions) -> None:
+        models.append(descriptions)
+        described.set()
+
+    client = OtherClient(
+        command_port=server.command_port, data_port=server.data_port, use_multicast=mode == "multicast"
+    )
+    client.on_data_frame_received_event.handlers.append(on_frame)
+    client.on_data_description_received_event.handlers.append(on_models)
+    start_s = time.monotonic()
+    with client:
+        client.run_async()
+        client.request_modeldef()
+        assert described.wait(30.0)
+        assert done.wait(30.0)
+        elapsed_s = time.monotonic() - start_s
+        client.stop_async()
+        assert client.protocol_version.components[:2] == tuple(version)
+        assert client.server_info.application_name == "carlab emulator"
+
+    assert [(b.name, b.id_num) for b in models[0].rigid_bodies] == [("car", 7), ("trailer", 9)]
+    assert [s.name for s in models[0].marker_sets] == ["car", "trailer", "all"]
+
+    numbers = [frame.prefix.frame_number for frame in frames]
+    assert numbers == sorted(set(numbers))
+    between = [n for n in list(sent) if numbers[0] <= n <= numbers[-1]]
+    assert len(numbers) > 0.95 * len(between)
+    # Connecting takes it 0.1 s or more, and where the machine stalls the server skips frames.
+    assert 100.0 < len(numbers) / elapsed_s < 260.0
+
+    for frame in frames:
+        number = frame.prefix.frame_number
+        car, trailer = frame.rigid_bodies
+        truth = sent[number][0]
+        assert truth is not None
+        assert (car.id_num, trailer.id_num) == (7, 9)
+        assert car.tracking_valid
+        assert trailer.tracking_valid == (number % 5 != 0)
+        # Y up on the wire: (x, y, z) of the map is (x, z, -y).
+        assert car.pos == pytest.approx((0.001 * number, 0.125, 1.5), abs=1e-6)
+        heading = Rotation.from_quat(car.rot).apply([1.0, 0.0, 0.0])
+        turned = Rotation.from_euler("y", 0.01 * (number % 300)).apply([1.0, 0.0, 0.0])
+        assert heading == pytest.approx(turned, abs=1e-5)
+        suffix = frame.suffix
+        assert suffix.stamp_camera_mid_exposure == server.ticks(truth.t_capture_s)
+        assert suffix.stamp_camera_mid_exposure <= suffix.stamp_data_received <= suffix.stamp_transmit
+        assert suffix.timestamp == pytest.approx(number / 240.0, abs=1e-9)
+        assert len(frame.labeled_markers) == 8

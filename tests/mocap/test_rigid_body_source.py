@@ -1,0 +1,306 @@
+"""One rigid body as a pose source: axes and offsets against scipy, times, sequences, what it says when it cannot."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from carlab.core.errors import NotReadyError
+from carlab.core.pose_source import PoseSource
+from carlab.core.quantities import PoseSample
+from mocap import axes
+from mocap.emulated_scene import EmulatedBody, RigidBodySample
+from mocap.emulator import NatNetServer
+from mocap.emulator_faults import ServerFaults
+from mocap.mocap_config import MocapConfig
+from mocap.natnet_models import BitstreamVersion, MarkerSetDescription, RigidBodyDescription
+from mocap.natnet_sockets import udp_socket
+from mocap.rigid_body import RigidBodyPoseSource, select_body
+
+Serve = Callable[..., NatNetServer]
+Configure = Callable[..., MocapConfig]
+Until = Callable[[Callable[[], bool]], None]
+
+# Y up to Z up: a quarter turn about x.
+UP = Rotation.from_euler("x", 90, degrees=True)
+numbers = st.floats(-3.0, 3.0)
+vectors = st.tuples(numbers, numbers, numbers)
+turns = st.tuples(numbers, numbers, numbers).map(Rotation.from_rotvec)
+
+
+# -- axes, against scipy --------------------------------------------------------------------------------------------
+
+
+@given(vectors, turns)
+@settings(max_examples=100, deadline=None)
+def test_axes_agree_with_scipy(vector: Any, turn: Rotation) -> None:
+    q = tuple(map(float, turn.as_quat()))
+    assert axes.rotate(q, vector) == pytest.approx(turn.apply(vector), abs=1e-9)  # type: ignore[arg-type]
+    assert axes.z_up_vector(vector) == pytest.approx(UP.apply(vector), abs=1e-9)
+    assert axes.y_up_vector(axes.z_up_vector(vector)) == vector
+    turned = Rotation.from_quat(axes.z_up_quaternion(q))  # type: ignore[arg-type]
+    assert (turned * (UP * turn * UP.inv()).inv()).magnitude() < 1e-7
+    assert axes.y_up_quaternion(axes.z_up_quaternion(q)) == q  # type: ignore[arg-type]
+    lean = math.acos(np.clip(turn.apply([0.0, 0.0, 1.0])[2], -1.0, 1.0))
+    assert axes.tilt_rad(q) == pytest.approx(lean, abs=1e-6)  # type: ignore[arg-type]
+
+
+@given(vectors, turns, st.floats(-math.pi, math.pi), vectors)
+@settings(max_examples=100, deadline=None)
+def test_base_link_agrees_with_scipy(position: Any, turn: Rotation, yaw_offset_rad: float, pivot: Any) -> None:
+    q = tuple(map(float, turn.as_quat()))
+    origin, yaw_rad = axes.base_link_pose(position, q, yaw_offset_rad, pivot)  # type: ignore[arg-type]
+    base = turn * Rotation.from_euler("z", yaw_offset_rad)
+    # The pivot, seen from the base_link that was found, is where the body is.
+    assert np.asarray(origin) + base.apply(pivot) == pytest.approx(position, abs=1e-9)
+    forward = base.apply([1.0, 0.0, 0.0])
+    assert math.hypot(*forward[:2]) * math.cos(yaw_rad) == pytest.approx(forward[0], abs=1e-9)
+    assert math.hypot(*forward[:2]) * math.sin(yaw_rad) == pytest.approx(forward[1], abs=1e-9)
+
+
+# -- over the wire --------------------------------------------------------------------------------------------------
+
+
+def standing(x_m: float = 1.0, y_m: float = -2.0, yaw_rad: float = 0.5) -> Callable[[float], list[RigidBodySample]]:
+    return lambda t_s: [RigidBodySample.planar(t_s, x_m, y_m, yaw_rad, 0.25)]
+
+
+def pose(sample: PoseSample | None) -> tuple[float, ...]:
+    assert sample is not None
+    return sample.x_m, sample.y_m, sample.z_m, sample.yaw_rad
+
+
+@pytest.mark.parametrize("up_axis", ["y", "z"])
+def test_the_pose_of_base_link(serve: Serve, configure: Configure, up_axis: str) -> None:
+    base, yaw_rad = np.array([1.5, -0.75, 0.0]), 2.5
+    pivot, yaw_offset_rad = (0.1, 0.02, 0.06), -1.2
+    frame = Rotation.from_euler("z", yaw_rad)
+    body = frame * Rotation.from_euler("z", -yaw_offset_rad)
+    place = base + frame.apply(pivot)
+    sample = RigidBodySample(0.0, tuple(place), tuple(body.as_quat()))
+    server = serve(lambda t_s: [RigidBodySample(t_s, sample.position_m, sample.quaternion)], up_axis=up_axis)
+    config = configure(server, up_axis=up_axis, yaw_offset_rad=yaw_offset_rad, pivot_in_base_link_m=pivot)
+    with RigidBodyPoseSource(config) as source:
+        assert isinstance(source, PoseSource)
+        assert pose(source.latest()) == pytest.approx((*base, yaw_rad), abs=1e-6)
+        assert source.problems() == ()
+
+
+def test_the_wrong_up_axis_is_suspected(serve: Serve, configure: Configure, until: Until) -> None:
+    def tumbled(t_s: float) -> list[RigidBodySample]:
+        return [RigidBodySample(t_s, (0.0, 0.0, 0.5), tuple(Rotation.from_euler("x", 60, degrees=True).as_quat()))]
+
+    with RigidBodyPoseSource(configure(serve(tumbled))) as source:
+        until(lambda: source.statistics()["tracked"] >= 5.0)
+        (text,) = source.problems()
+        assert "tilted" in text
+        assert 'up_axis = "z"' in text
+
+    def driving(t_s: float) -> list[RigidBodySample]:
+        return [RigidBodySample.planar(t_s, 0.0, 5.0 * math.sin(5.0 * t_s), 0.0)]
+
+    server = serve(driving, up_axis="y")
+    with RigidBodyPoseSource(configure(server, up_axis="z")) as source:
+        until(lambda: bool(source.problems()))
+        assert 'up_axis = "y"' in source.problems()[0]
+
+
+@pytest.mark.parametrize("version", ["3.0", "4.1"])
+def test_capture_times_are_the_truth(serve: Serve, configure: Configure, until: Until, version: str) -> None:
+    """By the x that the server gives a pose, its exposure is known on the host's monotonic clock."""
+    server = serve(version=version, faults=ServerFaults(clock_offset_s=-321.0, clock_drift_ppm=30.0, latency_s=0.02))
+    before_s = time.monotonic()
+    with RigidBodyPoseSource(configure(server)) as source:
+        until(lambda: source.statistics()["tracked"] >= 100.0)
+        samples = source.since(-1)
+        half_trip_s = 0.5e-3 * source.statistics()["round_trip_min_ms"]
+    errors_s = sorted(abs((s.t_capture_s - s.x_m + 8.0) % 16.0 - 8.0) for s in samples)
+    assert errors_s[len(errors_s) // 2] < max(1e-3, half_trip_s)
+    assert before_s - 1.0 < samples[0].t_capture_s < samples[0].t_receive_s <= time.monotonic()
+    assert all(s.t_receive_s - s.t_capture_s > 0.02 for s in samples)
+
+
+def test_latest_since_and_wait_for(serve: Serve, configure: Configure, until: Until) -> None:
+    source = RigidBodyPoseSource(configure(serve()), samples_kept=16)
+    assert source.latest() is None
+    assert source.since(-1) == ()
+    assert source.wait_for(0, 0.0) is None
+    with source:
+        newest = source.latest()
+        assert newest is not None
+        later = source.wait_for(newest.sequence, 30.0)
+        assert later is not None
+        assert later.sequence > newest.sequence
+        until(lambda: source.statistics()["tracked"] >= 50.0)
+        kept = source.since(-1)
+        assert len(kept) == 16
+        sequences = [s.sequence for s in kept]
+        assert sequences == sorted(set(sequences))
+        assert [s.sequence for s in source.since(sequences[-4])][:3] == sequences[-3:]
+        assert source.wait_for(10**9, 0.01) is None
+    assert source.latest() is not None  # what was received stays readable
+
+
+def test_many_may_wait_at_once(serve: Serve, configure: Configure) -> None:
+    with RigidBodyPoseSource(configure(serve())) as source:
+        found: list[PoseSample | None] = []
+        threads = [threading.Thread(target=lambda: found.append(source.wait_for(20, 30.0))) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(found) == 4
+    assert all(sample is not None and sample.sequence > 20 for sample in found)
+
+
+def test_tracking_lost_holds_the_last_pose(serve: Serve, configure: Configure, until: Until) -> None:
+    server = serve(standing())
+    with RigidBodyPoseSource(configure(server)) as source:
+        assert source.latest() is not None
+        server.faults = ServerFaults(occlusion=1.0)
+        until(lambda: not source.latest().tracked)  # type: ignore[union-attr]
+        assert pose(source.latest()) == pytest.approx((1.0, -2.0, 0.25, 0.5), abs=1e-6)
+        count = source.statistics()["untracked"]
+        until(lambda: source.statistics()["untracked"] > count)
+        server.faults = ServerFaults()
+        until(lambda: source.latest().tracked)  # type: ignore[union-attr]
+
+
+def test_a_pose_that_is_no_pose_is_not_tracked(serve: Serve, configure: Configure, until: Until) -> None:
+    quaternion = [(0.0, 0.0, 0.0, 1.0)]
+    place = [(1.0, 2.0, 0.0)]
+    server = serve(lambda t_s: [RigidBodySample(t_s, place[0], quaternion[0])])
+    with RigidBodyPoseSource(configure(server)) as source:
+        quaternion[0] = (0.0, 0.0, 0.0, 0.5)
+        until(lambda: source.statistics()["unusable"] > 3.0)
+        quaternion[0], place[0] = (0.0, 0.0, 0.0, 1.0), (float("nan"), 0.0, 0.0)
+        count = source.statistics()["unusable"]
+        until(lambda: source.statistics()["unusable"] > count + 3.0)
+        assert pose(source.latest()) == pytest.approx((1.0, 2.0, 0.0, 0.0), abs=1e-6)
+        assert not source.latest().tracked  # type: ignore[union-attr]
+        assert "no pose" in source.problems()[0]
+
+
+def test_a_body_that_disappears_and_returns(serve: Serve, configure: Configure, until: Until) -> None:
+    server = serve(standing())
+    with RigidBodyPoseSource(configure(server, body="car")) as source:
+        server.set_bodies((EmulatedBody("lorry", 5),))
+        until(lambda: source.statistics()["missing"] > 0.0 and bool(source.problems()))
+        assert "no longer knows the body" in source.problems()[0]
+        assert not source.latest().tracked  # type: ignore[union-attr]
+        server.set_bodies((EmulatedBody("car", 8),))
+        until(lambda: source.latest().tracked)  # type: ignore[union-attr]
+        assert source.problems() == ()
+
+
+def test_the_body_is_chosen_by_name_or_id(serve: Serve, configure: Configure) -> None:
+    bodies = (EmulatedBody("car", 3), EmulatedBody("trailer", 4))
+
+    def poses(t_s: float) -> Sequence[RigidBodySample]:
+        return [RigidBodySample.planar(t_s, 1.0, 0.0, 0.0), RigidBodySample.planar(t_s, 2.0, 0.0, 0.0)]
+
+    server = serve(poses, bodies=bodies)
+    for choice, x_m in (({"body": "car"}, 1.0), ({"body": "trailer"}, 2.0), ({"body_id": 4}, 2.0)):
+        with RigidBodyPoseSource(configure(server, **choice)) as source:
+            assert pose(source.latest())[0] == x_m
+    for choice, named in (({"body": "truck"}, "'truck'"), ({"body_id": 77}, "77"), ({}, "by itself")):
+        source = RigidBodyPoseSource(configure(server, **choice))
+        with pytest.raises(NotReadyError) as caught:
+            source.open()
+        text = str(caught.value)
+        for word in (named, "'car' (id 3)", "'trailer' (id 4)", "[hardware.mocap]"):
+            assert word in text
+
+
+def test_no_body_and_two_of_a_name() -> None:
+    with pytest.raises(NotReadyError, match="streams none: create one in Motive"):
+        select_body((MarkerSetDescription("all", ()),), MocapConfig())
+    twins = (RigidBodyDescription("car", 1), RigidBodyDescription("car", 2))
+    with pytest.raises(NotReadyError, match="set body_id"):
+        select_body(twins, MocapConfig(body="car"))
+    assert select_body(twins, MocapConfig(body_id=2)) is twins[1]
+
+
+def test_close_and_open_again(serve: Serve, configure: Configure) -> None:
+    source = RigidBodyPoseSource(configure(serve(standing())))
+    source.close()
+    for _ in range(3):
+        source.open()
+        source.open()
+        first = source.latest()
+        assert first is not None
+        assert first.tracked
+        source.close()
+        source.close()
+
+
+def no_pose(config: MocapConfig) -> str:
+    source = RigidBodyPoseSource(config)
+    with pytest.raises(NotReadyError) as caught:
+        source.open()
+    source.close()  # safe after an open that stopped half way
+    assert len(caught.value.reasons) == 1
+    return caught.value.reasons[0]
+
+
+def test_why_there_is_no_pose(serve: Serve, configure: Configure) -> None:
+    server = serve(faults=ServerFaults(silent=True))
+    assert "no frame came within 0.3 s" in no_pose(configure(server, timeout_s=0.3))
+    server.faults = ServerFaults(frame_version=BitstreamVersion(3, 0))
+    text = no_pose(configure(server, timeout_s=0.5))
+    for word in ("3.0, 3.1 or 4.0", "not 4.1", "2.6 to 4.1", "Motive's Data Streaming pane", 'bitstream = "3.0"'):
+        assert word in text
+    server.faults = ServerFaults()
+    with RigidBodyPoseSource(configure(server)) as source:
+        assert source.latest() is not None
+
+
+def test_frames_from_another_address_are_named(serve: Serve, configure: Configure) -> None:
+    """A computer with two addresses that answers from one and sends frames from the other."""
+    server = serve(rate_hz=100.0)
+    assert server._data is not None
+    port = server._data.getsockname()[1]
+    server._data.close()
+    server._data = udp_socket("127.0.0.3", port)
+    text = no_pose(configure(server, timeout_s=0.5))
+    assert "127.0.0.3" in text
+    assert "server_address" in text
+
+
+def test_a_failed_receiver_is_a_problem(
+    serve: Serve, configure: Configure, until: Until, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*arguments: object) -> None:
+        raise RuntimeError("out of order")
+
+    with RigidBodyPoseSource(configure(serve())) as source:
+        monkeypatch.setattr(source, "_sample", broken)
+        until(lambda: bool(source.problems()))
+        assert "out of order" in source.problems()[0]
+        assert "open it again" in source.problems()[0]
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = """if True:
+        import sys
+        import mocap
+        assert not [m for m in sys.modules if m.startswith("mocap.") or m in ("numpy", "scipy")]
+        assert all(getattr(mocap, name) for name in mocap.__all__)
+        try:
+            mocap.nothing
+        except AttributeError as error:
+            print(error)
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "'nothing'" in done.stdout

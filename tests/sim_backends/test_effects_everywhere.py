@@ -1,0 +1,362 @@
+"""What holds for every effect: identity, engines, gradients, files, symmetries, hidden states."""
+
+import math
+import tomllib
+
+import numpy as np
+import pytest
+import tomli_w
+import torch
+
+from carlab.core.errors import ConfigError, DataError
+from carlab.core.quantities import Action, CarState
+from sim_backends.batch_rollout import rollout
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS
+from sim_backends.plant import Plant
+
+NAMES = list(EFFECTS)
+CATALOGUE = [
+    "command_delay",
+    "steering_delay",
+    "throttle_delay",
+    "steering_lag",
+    "steering_rate_limit",
+    "steering_deadband",
+    "steering_backlash",
+    "steering_offset",
+    "steering_asymmetry",
+    "steering_nonlinearity",
+    "throttle_deadband",
+    "throttle_nonlinearity",
+    "motor_lag",
+    "motor_saturation",
+    "traction_limit",
+    "brake_asymmetry",
+    "battery_sag",
+    "rolling_resistance",
+    "aerodynamic_drag",
+    "cornering_drag",
+    "tyre_saturation",
+    "friction_ellipse",
+    "longitudinal_slip",
+    "tyre_relaxation",
+    "load_transfer",
+    "roll_dynamics",
+    "friction_drift",
+    "low_friction_patch",
+    "aerodynamic_downforce",
+    "yaw_damping",
+    "torque_steer",
+    "lateral_bias",
+    "road_slope",
+    "mocap_latency",
+    "marker_offset",
+    "mocap_yaw_misalignment",
+    "velocity_filter_lag",
+]
+
+
+def typical(name):
+    numbers = {p.name: p.typical for p in EFFECTS[name].parameters}
+    stronger = {"battery_sag": {"rate": 0.2}, "friction_drift": {"rate": -0.2}}
+    # Delays that do not end where the number of steps of a piece changes.
+    stronger |= {"steering_delay": {"delay": 0.0273}, "throttle_delay": {"delay": 0.0214}}
+    return {**numbers, **stronger.get(name, {})}
+
+
+def some(cars=4, ticks=6, seed=0):
+    rng = np.random.default_rng(seed)
+    start = rng.uniform(-1, 1, (cars, 6)) * [1, 1, 3, 1, 0.3, 1] + [0.5, 0, 0, 1.6, 0, 0]
+    return torch.tensor(start), torch.tensor(rng.uniform(-1, 1, (cars, ticks, 2)))
+
+
+def past(cars=4, ticks=5):
+    return torch.tensor(np.random.default_rng(5).uniform(-1, 1, (cars, ticks, 2)))
+
+
+def test_the_catalogue_is_complete():
+    assert list(EFFECTS) == CATALOGUE
+    for effect in EFFECTS.values():
+        assert set(effect.look_alikes) <= set(EFFECTS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("engine", ["fastest", "operators"])
+def test_identity_is_the_simulator_without_it_and_so_are_its_gradients(name, engine):
+    found = []
+    for effects in ({}, {name: {}}):
+        config = SimulatorConfig(effects=effects)
+        numbers = {k: v for k, v in config.values().items() if k != "timing.control_period"}
+        # A latency of its own takes the place of the base model's, whose gradient is then its.
+        numbers = {k: v for k, v in numbers.items() if not k.startswith("mocap.")}
+        values = {k: torch.full((4,), v, dtype=torch.float64, requires_grad=True) for k, v in numbers.items()}
+        (start, commands), history = some(), past()
+        commands[:, 2] = 0.0  # where a dead band and a power have kinks
+        leaves = [t.requires_grad_() for t in (start, commands, history)]
+        out = rollout(config, start, commands, history=history, values=values, measured=True, t0_s=2.0, engine=engine)
+        (out.states.square().sum() + out.measured.square().sum()).backward()
+        found.append((out, leaves, values))
+    (plain, plain_leaves, plain_values), (same, leaves, values) = found
+    assert (plain.states - same.states).abs().max() <= 1e-12
+    assert (plain.measured - same.measured).abs().max() <= 1e-12
+    for key, value in values.items():
+        assert value.grad is None or torch.isfinite(value.grad).all(), key
+        if key in plain_values and not (key.startswith("tyre.") and name == "tyre_saturation"):
+            assert torch.allclose(value.grad, plain_values[key].grad, rtol=1e-9, atol=1e-9), key
+    for ours, theirs in zip(leaves, plain_leaves, strict=True):
+        assert torch.allclose(ours.grad, theirs.grad, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", ["kinematic", "linear_tyre", "blend"])
+def test_identity_on_the_other_kinds(name, kind):
+    if name == "tyre_saturation" and kind != "blend":
+        pytest.skip("turns such a car into one with Pacejka tyres whatever its numbers are")
+    start, commands = some()
+    plain = rollout(SimulatorConfig(kind=kind), start, commands, measured=True)
+    same = rollout(SimulatorConfig(kind=kind, effects={name: {}}), start, commands, measured=True)
+    assert (plain.states - same.states).abs().max() <= 1e-12
+    assert (plain.measured - same.measured).abs().max() <= 1e-12
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("kind", ["dynamic", "kinematic"])
+def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeypatch):
+    """Without delay all of them cut time at the same places."""
+    config = SimulatorConfig(kind=kind, command_delay_s=0.0, effects={name: typical(name)})
+    if EFFECTS[name].kind == "input" and "delay" in name:
+        config = SimulatorConfig(kind=kind, command_delay_s=0.0, effects={name: {}})
+    start, commands = some()
+    arrays = rollout(config, start, commands).states
+    operators = rollout(config, start, commands, engine="operators").states
+    leaf = commands.clone().requires_grad_()
+    compiled = rollout(config, start, leaf).states
+    with monkeypatch.context() as patch:  # the code for many cars, which writes over what is not needed any more
+        patch.setattr("sim_backends.compiled_step.FEW_CARS", 2)
+        many = rollout(config, start, commands).states
+    for other in (operators, compiled.detach(), many):
+        assert torch.allclose(arrays, other, rtol=0, atol=1e-10)
+    single = rollout(config, start.float(), commands.float()).states
+    assert (single.double() - arrays).abs().max() < 2e-3
+    monkeypatch.setattr("sim_backends.plant.wrap", lambda yaw: yaw)
+    for i in range(2):
+        plant = Plant(config)
+        plant.reset(CarState(*start[i].tolist()), 0.0)
+        for k in range(commands.shape[1]):
+            plant.command(k * config.control_period_s, Action(*commands[i, k].tolist()))
+            plant.advance((k + 1) * config.control_period_s)
+            assert np.allclose(plant.state.to_array(), arrays[i, k + 1].numpy(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_car_may_have_its_own_numbers(name):
+    start, commands = some()
+    shares = (0.4, 0.7, 1.0, 1.3)
+    values = {}
+    for p in EFFECTS[name].parameters:
+        each = [p.typical * s for s in shares] if not p.choices else [0.0, 1.0, 1.0, 0.0]
+        values[f"effects.{name}.{p.name}"] = torch.tensor(each, dtype=torch.float64)
+    drawn = {"t0_s": torch.tensor([0.0, 5.0, 10.0, 0.0], dtype=torch.float64)}
+    together = rollout(SimulatorConfig(), start, commands, values=values, measured=True, max_step_s=0.002, **drawn)
+    for i in range(4):
+        config = SimulatorConfig().with_values({k: float(v[i]) for k, v in values.items()})
+        t0_s = float(drawn["t0_s"][i])
+        alone = rollout(config, start[i : i + 1], commands[i : i + 1], measured=True, max_step_s=0.002, t0_s=t0_s)
+        assert torch.allclose(alone.states[0], together.states[i], atol=1e-4)
+        assert torch.allclose(alone.measured[0], together.measured[i], atol=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_by_the_effects_numbers_equal_finite_differences(name):
+    base = SimulatorConfig(kind="linear_tyre" if name == "tyre_saturation" else "dynamic")
+    (start, commands), history = some(cars=1), past(cars=1)
+    keys = [f"effects.{name}.{p.name}" for p in EFFECTS[name].parameters if not p.choices]
+    numbers = {f"effects.{name}.{k}": v for k, v in typical(name).items()}
+    if name == "low_friction_patch":  # on its rim, where the place counts
+        x, y = float(start[0, 0]), float(start[0, 1])
+        numbers |= {f"effects.{name}.x": x - 0.5, f"effects.{name}.y": y - 0.4, f"effects.{name}.radius": 0.65}
+
+    def losses(values):
+        copies = len(next(iter(values.values())))
+        repeated = (t.repeat(copies, *[1] * (t.ndim - 1)) for t in (start, commands, history))
+        s, c, h = repeated
+        out = rollout(base, s, c, history=h, values=values, measured=True, t0_s=3.0)
+        weights = torch.linspace(0.5, 1.5, 42, dtype=torch.float64).reshape(7, 6)
+        return ((out.states + 0.6 * out.measured) * weights).sum(dim=(1, 2))
+
+    leaves = {k: torch.full((1,), v, dtype=torch.float64, requires_grad=True) for k, v in numbers.items()}
+    losses(leaves).sum().backward()
+    step = 1e-6
+    for key in keys:
+        moved = {k: torch.full((2,), v, dtype=torch.float64) for k, v in numbers.items()}
+        moved[key] += torch.tensor([step, -step], dtype=torch.float64)
+        up, down = losses(moved).tolist()
+        assert float(leaves[key].grad) == pytest.approx((up - down) / (2 * step), rel=5e-4, abs=1e-6), key
+        assert abs(up - down) > 1e-12, key
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_toml_round_trip(name):
+    for given in ({}, typical(name)):
+        config = SimulatorConfig(effects={name: given})
+        again = SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(config.to_tables())))
+        assert again == config
+        assert set(again.effects[name]) == {p.name for p in EFFECTS[name].parameters}
+
+
+def test_a_choice_is_a_word_in_the_file_and_a_number_elsewhere():
+    tables = {"effects": {"traction_limit": {"share": 0.8, "axle": "all"}}}
+    config = SimulatorConfig.from_tables(tables)
+    assert config.values()["effects.traction_limit.axle"] == 1.0
+    assert config.to_tables()["effects"]["traction_limit"]["axle"] == "all"
+    assert SimulatorConfig(effects={"traction_limit": {"axle": "rear"}}).effects["traction_limit"]["axle"] == 0.0
+    assert config == SimulatorConfig(effects=tables["effects"])
+    for wrong in ("front", 0.5, True, 3):
+        with pytest.raises(ConfigError, match="rear"):
+            SimulatorConfig.from_tables({"effects": {"traction_limit": {"axle": wrong}}})
+    with pytest.raises(ConfigError, match="must be a number"):
+        SimulatorConfig(effects={"steering_lag": {"time_constant": "rear"}})
+
+
+# Numbers that change sign where left and right are exchanged; a heading is mirrored by its sign.
+MIRRORED = {
+    "steering_offset": ("angle",),
+    "steering_asymmetry": ("gain",),
+    "torque_steer": ("coefficient",),
+    "lateral_bias": ("force",),
+    "low_friction_patch": ("y",),
+    "road_slope": ("direction",),
+    "marker_offset": ("left",),
+    "mocap_yaw_misalignment": ("angle",),
+}
+FLIP = torch.tensor([1, -1, -1, 1, -1, -1], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mirror_symmetry(name):
+    start, commands = some()
+    ours = rollout(SimulatorConfig(effects={name: typical(name)}), start, commands, history=past(), measured=True)
+    other = {k: -v if k in MIRRORED.get(name, ()) else v for k, v in typical(name).items()}
+    turned = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    theirs = rollout(
+        SimulatorConfig(effects={name: other}),
+        start * FLIP,
+        commands * turned,
+        history=past() * turned,
+        measured=True,
+    )
+    assert torch.allclose(ours.states, theirs.states * FLIP, rtol=0, atol=1e-11)
+    assert torch.allclose(ours.measured, theirs.measured * FLIP, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_moving_and_turning_the_world_with_what_is_fixed_in_it(name):
+    start, commands = some()
+    turn, east, north = 1.1, 4.0, -7.0
+    c, s = math.cos(turn), math.sin(turn)
+
+    def moved(states):
+        x, y, yaw, *rest = states.unbind(-1)
+        return torch.stack([east + c * x - s * y, north + s * x + c * y, yaw + turn, *rest], dim=-1)
+
+    numbers = typical(name)
+    there = dict(numbers)
+    if name == "low_friction_patch":
+        there["x"], there["y"] = (
+            east + c * numbers["x"] - s * numbers["y"],
+            north + s * numbers["x"] + c * numbers["y"],
+        )
+    if name == "road_slope":
+        there["direction"] += turn
+    ours = rollout(SimulatorConfig(effects={name: numbers}), start, commands, measured=True)
+    theirs = rollout(SimulatorConfig(effects={name: there}), moved(start), commands, measured=True)
+    assert torch.allclose(moved(ours.states), theirs.states, rtol=0, atol=1e-10)
+    assert torch.allclose(moved(ours.measured), theirs.measured, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_rollout_begun_in_the_middle_goes_on_as_the_whole_one(name):
+    """Hidden states come through the history, time through t0_s."""
+    config = SimulatorConfig(effects={name: typical(name)})
+    generator = np.random.default_rng(8)
+    start = torch.tensor([[0, 0, 0, 2.0, 0, 0], [1, 0, 1, 1.5, 0, 0]], dtype=torch.float64)
+    commands = torch.tensor(generator.uniform([-0.6, 0.1], [0.6, 0.6], (2, 45, 2)))
+    whole = rollout(config, start, commands).states
+    half = rollout(
+        config,
+        whole[:, 30],
+        commands[:, 30:],
+        history=commands[:, :30],
+        history_states=whole[:, :30],
+        t0_s=30 * config.control_period_s,
+    ).states
+    assert torch.allclose(half, whole[:, 30:], rtol=0, atol=2e-3)
+    if not {"states", "has_state"} & {k for k in dir(EFFECTS[name]) if getattr(EFFECTS[name], k)}:
+        assert torch.allclose(half, whole[:, 30:], rtol=0, atol=1e-9)
+
+
+def test_hidden_states_of_the_body_without_its_history_are_those_of_its_velocities():
+    """On a steady circle that is exact: nothing changes when a rollout is begun anew."""
+    effects = {n: typical(n) for n in ("tyre_relaxation", "roll_dynamics", "longitudinal_slip", "steering_lag")}
+    config = SimulatorConfig(effects=effects)
+    start = torch.tensor([[0, 0, 0, 1.2, 0, 0]], dtype=torch.float64)
+    commands = torch.tensor([0.25, 0.3], dtype=torch.float64).expand(1, 400, 2)
+    whole = rollout(config, start, commands).states
+    again = rollout(config, whole[:, 360], commands[:, 360:], history=commands[:, :20]).states
+    assert torch.allclose(again, whole[:, 360:], rtol=0, atol=1e-4)
+
+
+def test_time_since_the_first_row_counts():
+    start, commands = some(cars=1)
+    for name, rate in (("battery_sag", 0.01), ("friction_drift", -0.01)):
+        config = SimulatorConfig(effects={name: {"rate": rate}})
+        late = rollout(config, start, commands, t0_s=30.0).states
+        scale = (
+            {"motor.drive_gain": 8.2 * 0.7}
+            if name == "battery_sag"
+            else {"tyre.front.mu": 0.43 * 0.7, "tyre.rear.mu": 0.42 * 0.7}
+        )
+        about = rollout(SimulatorConfig().with_values(scale), start, commands).states
+        early = rollout(config, start, commands).states
+        assert (late - about).abs().max() < 0.1 * (early - about).abs().max()
+    shifted = rollout(config, start, commands, t0_s=torch.tensor(30.0, dtype=torch.float64)).states
+    assert torch.equal(shifted, late)
+    with pytest.raises(DataError, match="t0_s"):
+        rollout(config, start, commands, t0_s=torch.zeros(3))
+    with pytest.raises(DataError, match="history_states"):
+        rollout(config, start, commands, history=past(1), history_states=torch.zeros(1, 3, 6))
+
+
+def test_effects_do_not_depend_on_the_order_in_which_they_are_named():
+    """And the limits of a set: all of them at once stay finite, from rest and in reverse too."""
+    everything = {n: typical(n) for n in NAMES}
+    backwards = dict(reversed(everything.items()))
+    start, commands = some()
+    start[0], start[1, 3] = 0.0, -1.5
+    one, other = (rollout(SimulatorConfig(effects=e), start, commands, measured=True) for e in (everything, backwards))
+    assert torch.allclose(one.states, other.states, rtol=0, atol=1e-9)
+    assert torch.allclose(one.measured, other.measured, rtol=0, atol=1e-9)
+    assert torch.isfinite(one.measured).all()
+
+
+def test_misaligned_axes_turn_what_is_measured_and_nothing_else():
+    angle = 0.05
+    start, commands = some()
+    config = SimulatorConfig(
+        effects={"mocap_latency": {"latency": 0.0}, "mocap_yaw_misalignment": {"angle": angle}, "marker_offset": {}}
+    )
+    out = rollout(config, start, commands, measured=True)
+    true, seen = out.states, out.measured
+    assert torch.allclose(seen[..., 2], true[..., 2] + angle)
+    assert torch.allclose(seen[..., :2], true[..., :2])
+    # The velocity in the world is the same one.
+    for states in (true, seen):
+        states_vx = states[..., 3] * torch.cos(states[..., 2]) - states[..., 4] * torch.sin(states[..., 2])
+        assert torch.allclose(
+            states_vx, true[..., 3] * torch.cos(true[..., 2]) - true[..., 4] * torch.sin(true[..., 2])
+        )
+    small = torch.stack([true[..., 3] + angle * true[..., 4], true[..., 4] - angle * true[..., 3]], dim=-1)
+    assert (seen[..., 3:5] - small).abs().max() < angle**2 * 3
+    plant = Plant(SimulatorConfig(effects={"mocap_yaw_misalignment": {"angle": angle}}))
+    assert plant.measured_pose(0.0).yaw_rad == pytest.approx(angle)
