@@ -57,6 +57,7 @@ _DESCRIPTION = "Drive, learn and diagnose small race cars: real, emulated on the
 def _verbs() -> dict[str, Callable[..., Any]]:
     from carlab.cli.bench import Bench
     from carlab.cli.check import Check
+    from carlab.cli.diagnose import Diagnose
     from carlab.cli.drive import Drive
     from carlab.cli.emulate import Emulate
     from carlab.cli.export import Export
@@ -74,5 +75,6 @@ def _verbs() -> dict[str, Callable[..., Any]]:
         "check": Check,
         "emulate": Emulate,
         "listen": Listen,
+        "diagnose": Diagnose,
         "bench": Bench,
     }

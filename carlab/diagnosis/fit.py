@@ -83,8 +83,8 @@ def base_parameters(config: SimulatorConfig) -> tuple[Free, ...]:
     return tuple(found)
 
 
-def effect_parameters(effect_id: str) -> tuple[Free, ...]:
-    """The numbers of one effect."""
+def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[Free, ...]:
+    """The numbers of one effect; a delay that may be negative takes no more away than the car file has."""
     found = []
     for p in EFFECTS[effect_id].parameters:
         name = f"effects.{effect_id}.{p.name}"
@@ -93,6 +93,8 @@ def effect_parameters(effect_id: str) -> tuple[Free, ...]:
         else:
             origin = p.identity or 0.0
             low = max(p.low, origin - 20.0 * p.typical)
+            if p.name == "extra_delay":
+                low = max(low, -config.command_delay_s)
             found.append(Free(name, origin, abs(p.typical) or 1.0, low, min(p.high, origin + 20.0 * p.typical)))
     return tuple(found)
 

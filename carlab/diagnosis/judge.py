@@ -107,7 +107,7 @@ class Judge:
         for name in effects:
             config = with_effect(config, name)
         names = {f.name: k for k, f in enumerate(self.best.free)}
-        own = [f for e in (*self.search.nominal.effects, *effects) for f in effect_parameters(e)]
+        own = [f for e in (*self.search.nominal.effects, *effects) for f in effect_parameters(e, self.search.nominal)]
         free = (*base_parameters(self.search.nominal), *own)
         start = np.array([self.best.z[names[f.name]] for f in free])
         return self.fitter.fit(config, free, start)

@@ -139,8 +139,8 @@ class Search:
     # -- pieces ---------------------------------------------------------------------------------------------------
 
     def _free(self, effects: Sequence[str]) -> tuple[Free, ...]:
-        own = [f for name in self.nominal.effects for f in effect_parameters(name)]
-        return (*self.base_free, *own, *(f for name in effects for f in effect_parameters(name)))
+        own = [f for name in self.nominal.effects for f in effect_parameters(name, self.nominal)]
+        return (*self.base_free, *own, *(f for name in effects for f in effect_parameters(name, self.nominal)))
 
     def _config(self, effects: Sequence[str]) -> SimulatorConfig:
         config = self.nominal
@@ -220,7 +220,7 @@ class Search:
         for name in self.allowed:
             if name in effects or name in self.nominal.effects:
                 continue
-            free = effect_parameters(name)
+            free = effect_parameters(name, self.nominal)
             starts = _starts(free)
             trial_free = (*best.free, *free)
             trial_config = self._config((*effects, name))

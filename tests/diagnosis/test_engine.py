@@ -1,0 +1,50 @@
+"""The whole diagnosis on drives by an independent generator: a concealed effect is named and sized."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from carlab.cli import run
+from carlab.concealment import make_case
+from carlab.concealment.measurement import write_csv
+
+
+@pytest.fixture(scope="module")
+def concealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
+    """A servo lag concealed in 60 s of driving, base parameters off by up to 10 %, and 30 s to judge by."""
+    folder = tmp_path_factory.mktemp("concealed")
+    case = make_case("single", 11, effects=("steering_lag",), excess=4.0, fit_s=60, hold_s=30)
+    write_csv(folder / "fit.csv", case.fit)
+    write_csv(folder / "hold.csv", case.hold)
+    case.nominal.write(folder / "car.toml")
+    return folder, case.answer()["effects"][0]["parameters"]["time_constant"]
+
+
+def test_a_concealed_servo_lag_is_named_first_and_sized(concealed: tuple[Path, float]) -> None:
+    folder, truth_s = concealed
+    out = folder / "out"
+    arguments = [str(folder / "fit.csv"), "--car", str(folder / "car.toml"), "--holdout", str(folder / "hold.csv")]
+    assert run(["diagnose", *arguments, "--out", str(out)]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert report["verdict"] == "mismatch"
+    first = report["effects"][0]
+    assert first["id"] == "steering_lag"
+    assert first["parameters"]["time_constant"]["value"] == pytest.approx(truth_s, rel=0.05)
+    held_out = report["fit"]["held_out"]
+    assert held_out["with_effects"]["score"] < 0.5 * held_out["refit"]["score"]
+    for name in ("report.html", "report.rrd", "model.toml"):
+        assert (out / name).stat().st_size > 0
+
+
+def test_a_parked_car_is_inconclusive_and_says_what_to_record(
+    concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rows = (concealed[0] / "fit.csv").read_text().splitlines()
+    first = rows[1].split(",")
+    parked = [rows[0], *(",".join([r.split(",")[0], *first[1:4], "0", "0", "0", *r.split(",")[7:]]) for r in rows[1:])]
+    path = tmp_path / "parked.csv"
+    path.write_text("\n".join(parked) + "\n")
+    assert run(["diagnose", str(path), "--out", str(tmp_path / "out")]) == 5
+    assert "record it driving" in " ".join(capfd.readouterr().err.split())
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["verdict"] == "inconclusive"
