@@ -23,7 +23,7 @@ class Bench:
     out: Path | None = None
     """Write the figures as JSON."""
 
-    seconds: float = 5.0
+    seconds: float = 10.0
     """Length of each condition of the sender's measurement [s]."""
 
     verbose: bool = False
