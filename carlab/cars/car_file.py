@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from carlab.core.tables import check_keys, from_table
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig, HardwareConfig
 from mocap.mocap_config import MocapConfig
-from sim_backends.car_parameters import TABLES, SimulatorConfig
+from sim_backends.car_parameters import TABLES, SimulatorConfig, preset_names
 
 _ARMING = tuple(f.name for f in fields(HardwareConfig) if f.name.startswith("arm_"))
 
@@ -41,9 +42,19 @@ class CarFile:
 
 
 def load_car_file(path: Path) -> CarFile:
-    """Read a car file. Raises ConfigError for a missing file, bad TOML, an unknown key or an impossible value."""
+    """Read a car file, or one of the cars that come with the package by its bare name (``preset_names``).
+
+    Raises ConfigError for a missing file, bad TOML, an unknown key or an impossible value.
+    """
+    if is_preset(path):
+        name = path.name
+        text = (resources.files("sim_backends") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
+        return CarFile(name, text, SimulatorConfig.from_preset(name), None)
     if not path.is_file():
-        raise ConfigError(f"There is no car file '{path}'; name a TOML file, or one of sim, emulated, emulated-can.")
+        raise ConfigError(
+            f"There is no car file '{path}'; name a TOML file, one of sim, emulated, emulated-can, "
+            f"or a car that comes with carlab: {', '.join(preset_names())}."
+        )
     try:
         text = path.read_text(encoding="utf-8")
         tables = tomllib.loads(text)
@@ -56,6 +67,11 @@ def load_car_file(path: Path) -> CarFile:
     simulator = SimulatorConfig.from_tables(tables, str(path))
     real = None if hardware is None else _real_car(hardware, path)
     return CarFile(path.stem if real is None else real.name, text, simulator, real)
+
+
+def is_preset(path: Path) -> bool:
+    """Whether this is the bare name of a car that comes with the package, and no file of that name is there."""
+    return str(path) in preset_names() and not path.is_file()
 
 
 def default_car() -> CarFile:

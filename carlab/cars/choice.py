@@ -1,4 +1,4 @@
-"""``--car sim``, ``emulated``, ``emulated-can``, a name that a plug-in registered, or a car file."""
+"""``--car sim``, ``emulated``, ``emulated-can``, a plug-in, the name of a car that comes along, or a car file."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cars.car_file import CarFile, default_car, load_car_file
+from carlab.cars.car_file import CarFile, default_car, is_preset, load_car_file
 from carlab.core.car import Car
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, ActionLimits, Reality
 from carlab.core.safety import SafetyEnvelope
+from sim_backends.car_parameters import preset_names
 
 if TYPE_CHECKING:
     from sim_backends.car_parameters import SimulatorConfig
@@ -48,7 +49,8 @@ def choose_car(
 
     Args:
         name: sim, emulated, emulated-can, the name of a plug-in (entry point group ``carlab.cars``: a callable that
-            takes a CarFile and a seed and returns a CarChoice), or the path of a car file.
+            takes a CarFile and a seed and returns a CarChoice), a car that comes with the package (simulated), or
+            the path of a car file.
         vehicle: car file whose physics sim, emulated and plug-ins use; the default car without it.
         dry_run: swallow commands.
         seed: of the sensors' noise.
@@ -66,9 +68,10 @@ def choose_car(
         if vehicle is not None:
             raise ConfigError(f"--vehicle goes with --car sim or emulated; '{name}' is a car of its own.")
         path = Path(name)
-        if path.suffix != ".toml" and not path.exists():
+        if path.suffix != ".toml" and not path.exists() and not is_preset(path):
             raise ConfigError(
-                f"There is no car '{name}'; name one of {', '.join([*BUILT_IN, *plugins])}, or a FILE.toml."
+                f"There is no car '{name}'; name one of {', '.join([*BUILT_IN, *plugins, *preset_names()])}, "
+                "or a FILE.toml."
             )
         file = load_car_file(path)
         choice = _real(file, seed) if file.real is not None else _simulated(file, seed)

@@ -63,6 +63,7 @@ def _verbs() -> dict[str, Callable[..., Any]]:
     from carlab.cli.export import Export
     from carlab.cli.import_ import Import
     from carlab.cli.listen import Listen
+    from carlab.cli.prove import Prove
     from carlab.cli.replay import Replay
     from carlab.cli.view import View
 
@@ -76,5 +77,6 @@ def _verbs() -> dict[str, Callable[..., Any]]:
         "emulate": Emulate,
         "listen": Listen,
         "diagnose": Diagnose,
+        "prove": Prove,
         "bench": Bench,
     }

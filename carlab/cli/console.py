@@ -71,8 +71,11 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
 
 
 @contextmanager
-def progress() -> Iterator[Progress]:
-    """A progress bar on a terminal; nothing where the output is a file."""
+def progress(speed_estimate_period_s: float = 30.0) -> Iterator[Progress]:
+    """A progress bar on a terminal; nothing where the output is a file.
+
+    The time left is estimated from the steps of the last ``speed_estimate_period_s``.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -80,7 +83,13 @@ def progress() -> Iterator[Progress]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    with Progress(*columns, console=console, transient=True, disable=not sys.stdout.isatty()) as bar:
+    with Progress(
+        *columns,
+        console=console,
+        transient=True,
+        disable=not sys.stdout.isatty(),
+        speed_estimate_period=speed_estimate_period_s,
+    ) as bar:
         yield bar
 
 

@@ -37,7 +37,7 @@ class Diagnose:
     """MCAP or CSV files to fit."""
 
     car: str = "sim"
-    """Car file of the simulator to question; sim for the default car."""
+    """Simulator to question: a car file, a car that comes along (eth_rc_car, dart_jetracer ...), or sim."""
 
     holdout: tuple[Path, ...] = ()
     """Recordings that only judge; without any, the last 30 % of each recording is held out."""
@@ -104,21 +104,22 @@ class Diagnose:
     ) -> tuple[list[EpisodeData], list[DataFault], list[RecordingUse]]:
         from carlab.diagnosis.findings import DataFault, RecordingUse
         from carlab.recording.audit_report import Severity
-        from carlab.recording.foreign_csv import import_csv
+        from carlab.recording.forgiving_import import import_mended
         from carlab.recording.mcap_source import read_episode
 
         episodes, faults, uses = [], [], []
         for path in paths:
             required_file(path, "The recording")
             if is_csv(path):
-                imported = import_csv(path)
-                episodes += list(imported.episodes)
-                for finding in imported.report.findings:
-                    if finding.id in DATA_FAULTS and finding.severity >= Severity.REPAIRED:
-                        action = "repaired" if finding.severity is Severity.REPAIRED else "reported"
-                        faults.append(
-                            DataFault(finding.id, finding.channel, finding.count, f"{action}: {finding.sentence}")
-                        )
+                read = import_mended(path)
+                episodes += list(read.imported.episodes)
+                # What is wrong and not repaired is found again, and repaired, from the episodes themselves.
+                repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
+                faults += [
+                    DataFault(f.id, f.channel, f.count or episodes[-1].ticks + 1, f"repaired: {f.sentence}")
+                    for f in (*read.mended, *repaired)
+                    if f.id in DATA_FAULTS and f.id != "dropouts"
+                ]
             else:
                 episodes.append(read_episode(path))
             uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))

@@ -124,8 +124,12 @@ class Import:
     stamps: Literal["error", "drop"] | None = None
     """Stamps that do not increase: refuse, or leave those rows out."""
 
-    clock: Literal["column", "velocity"] | None = None
-    """Take times from their column, or rebuild each period from distance over speed where that was made up later."""
+    clock: Literal["column", "velocity", "even"] | None = None
+    """Take times from their column; rebuild each period from distance over speed where the column was made up later;
+    or put rows on an even clock where they are frames of a camera, stamped as they arrived."""
+
+    command_lag: float | None = None
+    """Known delay of the command columns behind the moment at which the commands were sent [s]."""
 
     rate: float | None = None
     """Row rate [Hz] of a file without a time column; needs --mapping."""
@@ -185,6 +189,7 @@ class Import:
             "gaps": self.gaps,
             "stamps": self.stamps,
             "clock": self.clock,
+            "command_lag_s": self.command_lag,
             "rate_hz": self.rate,
         }
         given = {name: value for name, value in options.items() if value is not None}

@@ -19,7 +19,8 @@ class CarOptions:
     """Which car."""
 
     car: str = "sim"
-    """sim, emulated (serial), emulated-can, or FILE.toml: with [hardware] that real car, else that simulated one."""
+    """sim, emulated (serial), emulated-can, a car that comes along (eth_rc_car, dart_jetracer ...: simulated), or
+    FILE.toml: with [hardware] that real car, else that simulated one."""
 
     vehicle: Path | None = None
     """Car file whose physics and motion capture sim and emulated use in place of the default car's."""

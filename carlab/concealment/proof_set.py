@@ -68,6 +68,12 @@ def short_set(
     return [CaseSpec(s.kind, s.seed, s.effects, s.form, s.excess, s.fault, s.period_s, 40.0, 20.0) for s in specs]
 
 
+def drawn(specs: list[CaseSpec], count: int, seed: int = 0) -> list[CaseSpec]:
+    """So many of the cases, drawn without replacement, in their order; all where there are no more."""
+    order = np.random.default_rng((seed, 7)).permutation(len(specs))[:count]
+    return [specs[k] for k in sorted(order.tolist())]
+
+
 def _specs(
     purpose: Purpose,
     seed: int,

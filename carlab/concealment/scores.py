@@ -148,10 +148,12 @@ def per_effect(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
     return found
 
 
-def write_scores(path: Path, rows: Mapping[str, Row], summary: Mapping[str, Any]) -> None:
-    """All figures as JSON."""
-    text = json.dumps({"summary": summary, "per_effect": per_effect(rows.values()), "cases": dict(rows)}, indent=1)
-    path.write_text(text + "\n")
+def write_scores(
+    path: Path, rows: Mapping[str, Row], summary: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]] = ()
+) -> None:
+    """All figures as JSON; ``baselines`` as ``baseline_scores.compare`` gives them."""
+    figures = {"summary": summary, "per_effect": per_effect(rows.values()), "baselines": list(baselines)}
+    path.write_text(json.dumps({**figures, "cases": dict(rows)}, indent=1) + "\n", encoding="utf-8")
 
 
 def confusion(rows: Iterable[Row]) -> tuple[list[str], list[str], np.ndarray[tuple[int, ...], np.dtype[np.int64]]]:

@@ -11,18 +11,19 @@ import numpy as np
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
+from carlab.diagnosis import data_faults as data_faults_of
 from carlab.diagnosis.findings import (
     DataFault,
     Diagnosis,
     Exhibits,
     RecordingUse,
 )
-from carlab.diagnosis.fit import Scale
+from carlab.diagnosis.fit import Fitter, Scale
 from carlab.diagnosis.judge import HORIZON_S, Judge, Texts
 from carlab.diagnosis.scoring import HeldOut, noise_floor
 from carlab.diagnosis.search import Progress, Search
 from carlab.diagnosis.shots import Shots, Track, cut, estimate_noise, tracks_of
-from carlab.diagnosis.unexplained import describe_rest
+from carlab.diagnosis.unexplained import describe, missing_terms, start_features
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -69,7 +70,7 @@ def diagnose(
         nominal: the simulator of the car file.
         texts: sentences and look-alikes.
         uses: which recording is what, for the report.
-        data_faults: what an audit of the files found.
+        data_faults: what was repaired when the files were read; what is found here is added to it.
         effects: the only effects to try; all of the catalogue unless given.
         seed: written into the report; nothing here draws random numbers that depend on it.
         progress: told what is being done and how far it is, in [0, 1].
@@ -82,6 +83,9 @@ def diagnose(
     clock = MonotonicClock()
     began_s = clock.now_s()
     progress("reading", 0.0)
+    fit, held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
+    data_faults = (*data_faults, *own_faults)
+    progress("reading", 0.03)
     fit_tracks, held_tracks = _split(fit, held_out)
     _check_excitation(fit_tracks)
     noise = estimate_noise(fit_tracks)
@@ -105,7 +109,11 @@ def diagnose(
     errors_of = judge.errors
     score = {name: judged.score(error) for name, error in errors_of.items()}
     share = _share_left(score)
-    rest = describe_rest(shots, found.best.config, floor, share)
+    left = missing_terms(shots, found.best, found.scale)
+    whole = missing_terms(shots, found.base, found.scale) if found.effects else left
+    named = float(Fitter(shots, found.scale).loss(found.base.config).sum() - found.best.loss.sum())
+    log.info("REST %s", __import__("json").dumps(dict(named=named, left=left.gain, whole=whole.gain, share=share, ndof=len(shots)*18, lw=left.words(), lf=left.formula(), ww=whole.words(), wf=whole.formula(), effects=found.effects, chi2=dict(found.chi2))))
+    rest = describe(left, share, errors_of["with_effects"], judged.floor, start_features(judged.shots)) if share >= 0.1 else None
     verdict = judge.verdict(rest, data_faults)
     progress("drawing", 0.95)
     exhibits = judge.exhibits(held_tracks)

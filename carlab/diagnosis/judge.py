@@ -23,9 +23,9 @@ from carlab.diagnosis.findings import (
 from carlab.diagnosis.fit import Fit, Fitter, base_parameters, clustered_gain, effect_parameters, with_effect
 from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.scoring import HeldOut
-from carlab.diagnosis.search import Search, SearchResult, Step
+from carlab.diagnosis.search import Search, SearchResult
 from carlab.diagnosis.shots import Shots, Track, cut
-from carlab.diagnosis.unexplained import REGIMES, features, worst_regime
+from carlab.diagnosis.unexplained import REGIMES, start_features, worst_regime
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.registry import REGISTRY
@@ -68,17 +68,14 @@ class Judge:
     def findings(self, progress: Callable[[float], None]) -> tuple[EffectFinding, ...]:
         """Each effect with its evidence, the strongest first."""
         made = []
-        rivals = {step.chosen.effect: step for step in self.found.steps}
         for k, name in enumerate(self.found.effects):
             progress(k / len(self.found.effects))
-            made.append(self._finding(name, rivals[name]))
-        made.sort(key=lambda f: -f.evidence.held_out_error_reduction)
-        for step in self.found.steps:
-            config = step.chosen.fit.config
-            self.ladder.append((f"+ {step.chosen.effect}", self.held_out.score(self.held_out.final_error(config))))
+            made.append(self._finding(name))
+        for name, fit in self.found.history:
+            self.ladder.append((f"+ {name}", self.held_out.score(self.held_out.final_error(fit.config))))
         return tuple(made)
 
-    def _finding(self, name: str, step: Step) -> EffectFinding:
+    def _finding(self, name: str) -> EffectFinding:
         rest = tuple(e for e in self.found.effects if e != name)
         without = self._refit(rest)
         error = self.held_out.final_error(without.config)
@@ -86,11 +83,10 @@ class Judge:
         gain, spread = self.held_out.gain(error, full)
         fingerprint = HeldOut.fingerprint(error, full)
         parameters = {p.name: self.estimate(f"effects.{name}.{p.name}") for p in EFFECTS[name].parameters}
-        others = tuple(r.effect for r in step.rivals)
+        others = self.found.rivals.get(name, ())
         reduction = 1.0 - self.held_out.score(full) / max(self.held_out.score(error), 1e-12)
         evidence = Evidence(reduction, gain / spread, self.visibility(name), fingerprint)
-        margin = min(step.chosen.standard_errors, gain / spread if gain > 0 else 0.0)
-        confidence = 1.0 / (1.0 + math.exp(-(margin - 3.0)))
+        confidence = 1.0 / (1.0 + math.exp(-(math.sqrt(max(self.found.chi2[name], 0.0)) - 4.0)))
         return EffectFinding(
             id=name,
             confidence=confidence / (1 + len(others)),
@@ -128,7 +124,7 @@ class Judge:
         time = (0.0, float(shots.t0_s.max())) if name in ("battery_sag", "friction_drift") else None
         white = errors(Predictor(shots, without.config)(), shots)[0, :, -1]
         channel = STATE_NAMES.index(channels[0])
-        return Where(channels, worst_regime(features(shots), np.abs(white[:, channel])), lag, time, place)
+        return Where(channels, worst_regime(start_features(shots), np.abs(white[:, channel])), lag, time, place)
 
     def estimate(self, name: str) -> Estimate:
         """A fitted number with its interval."""
@@ -177,7 +173,7 @@ class Judge:
         """Material for the pictures."""
         shots, held = self.search.shots, self.held_out.shots
         regimes: dict[str, tuple[FloatArray, FloatArray, FloatArray]] = {}
-        seen = features(held)
+        seen = start_features(held)
         size = {name: np.sqrt(np.mean((e / self.held_out.floor) ** 2, axis=1)) for name, e in self.errors.items()}
         for name, unit, value in REGIMES:
             feature = value(seen)

@@ -23,6 +23,8 @@ AHEAD, LEFT = "effects.marker_offset.ahead", "effects.marker_offset.left"
 TURNED = "effects.mocap_yaw_misalignment.angle"
 OBSERVED = (LATENCY, FILTER, AHEAD, LEFT, TURNED)
 DELAY = "timing.command_delay"
+STEP_S = 0.017
+"""Longest step of the integration: at 30 Hz its error stays within a hundredth of a noise floor."""
 _OBSERVATION_EFFECTS = ("mocap_latency", "velocity_filter_lag", "marker_offset", "mocap_yaw_misalignment")
 
 
@@ -32,6 +34,7 @@ class Predictor:
 
     shots: Shots
     config: SimulatorConfig
+    max_step_s: float = STEP_S
 
     def __call__(self, values: Mapping[str, FloatArray] | None = None) -> FloatArray:
         """Predict with P sets of numbers.
@@ -64,6 +67,7 @@ class Predictor:
             history=tensor(np.tile(self.shots.history, (sets, 1, 1))),
             values={name: tensor(np.repeat(v, count)) for name, v in inner.items()},
             t0_s=tensor(np.tile(self.shots.t0_s, sets)),
+            max_step_s=self.max_step_s,
         ).states
         out = states.numpy().astype(np.float64).reshape(sets, count, self.shots.steps + 1, 6)
         return self._done(out, seen)

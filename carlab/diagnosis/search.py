@@ -1,8 +1,8 @@
 """Which effects are missing: a projected screen of all candidates, joint refits, duels on unseen blocks, and moves.
 
 Every candidate is refitted together with the base parameters, because base parameters absorb most of any effect.
-What decides is the likelihood of blocks of the recording that were not fitted (two folds), with a standard error
-that takes the shots of a block as one observation.
+Its gain in likelihood is divided by how much the dependence of neighbouring errors overstates it (the sandwich
+covariance over the naive one; Kent 1982), and must hold on blocks of the recording that were not fitted.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.fit import (
-    HUBER,
     Fit,
     Fitter,
     Free,
@@ -24,58 +23,78 @@ from carlab.diagnosis.fit import (
     base_parameters,
     clustered_gain,
     effect_parameters,
-    huber,
     with_effect,
 )
 from carlab.diagnosis.prediction import Predictor, errors
+from carlab.diagnosis.screen import Promise, Screen, usable
 from carlab.diagnosis.shots import Shots
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 
 log = logging.getLogger(__name__)
 
-SIZES = (0.1, 0.3, 1.0, 2.5)
-REFITTED = 7
-ACCEPT_STANDARD_ERRORS = 3.0
-ACCEPT_SHARE = 0.01
+REFITTED = 10
+FOLDS = 6
+WORTH = 0.1
+"""Candidates that promise less than this share of the best promise are not refitted."""
+CLOSE = 0.3
+"""Candidates that gain less than this share of the best gain are not tried on unseen blocks."""
+ACCEPT_CHI2 = 25.0
+ACCEPT_CHI2_MORE = 8.0
+"""For every further number of the effect, and where its identity is infinite: so many more places to overfit."""
+ACCEPT_SHARE = 0.015
+"""Unseen gain, as a share of the loss that a perfect simulator would leave."""
+ACCEPT_UNSEEN = 0.3
+"""Unseen gain, as a share of the gain on the blocks that were fitted."""
+KEEP_CHI2 = 16.0
+HOPELESS_CHI2 = 8.0
+"""Candidates that promise less than this are not refitted."""
 SET_STANDARD_ERRORS = 2.0
-MAX_EFFECTS = 6
+MAX_EFFECTS = 8
+SETTLED = 0.03
+"""Relative change of the scale of errors below which it has settled."""
+UNSEEN_AT_MOST = 12.0
+"""Standard deviations beyond which an error on an unseen block counts no more: one spin must not decide."""
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """An effect tried beside those already found: in-sample fit, and gain on unseen blocks with its standard error."""
+    """An effect tried beside those already found.
+
+    gain: fall of the loss, in sample. chi2: twice the gain over its inflation. unseen_gain and unseen_error: on blocks
+    that were not fitted, with the clustered standard error; unseen_loss (S,) of each shot, empty where not tried.
+    """
 
     effect: str
     fit: Fit
     gain: float
-    unseen_gain: float = 0.0
+    chi2: float = 0.0
+    unseen_gain: float = -math.inf
     unseen_error: float = math.inf
     unseen_loss: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def standard_errors(self) -> float:
         """Unseen gain in standard errors."""
-        return self.unseen_gain / self.unseen_error
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """One accepted effect and the rivals that came close."""
-
-    chosen: Candidate
-    rivals: tuple[Candidate, ...]
+        return self.unseen_gain / self.unseen_error if math.isfinite(self.unseen_error) else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """base: the refit without effects; best: with the effects found; steps: in the order of acceptance."""
+    """What a search found.
+
+    base: the refit without effects; best: with the effects found, strongest first; chi2: of each of them, taken out of
+    the whole; rivals: look-alikes that do as well in its place; history: (effect, fit) as they were accepted;
+    tried: candidates for the first effect.
+    """
 
     base: Fit
     best: Fit
     effects: tuple[str, ...]
-    steps: tuple[Step, ...]
+    chi2: Mapping[str, float]
+    rivals: Mapping[str, tuple[str, ...]]
+    history: tuple[tuple[str, Fit], ...]
     tried: tuple[Candidate, ...]
     scale: Scale
 
@@ -111,15 +130,14 @@ class Search:
         self.allowed = tuple(EFFECTS) if allowed is None else tuple(allowed)
         self.progress = progress
         self.base_free = base_parameters(nominal)
-        # Folds of alternating blocks of ten seconds; a shot near a border belongs to one of them alone.
-        parity = (shots.block // 2) % 2
-        self.folds = (parity == 0, parity == 1)
+        blocks = np.unique(shots.block)
+        self.folds = np.searchsorted(blocks, shots.block) % min(FOLDS, max(len(blocks), 1))
 
     def run(self) -> SearchResult:
         """Search until nothing more is gained."""
         self.progress("refit of the base parameters", 0.0)
         base, scale = self._settled(self.nominal, self._free(()))
-        best, steps = base, list[Step]()
+        best, history = base, list[tuple[str, Fit]]()
         effects: tuple[str, ...] = ()
         tried: tuple[Candidate, ...] = ()
         while len(effects) < MAX_EFFECTS and not self.stop():
@@ -127,14 +145,20 @@ class Search:
             found = self._next(best, effects, scale)
             if not effects:
                 tried = tuple(found)
-            if self.stop() or not found or not self._accepts(found[0], best, effects, scale):
+            leader = next((c for c in found if self._accepts(c)), None)
+            if self.stop() or leader is None:
                 break
-            leader = found[0]
-            steps.append(Step(leader, tuple(self._rivals(leader, found[1:]))))
+            log.info("accepted %s", leader.effect)
+            before = effects
             effects = (*effects, leader.effect)
             best, scale = self._settled(leader.fit.config, leader.fit.free, leader.fit.z)
-            effects, best, scale, steps = self._pruned(effects, best, scale, steps)
-        return SearchResult(base, best, tuple(effects), tuple(steps), tried, scale)
+            effects, best, scale = self._moved(effects, best, scale)
+            history.append((leader.effect, best))
+            if set(effects) == set(before):
+                break
+        chi2, rivals = self._duels(effects, best, scale)
+        ordered = tuple(sorted(effects, key=lambda e: -chi2[e]))
+        return SearchResult(base, best, ordered, chi2, rivals, tuple(history), tried, scale)
 
     # -- pieces ---------------------------------------------------------------------------------------------------
 
@@ -155,11 +179,13 @@ class Search:
         start = self._own_start(free) if z is None else z
         error = errors(Predictor(self.shots, config)(_values(free, start)), self.shots)[0]
         scale = Scale.of(error, self.floor)
-        for _ in range(3):
+        for _ in range(4):
             fit = Fitter(self.shots, scale).fit(config, free, start)
             start = fit.z
             error = errors(Predictor(self.shots, fit.config)(), self.shots)[0]
-            scale = Scale.of(error, self.floor)
+            before, scale = scale, Scale.of(error, self.floor)
+            if np.abs(scale.sigma / before.sigma - 1.0).max() < SETTLED:
+                return fit, before
         return Fitter(self.shots, scale).fit(config, free, start), scale
 
     def _own_start(self, free: Sequence[Free]) -> FloatArray:
@@ -167,154 +193,179 @@ class Search:
         return np.array([f.coordinate(values[f.name]) if f.name in values else 0.0 for f in free])
 
     def _next(self, best: Fit, effects: Sequence[str], scale: Scale) -> list[Candidate]:
-        """Candidates refitted beside ``effects``, the best on unseen blocks first."""
-        screened = self._screen(best, effects, scale)
-        names = [name for name, _, _ in screened[:REFITTED]]
-        for name, _, _ in screened[:2]:
-            names += [n for n in self.look_alikes.get(name, ()) if n in self.allowed and n not in (*names, *effects)]
-        starts = {name: start for name, _, start in screened}
+        """Candidates refitted beside ``effects``: those tried on unseen blocks first, the best of them first."""
         fitter = Fitter(self.shots, scale)
+        promises = {p.effect: p for p in self._screen(best, effects, scale)}
+        if not promises:
+            return []
+        top = max(p.gain for p in promises.values())
+        least = 0.5 * HOPELESS_CHI2 * max(1.0, float(np.median(_deflation(fitter, best))))
+        names = [n for n, p in promises.items() if p.gain > max(WORTH * top, least)][:REFITTED]
+        for name in names[:3]:
+            names += [n for n in self.look_alikes.get(name, ()) if n in promises and n not in names]
         found = []
         for k, name in enumerate(names):
             self.progress(f"refitting with {name}", (len(effects) + 0.5 * k / len(names)) / MAX_EFFECTS)
-            if name not in starts or self.stop():
-                continue
-            config = self._config((*effects, name))
-            free = self._free((*effects, name))
-            fit = fitter.fit(config, free, np.concatenate([best.z, starts[name]]))
-            found.append(Candidate(name, fit, best.cost - fit.cost))
+            if self.stop():
+                break
+            found.append(self._refitted(fitter, best, (*effects, name), promises[name]))
         found.sort(key=lambda c: -c.gain)
-        reference = self._unseen(self._config(effects), best.free, best.z, scale)
+        if not found:
+            return []
+        reference = fitter.unseen(best, self.folds, UNSEEN_AT_MOST)
         judged = []
         for k, candidate in enumerate(found):
-            close = candidate.gain > 0.3 * found[0].gain or k < 2
-            if not close or self.stop():
+            if self.stop() or (candidate.gain < CLOSE * found[0].gain and k >= 2):
                 judged.append(candidate)
                 continue
             self.progress(f"testing {candidate.effect} on unseen blocks", (len(effects) + 0.7) / MAX_EFFECTS)
-            loss = self._unseen(self._config((*effects, candidate.effect)), candidate.fit.free, candidate.fit.z, scale)
-            gain, error = clustered_gain(reference, loss, self.shots)
-            judged.append(Candidate(candidate.effect, candidate.fit, candidate.gain, gain, error, loss))
-        judged.sort(key=lambda c: -c.unseen_gain)
+            judged.append(self._tested(fitter, candidate, reference))
+        judged.sort(key=lambda c: (not len(c.unseen_loss), -(c.gain + c.unseen_gain)))
+        for c in judged:
+            if len(c.unseen_loss):
+                log.info(
+                    "CAND %d %s gain %.1f chi2 %.1f need %.0f unseen %.1f (%.1f se) share %.3f %s",
+                    len(effects), c.effect, c.gain, c.chi2, self._needed(c.effect), c.unseen_gain, c.standard_errors,
+                    c.unseen_gain / self._expected(),
+                    {k: round(v, 4) for k, v in c.fit.values().items() if k.startswith("effects." + c.effect)},
+                )  # fmt: skip
         return judged
 
-    def _screen(self, best: Fit, effects: Sequence[str], scale: Scale) -> list[tuple[str, float, FloatArray]]:
-        """Gain that each candidate promises when the present parameters are free to follow, and where it starts.
+    def _refitted(self, fitter: Fitter, best: Fit, effects: tuple[str, ...], promise: Promise) -> Candidate:
+        config, free = self._config(effects), self._free(effects)
+        starts = [np.concatenate([best.z, s]) for s in promise.starts]
+        if len(starts) > 1:
+            tries = [fitter.fit(config, free, s, iterations=3) for s in starts]
+            starts = [min(tries, key=lambda f: f.cost).z]
+        fit = fitter.fit(config, free, starts[0])
+        return Candidate(promise.effect, fit, best.cost - fit.cost)
 
-        The error changes by a secant g when the candidate is switched on at some size; what the present parameters
-        could do themselves (their Jacobian) is projected out of it (a score test at finite size: Rao 1948).
-        """
-        fitter = Fitter(self.shots, scale)
-        count, step = len(best.free), 0.02
-        config = self._config(effects)
-        whites = fitter.white(config, best.free, np.vstack([best.z, best.z + step * np.eye(count)]))
-        white = whites[0].reshape(-1)
-        weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(white), 1e-12)))
-        jacobian = ((whites[1:].reshape(count, -1) - white) / step * weight).T
-        prior = np.diag([1.0 / f.prior_z for f in best.free])
-        basis, _ = np.linalg.qr(np.vstack([jacobian, prior]))
-        inside = basis[: len(white)]
-        residual = weight * white
-        residual = residual - inside @ (inside.T @ residual)
+    def _tested(self, fitter: Fitter, candidate: Candidate, reference: FloatArray) -> Candidate:
+        fit = fitter.with_covariance(candidate.fit)
+        loss = fitter.unseen(fit, self.folds, UNSEEN_AT_MOST)
+        gain, error = clustered_gain(reference, loss, self.shots)
+        chi2 = 2.0 * candidate.gain / _inflation(fit, candidate.effect)
+        return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)
+
+    def _screen(self, best: Fit, effects: Sequence[str], scale: Scale) -> list[Promise]:
+        """What each candidate promises beside ``effects``, the best first."""
+        screen = Screen(Fitter(self.shots, scale), self._config(effects), best)
         found = []
         for name in self.allowed:
-            if name in effects or name in self.nominal.effects:
+            if name in effects or name in self.nominal.effects or not usable(self.nominal, name):
                 continue
-            free = effect_parameters(name, self.nominal)
-            starts = _starts(free)
-            trial_free = (*best.free, *free)
-            trial_config = self._config((*effects, name))
-            points = np.hstack([np.tile(best.z, (len(starts), 1)), starts])
-            promised, chosen = -math.inf, starts[0]
-            for part in np.array_split(np.arange(len(starts)), max(1, math.ceil(len(starts) / 8))):
-                for k, moved in zip(part, fitter.white(trial_config, trial_free, points[part]), strict=True):
-                    secant = weight * np.clip(moved.reshape(-1) - white, -50.0, 50.0)
-                    left = secant - inside @ (inside.T @ secant)
-                    size = float(left @ left)
-                    slope = -float(left @ residual)
-                    along = min(max(slope / max(size, 1e-12), 0.0), 2.0)
-                    gain = along * slope - 0.5 * along**2 * size
-                    if gain > promised:
-                        promised, chosen = gain, starts[k] * min(max(along, 0.3), 1.5)
-            found.append((name, promised, chosen))
-        found.sort(key=lambda item: -item[1])
+            found.append(screen.promise(name, effect_parameters(name, self.nominal)))
+        found.sort(key=lambda p: -p.gain)
         return found
 
-    def _unseen(self, config: SimulatorConfig, free: tuple[Free, ...], z: FloatArray, scale: Scale) -> FloatArray:
-        """Loss of every shot (S,) by a fit that has not seen its block."""
-        loss = np.zeros(len(self.shots))
-        for fold in self.folds:
-            if not fold.any() or fold.all():
-                return Fitter(self.shots, scale).loss(config, free, z)
-            fit = Fitter(self.shots.take(~fold), scale).fit(config, free, z, iterations=6)
-            loss[fold] = Fitter(self.shots.take(fold), scale).loss(config, fit.free, fit.z)
-        return loss
+    def _expected(self) -> float:
+        """Loss of a perfect simulator: half for each whitened error."""
+        return 0.5 * len(self.shots) * 36
 
-    def _accepts(self, leader: Candidate, best: Fit, effects: Sequence[str], scale: Scale) -> bool:
-        share = leader.unseen_gain / max(float(best.loss.sum()), 1e-9)
-        log.info(
-            "%s: unseen gain %.1f (%.1f standard errors)", leader.effect, leader.unseen_gain, leader.standard_errors
+    def _needed(self, effect: str) -> float:
+        """What chi2 must exceed."""
+        numbers = [p for p in EFFECTS[effect].parameters if not p.choices]
+        infinite = any(p.identity is not None and math.isinf(p.identity) for p in numbers)
+        return ACCEPT_CHI2 + ACCEPT_CHI2_MORE * (len(numbers) - 1 + infinite)
+
+    def _accepts(self, candidate: Candidate) -> bool:
+        return (
+            len(candidate.unseen_loss) > 0
+            and candidate.chi2 > self._needed(candidate.effect)
+            and candidate.unseen_gain > ACCEPT_UNSEEN * candidate.gain
+            and candidate.unseen_gain > ACCEPT_SHARE * self._expected()
         )
-        return leader.standard_errors > ACCEPT_STANDARD_ERRORS and share > ACCEPT_SHARE
 
-    def _rivals(self, leader: Candidate, others: Sequence[Candidate]) -> list[Candidate]:
-        """Look-alikes that unseen blocks do not tell from the leader."""
-        close = []
-        for other in others:
-            if other.effect not in self.look_alikes.get(leader.effect, ()) or not len(other.unseen_loss):
-                continue
-            gap, error = clustered_gain(other.unseen_loss, leader.unseen_loss, self.shots)
-            if gap < SET_STANDARD_ERRORS * error and other.standard_errors > ACCEPT_STANDARD_ERRORS:
-                close.append(other)
-        return close[:2]
+    def _refit(self, effects: tuple[str, ...], like: Fit, scale: Scale) -> Fit:
+        """Fit with ``effects``, from the numbers that ``like`` has of them."""
+        free = self._free(effects)
+        known = {f.name: float(z) for f, z in zip(like.free, like.z, strict=True)}
+        start = np.array([known.get(f.name, 0.0) for f in free])
+        return Fitter(self.shots, scale).fit(self._config(effects), free, start)
 
-    def _pruned(
-        self, effects: tuple[str, ...], best: Fit, scale: Scale, steps: list[Step]
-    ) -> tuple[tuple[str, ...], Fit, Scale, list[Step]]:
-        """Take out again what the rest makes needless: the first effect accepted is often a proxy."""
-        while len(effects) > 1:
-            full = self._unseen(self._config(effects), best.free, best.z, scale)
-            worst: tuple[float, str, Fit] | None = None
-            for name in effects[:-1]:
-                rest = tuple(e for e in effects if e != name)
-                keep = [k for k, f in enumerate(best.free) if not f.name.startswith(f"effects.{name}.")]
-                free = self._free(rest)
-                start = np.array([best.z[[f.name for f in best.free].index(f.name)] for f in free])
-                assert len(keep) == len(free)
-                fit = Fitter(self.shots, scale).fit(self._config(rest), free, start)
-                gain, error = clustered_gain(self._unseen(self._config(rest), free, fit.z, scale), full, self.shots)
-                if gain / error < SET_STANDARD_ERRORS and (worst is None or gain / error < worst[0]):
-                    worst = (gain / error, name, fit)
-            if worst is None:
-                break
-            _, name, fit = worst
-            log.info("%s is no longer needed", name)
-            effects = tuple(e for e in effects if e != name)
-            steps = [s for s in steps if s.chosen.effect != name]
-            best, scale = self._settled(self._config(effects), fit.free, fit.z)
-        return effects, best, scale, steps
+    def _moved(self, effects: tuple[str, ...], best: Fit, scale: Scale) -> tuple[tuple[str, ...], Fit, Scale]:
+        """Take out or swap what others do better: the first effect accepted is often a proxy."""
+        if len(effects) < 2 or self.stop():
+            return effects, best, scale
+        fitter = Fitter(self.shots, scale)
+        for name in effects[:-1]:
+            rest = tuple(e for e in effects if e != name)
+            without = self._refit(rest, best, scale)
+            chi2 = 2.0 * (without.cost - best.cost) / _inflation(fitter.with_covariance(best), name)
+            if chi2 < KEEP_CHI2:
+                log.info("%s is no longer needed (%.1f)", name, chi2)
+                kept, scale = self._settled(self._config(rest), without.free, without.z)
+                return self._moved(rest, kept, scale)
+            promises = [p for p in self._screen(without, rest, scale) if p.effect != name][:2]
+            for promise in promises:
+                if self.stop() or promise.gain < 0.7 * (without.cost - best.cost):
+                    continue
+                other = self._refitted(fitter, without, (*rest, promise.effect), promise)
+                deflated = 2.0 * (best.cost - other.fit.cost) / _inflation(
+                    fitter.with_covariance(other.fit), promise.effect
+                )
+                if deflated > KEEP_CHI2:
+                    log.info("%s takes the place of %s (%.1f)", promise.effect, name, deflated)
+                    fit, scale = self._settled(other.fit.config, other.fit.free, other.fit.z)
+                    return (*rest, promise.effect), fit, scale
+        return effects, best, scale
+
+    def _duels(
+        self, effects: tuple[str, ...], best: Fit, scale: Scale
+    ) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
+        """How much each effect is needed, and which look-alikes unseen blocks do not tell from it."""
+        fitter = Fitter(self.shots, scale)
+        chi2: dict[str, float] = {}
+        rivals: dict[str, tuple[str, ...]] = {}
+        if not effects:
+            return chi2, rivals
+        whole = fitter.with_covariance(best)
+        own_loss = fitter.unseen(best, self.folds, UNSEEN_AT_MOST)
+        for name in effects:
+            rest = tuple(e for e in effects if e != name)
+            without = self._refit(rest, best, scale)
+            chi2[name] = 2.0 * (without.cost - best.cost) / _inflation(whole, name)
+            others = [o for o in self.look_alikes.get(name, ()) if o in self.allowed and o not in effects]
+            close = []
+            screen = Screen(fitter, self._config(rest), without)
+            for other in others:
+                if self.stop() or other in self.nominal.effects or not usable(self.nominal, other):
+                    continue
+                self.progress(f"{name} or {other}?", 0.95)
+                promise = screen.promise(other, effect_parameters(other, self.nominal))
+                rival = self._refitted(fitter, without, (*rest, other), promise)
+                if rival.gain < CLOSE * (without.cost - best.cost):
+                    continue
+                loss = fitter.unseen(rival.fit, self.folds, UNSEEN_AT_MOST)
+                gap, error = clustered_gain(loss, own_loss, self.shots)
+                log.info("duel %s - %s: %.1f (%.1f se)", name, other, gap, gap / error)
+                if gap < SET_STANDARD_ERRORS * error:
+                    close.append((gap, other))
+            rivals[name] = tuple(o for _, o in sorted(close)[:2])
+        return chi2, rivals
+
+
+def _deflation(fitter: Fitter, fit: Fit) -> FloatArray:
+    found = fitter.with_covariance(fit).deflation
+    assert found is not None
+    return found if len(found) else np.ones(1)
+
+
+def _inflation(fit: Fit, effect: str) -> float:
+    """How much dependent errors overstate the gain by an effect: sandwich over naive variance, at least one.
+
+    Where the effect's own figure cannot be had (a clip that nothing touches), the middle one of all numbers stands in.
+    """
+    assert fit.deflation is not None
+    own = [
+        float(d) for f, d in zip(fit.free, fit.deflation, strict=True)
+        if f.name.startswith(f"effects.{effect}.") and d > 1e-9
+    ]  # fmt: skip
+    return max([1.0, float(np.median(fit.deflation)), *own])
 
 
 def _values(free: Sequence[Free], z: FloatArray) -> dict[str, FloatArray]:
     return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
 
 
-def _starts(free: Sequence[Free]) -> FloatArray:
-    """Coordinates (P, n) at which a candidate is tried: several sizes, both signs where there are two."""
-    grids = []
-    for f in free:
-        if f.logarithmic:
-            grids.append([math.log(r) / f.size for r in (0.25, 0.5, 1.0, 2.0, 4.0)])
-        elif f.low < f.origin:
-            grids.append([s * sign for s in SIZES for sign in (1.0, -1.0)])
-        else:
-            grids.append(list(SIZES))
-    if len(free) == 1:
-        return np.array(grids[0])[:, None]
-    if len(free) == 2:
-        return np.array([(a, b) for a in [*grids[0], 0.0][::2] for b in [*grids[1], 0.0][::2] if (a, b) != (0.0, 0.0)])
-    rng = np.random.default_rng(0)
-    return np.array([[rng.choice(g) for g in grids] for _ in range(24)])
-
-
-__all__ = ["Candidate", "Search", "SearchResult", "Step", "huber"]
+__all__ = ["Candidate", "Search", "SearchResult"]

@@ -91,10 +91,20 @@ class AuditReport:
         }
 
 
+class RefusedError(DataError):
+    """A file that cannot be imported as declared; ``findings`` are those of severity ERROR."""
+
+    def __init__(self, source: str, findings: Sequence[Finding]) -> None:
+        self.findings = tuple(findings)
+        if len(self.findings) == 1:
+            super().__init__(f"{source}: {self.findings[0].sentence}")
+        else:
+            faults = "".join(f"\n  - {f.sentence}" for f in self.findings)
+            super().__init__(f"{source} has {len(self.findings)} faults:{faults}")
+
+
 def raise_errors(source: str, findings: Iterable[Finding]) -> None:
-    """Raise one DataError with the sentence of every finding that is an ERROR."""
-    sentences = [f.sentence for f in findings if f.severity is Severity.ERROR]
-    if len(sentences) == 1:
-        raise DataError(f"{source}: {sentences[0]}")
-    if sentences:
-        raise DataError(f"{source} has {len(sentences)} faults:" + "".join(f"\n  - {s}" for s in sentences))
+    """Raise one RefusedError with the sentence of every finding that is an ERROR."""
+    errors = [f for f in findings if f.severity is Severity.ERROR]
+    if errors:
+        raise RefusedError(source, errors)

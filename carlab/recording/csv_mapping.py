@@ -92,9 +92,11 @@ class ColumnMapping:
     "compared."""
     dead_reckoning: bool = False
     """There is no pose: integrate vx and yaw_rate from the origin, with vy = 0."""
-    clock: Literal["column", "velocity"] = "column"
-    """``velocity``: rebuild each period from distance over speed, where the time column was constructed "
-    "afterwards."""
+    clock: Literal["column", "velocity", "even"] = "column"
+    """``velocity``: rebuild each period from distance over speed, where the time column was constructed afterwards.
+    ``even``: rows are frames of a source of constant rate and the stamps are those of their arrival."""
+    command_lag_s: float = 0.0
+    """Known delay of the command columns behind the moment at which the commands were sent [s]."""
     rate_hz: float | None = None
     """Row rate of a file without a time column."""
     missing: Literal["error", "drop"] = "error"
@@ -176,7 +178,12 @@ ETH = ColumnMapping(
 )
 
 # Lorenzo-Lyons/DART. Declared:
-# - the pose is Vicon's, stamped by "vicon time"; sensors and commands come at 10 Hz and are repeated in these rows.
+# - the pose is Vicon's, stamped by "vicon time" when it arrived: read on an even 100 Hz instead, what a local cubic
+#   leaves of x and y falls by a tenth to two fifths in each of the files. Sensors and commands come at 10 Hz and are
+#   repeated in these rows.
+# - commands are sent at 10 Hz and held (racecar_pkg/src/system_id_gamepad_universal.py), and the logger copies the
+#   newest at 10 Hz of its own (publish_sensors_and_inputs_universal.py): a row is 0 to 0.1 s behind what was sent, by
+#   a phase that stays for a recording; 0.05 s on average. Uncorrected, the acceleration comes before the throttle.
 # - the car multiplies the throttle by the dead-man's safety value (their ROS_packages/racecar_pkg/src/
 #   racecar_universal.py: car.throttle = throttle * safety_value); the steering acts regardless. In 70_racetrack_lap
 #   the logged throttle is 0.25 for 676 rows in which the car stands still and safety_value is 0.
@@ -193,6 +200,8 @@ DART = ColumnMapping(
     layout="dart",
     throttle_gate="safety_value",
     references={"vel encoder": "vx", "W (IMU)": "yaw_rate"},
+    clock="even",
+    command_lag_s=0.05,
 )
 DART_ONBOARD = ColumnMapping(
     {

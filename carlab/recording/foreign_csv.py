@@ -13,12 +13,14 @@ import numpy as np
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
+from carlab.recording.audit_compare import held_at
 from carlab.recording.audit_heading import check_heading
 from carlab.recording.audit_report import AuditReport, Finding, Severity, raise_errors
 from carlab.recording.audit_stamps import check_jumps, check_missing, check_order, check_stamps, gap_rows, segments
+from carlab.recording.clocks import even_clock, rebuilt_clock
 from carlab.recording.csv_mapping import CHANNELS, VELOCITY_CHANNELS, ColumnMapping, missing_columns, recognise_layout
 from carlab.recording.csv_table import CsvTable, read_csv
-from carlab.recording.data_audit import Channels, audit_channels, true_periods
+from carlab.recording.data_audit import Channels, audit_channels
 from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
 
 
@@ -81,6 +83,9 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     origin_s = float(values["t"][0])
     t_s = values["t"] - origin_s
     findings += check_stamps(t_s, mapping)
+    if mapping.clock == "even":
+        t_s, found = even_clock(t_s)
+        findings += found
     if not mapping.dead_reckoning:
         findings += check_heading(t_s, values, mapping)
     raise_errors(source, findings)
@@ -92,7 +97,7 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     raise_errors(source, findings)
     states, notes = _states(channels, mapping, spikes)
     if mapping.clock == "velocity":
-        t_s, note = _rebuilt_clock(channels, mapping)
+        t_s, note = rebuilt_clock(channels)
         notes["clock"] = note
     metadata = {
         "source": str(table.path),
@@ -204,22 +209,6 @@ def _dead_reckoned(t_s: FloatArray, vx: FloatArray, yaw_rate: FloatArray) -> Flo
     return np.column_stack([x, y, yaw, vx, np.zeros_like(vx), yaw_rate])
 
 
-def _rebuilt_clock(channels: Channels, mapping: ColumnMapping) -> tuple[FloatArray, str]:
-    """Stamps from distance over speed; slower than 0.3 m/s, the median of those periods."""
-    if "vx" not in channels.values or "vy" not in channels.values:
-        raise DataError("The clock can be rebuilt only where vx and vy columns are given; use --clock column.")
-    periods = true_periods(channels)
-    median = float(np.nanmedian(periods)) if np.isfinite(periods).any() else float("nan")
-    # Beyond half to three times the median, the speed is at fault (an impact, a stale row), not the clock.
-    trusted = (periods > 0.5 * median) & (periods < 3 * median)
-    if trusted.sum() < 100:
-        raise DataError("The car hardly moves: the clock cannot be rebuilt by distance over speed; use --clock column.")
-    broken = np.diff(channels.segment) != 0
-    steps = np.where(trusted, periods, np.where(broken, np.diff(channels.t_s), median))
-    note = f"rebuilt from distance over speed for {int(trusted.sum())} of {len(steps)} periods, median elsewhere"
-    return np.concatenate([[0.0], np.cumsum(steps)]), note
-
-
 def _episodes(
     t_s: FloatArray, states: FloatArray, channels: Channels, mapping: ColumnMapping, metadata: Mapping[str, str]
 ) -> tuple[tuple[EpisodeData, ...], list[Finding]]:
@@ -230,6 +219,22 @@ def _episodes(
     extra = dict(channels.extra)
     parts = [slice(0, len(t_s))]
     findings = []
+    if mapping.command_lag_s:
+        requested, sent = (
+            np.column_stack([held_at(t_s, column, -mapping.command_lag_s) for column in table.T])
+            for table in (requested, sent)
+        )
+        findings.append(
+            Finding(
+                "column_shift",
+                "steering, throttle",
+                Severity.REPAIRED,
+                f"Commands were logged {mapping.command_lag_s * 1e3:.0f} ms after they were sent, by what the mapping "
+                "declares; they were taken that much earlier.",
+                len(t_s),
+                evidence={"lag_s": mapping.command_lag_s},
+            )
+        )
     numbers = np.unique(channels.segment)
     if mapping.gaps == "split" and len(numbers) > 1:
         bounds = [*(int(np.argmax(channels.segment == n)) for n in numbers), len(t_s)]
@@ -287,6 +292,10 @@ def _conversions(mapping: ColumnMapping) -> str:
         done.append("wrap spikes of yaw_rate repaired from the pose")
     if mapping.throttle_gate:
         done.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
+    if mapping.command_lag_s:
+        done.append(f"commands taken {mapping.command_lag_s * 1e3:.0f} ms earlier")
+    if mapping.clock == "even":
+        done.append("rows put on an even clock")
     if mapping.dead_reckoning:
         done.append("pose integrated from speed and turn rate")
     return ", ".join(done) if done else "nothing needed conversion"

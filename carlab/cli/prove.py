@@ -1,0 +1,184 @@
+"""``carlab prove``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from carlab.cli.console import console, fail, progress, table
+from carlab.core.clock import MonotonicClock
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from carlab.concealment.proof_set import CaseSpec
+    from carlab.concealment.runner import Proof
+    from carlab.experiment.interrupts import Interrupts
+
+STAGES = {
+    "make": "cases made",
+    "diagnose": "cases diagnosed",
+    "oracle": "cases diagnosed with the names told",
+    "baselines": "cases put to the baselines",
+}
+DAY_S = 86400.0
+
+
+@dataclass
+class Prove:
+    """Conceal effects in fresh recordings, diagnose them without being told, then open the seal and score.
+
+    Prints a hash over the answers before the first diagnosis. Takes hours (--set short: minutes). ^C ends after the
+    running cases, twice at once; the same command goes on from there. Writes scores.json, confusion.png, results.md.
+    """
+
+    out: Path = Path("proof")
+    """Folder of the proof; one that was begun with the same options is gone on with."""
+
+    set: Literal["short", "full", "development"] = "short"
+    """short: five small cases; full: some 350, from the seeds that figures come from; development: 350 other ones."""
+
+    seed: int = 0
+    """Another seed, other cases."""
+
+    limit: int | None = None
+    """Only so many cases, drawn from the set."""
+
+    jobs: int = 1
+    """Cases at a time; with more than one, each computes with one thread."""
+
+    timeout: float = 1800.0
+    """A diagnosis that takes longer counts as failed [s]."""
+
+    oracle: bool = True
+    """Diagnose again with the names told, for the oracle ratio."""
+
+    baselines: bool = True
+    """Put the same cases to PySINDy, a Gaussian process, stepwise BIC and cross-correlation."""
+
+    verbose: bool = False
+    """Show the whole log."""
+
+    def run(self) -> int:
+        """Make, seal, diagnose, open, score."""
+        from carlab.concealment.baselines import require_studies
+        from carlab.concealment.runner import Proof
+        from carlab.experiment.interrupts import Interrupts
+
+        specs = self._specs()
+        if self.jobs < 1 or self.timeout <= 0.0:
+            raise ConfigError("--jobs and --timeout: numbers above zero.")
+        if self.baselines:
+            require_studies()
+        with Interrupts() as interrupts, progress(speed_estimate_period_s=DAY_S) as bar:
+            said = _Bar(bar)
+            proof = Proof(
+                self.out, specs, command=_diagnose_command(), progress=said, timeout_s=self.timeout, jobs=self.jobs,
+                stop_requested=interrupts.requested.is_set, abandon=interrupts.urgent.is_set,
+            )  # fmt: skip
+            if not self._stages(proof, interrupts):
+                fail(f"Stopped with {said.last}; the same command goes on from there.")
+                return 130
+        return self._score(proof)
+
+    def _stages(self, proof: Proof, interrupts: Interrupts) -> bool:
+        if proof.make() is None or not proof.diagnose():
+            return False
+        if self.oracle and not proof.diagnose(oracle=True):
+            return False
+        if self.baselines and not proof.baselines():
+            return False
+        return not interrupts.requested.is_set()
+
+    def _specs(self) -> list[CaseSpec]:
+        from carlab.concealment.proof_set import drawn, full_set, short_set
+
+        if self.limit is not None and self.limit < 1:
+            raise ConfigError(f"--limit {self.limit}: at least one case.")
+        if self.set == "short":
+            specs = short_set("test", self.seed)
+        else:
+            specs = full_set("test" if self.set == "full" else "development", self.seed)
+        return specs if self.limit is None else drawn(specs, self.limit, self.seed)
+
+    def _score(self, proof: Proof) -> int:
+        from carlab.concealment.baseline_scores import COLUMNS, compare, comparison_rows
+        from carlab.concealment.results_page import results_page
+        from carlab.concealment.scores import draw_confusion, judge_all, summarise, table_rows, write_scores
+
+        answers = proof.open_seal()
+        console.print("The seal is whole: the answers are those of the hash.")
+        runs = proof.reports()
+        with console.status("Scoring"):
+            rows = judge_all(answers, runs, proof.reports(oracle=True) if self.oracle else None, proof.same)
+        summary = summarise(rows.values())
+        comparison = compare(rows, proof.baseline_reports()) if self.baselines else []
+        table(f"{len(rows)} cases", ["figure", "value (95 %)", "n", "asked"], table_rows(summary))
+        if comparison:
+            table("Beside the baselines, names strictly", ["figure", *COLUMNS], comparison_rows(comparison))
+        if summary["no_report"]:
+            fail(f"{summary['no_report']} diagnoses left no report; results.md says which and why.")
+        write_scores(proof.root / "scores.json", rows, summary, comparison)
+        draw_confusion(proof.root / "confusion.png", rows.values())
+        page = results_page(self._facts(proof, runs), rows, runs, summary, comparison)
+        (proof.root / "results.md").write_text(page, encoding="utf-8")
+        console.print(f"Read {self.out / 'results.md'} and {self.out / 'confusion.png'}; all figures: scores.json.")
+        return 0
+
+    def _facts(self, proof: Proof, runs: dict[str, dict[str, Any]]) -> dict[str, str]:
+        import os
+        from datetime import datetime
+
+        from carlab import __version__
+        from carlab.core.clock import wall_clock_ns
+
+        seeds = [spec.seed for spec in proof.specs]
+        memory = [run["peak_memory_mib"] for run in runs.values()]
+        jobs = sorted({int(run["jobs"]) for run in runs.values()})
+        return {
+            "date": datetime.fromtimestamp(wall_clock_ns() * 1e-9).astimezone().isoformat(timespec="minutes"),
+            "command": f"`{shlex.join(['carlab', *sys.argv[1:]])}`",
+            "seeds": f"{min(seeds)} to {max(seeds)} ({len(seeds)} cases)",
+            "carlab": f"{__version__}, {os.cpu_count()} cores, {' and '.join(map(str, jobs))} cases at a time",
+            "peak memory of a diagnosis": f"{max(memory, default=0.0):.0f} MiB",
+        }
+
+
+class _Bar:
+    """Shows the stages on the console: a bar on a terminal, a line now and then in a file; the seal always."""
+
+    def __init__(self, bar: Progress) -> None:
+        self.last = "nothing done"
+        self._bar = bar
+        self._tasks: dict[str, TaskID] = {}
+        self._clock = MonotonicClock()
+        self._began: dict[str, tuple[float, int]] = {}
+
+    def __call__(self, stage: str, done: int, total: int, note: str) -> None:
+        """Take one report of the proof."""
+        if stage == "seal":
+            self._bar.console.print(f"Sealed {total} answers: sha256 {note}", soft_wrap=True)
+            return
+        self.last = f"{done} of {total} {STAGES[stage]}"
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bar.add_task(STAGES[stage], total=total, completed=done, note="")
+        self._bar.update(self._tasks[stage], completed=done)
+        if self._bar.disable and (done == total or done % max(1, total // 20) == 0):
+            self._bar.console.print(self.last + self._time_left(stage, done, total))
+
+    def _time_left(self, stage: str, done: int, total: int) -> str:
+        now_s = self._clock.now_s()
+        since_s, before = self._began.setdefault(stage, (now_s, done))
+        if done in (before, total):
+            return ""
+        return f", about {(now_s - since_s) / (done - before) * (total - done) / 60.0:.0f} min left"
+
+
+def _diagnose_command() -> tuple[str, ...]:
+    from carlab.concealment.runner import DIAGNOSE
+
+    return DIAGNOSE

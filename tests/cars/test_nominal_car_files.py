@@ -1,0 +1,83 @@
+"""The nominal files of the two public cars load under their name, and their facts are those that were published."""
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from carlab.cars import choose_car, load_car_file
+from carlab.cli import run
+from carlab.core.errors import ConfigError
+from carlab.core.quantities import Action, CarState, Reality
+from sim_backends.car_parameters import SimulatorConfig
+
+CARS = ("eth_rc_car", "dart_jetracer", "dart_jetracer_linear")
+FACTS = ("vehicle.mass", "vehicle.front_axle", "vehicle.rear_axle", "timing.control_period", "timing.command_delay")
+
+
+@pytest.mark.parametrize("name", CARS)
+def test_a_car_that_comes_along_is_loaded_by_its_name_and_from_its_file(name):
+    by_name = load_car_file(Path(name))
+    with resources.as_file(resources.files("sim_backends") / "presets" / f"{name}.toml") as path:
+        by_path = load_car_file(path)
+    assert by_name == by_path
+    assert by_name.simulator == SimulatorConfig.from_preset(name)
+    assert tomllib.loads(by_name.text)["model"]["kind"] == by_name.simulator.kind
+
+
+@pytest.mark.parametrize("name", CARS)
+def test_what_was_measured_is_held_and_what_was_guessed_has_a_range(name):
+    config = SimulatorConfig.from_preset(name)
+    for fact in FACTS:
+        assert fact not in config.priors
+    guessed = {n for n in config.values() if n.startswith(("tyre.", "motor.", "steering."))} | {"vehicle.yaw_inertia"}
+    assert guessed == set(config.priors)
+    for low, high in config.priors.values():
+        assert high > 1.5 * low
+
+
+def test_the_published_facts():
+    eth = SimulatorConfig.from_preset("eth_rc_car").parameters
+    assert (eth.mass_kg, eth.front_axle_m, eth.rear_axle_m) == (1.65, 0.13, 0.17)
+    dart = SimulatorConfig.from_preset("dart_jetracer").parameters
+    # 0.847 of 1.58 kg on the front axle: the lever rule about either axle of a wheelbase of 0.1735 m.
+    assert dart.wheelbase_m == pytest.approx(0.1735, abs=1e-9)
+    assert dart.mass_kg * dart.rear_axle_m / dart.wheelbase_m == pytest.approx(0.847, abs=0.001)
+
+
+def test_the_linear_car_differs_from_the_other_in_nothing_but_its_tyre_model():
+    plain, linear = (SimulatorConfig.from_preset(n) for n in ("dart_jetracer", "dart_jetracer_linear"))
+    assert (plain.kind, linear.kind) == ("dynamic", "linear_tyre")
+    assert plain.values() == linear.values()
+    assert plain.priors == linear.priors
+
+
+@pytest.mark.parametrize("name", CARS)
+def test_it_can_be_driven_as_a_simulated_car(name):
+    choice = choose_car(name)
+    assert choice.car.reality is Reality.SIMULATED
+    with choice.car as car:
+        car.place(CarState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        car.arm()
+        for _ in range(3 * round(1.0 / choice.control_period_s)):
+            car.command(Action(0.3, 0.5))
+            car.clock.sleep_until(car.clock.now_s() + choice.control_period_s)
+        state = car.observe().state
+    assert state.vx_mps > 0.5
+    assert state.yaw_rate_radps > 0.2
+
+
+def test_an_unknown_name_is_answered_with_those_there_are(capfd):
+    with pytest.raises(ConfigError, match="dart_jetracer, dart_jetracer_linear, eth_rc_car, rc_car"):
+        load_car_file(Path("dart_jetracr"))
+    with pytest.raises(ConfigError, match=r"dart_jetracer, dart_jetracer_linear, eth_rc_car, rc_car, or a FILE\.toml"):
+        choose_car("dart_jetracr")
+    assert run(["replay", "nothing.csv", "--car", "dart_jetracr"]) == 2
+    assert "eth_rc_car" in " ".join(capfd.readouterr().err.split())
+
+
+def test_a_file_of_that_name_goes_before_the_car_that_comes_along(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("eth_rc_car").write_text("[vehicle]\nmass = 9.0\n")
+    assert load_car_file(Path("eth_rc_car")).simulator.parameters.mass_kg == 9.0
