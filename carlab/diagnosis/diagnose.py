@@ -21,7 +21,7 @@ from carlab.diagnosis.findings import (
 from carlab.diagnosis.fit import Fitter, Scale
 from carlab.diagnosis.judge import HORIZON_S, Judge, Texts
 from carlab.diagnosis.scoring import HeldOut, noise_floor
-from carlab.diagnosis.search import Progress, Search
+from carlab.diagnosis.search import Progress, Search, SearchResult
 from carlab.diagnosis.shots import Shots, Track, cut, estimate_noise, tracks_of
 from carlab.diagnosis.unexplained import describe, missing_terms, start_features
 from sim_backends.car_parameters import SimulatorConfig
@@ -31,9 +31,15 @@ log = logging.getLogger(__name__)
 FIT_SHOT_S = 0.8
 FIT_STRIDE_S = 0.3
 SCORE_STRIDE_S = 0.25
-MAX_SHOTS = 1200
+MAX_SHOTS = 600
+MAX_SCORED = 1200
 MIN_SECONDS = 8.0
 HOLD_OUT_SHARE = 0.3
+MIN_SHARE = 0.1
+FORCED_SHARE = 0.1
+FORCED_SHARE_MANY = 0.3
+MANY_EFFECTS = 3
+LEAST_LEFT = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +96,7 @@ def diagnose(
     _check_excitation(fit_tracks)
     noise = estimate_noise(fit_tracks)
     shots = _thinned(cut(fit_tracks, FIT_SHOT_S, FIT_STRIDE_S))
-    judged = HeldOut.of(_thinned(cut(held_tracks, HORIZON_S, SCORE_STRIDE_S)), noise, nominal)
+    judged = HeldOut.of(_thinned(cut(held_tracks, HORIZON_S, SCORE_STRIDE_S), MAX_SCORED), noise, nominal)
     floor = np.sqrt(np.mean(noise_floor(shots, noise, nominal)[1:] ** 2, axis=0))
     search = Search(
         nominal,
@@ -102,6 +108,13 @@ def diagnose(
         stop,
     )
     found = search.run()
+    progress("looking for what has no name", 0.8)
+    left = missing_terms(shots, found.best, found.scale)
+    enough = max(_doubtful_share(found) * (left.gain + _named_gain(shots, found)), LEAST_LEFT * 18.0 * len(shots))
+    if found.effects and left.gain > enough:
+        log.info("%s would be a forced name: %s is left", ", ".join(found.effects), left.formula())
+        found = found.without_effects()
+        left = missing_terms(shots, found.best, found.scale)
     progress("judging on held-out recordings", 0.82)
     judged = HeldOut.of(judged.shots, noise, found.best.config)
     judge = Judge(search, found, judged, texts)
@@ -109,12 +122,8 @@ def diagnose(
     errors_of = judge.errors
     score = {name: judged.score(error) for name, error in errors_of.items()}
     share = _share_left(score)
-    left = missing_terms(shots, found.best, found.scale)
-    whole = missing_terms(shots, found.base, found.scale) if found.effects else left
-    named = float(Fitter(shots, found.scale).loss(found.base.config).sum() - found.best.loss.sum())
-    log.info("REST %s", __import__("json").dumps(dict(named=named, left=left.gain, whole=whole.gain, share=share, ndof=len(shots)*18, lw=left.words(), lf=left.formula(), ww=whole.words(), wf=whole.formula(), effects=found.effects, chi2=dict(found.chi2))))
-    rest = describe(left, share, errors_of["with_effects"], judged.floor, start_features(judged.shots)) if share >= 0.1 else None
-    verdict = judge.verdict(rest, data_faults)
+    rest = describe(left, share, errors_of["with_effects"], judged.floor, start_features(judged.shots))
+    verdict = judge.verdict(left, data_faults)
     progress("drawing", 0.95)
     exhibits = judge.exhibits(held_tracks)
     diagnosis = Diagnosis(
@@ -125,13 +134,26 @@ def diagnose(
         horizon_s=HORIZON_S,
         held_out={name: judged.summary(error) for name, error in errors_of.items()}
         | {"noise_floor": judged.floor_summary()},
-        unexplained=rest,
+        unexplained=rest if share >= MIN_SHARE else None,
         data_faults=tuple(data_faults),
         recordings=tuple(uses),
         seed=seed,
         seconds=clock.now_s() - began_s,
     )
     return Outcome(diagnosis, exhibits, found.best.config)
+
+
+def _named_gain(shots: Shots, found: SearchResult) -> float:
+    """Fall of the loss by all named effects together."""
+    return float(Fitter(shots, found.scale).loss(found.base.config).sum() - found.best.loss.sum())
+
+
+def _doubtful_share(found: SearchResult) -> float:
+    """Share of the gain that unnamed terms may still promise beside a name that is not forced.
+
+    One or two names must explain nearly all; a car with many things wrong may keep something that has no name.
+    """
+    return FORCED_SHARE if len(found.effects) < MANY_EFFECTS else FORCED_SHARE_MANY
 
 
 def _share_left(score: Mapping[str, float]) -> float:
@@ -170,11 +192,11 @@ def _part(track: Track, rows: slice) -> Track:
     )
 
 
-def _thinned(shots: Shots) -> Shots:
-    """At most ``MAX_SHOTS``, evenly taken."""
-    if len(shots) <= MAX_SHOTS:
+def _thinned(shots: Shots, most: int = MAX_SHOTS) -> Shots:
+    """At most so many, evenly taken."""
+    if len(shots) <= most:
         return shots
-    return shots.take(np.unique(np.linspace(0, len(shots) - 1, MAX_SHOTS).round().astype(np.int64)))
+    return shots.take(np.unique(np.linspace(0, len(shots) - 1, most).round().astype(np.int64)))
 
 
 def _check_excitation(tracks: Sequence[Track]) -> None:

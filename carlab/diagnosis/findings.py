@@ -129,6 +129,10 @@ class Diagnosis:
         for e in self.effects:
             found = asdict(e)
             found["indistinguishable_from"] = list(e.indistinguishable_from)
+            if e.where.time is not None:
+                found["where"]["time"] = {"kind": "drift", "from_s": e.where.time[0], "to_s": e.where.time[1]}
+            if e.where.place is not None:
+                found["where"]["place"] = dict(zip(("x", "y", "radius"), e.where.place, strict=True))
             effects.append(found)
         unexplained = None
         if self.unexplained is not None and self.unexplained.share >= 0.1:

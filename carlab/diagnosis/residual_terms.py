@@ -44,6 +44,16 @@ def _harmonic(axis: str, length_m: float, phase: str) -> Term:
     )
 
 
+def _stepped(name: str, symbol: str, period: float) -> Term:
+    return Term(
+        f"sin(2 pi {symbol} / {period:.3g})",
+        f"repeats with the {name} in steps of about {period:.2g} of its range, as if the {name} were quantised",
+        (name, "steps"),
+        lambda f: np.asarray(np.sin(2.0 * np.pi * f[symbol] / period)),
+    )
+
+
+PERIODS = tuple(float(p) for p in np.geomspace(0.05, 0.8, 22))
 LENGTHS_M = (0.4, 0.5, 0.64, 0.8, 1.0, 1.3, 1.7, 2.2)
 TERMS: tuple[Term, ...] = (
     Term("1", "constant: a bias whatever the car does", ("bias",), lambda f: np.ones_like(f["v"])),
@@ -110,6 +120,8 @@ TERMS: tuple[Term, ...] = (
          ("steering", "history"), lambda f: f["d"] - f["d before"]),
     Term("|u| dd/dt", "follows the rate of steering where there is throttle: a lag (a state with history)",
          ("steering", "throttle", "history"), lambda f: f["dd"] * np.abs(f["u"])),
+    *(_stepped("steering", "d", p) for p in PERIODS),
+    *(_stepped("throttle", "u", p) for p in PERIODS),
     Term("grip work", "depends on the work that the tyres have done before: a slow state (history), like warming",
          ("history", "lateral acceleration"), lambda f: f["work"] * f["r"] * f["v"]),
 )  # fmt: skip

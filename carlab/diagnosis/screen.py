@@ -9,7 +9,7 @@ nothing depends on a guess of how large an effect usually is.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,8 @@ NEARLY = 0.75
 _PROBE = 0.03
 _CLIP = 50.0
 _AT_A_TIME = 8
+TYRE_GRIPS = (0.4, 0.65, 0.95, 1.4)
+TYRE_SHAPE = 1.5
 PATCH_SPACING_M = 0.5
 PATCH_RADIUS_M = 0.8
 
@@ -76,7 +78,9 @@ class Screen:
         order = np.argsort(-gains)[:STARTS]
         order = order[gains[order] >= NEARLY * gains[order[0]]]
         scalable = np.array([not f.logarithmic and not f.choice for f in free])
-        if effect == "low_friction_patch":
+        if effect == "tyre_saturation":
+            scalable[:] = False
+        elif effect == "low_friction_patch":
             scalable = np.array([f.name.endswith(".loss") for f in free])
         factor = np.clip(along[order], 0.3, 1.5)[:, None]
         starts = np.where(scalable, points[order] * factor, points[order])
@@ -107,11 +111,10 @@ class Screen:
             heading = np.array([free[1].coordinate(a) for a in angle])
             sized = self._sized(config, free, np.array([[1.0, heading[0]]]), held=(1,))[:, 0]
             return np.array([(s, h) for s in np.unique(sized) for h in heading])
-        grids = [_grid(f) for f in free]
-        if len(free) <= 2:
-            return np.stack([g.ravel() for g in np.meshgrid(*grids, indexing="ij")], axis=1)
-        rng = np.random.default_rng(0)
-        return np.array([[rng.choice(g) for g in grids] for _ in range(24)])
+        if effect == "tyre_saturation":
+            return _tyres(self.best.config, free)
+        grids = np.meshgrid(*(_grid(f) for f in free), indexing="ij")
+        return np.stack([g.ravel() for g in grids], axis=1)
 
     def _sized(
         self, config: SimulatorConfig, free: tuple[Free, ...], directions: FloatArray, held: tuple[int, ...] = ()
@@ -155,11 +158,20 @@ def _places(shots: Shots, free: tuple[Free, ...]) -> FloatArray:
     return np.array(columns).T
 
 
+def _tyres(config: SimulatorConfig, free: tuple[Free, ...]) -> FloatArray:
+    """Saturating tyres of several grips with the stiffness B C mu that the linear ones have."""
+    values = config.values()
+    stiffness = {axle: math.prod(values[f"tyre.{axle}.{k}"] for k in ("B", "C", "mu")) for axle in ("front", "rear")}
+    points = []
+    for mu_front in TYRE_GRIPS:
+        for mu_rear in TYRE_GRIPS:
+            wanted = {"mu_front": mu_front, "mu_rear": mu_rear, "C_front": TYRE_SHAPE, "C_rear": TYRE_SHAPE}
+            wanted["B_front"] = stiffness["front"] / (TYRE_SHAPE * mu_front)
+            wanted["B_rear"] = stiffness["rear"] / (TYRE_SHAPE * mu_rear)
+            points.append([f.coordinate(wanted[f.name.rsplit(".", 1)[1]]) for f in free])
+    return np.array(points)
+
+
 def usable(config: SimulatorConfig, effect: str) -> bool:
     """Whether the effect says anything new about this simulator."""
     return not (effect == "tyre_saturation" and config.kind == "dynamic")
-
-
-def by_promise(promises: Mapping[str, Promise]) -> list[Promise]:
-    """The most promising first."""
-    return sorted(promises.values(), key=lambda p: -p.gain)

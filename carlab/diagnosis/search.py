@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,11 +46,16 @@ ACCEPT_SHARE = 0.015
 """Unseen gain, as a share of the loss that a perfect simulator would leave."""
 ACCEPT_UNSEEN = 0.3
 """Unseen gain, as a share of the gain on the blocks that were fitted."""
+STEADY_STANDARD_ERRORS = 3.0
+STEADY_SHARE = 0.03
+"""An unseen gain of this size that is alike in all blocks also convinces."""
 KEEP_CHI2 = 16.0
 HOPELESS_CHI2 = 8.0
 """Candidates that promise less than this are not refitted."""
 SET_STANDARD_ERRORS = 2.0
-MAX_EFFECTS = 8
+MAX_EFFECTS = 10
+SWAP_PROMISE = 0.7
+"""A look-alike that promises this share of an effect's gain is tried in its place."""
 SETTLED = 0.03
 """Relative change of the scale of errors below which it has settled."""
 UNSEEN_AT_MOST = 12.0
@@ -97,6 +102,10 @@ class SearchResult:
     history: tuple[tuple[str, Fit], ...]
     tried: tuple[Candidate, ...]
     scale: Scale
+
+    def without_effects(self) -> SearchResult:
+        """The same search where no name is believed."""
+        return replace(self, best=self.base, effects=(), chi2={}, rivals={}, history=())
 
 
 class Search:
@@ -252,7 +261,7 @@ class Search:
         screen = Screen(Fitter(self.shots, scale), self._config(effects), best)
         found = []
         for name in self.allowed:
-            if name in effects or name in self.nominal.effects or not usable(self.nominal, name):
+            if name in effects or not self._tries(name):
                 continue
             found.append(screen.promise(name, effect_parameters(name, self.nominal)))
         found.sort(key=lambda p: -p.gain)
@@ -262,6 +271,10 @@ class Search:
         """Loss of a perfect simulator: half for each whitened error."""
         return 0.5 * len(self.shots) * 36
 
+    def _tries(self, effect: str) -> bool:
+        """Whether an effect may be tried at all."""
+        return effect in self.allowed and effect not in self.nominal.effects and usable(self.nominal, effect)
+
     def _needed(self, effect: str) -> float:
         """What chi2 must exceed."""
         numbers = [p for p in EFFECTS[effect].parameters if not p.choices]
@@ -269,12 +282,11 @@ class Search:
         return ACCEPT_CHI2 + ACCEPT_CHI2_MORE * (len(numbers) - 1 + infinite)
 
     def _accepts(self, candidate: Candidate) -> bool:
-        return (
-            len(candidate.unseen_loss) > 0
-            and candidate.chi2 > self._needed(candidate.effect)
-            and candidate.unseen_gain > ACCEPT_UNSEEN * candidate.gain
-            and candidate.unseen_gain > ACCEPT_SHARE * self._expected()
-        )
+        if not len(candidate.unseen_loss) or candidate.unseen_gain < ACCEPT_UNSEEN * candidate.gain:
+            return False
+        share = candidate.unseen_gain / self._expected()
+        sure = candidate.chi2 > self._needed(candidate.effect) and share > ACCEPT_SHARE
+        return sure or (candidate.standard_errors > STEADY_STANDARD_ERRORS and share > STEADY_SHARE)
 
     def _refit(self, effects: tuple[str, ...], like: Fit, scale: Scale) -> Fit:
         """Fit with ``effects``, from the numbers that ``like`` has of them."""
@@ -296,9 +308,12 @@ class Search:
                 log.info("%s is no longer needed (%.1f)", name, chi2)
                 kept, scale = self._settled(self._config(rest), without.free, without.z)
                 return self._moved(rest, kept, scale)
-            promises = [p for p in self._screen(without, rest, scale) if p.effect != name][:2]
-            for promise in promises:
-                if self.stop() or promise.gain < 0.7 * (without.cost - best.cost):
+            screen = Screen(fitter, self._config(rest), without)
+            for other_name in self.look_alikes.get(name, ()):
+                if self.stop() or other_name in effects or not self._tries(other_name):
+                    continue
+                promise = screen.promise(other_name, effect_parameters(other_name, self.nominal))
+                if promise.gain < SWAP_PROMISE * (without.cost - best.cost):
                     continue
                 other = self._refitted(fitter, without, (*rest, promise.effect), promise)
                 deflated = 2.0 * (best.cost - other.fit.cost) / _inflation(
@@ -325,12 +340,12 @@ class Search:
             rest = tuple(e for e in effects if e != name)
             without = self._refit(rest, best, scale)
             chi2[name] = 2.0 * (without.cost - best.cost) / _inflation(whole, name)
-            others = [o for o in self.look_alikes.get(name, ()) if o in self.allowed and o not in effects]
+            others = [o for o in self.look_alikes.get(name, ()) if o not in effects and self._tries(o)]
             close = []
             screen = Screen(fitter, self._config(rest), without)
             for other in others:
-                if self.stop() or other in self.nominal.effects or not usable(self.nominal, other):
-                    continue
+                if self.stop():
+                    break
                 self.progress(f"{name} or {other}?", 0.95)
                 promise = screen.promise(other, effect_parameters(other, self.nominal))
                 rival = self._refitted(fitter, without, (*rest, other), promise)
@@ -354,6 +369,7 @@ def _deflation(fitter: Fitter, fit: Fit) -> FloatArray:
 def _inflation(fit: Fit, effect: str) -> float:
     """How much dependent errors overstate the gain by an effect: sandwich over naive variance, at least one.
 
+    Twice the gain of several numbers is a sum of chi-squares weighted by such ratios, so their mean divides it.
     Where the effect's own figure cannot be had (a clip that nothing touches), the middle one of all numbers stands in.
     """
     assert fit.deflation is not None
@@ -361,7 +377,7 @@ def _inflation(fit: Fit, effect: str) -> float:
         float(d) for f, d in zip(fit.free, fit.deflation, strict=True)
         if f.name.startswith(f"effects.{effect}.") and d > 1e-9
     ]  # fmt: skip
-    return max([1.0, float(np.median(fit.deflation)), *own])
+    return max(1.0, float(np.median(fit.deflation)), float(np.mean(own)) if own else 0.0)
 
 
 def _values(free: Sequence[Free], z: FloatArray) -> dict[str, FloatArray]:

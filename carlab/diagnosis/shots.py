@@ -23,6 +23,8 @@ IndexArray = NDArray[np.int64]
 START_SPAN_S = 0.27
 """Poses that the start of a shot is estimated from: nine at 30 Hz."""
 HISTORY_S = 0.6
+COARSEST_S = 0.034
+"""Longest period to which a faster recording is thinned."""
 MIN_MOTION_MPS = 0.15
 
 
@@ -34,6 +36,8 @@ class Track:
     states     (n, 6)   as measured, yaw unwrapped
     smooth     (n, 6)   local cubic through the poses: pose, and body velocities from it
     commands   (n, 2)   mean over each cell of the commands held as recorded
+    residual   (m, 6)   what the local cubic leaves of the states while the car moves, at the recording's own period
+    sampled_s           that period
     """
 
     recording: int
@@ -42,6 +46,8 @@ class Track:
     states: FloatArray
     smooth: FloatArray
     commands: FloatArray
+    residual: FloatArray
+    sampled_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +105,12 @@ class Shots:
 def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) -> list[Track]:
     """Put recordings onto an even grid, cut at gaps and where a value is missing.
 
+    Recordings faster than ``COARSEST_S`` allows are thinned after smoothing: the dynamics of a car need no more, and
+    commands go in as means over the cells.
+
     Args:
         episodes: recordings; the column ``segment`` in ``extra`` numbers stretches that must not be joined.
-        period_s: grid; the median period of the first recording where None.
+        period_s: grid; that of the first recording where None.
 
     Raises:
         DataError: a recording has no two rows.
@@ -110,10 +119,11 @@ def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) ->
     for index, episode in enumerate(episodes):
         if episode.ticks < 2:
             raise DataError(f"Recording {index + 1} has {episode.ticks} commands; record at least some seconds.")
-        grid_s = episode.period_s if period_s is None else period_s
-        period_s = grid_s
-        for rows in _unbroken(episode, grid_s):
-            track = _track(index, episode, rows, grid_s)
+        if period_s is None:
+            period_s = episode.period_s * max(int(COARSEST_S / episode.period_s + 1e-6), 1)
+        every = max(round(period_s / episode.period_s), 1)
+        for rows in _unbroken(episode, episode.period_s):
+            track = _track(index, episode, rows, period_s / every, every)
             if track is not None:
                 found.append(track)
     return found
@@ -131,7 +141,7 @@ def _unbroken(episode: EpisodeData, period_s: float) -> Iterable[slice]:
             yield slice(int(first), int(last))
 
 
-def _track(index: int, episode: EpisodeData, rows: slice, period_s: float) -> Track | None:
+def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every: int) -> Track | None:
     t = episode.times_s[rows]
     states = episode.states[rows].copy()
     states[:, 2] = np.unwrap(states[:, 2])
@@ -149,7 +159,15 @@ def _track(index: int, episode: EpisodeData, rows: slice, period_s: float) -> Tr
     sin, cos = np.sin(pose[:, 2]), np.cos(pose[:, 2])
     forward, left = cos * rate[:, 0] + sin * rate[:, 1], cos * rate[:, 1] - sin * rate[:, 0]
     smooth = np.column_stack([pose, forward, left, rate[:, 2]])
-    return Track(index, period_s, grid - episode.times_s[0], states, smooth, commands)
+    residual = states - savgol_filter(states, width, 3, axis=0)
+    moving = np.hypot(forward, left) > MIN_MOTION_MPS
+    residual = residual[moving] if moving.sum() >= 20 else residual
+    if every > 1:
+        whole = len(grid) // every * every
+        commands = commands[:whole].reshape(-1, every, 2).mean(axis=1)
+        grid, states, smooth = grid[:whole:every], states[:whole:every], smooth[:whole:every]
+    begin_s = episode.times_s[0]
+    return Track(index, every * period_s, grid - begin_s, states, smooth, commands, residual, period_s)
 
 
 def _cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: float) -> FloatArray:
@@ -174,18 +192,11 @@ def estimate_noise(tracks: Sequence[Track]) -> Noise:
 
     An estimate: whatever in the recording is faster than the cubic counts as noise.
     """
-    period_s = tracks[0].period_s
+    period_s = tracks[0].sampled_s
     width = _odd(START_SPAN_S / period_s)
     value = savgol_coeffs(width, 3)
     slope = savgol_coeffs(width, 3, deriv=1, delta=period_s)
-    left = []
-    for track in tracks:
-        states = track.states
-        residual = states - savgol_filter(states, width, 3, axis=0)
-        left.append(residual[np.hypot(track.smooth[:, 3], track.smooth[:, 4]) > MIN_MOTION_MPS])
-    residual = np.concatenate(left) if left else np.zeros((0, 6))
-    if len(residual) < 20:
-        residual = np.concatenate([t.states - savgol_filter(t.states, width, 3, axis=0) for t in tracks])
+    residual = np.concatenate([t.residual for t in tracks])
     spread = 1.4826 * np.median(np.abs(residual), axis=0)
     measured = spread / np.sqrt(max(1.0 - value[width // 2], 0.1))
     measured[:2] = np.sqrt(np.mean(measured[:2] ** 2))

@@ -20,8 +20,8 @@ from carlab.diagnosis.screen import Screen
 from carlab.diagnosis.shots import Shots
 
 MOST_TERMS = 3
-TERM_CHI2 = 22.0
-"""Twice a term's gain over the inflation by dependent errors; some 250 terms are tried."""
+TERM_CHI2 = 28.0
+"""Twice a term's gain over the inflation by dependent errors; some 400 terms are tried."""
 NEXT_SHARE = 0.12
 """A further term must gain this share of the first."""
 ALIKE = 0.97
