@@ -3,7 +3,8 @@
 Read off vehicle_dynamics_mb.py, vehicle_dynamics_std.py, tire_model.py, steering_constraints.py and
 acceleration_constraints.py of version 3.0.2. ``yes``: the effect is in the equations. ``akin``: something else is
 there that acts alike, so the name is a fair reading of it but not its own. ``no``: nothing there acts like it.
-Written from the equations and the interface alone, before any diagnosis was looked at.
+Written from the equations and the interface alone, before any diagnosis was looked at; only ``steering_lag`` was
+raised from ``akin`` to ``yes`` afterwards, because the interface is that lag exactly.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from carlab.concealment.public_simulator import Model
+from carlab.concealment.public_simulator import Model, PublicCar
 
 Stance = Literal["yes", "akin", "no"]
 BOTH: tuple[Model, ...] = ("multi_body", "drift")
@@ -33,8 +34,8 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
     "command_delay": (Physics("no", "both commands act after the delay that the car file has"),),
     "steering_delay": (Physics("akin", "no delay beyond the file's; the bounded steering rate comes late, too"),),
     "throttle_delay": (Physics("akin", "no delay beyond the file's; wheel and tyre slip take a while to build force"),),
-    "steering_lag": (Physics("akin", "the angle is a state whose rate is bounded; for small steps it lags by 1/30 s"),),
-    "steering_rate_limit": (Physics("yes", "steering_constraints.py: |d delta/dt| <= v_max, 1.26 rad/s as scaled"),),
+    "steering_lag": (Physics("yes", "of the interface: the rate asked is (command - angle) / (1/30 s), a lag"),),
+    "steering_rate_limit": (Physics("yes", "steering_constraints.py: abs(d delta/dt) <= v_max, 1.26 rad/s as scaled"),),
     "steering_deadband": (Physics("no", "the angle follows its input without play or threshold"),),
     "steering_backlash": (Physics("no", "the angle follows its input without play"),),
     "steering_offset": (
@@ -98,3 +99,13 @@ def physics_of(effect: str, model: Model) -> Physics:
         if model in said.models:
             return said
     return Physics("no", "not a name of the catalogue")
+
+
+def true_values(car: PublicCar) -> dict[tuple[str, str], float]:
+    """What a parameter of an effect is in the package, where it has one of the same meaning: by effect and name."""
+    p = car.p
+    return {
+        ("steering_rate_limit", "rate"): p.steering.v_max,
+        ("steering_lag", "time_constant"): car.car.control_period,
+        ("load_transfer", "height"): p.h_cg if car.model == "multi_body" else p.h_s,
+    }

@@ -68,15 +68,16 @@ def _score_cells(row: dict[str, Any]) -> tuple[str, ...]:
 def _evidence(effect: dict[str, Any]) -> str:
     given = {k: v for k, v in (effect["evidence"] or {}).items() if isinstance(v, int | float)}
     cells = [(k.replace("_", " "), f"{v:.3g}") for k, v in given.items()]
-    cells += [(name, _value(p)) for name, p in (effect["parameters"] or {}).items()]
+    cells += [(name, _value(p, effect["true_values"].get(name))) for name, p in (effect["parameters"] or {}).items()]
     others = [f"{name} ({STANCES[stance]})" for name, stance in effect["others"].items()]
     cells += [("not to be told from", ", ".join(others))] if others else []
     cells.append((f"the package: {STANCES[effect['in_equations']]}", effect["why"]))
     return markdown(("evidence", "value"), cells)
 
 
-def _value(parameter: dict[str, Any]) -> str:
+def _value(parameter: dict[str, Any], truth: float | None) -> str:
     unit = f" {parameter['unit']}" if parameter.get("unit") else ""
-    if parameter.get("low90") is None or parameter.get("high90") is None:
-        return f"{parameter['value']:.3g}{unit}"
-    return f"{parameter['value']:.3g}{unit} ({parameter['low90']:.3g} to {parameter['high90']:.3g})"
+    words = f"{parameter['value']:.3g}{unit}"
+    if parameter.get("low90") is not None and parameter.get("high90") is not None:
+        words += f" ({parameter['low90']:.3g} to {parameter['high90']:.3g})"
+    return words if truth is None else f"{words}; in the package {truth:.3g}"

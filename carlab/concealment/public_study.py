@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -14,7 +13,7 @@ import numpy as np
 
 from carlab.concealment.children import run_child
 from carlab.concealment.measurement import as_table, write_csv
-from carlab.concealment.public_physics import physics_of
+from carlab.concealment.public_physics import physics_of, true_values
 from carlab.concealment.public_report import ASKED_RATIO, study_page
 from carlab.concealment.public_simulator import SCALE, Model, PublicCar, PublicDrive, drive_public
 from carlab.concealment.runner import DIAGNOSE
@@ -153,7 +152,7 @@ def study(
         run = _diagnose(handed, command, timeout_s, abandon)
         if run is None:
             break
-        rows.append(_row(model, seed, run, handed / "report.json") | {"activity": activity(car, drive)})
+        rows.append(_row(car, seed, run, handed / "report.json") | {"activity": activity(car, drive)})
     write_json(out / "study.json", {"facts": facts, "asked_ratio": ASKED_RATIO, "seeds": rows})
     (out / "study.md").write_text(study_page(facts, rows), encoding="utf-8")
     return rows
@@ -177,14 +176,14 @@ def _diagnose(
     return {"exit_status": end.exit_status, "seconds": round(end.seconds, 1), "words": end.words}
 
 
-def _row(model: Model, seed: int, run: dict[str, Any], path: Path) -> dict[str, Any]:
+def _row(car: PublicCar, seed: int, run: dict[str, Any], path: Path) -> dict[str, Any]:
     if not path.exists():
         return {"seed": seed, "verdict": None, **run}
     try:
         report = read_json(path)
         held = report.get("fit", {}).get("held_out", {})
         scores = {name: held[name]["score"] for name in ("nominal", "refit", "with_effects") if name in held}
-        named = [_named(model, effect) for effect in report["effects"]]
+        named = [_named(car, effect) for effect in report["effects"]]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is not a report of the schema carlab.diagnosis/1 ({error!r}).") from error
     ratio = scores["with_effects"] / scores["refit"] if {"with_effects", "refit"} <= set(scores) else None
@@ -195,13 +194,15 @@ def _row(model: Model, seed: int, run: dict[str, Any], path: Path) -> dict[str, 
     }  # fmt: skip
 
 
-def _named(model: Model, effect: dict[str, Any]) -> dict[str, Any]:
-    said = physics_of(effect["id"], model)
+def _named(car: PublicCar, effect: dict[str, Any]) -> dict[str, Any]:
+    said = physics_of(effect["id"], car.model)
     others = effect.get("indistinguishable_from", [])
+    truth = {name: value for (owner, name), value in true_values(car).items() if owner == effect["id"]}
     return {
         **{k: effect.get(k) for k in ("id", "confidence", "parameters", "where", "evidence", "sentence")},
         "indistinguishable_from": others,
-        "in_equations": dataclasses.asdict(said)["stance"],
+        "in_equations": said.stance,
         "why": said.why,
-        "others": {name: physics_of(name, model).stance for name in others},
+        "true_values": truth,
+        "others": {name: physics_of(name, car.model).stance for name in others},
     }

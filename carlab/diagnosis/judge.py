@@ -119,7 +119,8 @@ class Judge:
         """Channels by how much of the squared score the effect takes away; regime, lag, time and place."""
         floor = self.held_out.floor
         gone = np.mean((error / floor) ** 2, axis=0) - np.mean((self.errors["with_effects"] / floor) ** 2, axis=0)
-        channels = tuple(STATE_NAMES[k] for k in np.argsort(-gone) if gone[k] >= 0.5 * gone.max())
+        main = gone >= min(0.5 * gone.max(), gone.max())
+        channels = tuple(STATE_NAMES[k] for k in np.argsort(-gone) if main[k])
         lag = next(
             (parameters[k].value for k in ("time_constant", "delay", "extra_delay", "latency") if k in parameters), None
         )

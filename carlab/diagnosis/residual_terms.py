@@ -145,10 +145,10 @@ class Responses:
 
 
 def responses(shots: Shots, config: SimulatorConfig, scale: Scale) -> Responses:
-    """Impulse responses of ``config`` along its own predictions of ``shots``."""
+    """Impulse responses of ``config`` along its own predictions of ``shots``, from the middle of each span of time."""
     predicted = Predictor(shots, config)()[0]
     every = max(shots.steps // IMPULSES, 1)
-    begins = np.arange(0, shots.steps, every)
+    begins = np.arange(every // 2, shots.steps, every)
     sin, cos = np.sin(shots.start[:, 2]), np.cos(shots.start[:, 2])
     matrix = np.zeros((3, len(begins), len(shots), len(scale.steps), 6))
     for j, begin in enumerate(begins):
@@ -166,8 +166,7 @@ def responses(shots: Shots, config: SimulatorConfig, scale: Scale) -> Responses:
             change[..., 1] = cos[:, None] * dy - sin[:, None] * dx
             matrix[which, j][:, later] = change / scale.sigma[later]
     matrix = np.nan_to_num(matrix.clip(-1e3, 1e3))
-    middles = np.minimum(begins + every // 2, shots.steps - 1)
-    return Responses(matrix, features(shots, predicted, config, middles), every * shots.period_s)
+    return Responses(matrix, features(shots, predicted, config, begins), every * shots.period_s)
 
 
 def _rest_of(shots: Shots, predicted: FloatArray, begin: int, start: FloatArray) -> Shots:

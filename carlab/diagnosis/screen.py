@@ -45,17 +45,25 @@ class Promise:
 
 
 class Screen:
-    """Screens candidates beside the fit ``best`` of ``config``."""
+    """Screens candidates beside the fit ``best`` of ``config``, on at most ``most`` shots, evenly taken.
 
-    def __init__(self, fitter: Fitter, config: SimulatorConfig, best: Fit) -> None:
+    Gains are given for all shots.
+    """
+
+    def __init__(self, fitter: Fitter, config: SimulatorConfig, best: Fit, most: int | None = None) -> None:
+        count = len(fitter.shots)
+        if most is not None and count > most:
+            few = np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))
+            fitter = Fitter(fitter.shots.take(few), fitter.scale)
+        self.share = len(fitter.shots) / count
         self.fitter = fitter
         self.config = config
         self.best = best
-        count, step = len(best.free), 0.02
-        whites = fitter.white(config, best.free, np.vstack([best.z, best.z + step * np.eye(count)]))
+        numbers, step = len(best.free), 0.02
+        whites = fitter.white(config, best.free, np.vstack([best.z, best.z + step * np.eye(numbers)]))
         self.white = whites[0].reshape(-1)
         self.weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(self.white), 1e-12)))
-        jacobian = ((whites[1:].reshape(count, -1) - self.white) / step * self.weight).T
+        jacobian = ((whites[1:].reshape(numbers, -1) - self.white) / step * self.weight).T
         prior = np.diag([1.0 / f.prior_z for f in best.free])
         basis, _ = np.linalg.qr(np.vstack([jacobian, prior]))
         self._inside = basis[: len(self.white)]
@@ -84,7 +92,7 @@ class Screen:
             scalable = np.array([f.name.endswith(".loss") for f in free])
         factor = np.clip(along[order], 0.3, 1.5)[:, None]
         starts = np.where(scalable, points[order] * factor, points[order])
-        return Promise(effect, float(gains[order[0]]), starts)
+        return Promise(effect, float(gains[order[0]]) / self.share, starts)
 
     def _gain(self, moved: FloatArray) -> tuple[float, float]:
         left = self.projected(np.clip(moved.reshape(-1) - self.white, -_CLIP, _CLIP))

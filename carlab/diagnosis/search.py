@@ -33,6 +33,7 @@ from sim_backends.effects import EFFECTS
 
 log = logging.getLogger(__name__)
 
+SCREENED_SHOTS = 180
 REFITTED = 10
 FOLDS = 6
 WORTH = 0.1
@@ -258,7 +259,7 @@ class Search:
 
     def _screen(self, best: Fit, effects: Sequence[str], scale: Scale) -> list[Promise]:
         """What each candidate promises beside ``effects``, the best first."""
-        screen = Screen(Fitter(self.shots, scale), self._config(effects), best)
+        screen = Screen(Fitter(self.shots, scale), self._config(effects), best, SCREENED_SHOTS)
         found = []
         for name in self.allowed:
             if name in effects or not self._tries(name):
@@ -308,7 +309,7 @@ class Search:
                 log.info("%s is no longer needed (%.1f)", name, chi2)
                 kept, scale = self._settled(self._config(rest), without.free, without.z)
                 return self._moved(rest, kept, scale)
-            screen = Screen(fitter, self._config(rest), without)
+            screen = Screen(fitter, self._config(rest), without, SCREENED_SHOTS)
             for other_name in self.look_alikes.get(name, ()):
                 if self.stop() or other_name in effects or not self._tries(other_name):
                     continue
@@ -316,8 +317,8 @@ class Search:
                 if promise.gain < SWAP_PROMISE * (without.cost - best.cost):
                     continue
                 other = self._refitted(fitter, without, (*rest, promise.effect), promise)
-                deflated = 2.0 * (best.cost - other.fit.cost) / _inflation(
-                    fitter.with_covariance(other.fit), promise.effect
+                deflated = (
+                    2.0 * (best.cost - other.fit.cost) / _inflation(fitter.with_covariance(other.fit), promise.effect)
                 )
                 if deflated > KEEP_CHI2:
                     log.info("%s takes the place of %s (%.1f)", promise.effect, name, deflated)
@@ -342,7 +343,7 @@ class Search:
             chi2[name] = 2.0 * (without.cost - best.cost) / _inflation(whole, name)
             others = [o for o in self.look_alikes.get(name, ()) if o not in effects and self._tries(o)]
             close = []
-            screen = Screen(fitter, self._config(rest), without)
+            screen = Screen(fitter, self._config(rest), without, SCREENED_SHOTS)
             for other in others:
                 if self.stop():
                     break
