@@ -29,8 +29,8 @@ DATA_FAULTS = (
 class Diagnose:
     """Find what a simulator leaves out of recordings: locate it, name it, model it, and show the held-out fit improve.
 
-    Writes report.html, report.json, report.rrd and model.toml (the car file with what was found). ^C ends the search
-    and reports what was found until then. Exit code 0 with a verdict, 5 where the recordings cannot tell.
+    Writes report.html, report.json, report.rrd, summary.png and model.toml (the car file with what was found). ^C ends
+    the search and reports what was found until then. Exit code 0 with a verdict, 5 where the recordings cannot tell.
     """
 
     recordings: Positional[tuple[Path, ...]]

@@ -96,6 +96,7 @@ class PublicCar:
             from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb as rates
         else:
             from vehiclemodels.vehicle_dynamics_std import vehicle_dynamics_std as rates
+        self._spins = range(23, 27) if model == "multi_body" else range(7, 9)
         self._rates: Callable[[list[float], list[float], Any], list[float]] = rates
         p = self.p
         grip = DRIVER_GRIP * p.tire.p_dy1
@@ -115,8 +116,20 @@ class PublicCar:
         return np.array(init(core, self.p), dtype=np.float64)
 
     def rates(self, state: FloatArray, inputs: Sequence[float]) -> list[float]:
-        """The package's right-hand side; inputs are steering rate [rad/s] and acceleration [m/s^2] as asked."""
-        return self._rates(state.tolist(), list(inputs), self.p)
+        """The package's right-hand side; inputs are steering rate [rad/s] and acceleration [m/s^2] as asked.
+
+        The package forbids negative wheel spin by changing its caller's state, and sets the rate to 0 where spin is
+        negative. An integrator that tries states does not hear of the change, and a wheel a hair below 0 would stay
+        locked for ever; so spin is held at 0 before the call and may only grow from there after it.
+        """
+        x = state.tolist()
+        locked = [i for i in self._spins if x[i] <= 0.0]
+        for i in locked:
+            x[i] = 0.0
+        found = self._rates(x, list(inputs), self.p)
+        for i in locked:
+            found[i] = max(found[i], 0.0)
+        return found
 
     def motion(self, states: FloatArray) -> FloatArray:
         """x, y, yaw, vx, vy, yaw_rate at the centre of mass, (N, 6), of states (N, n)."""
@@ -165,24 +178,32 @@ class PublicDrive:
     states: FloatArray
 
 
-def drive_public(car: PublicCar, seed: int, part: int, duration_s: float) -> PublicDrive:
+class AbandonedError(Exception):
+    """A drive was given up because somebody asked for it."""
+
+
+def drive_public(
+    car: PublicCar, seed: int, part: int, duration_s: float, abandon: Callable[[], bool] = lambda: False
+) -> PublicDrive:
     """Drive and record; ``part`` tells the recordings of one seed apart. The same arguments give the same drive.
 
     Raises:
+        AbandonedError: where ``abandon``, asked at every tick, says so.
         DataError: where the package cannot be integrated or the car has spun.
     """
     track = Track(np.random.default_rng((seed, 1)))
     human = RollingDriver(car.car, track, np.random.default_rng((seed, 2, part)))
     x, y, yaw = human.start()[:3]
-    driven, states = _integrate(car, human, duration_s, car.start(x, y, yaw, START_MPS))
+    driven, states = _integrate(car, human, duration_s, car.start(x, y, yaw, START_MPS), abandon)
     noise = Noise(car.car.position_std, car.car.yaw_std)
     recording = record(driven, World(car.car), noise, np.random.default_rng((seed, 3, part)))
     return PublicDrive(recording, driven, states)
 
 
 def _integrate(
-    car: PublicCar, driver: Callable[[float, FloatArray], tuple[float, float]], duration_s: float, state: FloatArray
-) -> tuple[Drive, FloatArray]:
+    car: PublicCar, driver: Callable[[float, FloatArray], tuple[float, float]], duration_s: float, state: FloatArray,
+    abandon: Callable[[], bool],
+) -> tuple[Drive, FloatArray]:  # fmt: skip
     base = car.car
     period, per_row = base.control_period, round(base.control_period * base.mocap_rate)
     count = round(duration_s / period) + 1
@@ -197,6 +218,8 @@ def _integrate(
     pending: list[tuple[float, tuple[float, float]]] = []
     log = [(0.0, *acting)]
     for tick in range(count):
+        if abandon():
+            raise AbandonedError
         t, end = tick * period, (tick + 1) * period
         steering, throttle = driver(t, car.motion(states[done - 1 : done])[0])
         commands[tick] = steering, throttle

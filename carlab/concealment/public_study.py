@@ -15,7 +15,7 @@ from carlab.concealment.children import run_child
 from carlab.concealment.measurement import as_table, write_csv
 from carlab.concealment.public_physics import physics_of, true_values
 from carlab.concealment.public_report import ASKED_RATIO, study_page
-from carlab.concealment.public_simulator import SCALE, Model, PublicCar, PublicDrive, drive_public
+from carlab.concealment.public_simulator import SCALE, AbandonedError, Model, PublicCar, PublicDrive, drive_public
 from carlab.concealment.runner import DIAGNOSE
 from carlab.concealment.worker import FILES, read_json, write_json
 from carlab.core.errors import DataError
@@ -72,10 +72,13 @@ dropout = 0.0
 """
 
 
-def hand_over(car: PublicCar, seed: int, folder: Path, lengths_s: Sequence[float] = (100.0, 40.0)) -> PublicDrive:
+def hand_over(
+    car: PublicCar, seed: int, folder: Path, lengths_s: Sequence[float] = (100.0, 40.0),
+    abandon: Callable[[], bool] = lambda: False,
+) -> PublicDrive:  # fmt: skip
     """Drive twice and write fit.csv, hold.csv and car.toml; returns the drive to fit."""
     folder.mkdir(parents=True, exist_ok=True)
-    drives = [drive_public(car, seed, part, length_s) for part, length_s in enumerate(lengths_s)]
+    drives = [drive_public(car, seed, part, length_s, abandon) for part, length_s in enumerate(lengths_s)]
     for drive, name in zip(drives, FILES[:2], strict=True):
         write_csv(folder / name, as_table(drive.recording))
     (folder / FILES[2]).write_text(nominal_text(car), encoding="utf-8")
@@ -123,7 +126,7 @@ def study(
         timeout_s: A diagnosis that takes longer is ended and counts as failed.
         lengths_s: Seconds to fit and held out.
         say: Told what is being done.
-        abandon: Asked while a diagnosis runs; True ends the study after what is done.
+        abandon: Asked all along; True ends the study after what is done.
 
     Returns:
         A row a seed, as in study.json; a seed that cannot be driven has no verdict and says why.
@@ -144,7 +147,9 @@ def study(
         handed = out / f"seed_{seed}"
         say(f"seed {seed}: driving the package's {model} car")
         try:
-            drive = hand_over(car, seed, handed, lengths_s)
+            drive = hand_over(car, seed, handed, lengths_s, abandon)
+        except AbandonedError:
+            break
         except DataError as error:
             rows.append({"seed": seed, "verdict": None, "exit_status": None, "seconds": 0.0, "words": str(error)})
             continue

@@ -23,7 +23,7 @@ from carlab.diagnosis.judge import HORIZON_S, Judge, Texts
 from carlab.diagnosis.scoring import HeldOut, noise_floor
 from carlab.diagnosis.search import Progress, Search, SearchResult
 from carlab.diagnosis.shots import Shots, Track, cut, estimate_noise, tracks_of
-from carlab.diagnosis.unexplained import describe, missing_terms, start_features
+from carlab.diagnosis.unexplained import Rest, describe, missing_terms, start_features
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -40,6 +40,7 @@ FORCED_SHARE = 0.1
 FORCED_SHARE_MANY = 0.3
 MANY_EFFECTS = 3
 LEAST_LEFT = 0.04
+BETTER_UNNAMED = 1.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +111,7 @@ def diagnose(
     found = search.run()
     progress("looking for what has no name", 0.8)
     left = missing_terms(shots, found.best, found.scale)
-    enough = max(_doubtful_share(found) * (left.gain + _named_gain(shots, found)), LEAST_LEFT * 18.0 * len(shots))
-    if found.effects and left.gain > enough:
+    if found.effects and _forced(shots, found, left):
         log.info("%s would be a forced name: %s is left", ", ".join(found.effects), left.formula())
         found = found.without_effects()
         left = missing_terms(shots, found.best, found.scale)
@@ -143,17 +143,21 @@ def diagnose(
     return Outcome(diagnosis, exhibits, found.best.config)
 
 
-def _named_gain(shots: Shots, found: SearchResult) -> float:
-    """Fall of the loss by all named effects together."""
-    return float(Fitter(shots, found.scale).loss(found.base.config).sum() - found.best.loss.sum())
+def _forced(shots: Shots, found: SearchResult, left: Rest) -> bool:
+    """Whether terms without a name explain so much that the names would be forced.
 
-
-def _doubtful_share(found: SearchResult) -> float:
-    """Share of the gain that unnamed terms may still promise beside a name that is not forced.
-
-    One or two names must explain nearly all; a car with many things wrong may keep something that has no name.
+    One or two names must leave nearly nothing, and must explain what happens about as well as three terms that have no
+    name; a car with many things wrong may keep something that has none.
     """
-    return FORCED_SHARE if len(found.effects) < MANY_EFFECTS else FORCED_SHARE_MANY
+    named = float(Fitter(shots, found.scale).loss(found.base.config).sum() - found.best.loss.sum())
+    few = len(found.effects) < MANY_EFFECTS
+    least = LEAST_LEFT * 0.5 * found.scale.sigma.size * len(shots)
+    if left.gain > max((FORCED_SHARE if few else FORCED_SHARE_MANY) * (left.gain + named), least):
+        return True
+    if not few:
+        return False
+    instead = missing_terms(shots, found.base, found.scale)
+    return instead.gain > max(BETTER_UNNAMED * named, named + least)
 
 
 def _share_left(score: Mapping[str, float]) -> float:

@@ -188,7 +188,7 @@ class Exhibits:
     regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
     correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
                  and the 99 % bound
-    candidates: every effect tried first: id, held-out gain in standard errors, score with it
+    candidates: every effect tried first: id, gain on unseen blocks in standard errors, loss with it
     """
 
     traces: tuple[Trace, ...] = ()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from carlab.core.errors import DataError
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import (
     DataFault,
@@ -204,7 +205,8 @@ class Judge:
             "refit": self.found.base.config,
             "with_effects": self.found.best.config,
         }
-        traces = tuple(_trace(track, models) for track in tracks[:3])
+        longest = sorted(tracks, key=lambda track: -len(track.t_s))
+        traces = tuple(found for track in longest[:6] if (found := _trace(track, models)) is not None)[:3]
         candidates = tuple(
             (c.effect, c.standard_errors if math.isfinite(c.unseen_error) else 0.0, float(c.fit.loss.sum()))
             for c in self.found.tried
@@ -234,10 +236,13 @@ def _correlation(shots: Shots, config: SimulatorConfig, channel: str) -> tuple[F
     return lags * shots.period_s, np.array(values), 2.58 / math.sqrt(max(blocks, 1))
 
 
-def _trace(track: Track, models: Mapping[str, SimulatorConfig]) -> Trace:
-    """Predictions along a track, restarted every horizon."""
+def _trace(track: Track, models: Mapping[str, SimulatorConfig]) -> Trace | None:
+    """Predictions along a track, restarted every horizon; None where the car does not move long enough."""
     period_s = track.period_s
-    shots = cut([track], HORIZON_S, HORIZON_S)
+    try:
+        shots = cut([track], HORIZON_S, HORIZON_S)
+    except DataError:
+        return None
     predicted = {}
     worst: list[tuple[float, float]] = []
     for name, config in models.items():

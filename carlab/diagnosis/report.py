@@ -1,4 +1,4 @@
-"""Writes a diagnosis into a folder: report.json, report.html, report.rrd and model.toml."""
+"""Writes a diagnosis into a folder: report.json, report.html, report.rrd, summary.png and model.toml."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from carlab.recording.sink import describe_os_error, make_folder, partial_path
 from sim_backends.car_parameters import SimulatorConfig
 
 JSON_NAME, HTML_NAME, RRD_NAME, MODEL_NAME = "report.json", "report.html", "report.rrd", "model.toml"
+PICTURE_NAME = "summary.png"
 COMMENT_CHARACTERS = 110
 
 
@@ -36,6 +37,7 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
         DataError: the folder cannot be made or written to; the message says why and what to do.
     """
     from carlab.diagnosis.report_page import render_page
+    from carlab.diagnosis.report_picture import draw_picture
     from carlab.diagnosis.report_rrd import write_rrd
 
     folder = Path(folder)
@@ -53,6 +55,8 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
     except OSError as error:
         raise DataError(describe_os_error(error, folder)) from error
     write_rrd(told, exhibits, folder / RRD_NAME)
+    if exhibits.ladder:
+        draw_picture(told, exhibits, folder / PICTURE_NAME)
     for name, content in texts.items():
         _write_whole(folder / name, content)
 

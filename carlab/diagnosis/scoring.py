@@ -13,6 +13,9 @@ from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.shots import Noise, Shots
 from sim_backends.car_parameters import SimulatorConfig
 
+CERTAIN = 0.99
+"""Quantile beyond which a start's error does not count: a shot at the edge of a spin says nothing of noise."""
+
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
@@ -76,5 +79,6 @@ def noise_floor(shots: Shots, noise: Noise, config: SimulatorConfig) -> FloatArr
         start[:, k] += noise.start[k]
         moved = Predictor(replace(shots, start=start), config)()
         grown = errors(moved - reference + shots.measured[None], shots)[0]
-        variance += np.median(grown**2, axis=0)
+        squared = grown**2
+        variance += np.mean(np.minimum(squared, np.quantile(squared, CERTAIN, axis=0)), axis=0)
     return np.sqrt(variance)

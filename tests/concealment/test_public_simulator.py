@@ -95,6 +95,18 @@ def test_the_multi_body_car_leans_by_its_springs() -> None:
     assert lean == pytest.approx((push + p.m_s * 9.81 * abs(state[6])) * p.h_s / stiffness, rel=0.15)
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_a_locked_wheel_rolls_again(model: Model) -> None:
+    from scipy.integrate import solve_ivp
+
+    car = PublicCar(model)
+    spins = [23, 24, 25, 26] if model == "multi_body" else [7, 8]
+    x = car.start(0.0, 0.0, 0.0, 2.0)
+    x[spins] = -1e-9
+    x = solve_ivp(lambda _, s: car.rates(s, (0.0, 0.0)), (0.0, 0.2), x, "LSODA").y[:, -1]
+    assert x[spins] * car.p.R_w == pytest.approx(x[3], rel=0.02)
+
+
 def test_noise_rates_and_bounds_of_a_recording() -> None:
     car = PublicCar("drift")
     made = drive_public(car, 3, 0, 5.0)
@@ -171,6 +183,11 @@ def test_a_diagnosis_without_a_report_is_said(tmp_path: Path) -> None:
     page = (tmp_path / "study.md").read_text()
     assert "Met for 0 of 1 seeds" in page
     assert "No report (exit status 1): no idea" in page
+
+
+def test_a_study_that_is_stopped_ends_with_what_it_has(tmp_path: Path) -> None:
+    assert study(tmp_path, "drift", [0, 1], command=STAND_IN, lengths_s=(3.0, 2.0), abandon=lambda: True) == []
+    assert json.loads((tmp_path / "study.json").read_text())["seeds"] == []
 
 
 def test_activity_of_a_drive_that_steers_hard(tmp_path: Path) -> None:

@@ -264,7 +264,7 @@ def test_json_has_the_keys_of_the_schema_for_each_verdict(case: Diagnosis, tmp_p
 def test_json_holds_the_numbers_and_fills_in_the_sentences(written: Path) -> None:
     report = json.loads((written / "report.json").read_text(encoding="utf-8"))
     assert report["effects"][0]["parameters"]["time_constant"]["value"] == 0.11
-    assert report["effects"][1]["where"]["place"] == [1.31, -0.42, 0.62]
+    assert report["effects"][1]["where"]["place"] == {"x": 1.31, "y": -0.42, "radius": 0.62}
     assert report["fit"]["held_out"]["refit"]["score"] == 3.86
     assert report["sentence"].startswith("The simulator leaves out two things")
     assert report["effects"][0]["sentence"] == "Left out: the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)."
