@@ -52,6 +52,7 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
         make_folder(folder)
         # An old report.json beside new pictures would lie about them.
         (folder / JSON_NAME).unlink(missing_ok=True)
+        (folder / PICTURE_NAME).unlink(missing_ok=True)
     except OSError as error:
         raise DataError(describe_os_error(error, folder)) from error
     write_rrd(told, exhibits, folder / RRD_NAME)

@@ -17,6 +17,11 @@ ORDER = ("nominal", "refit", "with_effects")
 LABELS = {"nominal": "car file", "refit": "refit", "with_effects": "with effects"}
 
 
+def _plain(words: str) -> str:
+    """Words that a figure shows as they are: names of files may hold anything."""
+    return "".join(c if " " <= c <= "~" else "?" for c in words).replace("$", r"\$")
+
+
 def _color(rgb: tuple[int, int, int]) -> tuple[float, float, float]:
     return rgb[0] / 255.0, rgb[1] / 255.0, rgb[2] / 255.0
 
@@ -42,7 +47,7 @@ def draw_picture(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
     names = ", ".join(e.id.replace("_", " ") for e in diagnosis.effects[:MOST_NAMES]) or diagnosis.verdict
     if len(diagnosis.effects) > MOST_NAMES:
         names += f" and {len(diagnosis.effects) - MOST_NAMES} more"
-    figure.suptitle(names, fontsize=11)
+    figure.suptitle(_plain(names), fontsize=11)
     figure.savefig(path, dpi=110)
 
 
@@ -55,7 +60,7 @@ def _ladder(axes: Axes, exhibits: Exhibits) -> None:
               strict=True)])  # fmt: skip
     for place, score in zip(places, scores, strict=True):
         axes.text(score, place, f" {score:.2f}", va="center", fontsize=8)
-    axes.set_yticks(places, [label.replace("_", " ") for label in labels], fontsize=8)
+    axes.set_yticks(places, [_plain(label.replace("_", " ")) for label in labels], fontsize=8)
     axes.set_xlabel("held-out error after one second, in noise floors")
     axes.margins(x=0.15)
 
@@ -74,5 +79,5 @@ def _worst(axes: Axes, trace: Trace) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.set_title(f"{trace.name}: its worst seconds", fontsize=9)
+    axes.set_title(_plain(f"{trace.name}: its worst seconds"), fontsize=9)
     axes.legend(fontsize=8, frameon=False)
