@@ -93,7 +93,8 @@ class Diagnose:
                 )
             except Inconclusive as error:
                 fail(str(error))
-                self._write_inconclusive(str(error), (*faults, *more), (*uses, *others), car.simulator)
+                known = error.data_faults or (*faults, *more)
+                self._write_inconclusive(str(error), known, (*uses, *others), car.simulator)
                 return EXIT_INCONCLUSIVE
         write_report(outcome.diagnosis, outcome.exhibits, self.out, outcome.model)
         self._print(outcome.diagnosis)

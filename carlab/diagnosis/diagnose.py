@@ -18,7 +18,7 @@ from carlab.diagnosis.findings import (
     Exhibits,
     RecordingUse,
 )
-from carlab.diagnosis.fit import Fitter, Scale
+from carlab.diagnosis.fit import Fitter
 from carlab.diagnosis.judge import HORIZON_S, Judge, Texts
 from carlab.diagnosis.scoring import HeldOut, noise_floor
 from carlab.diagnosis.search import Progress, Search, SearchResult
@@ -53,7 +53,9 @@ class Outcome:
 
 
 class Inconclusive(DataError):
-    """The recording cannot tell; the message says why and what to record."""
+    """The recording cannot tell; the message says why and what to record. ``data_faults`` were found until then."""
+
+    data_faults: tuple[DataFault, ...] = ()
 
 
 def diagnose(
@@ -78,7 +80,7 @@ def diagnose(
         texts: sentences and look-alikes.
         uses: which recording is what, for the report.
         data_faults: what was repaired when the files were read; what is found here is added to it.
-        effects: the only effects to try; all of the catalogue unless given.
+        effects: the only effects to try; all of the catalogue unless given. Names that were given are not withdrawn.
         seed: written into the report; nothing here draws random numbers that depend on it.
         progress: told what is being done and how far it is, in [0, 1].
         stop: once true, the search ends and what it has found is judged and reported.
@@ -93,11 +95,15 @@ def diagnose(
     fit, held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
     data_faults = (*data_faults, *own_faults)
     progress("reading", 0.03)
-    fit_tracks, held_tracks = _split(fit, held_out)
-    _check_excitation(fit_tracks)
+    try:
+        fit_tracks, held_tracks = _split(fit, held_out)
+        _check_excitation(fit_tracks)
+        shots = _thinned(_cut(fit_tracks, FIT_SHOT_S, FIT_STRIDE_S))
+        held_shots = _thinned(_cut(held_tracks, HORIZON_S, SCORE_STRIDE_S), MAX_SCORED)
+    except Inconclusive as error:
+        error.data_faults = tuple(data_faults)
+        raise
     noise = estimate_noise(fit_tracks)
-    shots = _thinned(cut(fit_tracks, FIT_SHOT_S, FIT_STRIDE_S))
-    judged = HeldOut.of(_thinned(cut(held_tracks, HORIZON_S, SCORE_STRIDE_S), MAX_SCORED), noise, nominal)
     floor = np.sqrt(np.mean(noise_floor(shots, noise, nominal)[1:] ** 2, axis=0))
     search = Search(
         nominal,
@@ -111,12 +117,12 @@ def diagnose(
     found = search.run()
     progress("looking for what has no name", 0.8)
     left = missing_terms(shots, found.best, found.scale)
-    if found.effects and _forced(shots, found, left):
+    if effects is None and found.effects and _forced(shots, found, left):
         log.info("%s would be a forced name: %s is left", ", ".join(found.effects), left.formula())
         found = found.without_effects()
         left = missing_terms(shots, found.best, found.scale)
     progress("judging on held-out recordings", 0.82)
-    judged = HeldOut.of(judged.shots, noise, found.best.config)
+    judged = HeldOut.of(held_shots, noise, found.best.config)
     judge = Judge(search, found, judged, texts)
     findings = judge.findings(lambda share: progress("taking effects out again", 0.82 + 0.1 * share))
     errors_of = judge.errors
@@ -186,6 +192,16 @@ def _split(fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData]) -> tuple
     return [t for t in early if len(t.t_s) > guard], [t for t in late if len(t.t_s) > guard]
 
 
+def _cut(tracks: list[Track], horizon_s: float, stride_s: float) -> Shots:
+    """Shots; Inconclusive where there are none."""
+    if not tracks:
+        raise Inconclusive("Too little is left to judge by when part is held out; record a longer drive (100 s).")
+    try:
+        return cut(tracks, horizon_s, stride_s)
+    except DataError as error:
+        raise Inconclusive(str(error)) from error
+
+
 def _part(track: Track, rows: slice) -> Track:
     return replace(
         track,
@@ -224,4 +240,4 @@ def _check_excitation(tracks: Sequence[Track]) -> None:
             )
 
 
-__all__ = ["Inconclusive", "Outcome", "Scale", "Texts", "diagnose"]
+__all__ = ["Inconclusive", "Outcome", "Texts", "diagnose"]

@@ -141,7 +141,7 @@ class Fit:
     """A fitted simulator.
 
     config carries the fitted numbers; loss (S,) is each shot's Huber loss; covariance (n, n) of the coordinates z of
-    ``free`` is the sandwich estimate, clustered by block.
+    ``free`` is the sandwich estimate, clustered by block; deflation (n,) its diagonal over that of independent errors.
     """
 
     config: SimulatorConfig
@@ -151,7 +151,11 @@ class Fit:
     loss: FloatArray
     covariance: FloatArray | None = None
     deflation: FloatArray | None = None
-    optimism: float = 0.0
+
+    @property
+    def inflation(self) -> float:
+        """How much dependent errors overstate a gain, as a rule: the middle of ``deflation``, at least one."""
+        return max(1.0, float(np.median(self.deflation))) if self.deflation is not None and len(self.free) else 1.0
 
     def values(self) -> dict[str, float]:
         """Fitted numbers by dotted name."""
@@ -254,7 +258,7 @@ class Fitter:
         """The same fit with its sandwich covariance, clustered by block (White 1980; Liang and Zeger 1986)."""
         if not fit.free:
             return replace(fit, covariance=np.zeros((0, 0)), deflation=np.zeros(0))
-        jacobian, white = self._linear(fit)
+        jacobian, white = self.linear(fit)
         normal, score = self._normal(fit, jacobian, white)
         blocks, index = np.unique(self.shots.block, return_inverse=True)
         clustered = np.stack([np.bincount(index, weights=row, minlength=len(blocks)) for row in score])
@@ -278,7 +282,7 @@ class Fitter:
         """
         if not fit.free:
             return self.loss(fit.config, most=most)
-        jacobian, white = self._linear(fit)
+        jacobian, white = self.linear(fit)
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(white), 1e-12))
         normal, score = self._normal(fit, jacobian, white)
         loss = np.zeros(len(self.shots))
@@ -295,7 +299,7 @@ class Fitter:
             loss[own] = huber(whites[int(np.argmin(seen)), own].clip(-most, most)).sum(axis=(1, 2))
         return loss
 
-    def _linear(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
+    def linear(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
         """Jacobian (n, S, U, 6) of the whitened errors (S, U, 6) at a fit."""
         count, step = len(fit.free), 0.02
         whites = self.white(fit.config, fit.free, np.vstack([fit.z, fit.z + step * np.eye(count)]))

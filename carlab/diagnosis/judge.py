@@ -20,7 +20,7 @@ from carlab.diagnosis.findings import (
     Verdict,
     Where,
 )
-from carlab.diagnosis.fit import Fit, Fitter, base_parameters, clustered_gain, effect_parameters, with_effect
+from carlab.diagnosis.fit import Fit, Fitter, clustered_gain
 from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.scoring import HeldOut
 from carlab.diagnosis.search import Search, SearchResult
@@ -85,7 +85,7 @@ class Judge:
 
     def _finding(self, name: str) -> EffectFinding:
         rest = tuple(e for e in self.found.effects if e != name)
-        without = self._refit(rest)
+        without = self.search.refit(rest, self.best, self.found.scale)
         error = self.held_out.final_error(without.config)
         full = self.errors["with_effects"]
         gain, spread = self.held_out.gain(error, full)
@@ -106,25 +106,13 @@ class Judge:
             separating_drive=self.texts.separating_drive(name, others) if others else "",
         )
 
-    def _refit(self, effects: Sequence[str]) -> Fit:
-        config = self.search.nominal
-        for name in effects:
-            config = with_effect(config, name)
-        names = {f.name: k for k, f in enumerate(self.best.free)}
-        own = [f for e in (*self.search.nominal.effects, *effects) for f in effect_parameters(e, self.search.nominal)]
-        free = (*base_parameters(self.search.nominal), *own)
-        start = np.array([self.best.z[names[f.name]] for f in free])
-        return self.fitter.fit(config, free, start)
-
     def _where(self, name: str, parameters: Mapping[str, Estimate], error: FloatArray, without: Fit) -> Where:
         """Channels by how much of the squared score the effect takes away; regime, lag, time and place."""
         floor = self.held_out.floor
         gone = np.mean((error / floor) ** 2, axis=0) - np.mean((self.errors["with_effects"] / floor) ** 2, axis=0)
         main = gone >= min(0.5 * gone.max(), gone.max())
         channels = tuple(STATE_NAMES[k] for k in np.argsort(-gone) if main[k])
-        lag = next(
-            (parameters[k].value for k in ("time_constant", "delay", "extra_delay", "latency") if k in parameters), None
-        )
+        lag = next((parameters[k].value for k in LAG_NAMES if k in parameters), None)
         place = None
         if {"x", "y", "radius"} <= parameters.keys():
             place = (parameters["x"].value, parameters["y"].value, parameters["radius"].value)
@@ -152,10 +140,8 @@ class Judge:
 
     def visibility(self, effect: str) -> float:
         """Share of an effect's influence that base parameters cannot imitate, in [0, 1]."""
-        free, z = self.best.free, self.best.z
-        step = 0.02
-        whites = self.fitter.white(self.best.config, free, np.vstack([z, z + step * np.eye(len(free))]))
-        jacobian = (whites[1:] - whites[0]).reshape(len(free), -1) / step
+        free = self.best.free
+        jacobian = self.fitter.linear(self.best)[0].reshape(len(free), -1)
         own = [k for k, f in enumerate(free) if f.name.startswith(f"effects.{effect}.")]
         other = [k for k in range(len(free)) if k not in own]
         basis, _ = np.linalg.qr(jacobian[other].T)
@@ -215,9 +201,7 @@ class Judge:
 
 
 def _on_throttle(effect: str) -> bool:
-    return any(
-        word in effect for word in ("throttle", "motor", "traction", "brake", "battery", "drag", "rolling", "slip")
-    )
+    return any(word in effect for word in THROTTLE_WORDS)
 
 
 def _correlation(shots: Shots, config: SimulatorConfig, channel: str) -> tuple[FloatArray, FloatArray, float]:

@@ -59,11 +59,10 @@ class Screen:
         self.fitter = fitter
         self.config = config
         self.best = best
-        numbers, step = len(best.free), 0.02
-        whites = fitter.white(config, best.free, np.vstack([best.z, best.z + step * np.eye(numbers)]))
-        self.white = whites[0].reshape(-1)
+        slopes, white = fitter.linear(best)
+        self.white = white.reshape(-1)
         self.weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(self.white), 1e-12)))
-        jacobian = ((whites[1:].reshape(numbers, -1) - self.white) / step * self.weight).T
+        jacobian = (slopes.reshape(len(best.free), -1) * self.weight).T
         prior = np.diag([1.0 / f.prior_z for f in best.free])
         basis, _ = np.linalg.qr(np.vstack([jacobian, prior]))
         self._inside = basis[: len(self.white)]

@@ -209,7 +209,7 @@ class Search:
         if not promises:
             return []
         top = max(p.gain for p in promises.values())
-        least = 0.5 * HOPELESS_CHI2 * max(1.0, float(np.median(_deflation(fitter, best))))
+        least = 0.5 * HOPELESS_CHI2 * fitter.with_covariance(best).inflation
         names = [n for n, p in promises.items() if p.gain > max(WORTH * top, least)][:REFITTED]
         for name in names[:3]:
             names += [n for n in self.look_alikes.get(name, ()) if n in promises and n not in names]
@@ -289,7 +289,7 @@ class Search:
         sure = candidate.chi2 > self._needed(candidate.effect) and share > ACCEPT_SHARE
         return sure or (candidate.standard_errors > STEADY_STANDARD_ERRORS and share > STEADY_SHARE)
 
-    def _refit(self, effects: tuple[str, ...], like: Fit, scale: Scale) -> Fit:
+    def refit(self, effects: tuple[str, ...], like: Fit, scale: Scale) -> Fit:
         """Fit with ``effects``, from the numbers that ``like`` has of them."""
         free = self._free(effects)
         known = {f.name: float(z) for f, z in zip(like.free, like.z, strict=True)}
@@ -303,7 +303,7 @@ class Search:
         fitter = Fitter(self.shots, scale)
         for name in effects[:-1]:
             rest = tuple(e for e in effects if e != name)
-            without = self._refit(rest, best, scale)
+            without = self.refit(rest, best, scale)
             chi2 = 2.0 * (without.cost - best.cost) / _inflation(fitter.with_covariance(best), name)
             if chi2 < KEEP_CHI2:
                 log.info("%s is no longer needed (%.1f)", name, chi2)
@@ -339,7 +339,7 @@ class Search:
         own_loss = fitter.unseen(best, self.folds, UNSEEN_AT_MOST)
         for name in effects:
             rest = tuple(e for e in effects if e != name)
-            without = self._refit(rest, best, scale)
+            without = self.refit(rest, best, scale)
             chi2[name] = 2.0 * (without.cost - best.cost) / _inflation(whole, name)
             others = [o for o in self.look_alikes.get(name, ()) if o not in effects and self._tries(o)]
             close = []
@@ -361,12 +361,6 @@ class Search:
         return chi2, rivals
 
 
-def _deflation(fitter: Fitter, fit: Fit) -> FloatArray:
-    found = fitter.with_covariance(fit).deflation
-    assert found is not None
-    return found if len(found) else np.ones(1)
-
-
 def _inflation(fit: Fit, effect: str) -> float:
     """How much dependent errors overstate the gain by an effect: sandwich over naive variance, at least one.
 
@@ -378,7 +372,7 @@ def _inflation(fit: Fit, effect: str) -> float:
         float(d) for f, d in zip(fit.free, fit.deflation, strict=True)
         if f.name.startswith(f"effects.{effect}.") and d > 1e-9
     ]  # fmt: skip
-    return max(1.0, float(np.median(fit.deflation)), float(np.mean(own)) if own else 0.0)
+    return max(fit.inflation, float(np.mean(own)) if own else 0.0)
 
 
 def _values(free: Sequence[Free], z: FloatArray) -> dict[str, FloatArray]:

@@ -75,8 +75,7 @@ def missing_terms(shots: Shots, fit: Fit, scale: Scale) -> Rest:
     """Forward selection of unnamed terms beside everything that ``fit`` already has."""
     fitter = Fitter(shots, scale)
     screen = Screen(fitter, fit.config, fit)
-    found = fitter.with_covariance(fit).deflation
-    inflation = max(1.0, float(np.median(found))) if found is not None and len(found) else 1.0
+    inflation = fitter.with_covariance(fit).inflation
     response = responses(shots, fit.config, scale)
     columns, labels = [], []
     for channel in range(3):

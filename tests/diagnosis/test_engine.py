@@ -48,3 +48,35 @@ def test_a_parked_car_is_inconclusive_and_says_what_to_record(
     assert run(["diagnose", str(path), "--out", str(tmp_path / "out")]) == 5
     assert "record it driving" in " ".join(capfd.readouterr().err.split())
     assert json.loads((tmp_path / "out" / "report.json").read_text())["verdict"] == "inconclusive"
+
+
+@pytest.mark.parametrize("held_out", [False, True])
+def test_a_recording_that_is_too_short_is_inconclusive(
+    concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], held_out: bool
+) -> None:
+    path = tmp_path / "short.csv"
+    path.write_text("\n".join((concealed[0] / "fit.csv").read_text().splitlines()[:120]) + "\n")
+    more = ["--holdout", str(concealed[0] / "hold.csv")] if held_out else []
+    assert run(["diagnose", str(path), *more, "--out", str(tmp_path / "out")]) == 5
+    assert "100 s" in " ".join(capfd.readouterr().err.split())
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["verdict"] == "inconclusive"
+    assert report["effects"] == []
+
+
+def test_a_constant_command_is_inconclusive_and_names_the_drive_that_varies_it(
+    concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rows = [r.split(",") for r in (concealed[0] / "fit.csv").read_text().splitlines()]
+    column = rows[0].index("throttle")
+    path = tmp_path / "constant.csv"
+    path.write_text("\n".join(",".join([*r[:column], "throttle" if k == 0 else "0.3", *r[column + 1 :]])
+                              for k, r in enumerate(rows)) + "\n")  # fmt: skip
+    assert run(["diagnose", str(path), "--out", str(tmp_path / "out")]) == 5
+    assert "--policy throttle_steps" in " ".join(capfd.readouterr().err.split())
+
+
+def test_what_is_fitted_cannot_judge(concealed: tuple[Path, float], tmp_path: Path) -> None:
+    same = str(concealed[0] / "fit.csv")
+    assert run(["diagnose", same, "--holdout", same, "--out", str(tmp_path / "out")]) == 2
+    assert not (tmp_path / "out").exists()

@@ -85,6 +85,23 @@ def test_the_same_recording_gives_the_same_answer_twice(drag: tuple[Path, float]
     assert replace(one, seconds=0.0) == replace(other, seconds=0.0)
 
 
+def test_the_halves_of_a_recording_do_not_contradict_each_other(drag: tuple[Path, float], tmp_path: Path) -> None:
+    folder = drag[0]
+    table = read_csv(folder / "fit.csv")
+    car = load_car_file(folder / "car.toml").simulator
+    hold = episodes(tmp_path / "hold.csv", read_csv(folder / "hold.csv"))
+    middle = len(table["t"]) // 2
+    ranges = []
+    for rows in (slice(None, middle), slice(middle, None)):
+        half = {name: column[rows] for name, column in table.items()}
+        found = diagnose(episodes(tmp_path / "half.csv", half), hold, car, TEXTS, effects=CANDIDATES).diagnosis
+        assert [e.id for e in found.effects] == ["aerodynamic_drag"]
+        ranges.append(found.effects[0].parameters["coefficient"])
+    one, other = ranges
+    apart = abs(one.value - other.value)
+    assert apart < 3.0 * np.hypot(one.std, other.std)
+
+
 def test_nothing_is_named_where_only_base_parameters_are_off(tmp_path: Path) -> None:
     found = outcome(write(tmp_path, make_case("parameters", 31, fit_s=60, hold_s=30))).diagnosis
     assert found.verdict == "parameters"
