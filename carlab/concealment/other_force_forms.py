@@ -9,7 +9,7 @@ from carlab.concealment.base_car import GRAVITY_MPS2
 from carlab.concealment.catalogue import Form, Parameters, factor, plain, signed
 from carlab.concealment.force_forms import STICTION_MPS
 from carlab.concealment.physics import Instant, World
-from carlab.concealment.tyre_forms import WHEEL_RADIUS_M, placed, saturating
+from carlab.concealment.tyre_forms import driven_wheels, placed, saturating
 
 
 def soft_motor(world: World, p: Parameters) -> None:
@@ -124,18 +124,7 @@ def friction_circle(world: World, p: Parameters) -> None:
 
 def brush_slip(world: World, p: Parameters) -> None:
     """Wheel speed as a state with the slip curve of a brush tyre."""
-    inertia, stiffness = p["inertia"] / WHEEL_RADIUS_M**2, p["stiffness"]
-    peak = brush_shape(1.0)
-    k = world.add_state(rolling=True)
-
-    def spin(now: Instant) -> None:
-        slip = (now.extra[k] - now.vx) / max(abs(now.vx), 0.3)
-        top = now.mu_r * now.fz_r
-        force = top * peak(stiffness * slip / top)
-        now.rates[k] = (now.fx - force) / inertia
-        now.fx = force
-
-    world.hooks["limit"].append(spin)
+    driven_wheels(world, p, brush_shape(1.0))
 
 
 def slip_relaxation(world: World, p: Parameters) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from carlab.concealment.base_car import GRAVITY_MPS2
 from carlab.concealment.catalogue import Draw, Form, Parameters, plain, signed
@@ -51,13 +52,18 @@ def longitudinal_slip(world: World, p: Parameters) -> None:
 
     The catalogue leaves F_x(slip) open; a hyperbolic tangent between slope and limit is the usual choice.
     """
+    driven_wheels(world, p, math.tanh)
+
+
+def driven_wheels(world: World, p: Parameters, curve: Callable[[float], float]) -> None:
+    """Speed of the driven wheels as a state; ``curve`` goes from slope one at no slip to one at the limit."""
     inertia, stiffness = p["inertia"] / WHEEL_RADIUS_M**2, p["stiffness"]
     k = world.add_state(rolling=True)
 
     def spin(now: Instant) -> None:
         slip = (now.extra[k] - now.vx) / max(abs(now.vx), 0.3)
         top = now.mu_r * now.fz_r
-        force = top * math.tanh(stiffness * slip / top)
+        force = top * curve(stiffness * slip / top)
         now.rates[k] = (now.fx - force) / inertia
         now.fx = force
 
