@@ -24,8 +24,12 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Tests that only compute run side by side, one to a core; the others watch the clock and have the machine to themselves.
+COMPUTING := tests/concealment tests/diagnosis tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py
+
 test: lint
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
+	$(BIN)/pytest $(addprefix --ignore=,$(COMPUTING))
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

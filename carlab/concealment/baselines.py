@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from carlab.concealment.base_car import BaseCar
 from carlab.concealment.baseline_correlation import largest_correlation
 from carlab.concealment.baseline_data import Prepared, Table, prepare
@@ -33,7 +35,7 @@ NAMES_NOTHING = ("refit only", "GP residual")
 
 def require_studies() -> None:
     """Raise ConfigError where the packages of the baselines are not installed."""
-    missing = [name for name in ("pysindy", "sklearn", "threadpoolctl") if find_spec(name) is None]
+    missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
     if missing:
         raise ConfigError(
             f"The baselines need {' and '.join(missing)}: pip install 'carlab[studies]', or leave the baselines out "
@@ -54,8 +56,6 @@ def run_baselines(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str,
         By baseline ``named`` (an id or None), ``score`` (None where it has none), ``refit_score`` and ``seconds``; or
         ``failed`` with a sentence where the recording cannot be used.
     """
-    from threadpoolctl import threadpool_limits
-
     with threadpool_limits(1):  # small matrices: threads only fight over the cores
         return _run_all(fit, hold, nominal, floor)
 
