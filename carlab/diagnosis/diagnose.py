@@ -18,12 +18,12 @@ from carlab.diagnosis.findings import (
     Exhibits,
     RecordingUse,
 )
-from carlab.diagnosis.fit import Fitter
 from carlab.diagnosis.judge import HORIZON_S, Judge, Texts
+from carlab.diagnosis.naming import Believed, believed, unexplained
 from carlab.diagnosis.scoring import HeldOut, noise_floor
-from carlab.diagnosis.search import Progress, Search, SearchResult
+from carlab.diagnosis.search import Progress, Search
 from carlab.diagnosis.shots import Shots, Track, cut, estimate_noise, tracks_of
-from carlab.diagnosis.unexplained import Rest, describe, missing_terms, start_features
+from carlab.diagnosis.unexplained import missing_terms
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -36,11 +36,6 @@ MAX_SCORED = 1200
 MIN_SECONDS = 8.0
 HOLD_OUT_SHARE = 0.3
 MIN_SHARE = 0.1
-FORCED_SHARE = 0.1
-FORCED_SHARE_MANY = 0.3
-MANY_EFFECTS = 3
-LEAST_LEFT = 0.04
-BETTER_UNNAMED = 1.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,20 +111,20 @@ def diagnose(
     )
     found = search.run()
     progress("looking for what has no name", 0.8)
-    left = missing_terms(shots, found.best, found.scale)
-    if effects is None and found.effects and _forced(shots, found, left):
-        log.info("%s would be a forced name: %s is left", ", ".join(found.effects), left.formula())
-        found = found.without_effects()
-        left = missing_terms(shots, found.best, found.scale)
+    held = HeldOut.of(held_shots, noise, found.best.config)
+    if effects is None:
+        what = believed(search, found, held)
+    else:
+        what = Believed(found, missing_terms(shots, found.best, found.scale), None)
+    found = what.found
     progress("judging on held-out recordings", 0.82)
-    judged = HeldOut.of(held_shots, noise, found.best.config)
-    judge = Judge(search, found, judged, texts)
+    judge = Judge(search, found, held, texts)
     findings = judge.findings(lambda share: progress("taking effects out again", 0.82 + 0.1 * share))
     errors_of = judge.errors
-    score = {name: judged.score(error) for name, error in errors_of.items()}
+    score = {name: held.score(error) for name, error in errors_of.items()}
     share = _share_left(score)
-    rest = describe(left, share, errors_of["with_effects"], judged.floor, start_features(judged.shots))
-    verdict = judge.verdict(left, data_faults)
+    rest = unexplained(search, what, share, errors_of["with_effects"], held) if share >= MIN_SHARE else None
+    verdict = judge.verdict(what.something, data_faults)
     progress("drawing", 0.95)
     exhibits = judge.exhibits(held_tracks)
     diagnosis = Diagnosis(
@@ -138,32 +133,15 @@ def diagnose(
         effects=findings if verdict == "mismatch" else (),
         parameters=judge.parameters(),
         horizon_s=HORIZON_S,
-        held_out={name: judged.summary(error) for name, error in errors_of.items()}
-        | {"noise_floor": judged.floor_summary()},
-        unexplained=rest if share >= MIN_SHARE else None,
+        held_out={name: held.summary(error) for name, error in errors_of.items()}
+        | {"noise_floor": held.floor_summary()},
+        unexplained=rest,
         data_faults=tuple(data_faults),
         recordings=tuple(uses),
         seed=seed,
         seconds=clock.now_s() - began_s,
     )
     return Outcome(diagnosis, exhibits, found.best.config)
-
-
-def _forced(shots: Shots, found: SearchResult, left: Rest) -> bool:
-    """Whether terms without a name explain so much that the names would be forced.
-
-    One or two names must leave nearly nothing, and must explain what happens about as well as three terms that have no
-    name; a car with many things wrong may keep something that has none.
-    """
-    named = float(Fitter(shots, found.scale).loss(found.base.config).sum() - found.best.loss.sum())
-    few = len(found.effects) < MANY_EFFECTS
-    least = LEAST_LEFT * 0.5 * found.scale.sigma.size * len(shots)
-    if left.gain > max((FORCED_SHARE if few else FORCED_SHARE_MANY) * (left.gain + named), least):
-        return True
-    if not few:
-        return False
-    instead = missing_terms(shots, found.base, found.scale)
-    return instead.gain > max(BETTER_UNNAMED * named, named + least)
 
 
 def _share_left(score: Mapping[str, float]) -> float:

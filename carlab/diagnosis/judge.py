@@ -25,7 +25,7 @@ from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.scoring import HeldOut
 from carlab.diagnosis.search import Search, SearchResult
 from carlab.diagnosis.shots import Shots, Track, cut
-from carlab.diagnosis.unexplained import REGIMES, Rest, start_features, worst_regime
+from carlab.diagnosis.unexplained import REGIMES, start_features, worst_regime
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.registry import REGISTRY
@@ -149,15 +149,15 @@ class Judge:
         left = columns - (columns @ basis) @ basis.T
         return float(np.linalg.norm(left) / max(float(np.linalg.norm(columns)), 1e-12))
 
-    def verdict(self, left: Rest, data_faults: Sequence[DataFault]) -> Verdict:
-        """What the figures amount to."""
+    def verdict(self, more: bool, data_faults: Sequence[DataFault]) -> Verdict:
+        """What the figures amount to; ``more``: whether something without a name is called for."""
         if any(f.action.startswith("unusable") for f in data_faults):
             return "data"
         if self.found.effects:
             return "mismatch"
         shots = self.search.shots
         score = {name: self.held_out.score(error) for name, error in self.errors.items()}
-        if (left.chosen and score["refit"] > MISSING_SCORE) or score["refit"] > MISSING_WITHOUT_FORMULA_SCORE:
+        if (more and score["refit"] > MISSING_SCORE) or score["refit"] > MISSING_WITHOUT_FORMULA_SCORE:
             return "unexplained"
         nominal_loss = self.fitter.loss(self.search.nominal)
         gain, spread = clustered_gain(nominal_loss, self.found.base.loss, shots)

@@ -21,11 +21,19 @@ LATENCY = "effects.mocap_latency.latency"
 FILTER = "effects.velocity_filter_lag.time_constant"
 AHEAD, LEFT = "effects.marker_offset.ahead", "effects.marker_offset.left"
 TURNED = "effects.mocap_yaw_misalignment.angle"
-OBSERVED = (LATENCY, FILTER, AHEAD, LEFT, TURNED)
+SCALE = "effects.position_scale.scale"
+OBSERVED = (LATENCY, FILTER, AHEAD, LEFT, TURNED, SCALE)
 DELAY = "timing.command_delay"
 STEP_S = 0.017
 """Longest step of the integration: at 30 Hz its error stays within a hundredth of a noise floor."""
-_OBSERVATION_EFFECTS = ("mocap_latency", "velocity_filter_lag", "marker_offset", "mocap_yaw_misalignment")
+_OBSERVATION_EFFECTS = (
+    "mocap_latency",
+    "velocity_filter_lag",
+    "marker_offset",
+    "mocap_yaw_misalignment",
+    "position_scale",
+)
+_LENGTHS = (0, 1, 3, 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +90,9 @@ class Predictor:
             states[..., 1] += sin * ahead + cos * left
             states[..., 3] -= left * rate
             states[..., 4] += ahead * rate
+        scale = seen[SCALE]
+        if np.any(scale):
+            states[..., _LENGTHS] *= (1.0 + scale)[:, None, None, None]
         if np.any(turned):
             sin, cos = np.sin(turned), np.cos(turned)
             vx, vy = states[..., 3].copy(), states[..., 4].copy()
@@ -127,6 +138,8 @@ def _undone(start: FloatArray, seen: Mapping[str, FloatArray]) -> FloatArray:
         true[..., 2] -= turned
         true[..., 3] = cos * vx - sin * vy
         true[..., 4] = sin * vx + cos * vy
+    if np.any(seen[SCALE]):
+        true[..., _LENGTHS] /= (1.0 + seen[SCALE])[:, None, None]
     if np.any(ahead) or np.any(left):
         sin, cos = np.sin(true[..., 2]), np.cos(true[..., 2])
         true[..., 0] -= cos * ahead - sin * left

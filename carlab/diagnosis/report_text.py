@@ -13,7 +13,7 @@ from types import MappingProxyType
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
 from carlab.diagnosis.report_catalogue import EFFECT_TEXTS, SEPARATING
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import CATALOGUE
 
 CHANNEL_WORDS = {
     "x": "position ahead",
@@ -36,9 +36,9 @@ VERDICT_TITLES = {
 
 
 def _symmetric() -> dict[str, tuple[str, ...]]:
-    pairs = {(a, b) for a, effect in EFFECTS.items() for b in effect.look_alikes}
+    pairs = {(a, b) for a, effect in CATALOGUE.items() for b in effect.look_alikes}
     pairs |= {(b, a) for a, b in pairs}
-    return {name: tuple(other for other in EFFECTS if (name, other) in pairs) for name in EFFECTS}
+    return {name: tuple(other for other in CATALOGUE if (name, other) in pairs) for name in CATALOGUE}
 
 
 LOOK_ALIKES: Mapping[str, tuple[str, ...]] = MappingProxyType(_symmetric())

@@ -31,6 +31,7 @@ _CLIP = 50.0
 _AT_A_TIME = 8
 TYRE_GRIPS = (0.4, 0.65, 0.95, 1.4)
 TYRE_SHAPE = 1.5
+WIND_COEFFICIENT = 0.15
 PATCH_SPACING_M = 0.5
 PATCH_RADIUS_M = 0.8
 
@@ -87,6 +88,8 @@ class Screen:
         scalable = np.array([not f.logarithmic and not f.choice for f in free])
         if effect == "tyre_saturation":
             scalable[:] = False
+        elif effect == "wind":
+            scalable = np.array([f.name.endswith(".speed") for f in free])
         elif effect == "low_friction_patch":
             scalable = np.array([f.name.endswith(".loss") for f in free])
         factor = np.clip(along[order], 0.3, 1.5)[:, None]
@@ -118,6 +121,11 @@ class Screen:
             heading = np.array([free[1].coordinate(a) for a in angle])
             sized = self._sized(config, free, np.array([[1.0, heading[0]]]), held=(1,))[:, 0]
             return np.array([(s, h) for s in np.unique(sized) for h in heading])
+        if effect == "wind":
+            start = np.array([[1.0, 0.0, free[2].coordinate(WIND_COEFFICIENT)]])
+            sized = self._sized(config, free, start, held=(1, 2))
+            headings = [free[1].coordinate(a) for a in np.linspace(-np.pi, np.pi, 8, endpoint=False)]
+            return np.array([(s, h, c) for s, _, c in sized for h in headings])
         if effect == "tyre_saturation":
             return _tyres(self.best.config, free)
         grids = np.meshgrid(*(_grid(f) for f in free), indexing="ij")

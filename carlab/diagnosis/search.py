@@ -29,7 +29,7 @@ from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.screen import Promise, Screen, usable
 from carlab.diagnosis.shots import Shots
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import CATALOGUE, EFFECTS
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +137,7 @@ class Search:
         self.shots = shots
         self.floor = floor
         self.look_alikes = look_alikes
-        self.allowed = tuple(EFFECTS) if allowed is None else tuple(allowed)
+        self.allowed = tuple(CATALOGUE) if allowed is None else tuple(allowed)
         self.progress = progress
         self.base_free = base_parameters(nominal)
         blocks = np.unique(shots.block)
@@ -146,7 +146,7 @@ class Search:
     def run(self) -> SearchResult:
         """Search until nothing more is gained."""
         self.progress("refit of the base parameters", 0.0)
-        base, scale = self._settled(self.nominal, self._free(()))
+        base, scale = self._settled(self.nominal, self.free_with(()))
         best, history = base, list[tuple[str, Fit]]()
         effects: tuple[str, ...] = ()
         tried: tuple[Candidate, ...] = ()
@@ -170,13 +170,24 @@ class Search:
         ordered = tuple(sorted(effects, key=lambda e: -chi2[e]))
         return SearchResult(base, best, ordered, chi2, rivals, tuple(history), tried, scale)
 
+    def only(self, found: SearchResult, names: tuple[str, ...]) -> SearchResult:
+        """What was found, with these of its names alone."""
+        if not names:
+            return found.without_effects()
+        fit = self.refit(names, found.best, found.scale)
+        chi2, rivals = self._duels(names, fit, found.scale)
+        history = tuple((name, step) for name, step in found.history if name in names)
+        return replace(found, best=fit, effects=names, chi2=chi2, rivals=rivals, history=history)
+
     # -- pieces ---------------------------------------------------------------------------------------------------
 
-    def _free(self, effects: Sequence[str]) -> tuple[Free, ...]:
+    def free_with(self, effects: Sequence[str]) -> tuple[Free, ...]:
+        """The numbers that a fit with ``effects`` moves."""
         own = [f for name in self.nominal.effects for f in effect_parameters(name, self.nominal)]
         return (*self.base_free, *own, *(f for name in effects for f in effect_parameters(name, self.nominal)))
 
-    def _config(self, effects: Sequence[str]) -> SimulatorConfig:
+    def config_with(self, effects: Sequence[str]) -> SimulatorConfig:
+        """The simulator with ``effects`` switched on, doing nothing yet."""
         config = self.nominal
         for name in effects:
             config = with_effect(config, name)
@@ -218,7 +229,7 @@ class Search:
             self.progress(f"refitting with {name}", (len(effects) + 0.5 * k / len(names)) / MAX_EFFECTS)
             if self.stop():
                 break
-            found.append(self._refitted(fitter, best, (*effects, name), promises[name]))
+            found.append(self.refitted(fitter, best, (*effects, name), promises[name]))
         found.sort(key=lambda c: -c.gain)
         if not found:
             return []
@@ -241,8 +252,9 @@ class Search:
                 )  # fmt: skip
         return judged
 
-    def _refitted(self, fitter: Fitter, best: Fit, effects: tuple[str, ...], promise: Promise) -> Candidate:
-        config, free = self._config(effects), self._free(effects)
+    def refitted(self, fitter: Fitter, best: Fit, effects: tuple[str, ...], promise: Promise) -> Candidate:
+        """Fit ``effects``, the last of them from where it promised most beside ``best``."""
+        config, free = self.config_with(effects), self.free_with(effects)
         starts = [np.concatenate([best.z, s]) for s in promise.starts]
         if len(starts) > 1:
             tries = [fitter.fit(config, free, s, iterations=3) for s in starts]
@@ -254,12 +266,12 @@ class Search:
         fit = fitter.with_covariance(candidate.fit)
         loss = fitter.unseen(fit, self.folds, UNSEEN_AT_MOST)
         gain, error = clustered_gain(reference, loss, self.shots)
-        chi2 = 2.0 * candidate.gain / _inflation(fit, candidate.effect)
+        chi2 = 2.0 * candidate.gain / inflation_of(fit, candidate.effect)
         return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)
 
     def _screen(self, best: Fit, effects: Sequence[str], scale: Scale) -> list[Promise]:
         """What each candidate promises beside ``effects``, the best first."""
-        screen = Screen(Fitter(self.shots, scale), self._config(effects), best, SCREENED_SHOTS)
+        screen = Screen(Fitter(self.shots, scale), self.config_with(effects), best, SCREENED_SHOTS)
         found = []
         for name in self.allowed:
             if name in effects or not self._tries(name):
@@ -291,10 +303,10 @@ class Search:
 
     def refit(self, effects: tuple[str, ...], like: Fit, scale: Scale) -> Fit:
         """Fit with ``effects``, from the numbers that ``like`` has of them."""
-        free = self._free(effects)
+        free = self.free_with(effects)
         known = {f.name: float(z) for f, z in zip(like.free, like.z, strict=True)}
         start = np.array([known.get(f.name, 0.0) for f in free])
-        return Fitter(self.shots, scale).fit(self._config(effects), free, start)
+        return Fitter(self.shots, scale).fit(self.config_with(effects), free, start)
 
     def _moved(self, effects: tuple[str, ...], best: Fit, scale: Scale) -> tuple[tuple[str, ...], Fit, Scale]:
         """Take out or swap what others do better: the first effect accepted is often a proxy."""
@@ -304,21 +316,21 @@ class Search:
         for name in effects[:-1]:
             rest = tuple(e for e in effects if e != name)
             without = self.refit(rest, best, scale)
-            chi2 = 2.0 * (without.cost - best.cost) / _inflation(fitter.with_covariance(best), name)
+            chi2 = 2.0 * (without.cost - best.cost) / inflation_of(fitter.with_covariance(best), name)
             if chi2 < KEEP_CHI2:
                 log.info("%s is no longer needed (%.1f)", name, chi2)
-                kept, scale = self._settled(self._config(rest), without.free, without.z)
+                kept, scale = self._settled(self.config_with(rest), without.free, without.z)
                 return self._moved(rest, kept, scale)
-            screen = Screen(fitter, self._config(rest), without, SCREENED_SHOTS)
+            screen = Screen(fitter, self.config_with(rest), without, SCREENED_SHOTS)
             for other_name in self.look_alikes.get(name, ()):
                 if self.stop() or other_name in effects or not self._tries(other_name):
                     continue
                 promise = screen.promise(other_name, effect_parameters(other_name, self.nominal))
                 if promise.gain < SWAP_PROMISE * (without.cost - best.cost):
                     continue
-                other = self._refitted(fitter, without, (*rest, promise.effect), promise)
+                other = self.refitted(fitter, without, (*rest, promise.effect), promise)
                 deflated = (
-                    2.0 * (best.cost - other.fit.cost) / _inflation(fitter.with_covariance(other.fit), promise.effect)
+                    2.0 * (best.cost - other.fit.cost) / inflation_of(fitter.with_covariance(other.fit), promise.effect)
                 )
                 if deflated > KEEP_CHI2:
                     log.info("%s takes the place of %s (%.1f)", promise.effect, name, deflated)
@@ -340,16 +352,16 @@ class Search:
         for name in effects:
             rest = tuple(e for e in effects if e != name)
             without = self.refit(rest, best, scale)
-            chi2[name] = 2.0 * (without.cost - best.cost) / _inflation(whole, name)
+            chi2[name] = 2.0 * (without.cost - best.cost) / inflation_of(whole, name)
             others = [o for o in self.look_alikes.get(name, ()) if o not in effects and self._tries(o)]
             close = []
-            screen = Screen(fitter, self._config(rest), without, SCREENED_SHOTS)
+            screen = Screen(fitter, self.config_with(rest), without, SCREENED_SHOTS)
             for other in others:
                 if self.stop():
                     break
                 self.progress(f"{name} or {other}?", 0.95)
                 promise = screen.promise(other, effect_parameters(other, self.nominal))
-                rival = self._refitted(fitter, without, (*rest, other), promise)
+                rival = self.refitted(fitter, without, (*rest, other), promise)
                 if rival.gain < CLOSE * (without.cost - best.cost):
                     continue
                 loss = fitter.unseen(rival.fit, self.folds, UNSEEN_AT_MOST)
@@ -361,7 +373,7 @@ class Search:
         return chi2, rivals
 
 
-def _inflation(fit: Fit, effect: str) -> float:
+def inflation_of(fit: Fit, effect: str) -> float:
     """How much dependent errors overstate the gain by an effect: sandwich over naive variance, at least one.
 
     Twice the gain of several numbers is a sum of chi-squares weighted by such ratios, so their mean divides it.
@@ -379,4 +391,4 @@ def _values(free: Sequence[Free], z: FloatArray) -> dict[str, FloatArray]:
     return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
 
 
-__all__ = ["Candidate", "Search", "SearchResult"]
+__all__ = ["Candidate", "Search", "SearchResult", "inflation_of"]

@@ -8,7 +8,7 @@ regression; Brunton et al. 2016, Kaheman et al. 2019). What the chosen terms dep
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from carlab.diagnosis.fit import Fit, Fitter, Scale
 from carlab.diagnosis.residual_terms import TERMS, Term, responses
 from carlab.diagnosis.screen import Screen
 from carlab.diagnosis.shots import Shots
+from sim_backends.car_parameters import SimulatorConfig
 
 MOST_TERMS = 3
 TERM_CHI2 = 28.0
@@ -26,12 +27,19 @@ NEXT_SHARE = 0.12
 """A further term must gain this share of the first."""
 ALIKE = 0.97
 """Among terms that gain this share of the best, the simplest is taken."""
-_ACTS_ON = (("vx", "dvx/dt", "m/s2"), ("vy", "dvy/dt", "m/s2"), ("yaw_rate", "dr/dt", "rad/s2"))
+_ACTS_ON = (
+    ("vx", "dvx/dt"),
+    ("vy", "dvy/dt"),
+    ("yaw_rate", "dr/dt"),
+    ("vy and yaw_rate, like a side force of the front axle", "F_front/m"),
+    ("vy and yaw_rate, like a side force of the rear axle", "F_rear/m"),
+)
+"""What a term may act on, in words and symbols; forces are in m/s2 of the whole car's mass."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """One term with the channel it acts on (0 vx, 1 vy, 2 yaw rate), its coefficient and its gain in likelihood."""
+    """One term with what it acts on (its number in ``_ACTS_ON``), its coefficient and its gain in likelihood."""
 
     term: Term
     channel: int
@@ -44,6 +52,8 @@ class Rest:
     """Unnamed terms that a fit calls for, and the fall of its loss that they promise."""
 
     chosen: tuple[Chosen, ...]
+    fall: FloatArray = field(default_factory=lambda: np.zeros(6))
+    """Fall of the mean squared error at the ends of shots, by channel (6,) and in squared units."""
 
     @property
     def gain(self) -> float:
@@ -64,23 +74,24 @@ class Rest:
     def formula(self) -> str:
         """Missing accelerations in SI units; steering d and throttle u in [-1, 1] as they act, r the yaw rate."""
         rows = []
-        for channel, (_, symbol, _) in enumerate(_ACTS_ON):
+        for channel, (_, symbol) in enumerate(_ACTS_ON):
             own = [c for c in self.chosen if c.channel == channel]
             if own:
                 rows.append(f"{symbol} += " + " ".join(f"{c.coefficient:+.3g} {c.term.formula}" for c in own))
         return "; ".join(rows)
 
 
-def missing_terms(shots: Shots, fit: Fit, scale: Scale) -> Rest:
+def missing_terms(shots: Shots, fit: Fit, scale: Scale, least_chi2: float = TERM_CHI2) -> Rest:
     """Forward selection of unnamed terms beside everything that ``fit`` already has."""
     fitter = Fitter(shots, scale)
     screen = Screen(fitter, fit.config, fit)
     inflation = fitter.with_covariance(fit).inflation
     response = responses(shots, fit.config, scale)
+    arms = _arms(fit.config)
     columns, labels = [], []
-    for channel in range(3):
-        for term in TERMS:
-            column = screen.projected(response.of(term, channel))
+    for term in TERMS:
+        vx, vy, rate = (screen.projected(response.of(term, k)) for k in range(3))
+        for channel, column in enumerate((vx, vy, rate, *(vy + arm * rate for arm in arms))):
             size = float(np.linalg.norm(column))
             if size > 1e-6:
                 columns.append(column / size)
@@ -97,7 +108,7 @@ def missing_terms(shots: Shots, fit: Fit, scale: Scale) -> Rest:
         length = np.linalg.norm(left, axis=1)
         promise = np.where(length > 0.1, 0.5 * (left @ residual / np.maximum(length, 0.1)) ** 2, 0.0)
         best = float(promise.max())
-        if 2.0 * best / inflation < TERM_CHI2 or (gains and best < NEXT_SHARE * gains[0]):
+        if 2.0 * best / inflation < least_chi2 or (gains and best < NEXT_SHARE * gains[0]):
             break
         alike = np.flatnonzero(promise > ALIKE * best)
         k = int(min(alike, key=lambda i: (len(labels[i][0].inputs), i)))
@@ -109,29 +120,38 @@ def missing_terms(shots: Shots, fit: Fit, scale: Scale) -> Rest:
     if not picked:
         return Rest(())
     numbers = -np.linalg.lstsq(design[picked].T, screen.residual, rcond=None)[0]
-    return Rest(tuple(
+    chosen = tuple(
         Chosen(labels[k][0], labels[k][1], float(n / labels[k][2]), g)
         for k, n, g in zip(picked, numbers, gains, strict=True)
-    ))  # fmt: skip
+    )
+    shape = (len(shots), -1, 6)
+    before, change = screen.residual.reshape(shape)[:, -1], (numbers @ design[picked]).reshape(shape)[:, -1]
+    return Rest(chosen, np.mean(before**2 - (before + change) ** 2, axis=0) * scale.sigma[-1] ** 2)
 
 
-def describe(rest: Rest, share: float, held_error: FloatArray, floor: FloatArray, seen: dict[str, FloatArray]) -> (
-    Unexplained
-):  # fmt: skip
+def _arms(config: SimulatorConfig) -> tuple[float, float]:
+    """Yaw acceleration [rad/s2] by a side force of the front and of the rear axle that gives 1 m/s2."""
+    values = config.values()
+    per_inertia = values["vehicle.mass"] / values["vehicle.yaw_inertia"]
+    return per_inertia * values["vehicle.front_axle"], -per_inertia * values["vehicle.rear_axle"]
+
+
+def describe(
+    share: float, words: str, formula: str, of_channel: FloatArray, size: FloatArray, seen: dict[str, FloatArray]
+) -> Unexplained:
     """The report's entry.
 
     Args:
-        rest: the terms.
         share: of the squared excess.
-        held_error: held-out errors after the horizon (S, 6).
-        floor: of each channel (6,).
+        words: the class statement.
+        formula: of the missing accelerations.
+        of_channel: how much is missing in each channel (6,), in squared noise floors.
+        size: of each held-out shot's error (S,).
         seen: features at the starts of the held-out shots, each (S,).
     """
-    excess = np.maximum(np.mean((held_error / floor) ** 2, axis=0) - 1.0, 0.0)
-    order = np.argsort(-excess)
-    channels = tuple(STATE_NAMES[k] for k in order if excess[k] > 0.5 * excess[order[0]])
-    size = np.sqrt(np.mean((held_error / floor) ** 2, axis=1))
-    return Unexplained(share, channels, worst_regime(seen, size), rest.words(), rest.formula())
+    order = np.argsort(-of_channel)
+    channels = tuple(STATE_NAMES[k] for k in order if of_channel[k] > 0.5 * of_channel[order[0]])
+    return Unexplained(share, channels, worst_regime(seen, size), words, formula)
 
 
 def start_features(shots: Shots) -> dict[str, FloatArray]:

@@ -41,6 +41,7 @@ from sim_backends.effects.tyres import (
     TyreRelaxation,
     TyreSaturation,
 )
+from sim_backends.effects.uncatalogued import UNCATALOGUED
 from sim_backends.effects.wheel_slip import LongitudinalSlip
 
 _ALL: tuple[Effect, ...] = (
@@ -82,10 +83,13 @@ _ALL: tuple[Effect, ...] = (
     MocapYawMisalignment(),
     VelocityFilterLag(),
 )
-EFFECTS: dict[str, Effect] = {effect.id: effect for effect in _ALL}
-"""Every effect by its id, in the order of the catalogue."""
+CATALOGUE: dict[str, Effect] = {effect.id: effect for effect in _ALL}
+"""The effects that a diagnosis names, by id, in the order of the catalogue."""
+EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in UNCATALOGUED}}
+"""Everything that a simulator can have: the catalogue, then physics outside it."""
 
 __all__ = [
+    "CATALOGUE",
     "EFFECTS",
     "ActuatorEffect",
     "DelayEffect",

@@ -54,6 +54,10 @@ class Effect:
     sentence: ClassVar[str]
     parameters: ClassVar[tuple[EffectParameter, ...]]
     look_alikes: ClassVar[tuple[str, ...]] = ()
+    catalogued: ClassVar[bool] = True
+    """Whether it has an id of the catalogue, by which a diagnosis may name it."""
+    class_statement: ClassVar[str] = ""
+    """What a diagnosis says instead of a name that is not in the catalogue."""
     order: ClassVar[int] = 50
     """Effects of a kind act in ascending order."""
 

@@ -120,6 +120,24 @@ def test_what_has_no_name_is_described_and_not_forced(tmp_path: Path) -> None:
     assert "x cos(yaw)" in found.unexplained.formula
 
 
+@pytest.mark.parametrize(
+    ("concealed", "taken_for", "said"),
+    [("locked_differential", "yaw_damping", "curvature"), ("camber", "steering_offset", "front wheels")],
+)
+def test_a_name_is_not_given_to_what_something_outside_the_catalogue_explains_better(
+    concealed: str, taken_for: str, said: str, tmp_path: Path
+) -> None:
+    """By itself the nearest name of the catalogue would do."""
+    case = make_case("outside", 43, effects=(concealed,), excess=1.5, fit_s=60, hold_s=30)
+    folder = write(tmp_path, case)
+    found = outcome(folder).diagnosis
+    assert found.effects == ()
+    assert found.unexplained is not None
+    assert said in found.unexplained.kind
+    told = outcome(folder, effects=(taken_for,)).diagnosis
+    assert [e.id for e in told.effects] == [taken_for]
+
+
 def test_impulse_responses_add_up_to_what_the_simulator_does(drag: tuple[Path, float], shots: Shots) -> None:
     """The linear answer to -c v|v| / m against switching the drag on in the simulator."""
     car = load_car_file(drag[0] / "car.toml").simulator

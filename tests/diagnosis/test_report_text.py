@@ -33,7 +33,7 @@ from carlab.diagnosis.report_text import (
     verdict_title,
     wrong_sentence,
 )
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import CATALOGUE
 
 PAIRS = [(a, b) for a in LOOK_ALIKES for b in LOOK_ALIKES[a]]
 INSEPARABLE = {"command_delay", "mocap_latency"}
@@ -44,7 +44,7 @@ def around(value: float, unit: str) -> Estimate:
 
 
 def finding(effect_id: str, others: tuple[str, ...] = ()) -> EffectFinding:
-    parameters = {p.name: around(p.typical, p.unit) for p in EFFECTS[effect_id].parameters}
+    parameters = {p.name: around(p.typical, p.unit) for p in CATALOGUE[effect_id].parameters}
     evidence = Evidence(0.3, 9.0, 0.6, {"vx": 0.2})
     return EffectFinding(effect_id, 0.9, parameters, Where(("vx",), "speed > 1 m/s"), evidence, "", others)
 
@@ -55,16 +55,16 @@ def diagnosis(verdict: str, *effects: EffectFinding, refit: float = 4.0, with_ef
     return Diagnosis(verdict, "", effects, {}, 1.0, held, None, (), (), 0, 1.0)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("effect_id", EFFECTS)
+@pytest.mark.parametrize("effect_id", CATALOGUE)
 def test_every_effect_says_each_of_its_numbers_with_its_unit(effect_id: str) -> None:
-    parameters = {p.name: around(p.typical, p.unit) for p in EFFECTS[effect_id].parameters}
+    parameters = {p.name: around(p.typical, p.unit) for p in CATALOGUE[effect_id].parameters}
     sentence = effect_sentence(effect_id, parameters)
     assert sentence.startswith("Left out: ")
     assert sentence.endswith(".")
     assert sentence.count(" at 90 %") == 1
     assert not re.search(r"[{}_]|nan|unknown|  ", sentence)
     hidden = {"B_front", "C_front", "B_rear", "C_rear", "axle"}  # shape factors say nothing to most readers
-    for p in EFFECTS[effect_id].parameters:
+    for p in CATALOGUE[effect_id].parameters:
         if p.name in hidden:
             continue
         shown = {number(abs(p.typical)), number(100 * abs(p.typical)), number(6000 * abs(p.typical))}
@@ -73,15 +73,15 @@ def test_every_effect_says_each_of_its_numbers_with_its_unit(effect_id: str) -> 
         assert unit in sentence or "%" in sentence
 
 
-@pytest.mark.parametrize("effect_id", EFFECTS)
+@pytest.mark.parametrize("effect_id", CATALOGUE)
 def test_every_effect_says_what_would_prove_it_wrong(effect_id: str) -> None:
     assert re.fullmatch(r"This would be wrong if .{20,}\.", wrong_sentence(effect_id))
 
 
-@pytest.mark.parametrize("effect_id", EFFECTS)
+@pytest.mark.parametrize("effect_id", CATALOGUE)
 def test_a_sentence_survives_missing_and_infinite_numbers(effect_id: str) -> None:
     assert effect_sentence(effect_id, {}).startswith("Left out: ")
-    odd = {p.name: Estimate(math.inf, math.nan, math.nan, math.inf, p.unit) for p in EFFECTS[effect_id].parameters}
+    odd = {p.name: Estimate(math.inf, math.nan, math.nan, math.inf, p.unit) for p in CATALOGUE[effect_id].parameters}
     assert "inf" not in effect_sentence(effect_id, odd).replace("infl", "")
 
 
@@ -108,7 +108,7 @@ def test_an_effect_beyond_the_catalogue_stands_for_itself() -> None:
 
 
 def test_look_alikes_hold_the_catalogue_both_ways() -> None:
-    assert set(LOOK_ALIKES) == set(EFFECTS)
+    assert set(LOOK_ALIKES) == set(CATALOGUE)
     assert all(a in LOOK_ALIKES[b] for a, b in PAIRS)
     assert set(LOOK_ALIKES["steering_lag"]) == {
         *("steering_delay", "steering_rate_limit", "tyre_relaxation", "velocity_filter_lag"),

@@ -92,6 +92,18 @@ def reference_rates(t, s, d, u, p, e):
     if has("torque_steer"):
         moment += e["torque_steer"]["coefficient"] * u
 
+    if has("wind"):
+        q = e["wind"]
+        air = np.array([vx, vy]) - q["speed"] * np.array([math.cos(q["direction"] - yaw), math.sin(q["direction"] - yaw)])
+        push = q["coefficient"] * (math.hypot(vx, vy) * np.array([vx, vy]) - np.linalg.norm(air) * air)
+        body_x, body_y = body_x + push[0], body_y + push[1]
+    if has("locked_axle"):
+        moment -= e["locked_axle"]["moment"] * math.tanh(r / max(abs(vx), 0.3))
+    if has("braking_pull") and u < 0:
+        moment -= e["braking_pull"]["coefficient"] * u
+    if has("coast_brake"):
+        body_x -= e["coast_brake"]["coefficient"] * vx * math.exp(-((u / 0.05) ** 2))
+
     side = vy + a * r
     slip_front = math.atan2(side * math.cos(d) - vx * math.sin(d), max(abs(vx * math.cos(d) + side * math.sin(d)), 0.3))
     slip_rear = math.atan2(vy - b * r, max(abs(vx), 0.3))
@@ -125,6 +137,10 @@ def reference_rates(t, s, d, u, p, e):
         w = 2 * math.pi * q["frequency"]
         roll_acc = w**2 * (steady - roll) - 2 * q["damping"] * w * roll_rate
         f_front, f_rear = (f * (1 - 0.3 * (roll**2 - steady**2)) for f in (f_front, f_rear))
+    if has("front_side_force"):
+        f_front += e["front_side_force"]["force"] * math.tanh(abs(vx) / 0.2)
+    if has("rear_side_force"):
+        f_rear += e["rear_side_force"]["force"] * math.tanh(abs(vx) / 0.2)
     lag_rates = (0.0, 0.0)
     if has("tyre_relaxation"):
         per_s = max(abs(vx), 0.3) / e["tyre_relaxation"]["length"]

@@ -1,0 +1,155 @@
+"""Physics outside the catalogue, which a diagnosis does not name.
+
+The simulator can have it like any effect, and a diagnosis keeps it as a rival, so that a name of the catalogue is not
+given to what one of these explains better.
+"""
+
+from __future__ import annotations
+
+import math
+
+from sim_backends.array_ops import Ops, Value
+from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, ObservationEffect, Parameters
+
+AT_REST_MPS = 0.2
+"""Speed over which a force of rolling wheels builds up."""
+SCRUB_FLOOR_MPS = 0.3
+SCRUB_CURVATURE = 1.0
+"""Curvature of the path at which the wheels of a locked axle begin to slide [1/m]."""
+STILL_AIR_M2PS2 = 1e-6
+COASTING = 0.05
+"""Throttle below which a speed controller brakes by itself."""
+
+
+class Wind(DynamicsEffect):
+    """A steady wind of ``speed`` that blows towards the world heading ``direction``.
+
+    With w the wind in the body frame, ``F += -coefficient (|v - w| (v - w) - |v| v)``: drag in moving air less that in
+    still air, so that a speed of zero does nothing.
+    """
+
+    id = "wind"
+    catalogued = False
+    sentence = "A steady wind blows over the floor."
+    class_statement = "depends on the heading, a direction of the world, and grows with speed, as the force of a steady wind"
+    parameters = (
+        EffectParameter("speed", "m/s", 0.0, 0.0, 30.0, 1.0),
+        EffectParameter("direction", "rad", 0.0, -2.0 * math.pi, 2.0 * math.pi, 1.0),
+        EffectParameter("coefficient", "N s2/m2", 0.1, 0.0, 10.0, 0.15),
+    )
+    look_alikes = ("road_slope",)
+
+    def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Blow."""
+        ahead = values["direction"] - forces.yaw
+        air_x = forces.vx - values["speed"] * ops.cos(ahead)
+        air_y = forces.vy - values["speed"] * ops.sin(ahead)
+        moving = ops.sqrt(air_x * air_x + air_y * air_y + STILL_AIR_M2PS2)
+        still = ops.sqrt(forces.vx * forces.vx + forces.vy * forces.vy + STILL_AIR_M2PS2)
+        forces.force_x = forces.force_x - values["coefficient"] * (moving * air_x - still * forces.vx)
+        forces.force_y = forces.force_y - values["coefficient"] * (moving * air_y - still * forces.vy)
+
+
+class FrontSideForce(DynamicsEffect):
+    """``F_y,front += force tanh(|vx| / 0.2 m/s)`` in the front wheels' frame: toe or camber of the front wheels."""
+
+    id = "front_side_force"
+    catalogued = False
+    order = 80
+    sentence = "Toe or camber of the front wheels pushes them to one side."
+    class_statement = "constant: a bias of the front wheels' side force, even in steering, as of toe or camber"
+    parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
+    look_alikes = ("steering_offset", "lateral_bias")
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Push to the left."""
+        forces.side_front = forces.side_front + values["force"] * ops.tanh(ops.abs(forces.vx) * (1.0 / AT_REST_MPS))
+
+
+class RearSideForce(DynamicsEffect):
+    """``F_y,rear += force tanh(|vx| / 0.2 m/s)``: toe or camber of the rear wheels."""
+
+    id = "rear_side_force"
+    catalogued = False
+    order = 80
+    sentence = "Toe or camber of the rear wheels pushes them to one side."
+    class_statement = "constant: a bias of the rear wheels' side force, even in steering, as of toe or camber"
+    parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
+    look_alikes = ("steering_offset", "lateral_bias")
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Push to the left."""
+        forces.side_rear = forces.side_rear + values["force"] * ops.tanh(ops.abs(forces.vx) * (1.0 / AT_REST_MPS))
+
+
+class LockedAxle(DynamicsEffect):
+    """``M -= moment tanh(curvature / (1 /m))``, curvature ``r / max(|vx|, 0.3 m/s)``: two wheels that turn as one.
+
+    The difference of the paths of both wheels makes them slide against each other, the more the tighter the turn is and
+    whatever its speed, until both slide wholly.
+    """
+
+    id = "locked_axle"
+    catalogued = False
+    sentence = "Two driven wheels that turn as one scrub in turns."
+    class_statement = "odd in the yaw rate, through the path's curvature whatever the speed, as of a locked differential"
+    parameters = (EffectParameter("moment", "N m", 0.0, 0.0, 20.0, 0.1),)
+    look_alikes = ("yaw_damping",)
+
+    def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Scrub."""
+        speed = ops.floor(ops.abs(forces.vx), SCRUB_FLOOR_MPS)
+        scrub = ops.tanh(forces.yaw_rate / speed * (1.0 / SCRUB_CURVATURE))
+        forces.moment = forces.moment - values["moment"] * scrub
+
+
+class BrakingPull(DynamicsEffect):
+    """``M += coefficient max(-u, 0)``: brakes that pull to one side."""
+
+    id = "braking_pull"
+    catalogued = False
+    sentence = "The brakes pull to one side."
+    class_statement = "follows negative throttle only: braking turns the car to one side"
+    parameters = (EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.2),)
+    look_alikes = ("torque_steer",)
+
+    def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Pull."""
+        forces.moment = forces.moment + values["coefficient"] * ops.floor(-forces.throttle, 0.0)
+
+
+class CoastBrake(DynamicsEffect):
+    """``F_x -= coefficient vx exp(-(u / 0.05)^2)``: a speed controller that brakes while the throttle is released."""
+
+    id = "coast_brake"
+    catalogued = False
+    sentence = "The motor brakes while the throttle is released."
+    class_statement = "odd in speed where there is no throttle, as of a motor that brakes while it coasts"
+    parameters = (EffectParameter("coefficient", "N s/m", 0.0, 0.0, 50.0, 0.5),)
+    look_alikes = ("rolling_resistance", "throttle_deadband")
+
+    def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Brake."""
+        share = forces.throttle * (1.0 / COASTING)
+        forces.force_x = ops.fms(values["coefficient"], forces.vx * ops.exp(-share * share), forces.force_x)
+
+
+class PositionScale(ObservationEffect):
+    """``p_meas = (1 + scale) p`` and so for the velocities: motion capture whose metre has another length."""
+
+    id = "position_scale"
+    catalogued = False
+    order = 50
+    sentence = "The metre of motion capture has another length."
+    class_statement = "every length and speed is proportionally too long or too short, as by a scale of motion capture"
+    parameters = (EffectParameter("scale", "1", 0.0, -0.5, 0.5, 0.03),)
+    look_alikes = ("marker_offset",)
+
+    def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
+        """Stretch."""
+        x, y, yaw, vx, vy, yaw_rate = state
+        stretch = 1.0 + values["scale"]
+        return x * stretch, y * stretch, yaw, vx * stretch, vy * stretch, yaw_rate
+
+
+UNCATALOGUED = (Wind(), FrontSideForce(), RearSideForce(), LockedAxle(), BrakingPull(), CoastBrake(), PositionScale())
