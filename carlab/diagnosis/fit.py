@@ -322,6 +322,20 @@ def clustered_gain(before: FloatArray, after: FloatArray, shots: Shots) -> tuple
     return float(gain.sum()), max(error, 1e-9)
 
 
+def inflation_of(fit: Fit, effect: str) -> float:
+    """How much dependent errors overstate the gain by an effect: sandwich over naive variance, at least one.
+
+    Twice the gain of several numbers is a sum of chi-squares weighted by such ratios, so their mean divides it.
+    Where the effect's own figure cannot be had (a clip that nothing touches), the middle one of all numbers stands in.
+    """
+    assert fit.deflation is not None
+    own = [
+        float(d) for f, d in zip(fit.free, fit.deflation, strict=True)
+        if f.name.startswith(f"effects.{effect}.") and d > 1e-9
+    ]  # fmt: skip
+    return max(fit.inflation, float(np.mean(own)) if own else 0.0)
+
+
 def with_effect(config: SimulatorConfig, effect_id: str) -> SimulatorConfig:
     """The simulator with one more effect, switched on at its identity or, where that is infinite, far from acting."""
     effect = EFFECTS[effect_id]

@@ -42,6 +42,9 @@ MISSING_SCORE = 1.2
 """Held-out score of the refit above which unnamed terms amount to missing physics."""
 MISSING_WITHOUT_FORMULA_SCORE = 1.8
 """The same where no term explains anything."""
+EVEN, STEEP = 8.0, 5.0
+"""Root of chi2 at which half of the names are right, and how fast they become surer: a logistic regression on the
+names that were given to development cases."""
 LAG_NAMES = ("time_constant", "delay", "extra_delay", "latency")
 THROTTLE_WORDS = ("throttle", "motor", "traction", "brake", "battery", "drag", "rolling", "slip")
 
@@ -81,6 +84,8 @@ class Judge:
             made.append(self._finding(name))
         for name, fit in self.found.history:
             self.ladder.append((f"+ {name}", self.held_out.score(self.held_out.final_error(fit.config))))
+        if self.found.history and self.found.history[-1][1] is not self.found.best:
+            self.ladder.append(("those that stay", self.held_out.score(self.errors["with_effects"])))
         return tuple(made)
 
     def _finding(self, name: str) -> EffectFinding:
@@ -94,7 +99,7 @@ class Judge:
         others = self.found.rivals.get(name, ())
         reduction = 1.0 - self.held_out.score(full) / max(self.held_out.score(error), 1e-12)
         evidence = Evidence(reduction, gain / spread, self.visibility(name), fingerprint)
-        confidence = 1.0 / (1.0 + math.exp(-(math.sqrt(max(self.found.chi2[name], 0.0)) - 4.0)))
+        confidence = 1.0 / (1.0 + (EVEN / math.sqrt(max(self.found.chi2[name], 1e-3))) ** STEEP)
         return EffectFinding(
             id=name,
             confidence=confidence / (1 + len(others)),

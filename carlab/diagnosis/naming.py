@@ -113,8 +113,9 @@ def unexplained(search: Search, what: Believed, share: float, error: FloatArray,
     words, formula = left.words(), left.formula()
     if outside is not None and outside.names == what.found.effects and outside.gain > AS_GOOD * left.gain:
         after = held_out.final_error(outside.fit.config)
-        fall = np.mean(squared - (after / held_out.floor) ** 2, axis=0)
-        words, formula = outside.words(), outside.formula()
+        if held_out.score(after) < held_out.score(error):
+            fall = np.mean(squared - (after / held_out.floor) ** 2, axis=0)
+            words, formula = outside.words(), outside.formula()
     if fall.max() <= 0.0:
         fall = np.maximum(squared.mean(axis=0) - 1.0, 0.0)
     size: FloatArray = np.sqrt(squared.mean(axis=1))

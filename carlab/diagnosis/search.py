@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.duels import CLOSE, SCREENED_SHOTS, UNSEEN_AT_MOST, deletions, duels, pruned
 from carlab.diagnosis.fit import (
     Fit,
     Fitter,
@@ -23,6 +24,7 @@ from carlab.diagnosis.fit import (
     base_parameters,
     clustered_gain,
     effect_parameters,
+    inflation_of,
     with_effect,
 )
 from carlab.diagnosis.prediction import Predictor, errors
@@ -33,13 +35,10 @@ from sim_backends.effects import CATALOGUE, EFFECTS
 
 log = logging.getLogger(__name__)
 
-SCREENED_SHOTS = 180
 REFITTED = 10
 FOLDS = 6
 WORTH = 0.1
 """Candidates that promise less than this share of the best promise are not refitted."""
-CLOSE = 0.3
-"""Candidates that gain less than this share of the best gain are not tried on unseen blocks."""
 ACCEPT_CHI2 = 25.0
 ACCEPT_CHI2_MORE = 8.0
 """For every further number of the effect, and where its identity is infinite: so many more places to overfit."""
@@ -53,14 +52,11 @@ STEADY_SHARE = 0.03
 KEEP_CHI2 = 16.0
 HOPELESS_CHI2 = 8.0
 """Candidates that promise less than this are not refitted."""
-SET_STANDARD_ERRORS = 2.0
 MAX_EFFECTS = 10
 SWAP_PROMISE = 0.7
 """A look-alike that promises this share of an effect's gain is tried in its place."""
 SETTLED = 0.03
 """Relative change of the scale of errors below which it has settled."""
-UNSEEN_AT_MOST = 12.0
-"""Standard deviations beyond which an error on an unseen block counts no more: one spin must not decide."""
 Progress = Callable[[str, float], None]
 
 
@@ -166,7 +162,8 @@ class Search:
             history.append((leader.effect, best))
             if set(effects) == set(before):
                 break
-        chi2, rivals = self._duels(effects, best, scale)
+        effects, best, apart = pruned(self, effects, best, scale)
+        chi2, rivals = duels(self, effects, best, scale, apart)
         ordered = tuple(sorted(effects, key=lambda e: -chi2[e]))
         return SearchResult(base, best, ordered, chi2, rivals, tuple(history), tried, scale)
 
@@ -175,7 +172,7 @@ class Search:
         if not names:
             return found.without_effects()
         fit = self.refit(names, found.best, found.scale)
-        chi2, rivals = self._duels(names, fit, found.scale)
+        chi2, rivals = duels(self, names, fit, found.scale, deletions(self, names, fit, found.scale))
         history = tuple((name, step) for name, step in found.history if name in names)
         return replace(found, best=fit, effects=names, chi2=chi2, rivals=rivals, history=history)
 
@@ -274,7 +271,7 @@ class Search:
         screen = Screen(Fitter(self.shots, scale), self.config_with(effects), best, SCREENED_SHOTS)
         found = []
         for name in self.allowed:
-            if name in effects or not self._tries(name):
+            if name in effects or not self.tries(name):
                 continue
             found.append(screen.promise(name, effect_parameters(name, self.nominal)))
         found.sort(key=lambda p: -p.gain)
@@ -284,7 +281,7 @@ class Search:
         """Loss of a perfect simulator: half for each whitened error."""
         return 0.5 * len(self.shots) * 36
 
-    def _tries(self, effect: str) -> bool:
+    def tries(self, effect: str) -> bool:
         """Whether an effect may be tried at all."""
         return effect in self.allowed and effect not in self.nominal.effects and usable(self.nominal, effect)
 
@@ -323,7 +320,7 @@ class Search:
                 return self._moved(rest, kept, scale)
             screen = Screen(fitter, self.config_with(rest), without, SCREENED_SHOTS)
             for other_name in self.look_alikes.get(name, ()):
-                if self.stop() or other_name in effects or not self._tries(other_name):
+                if self.stop() or other_name in effects or not self.tries(other_name):
                     continue
                 promise = screen.promise(other_name, effect_parameters(other_name, self.nominal))
                 if promise.gain < SWAP_PROMISE * (without.cost - best.cost):
@@ -338,57 +335,9 @@ class Search:
                     return (*rest, promise.effect), fit, scale
         return effects, best, scale
 
-    def _duels(
-        self, effects: tuple[str, ...], best: Fit, scale: Scale
-    ) -> tuple[dict[str, float], dict[str, tuple[str, ...]]]:
-        """How much each effect is needed, and which look-alikes unseen blocks do not tell from it."""
-        fitter = Fitter(self.shots, scale)
-        chi2: dict[str, float] = {}
-        rivals: dict[str, tuple[str, ...]] = {}
-        if not effects:
-            return chi2, rivals
-        whole = fitter.with_covariance(best)
-        own_loss = fitter.unseen(best, self.folds, UNSEEN_AT_MOST)
-        for name in effects:
-            rest = tuple(e for e in effects if e != name)
-            without = self.refit(rest, best, scale)
-            chi2[name] = 2.0 * (without.cost - best.cost) / inflation_of(whole, name)
-            others = [o for o in self.look_alikes.get(name, ()) if o not in effects and self._tries(o)]
-            close = []
-            screen = Screen(fitter, self.config_with(rest), without, SCREENED_SHOTS)
-            for other in others:
-                if self.stop():
-                    break
-                self.progress(f"{name} or {other}?", 0.95)
-                promise = screen.promise(other, effect_parameters(other, self.nominal))
-                rival = self.refitted(fitter, without, (*rest, other), promise)
-                if rival.gain < CLOSE * (without.cost - best.cost):
-                    continue
-                loss = fitter.unseen(rival.fit, self.folds, UNSEEN_AT_MOST)
-                gap, error = clustered_gain(loss, own_loss, self.shots)
-                log.info("duel %s - %s: %.1f (%.1f se)", name, other, gap, gap / error)
-                if gap < SET_STANDARD_ERRORS * error:
-                    close.append((gap, other))
-            rivals[name] = tuple(o for _, o in sorted(close)[:2])
-        return chi2, rivals
-
-
-def inflation_of(fit: Fit, effect: str) -> float:
-    """How much dependent errors overstate the gain by an effect: sandwich over naive variance, at least one.
-
-    Twice the gain of several numbers is a sum of chi-squares weighted by such ratios, so their mean divides it.
-    Where the effect's own figure cannot be had (a clip that nothing touches), the middle one of all numbers stands in.
-    """
-    assert fit.deflation is not None
-    own = [
-        float(d) for f, d in zip(fit.free, fit.deflation, strict=True)
-        if f.name.startswith(f"effects.{effect}.") and d > 1e-9
-    ]  # fmt: skip
-    return max(fit.inflation, float(np.mean(own)) if own else 0.0)
-
 
 def _values(free: Sequence[Free], z: FloatArray) -> dict[str, FloatArray]:
     return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
 
 
-__all__ = ["Candidate", "Search", "SearchResult", "inflation_of"]
+__all__ = ["Candidate", "Search", "SearchResult"]
