@@ -16,7 +16,7 @@ from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
-    from carlab.diagnosis.findings import DataFault, Diagnosis, RecordingUse
+    from carlab.diagnosis.findings import DataFault, Diagnosis, RecordingUse, Verdict
 
 EXIT_INCONCLUSIVE = 5
 DATA_FAULTS = (
@@ -92,10 +92,14 @@ class Diagnose:
                     stop=interrupts.requested.is_set,
                 )
             except Inconclusive as error:
-                fail(str(error))
                 known = error.data_faults or (*faults, *more)
-                self._write_inconclusive(str(error), known, (*uses, *others), car.simulator)
-                return EXIT_INCONCLUSIVE
+                why = str(error)
+                if error.verdict == "data":
+                    causes = ", ".join(sorted({f.id.replace("_", " ") for f in known}))
+                    why = f"The recording is at fault ({causes}), so no physics can be judged: {why}"
+                fail(why)
+                self._write_undecided(error.verdict, why, known, (*uses, *others), car.simulator)
+                return 0 if error.verdict == "data" else EXIT_INCONCLUSIVE
         write_report(outcome.diagnosis, outcome.exhibits, self.out, outcome.model)
         self._print(outcome.diagnosis)
         return 0
@@ -126,15 +130,20 @@ class Diagnose:
             uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))
         return episodes, faults, uses
 
-    def _write_inconclusive(
-        self, why: str, faults: tuple[DataFault, ...], uses: tuple[RecordingUse, ...], simulator: object
+    def _write_undecided(
+        self,
+        verdict: Verdict,
+        why: str,
+        faults: tuple[DataFault, ...],
+        uses: tuple[RecordingUse, ...],
+        simulator: object,
     ) -> None:
         from carlab.diagnosis.findings import Diagnosis, Exhibits
         from carlab.diagnosis.report import write_report
         from sim_backends.car_parameters import SimulatorConfig
 
         assert isinstance(simulator, SimulatorConfig)
-        diagnosis = Diagnosis("inconclusive", why, (), {}, 1.0, {}, None, faults, uses, self.seed, 0.0, why)
+        diagnosis = Diagnosis(verdict, why, (), {}, 1.0, {}, None, faults, uses, self.seed, 0.0, why)
         write_report(diagnosis, Exhibits(), self.out, simulator)
 
     def _print(self, diagnosis: Diagnosis) -> None:

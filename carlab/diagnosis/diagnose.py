@@ -17,6 +17,7 @@ from carlab.diagnosis.findings import (
     Diagnosis,
     Exhibits,
     RecordingUse,
+    Verdict,
 )
 from carlab.diagnosis.judge import HORIZON_S, Judge, Texts
 from carlab.diagnosis.naming import Believed, believed, unexplained
@@ -48,9 +49,13 @@ class Outcome:
 
 
 class Inconclusive(DataError):
-    """The recording cannot tell; the message says why and what to record. ``data_faults`` were found until then."""
+    """The recording cannot tell; the message says why and what to record.
+
+    ``data_faults`` were found until then; ``verdict`` is "data" where they, and not the drive, leave too little.
+    """
 
     data_faults: tuple[DataFault, ...] = ()
+    verdict: Verdict = "inconclusive"
 
 
 def diagnose(
@@ -87,6 +92,7 @@ def diagnose(
     clock = MonotonicClock()
     began_s = clock.now_s()
     progress("reading", 0.0)
+    recorded_s = sum(len(e.times_s) for e in fit) * nominal.control_period_s
     fit, held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
     data_faults = (*data_faults, *own_faults)
     progress("reading", 0.03)
@@ -97,6 +103,9 @@ def diagnose(
         held_shots = _thinned(_cut(held_tracks, HORIZON_S, SCORE_STRIDE_S), MAX_SCORED)
     except Inconclusive as error:
         error.data_faults = tuple(data_faults)
+        left_s = sum(len(track.t_s) * track.period_s for track in tracks_of(fit))
+        if data_faults and recorded_s >= MIN_SECONDS > left_s:
+            error.verdict = "data"
         raise
     noise = estimate_noise(fit_tracks)
     floor = np.sqrt(np.mean(noise_floor(shots, noise, nominal)[1:] ** 2, axis=0))

@@ -64,6 +64,25 @@ def test_a_recording_that_is_too_short_is_inconclusive(
     assert report["effects"] == []
 
 
+def test_a_recording_whose_tracking_is_lost_all_the_time_is_itself_at_fault(
+    concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Motion capture takes another body for the car for a third of a second in each second."""
+    rows = [r.split(",") for r in (concealed[0] / "fit.csv").read_text().splitlines()]
+    column = rows[0].index("x")
+    for k, row in enumerate(rows[1:]):
+        if k % 12 < 4:
+            row[column] = str(float(row[column]) + 2.0)
+    path = tmp_path / "swapped.csv"
+    path.write_text("\n".join(",".join(row) for row in rows) + "\n")
+    assert run(["diagnose", str(path), "--out", str(tmp_path / "out")]) == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["verdict"] == "data"
+    assert report["effects"] == []
+    assert "outliers" in {fault["id"] for fault in report["data_faults"]}
+    assert "The recording is at fault" in " ".join(capfd.readouterr().err.split())
+
+
 def test_a_constant_command_is_inconclusive_and_names_the_drive_that_varies_it(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -94,7 +94,8 @@ def reference_rates(t, s, d, u, p, e):
 
     if has("wind"):
         q = e["wind"]
-        air = np.array([vx, vy]) - q["speed"] * np.array([math.cos(q["direction"] - yaw), math.sin(q["direction"] - yaw)])
+        ahead = q["direction"] - yaw
+        air = np.array([vx, vy]) - q["speed"] * np.array([math.cos(ahead), math.sin(ahead)])
         push = q["coefficient"] * (math.hypot(vx, vy) * np.array([vx, vy]) - np.linalg.norm(air) * air)
         body_x, body_y = body_x + push[0], body_y + push[1]
     if has("locked_axle"):
