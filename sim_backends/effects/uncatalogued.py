@@ -31,7 +31,7 @@ class Wind(DynamicsEffect):
     id = "wind"
     catalogued = False
     sentence = "A steady wind blows over the floor."
-    class_statement = "depends on the heading, a direction of the world, and grows with speed, as the force of a steady wind"
+    class_statement = "depends on the heading, a direction of the world, and grows with speed, as a steady wind's force"
     parameters = (
         EffectParameter("speed", "m/s", 0.0, 0.0, 30.0, 1.0),
         EffectParameter("direction", "rad", 0.0, -2.0 * math.pi, 2.0 * math.pi, 1.0),
@@ -92,7 +92,7 @@ class LockedAxle(DynamicsEffect):
     id = "locked_axle"
     catalogued = False
     sentence = "Two driven wheels that turn as one scrub in turns."
-    class_statement = "odd in the yaw rate, through the path's curvature whatever the speed, as of a locked differential"
+    class_statement = "odd in the yaw rate, by the path's curvature whatever the speed, as of a locked differential"
     parameters = (EffectParameter("moment", "N m", 0.0, 0.0, 20.0, 0.1),)
     look_alikes = ("yaw_damping",)
 
