@@ -132,7 +132,9 @@ def diagnose(
     errors_of = judge.errors
     score = {name: held.score(error) for name, error in errors_of.items()}
     share = _share_left(score)
-    rest = unexplained(search, what, share, errors_of["with_effects"], held) if share >= MIN_SHARE else None
+    rest, model = None, None
+    if share >= MIN_SHARE:
+        rest, model = unexplained(search, what, share, errors_of["with_effects"], held)
     verdict = judge.verdict(what.something, data_faults)
     progress("drawing", 0.95)
     exhibits = judge.exhibits(held_tracks)
@@ -150,7 +152,7 @@ def diagnose(
         seed=seed,
         seconds=clock.now_s() - began_s,
     )
-    return Outcome(diagnosis, exhibits, found.best.config)
+    return Outcome(diagnosis, exhibits, model or found.best.config)
 
 
 def _share_left(score: Mapping[str, float]) -> float:

@@ -19,6 +19,7 @@ from carlab.diagnosis.fit import Fitter
 from carlab.diagnosis.scoring import HeldOut
 from carlab.diagnosis.search import Search, SearchResult
 from carlab.diagnosis.unexplained import Rest, describe, missing_terms, start_features
+from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
 
@@ -95,8 +96,10 @@ def _contradicted(found: SearchResult, held_out: HeldOut) -> bool:
     return held_out.score(with_names) > held_out.score(without) and held_out.gain(without, with_names)[0] < 0.0
 
 
-def unexplained(search: Search, what: Believed, share: float, error: FloatArray, held_out: HeldOut) -> Unexplained:
-    """What is said of the rest.
+def unexplained(
+    search: Search, what: Believed, share: float, error: FloatArray, held_out: HeldOut
+) -> tuple[Unexplained, SimulatorConfig | None]:
+    """What is said of the rest, and the simulator with it where physics outside the catalogue is what it is.
 
     Args:
         search: with its shots.
@@ -111,15 +114,18 @@ def unexplained(search: Search, what: Believed, share: float, error: FloatArray,
     squared = (error / held_out.floor) ** 2
     fall: FloatArray = left.fall / held_out.floor**2
     words, formula = left.words(), left.formula()
+    model = None
     if outside is not None and outside.names == what.found.effects and outside.gain > AS_GOOD * left.gain:
         after = held_out.final_error(outside.fit.config)
         if held_out.score(after) < held_out.score(error):
             fall = np.mean(squared - (after / held_out.floor) ** 2, axis=0)
-            words, formula = outside.words(), outside.formula()
+            before_score, after_score = held_out.score(error), held_out.score(after)
+            words = f"{outside.words()} (with it in model.toml the score is {after_score:.3g}, not {before_score:.3g})"
+            formula, model = outside.formula(), outside.fit.config
     if fall.max() <= 0.0:
         fall = np.maximum(squared.mean(axis=0) - 1.0, 0.0)
     size: FloatArray = np.sqrt(squared.mean(axis=1))
-    return describe(share, words, formula, fall, size, start_features(held_out.shots))
+    return describe(share, words, formula, fall, size, start_features(held_out.shots)), model
 
 
 __all__ = ["Believed", "believed", "unexplained"]

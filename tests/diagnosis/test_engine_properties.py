@@ -20,6 +20,7 @@ from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separatin
 from carlab.diagnosis.residual_terms import TERMS, responses
 from carlab.diagnosis.shots import Shots, cut, estimate_noise, tracks_of
 from carlab.recording.foreign_csv import import_csv
+from sim_backends.effects import EFFECTS
 
 Table = dict[str, np.ndarray]
 TEXTS = Texts(effect_sentence, separating_drive, LOOK_ALIKES)
@@ -130,10 +131,12 @@ def test_a_name_is_not_given_to_what_something_outside_the_catalogue_explains_be
     """By itself the nearest name of the catalogue would do."""
     case = make_case("outside", 43, effects=(concealed,), excess=1.5, fit_s=60, hold_s=30)
     folder = write(tmp_path, case)
-    found = outcome(folder).diagnosis
+    whole = outcome(folder)
+    found = whole.diagnosis
     assert found.effects == ()
     assert found.unexplained is not None
     assert said in found.unexplained.kind
+    assert {e for e in whole.model.effects if not EFFECTS[e].catalogued}
     told = outcome(folder, effects=(taken_for,)).diagnosis
     assert [e.id for e in told.effects] == [taken_for]
 
