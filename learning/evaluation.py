@@ -1,0 +1,71 @@
+"""How good a probabilistic prediction is: joint log-likelihood, error, and calibration."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.977, 0.99)
+"""Nominal coverages at which calibration is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mixture:
+    """Equally weighted Gaussians: means (L, N, O) and standard deviations that broadcast against them."""
+
+    means: Tensor
+    stds: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean (N, O)."""
+        return self.means.mean(dim=0)
+
+    @property
+    def epistemic_std(self) -> Tensor:
+        """Spread of the components' means (N, O)."""
+        return self.means.std(dim=0, correction=0)
+
+    @property
+    def aleatoric_std(self) -> Tensor:
+        """Root of the components' mean variance (N, O)."""
+        return (self.stds**2).expand_as(self.means).mean(dim=0).sqrt()
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviation of the mixture (N, O), by the law of total variance."""
+        return (self.epistemic_std**2 + self.aleatoric_std**2).sqrt()
+
+    def log_density(self, targets: Tensor) -> Tensor:
+        """Joint log density (N,) of targets (N, O)."""
+        white = (targets - self.means) / self.stds
+        each = -0.5 * white**2 - self.stds.log() - 0.5 * math.log(2.0 * math.pi)
+        return torch.logsumexp(each.sum(dim=2), dim=0) - math.log(len(self.means))
+
+
+def negative_log_likelihood(prediction: Mixture, targets: Tensor) -> float:
+    """Mean over points of the joint negative log density of all outputs [nat]."""
+    return -float(prediction.log_density(targets).mean())
+
+
+def root_mean_square_error(prediction: Mixture, targets: Tensor) -> float:
+    """Root of the squared error of the mean, summed over outputs and averaged over points."""
+    return float(((prediction.mean - targets) ** 2).sum(dim=1).mean().sqrt())
+
+
+def calibration_error(prediction: Mixture, targets: Tensor) -> float:
+    """Mean absolute difference of empirical and nominal coverage over ``LEVELS`` and outputs.
+
+    Central intervals of a Gaussian with the mixture's mean and standard deviation, as the authors measure it.
+    """
+    white = ((targets - prediction.mean) / prediction.std).abs()
+    levels = torch.tensor(LEVELS, dtype=white.dtype, device=white.device)
+    bounds = math.sqrt(2.0) * torch.erfinv(levels)
+    covered = (white[None] <= bounds[:, None, None]).to(white.dtype).mean(dim=1)
+    return float((covered - levels[:, None]).abs().mean())
+
+
+__all__ = ["LEVELS", "Mixture", "calibration_error", "negative_log_likelihood", "root_mean_square_error"]

@@ -1,0 +1,237 @@
+"""Fitting particles of a network to data and to a prior over functions: (Sim-)FSVGD.
+
+Each step draws a measurement set (a minibatch of the data and points of the domain), adds the score of the likelihood
+to that of the prior's Gaussian marginals there, and moves the particles along Stein's direction, pulled back to their
+parameters (Rothfuss et al., arXiv 2403.16644, algorithm 1; Wang et al. 2019 for the update in function space).
+
+What differs from the authors' code, on purpose: driving and repulsive term are both averaged over the particles; draws
+of the simulator are taken once, for the data and for a pool of domain points, from which measurement sets are drawn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from learning.evaluation import Mixture
+from learning.function_prior import JITTER, Marginal, RbfCovariance, gaussian_process, simulator_marginal
+from learning.normaliser import Normaliser
+from learning.particles import Network
+from learning.stein import RbfKernel, median_bandwidth, stein_direction
+
+CHECKED_EVERY = 500
+LEAST_NOISE = 1e-4
+"""Floor of the likelihood's standard deviation, in normalised units."""
+
+
+class FunctionPrior(Protocol):
+    """A prior over functions on a pool of inputs, in normalised units."""
+
+    def marginal(self, chosen: Tensor) -> Marginal:
+        """Gaussian at the pool's inputs with indices ``chosen`` (N,)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class GaussianProcessPrior:
+    """A zero-mean Gaussian process on normalised inputs (M, D)."""
+
+    inputs: Tensor
+    covariance: RbfCovariance
+    jitter: float = 1e-3
+
+    def marginal(self, chosen: Tensor) -> Marginal:
+        """Gaussian at some of the inputs."""
+        return gaussian_process(self.inputs[chosen], self.covariance, self.jitter)
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorPrior:
+    """Draws of a simulator and the covariance of what it leaves out.
+
+    Attributes:
+        draws: normalised outputs of P simulators at all inputs of the pool (P, M, O).
+        gap_inputs: the pool as the gap's covariance sees it (M, G).
+        gap: its covariance in normalised outputs; none where the simulator is trusted.
+    """
+
+    draws: Tensor
+    gap_inputs: Tensor
+    gap: RbfCovariance | None = None
+    jitter: float = JITTER
+
+    def marginal(self, chosen: Tensor) -> Marginal:
+        """Gaussian with the moments of the draws at some of the inputs."""
+        return simulator_marginal(self.draws[:, chosen], self.gap_inputs[chosen], self.gap, self.jitter)
+
+
+@dataclass(frozen=True, slots=True)
+class FsvgdSettings:
+    """How particles are fitted.
+
+    Attributes:
+        particles: how many.
+        hidden: widths of each particle's hidden layers.
+        steps: of the optimiser.
+        batch: rows of data in a measurement set; all of them where there are fewer.
+        measurement_points: points of the domain in a measurement set.
+        bandwidth: of the kernel on flattened normalised function values; by the median heuristic at each step if None.
+        learning_rate: of Adam at the start; it falls to a hundredth along a half cosine.
+        weight_decay: of AdamW, on the networks alone.
+        noise_std: standard deviation of the likelihood at the start, normalised, one or one for each output.
+        learn_noise: whether it is fitted too.
+        likelihood_exponent: power of the likelihood.
+        seed: of everything that is drawn.
+    """
+
+    particles: int = 20
+    hidden: tuple[int, ...] = (64, 64, 64)
+    steps: int = 5000
+    batch: int = 32
+    measurement_points: int = 16
+    bandwidth: float | None = None
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-3
+    noise_std: float | tuple[float, ...] = 0.1
+    learn_noise: bool = True
+    likelihood_exponent: float = 1.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """Fitted particles: a model of dynamics with its uncertainty.
+
+    Attributes:
+        network: their shape.
+        parameters: (L, P).
+        noise_std: of the likelihood, normalised (O,).
+        normaliser: between raw and normalised units.
+    """
+
+    network: Network
+    parameters: Tensor
+    noise_std: Tensor
+    normaliser: Normaliser
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Prediction at raw inputs (N, D), in raw units."""
+        with torch.no_grad():
+            values = self.network(self.parameters, self.normaliser.inputs(inputs))
+        return Mixture(
+            self.normaliser.raw_outputs(values), (self.noise_std * self.normaliser.output_std).expand(1, 1, -1)
+        )
+
+
+@dataclass
+class _State:
+    """What an optimiser moves: networks, and the logarithm of the noise."""
+
+    networks: Tensor
+    log_noise: Tensor
+    optimiser: torch.optim.Optimizer = field(init=False)
+
+    def prepare(self, settings: FsvgdSettings) -> None:
+        groups = [{"params": [self.networks], "weight_decay": settings.weight_decay}]
+        if settings.learn_noise:
+            groups.append({"params": [self.log_noise], "weight_decay": 0.0})
+        self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
+
+
+def fit(
+    inputs: Tensor,
+    outputs: Tensor,
+    pool: Tensor,
+    prior: FunctionPrior | None,
+    normaliser: Normaliser,
+    settings: FsvgdSettings,
+    progress: Callable[[int], None] = lambda step: None,
+) -> Posterior:
+    """Fit particles to data and prior.
+
+    Args:
+        inputs: raw inputs of the data (n, D); may be empty, then the prior alone is fitted.
+        outputs: raw outputs (n, O).
+        pool: raw inputs of the domain (M, D).
+        prior: over functions, its pool being the data's inputs and then ``pool``; none is allowed where there is data.
+        normaliser: of inputs and outputs.
+        settings: how.
+        progress: told the number of steps done, from time to time.
+
+    Raises:
+        DataError: there is nothing to fit, or numbers are missing or infinite; says what to do.
+    """
+    count = len(inputs)
+    if count == 0 and prior is None:
+        raise DataError("There is neither data nor a prior to fit; record an episode, or name a car file as the prior.")
+    if len(outputs) != count:
+        raise DataError(f"There are {count} rows of inputs and {len(outputs)} of outputs; each row needs both.")
+    if not (torch.isfinite(inputs).all() and torch.isfinite(outputs).all() and torch.isfinite(pool).all()):
+        raise DataError("The data holds numbers that are missing or infinite; leave those rows out and fit again.")
+    device = pool.device
+    generator = torch.Generator().manual_seed(settings.seed)
+    width = len(normaliser.output_mean)
+    network = Network(pool.shape[1], width, settings.hidden)
+    everything = normaliser.inputs(torch.cat([inputs, pool]))
+    targets = normaliser.outputs(outputs)
+    noise = torch.as_tensor(settings.noise_std, dtype=everything.dtype).expand(width).to(device)
+    state = _State(
+        network.initial(settings.particles, generator, device).to(everything.dtype), noise.clamp_min(LEAST_NOISE).log()
+    )
+    state.prepare(settings)
+    points = settings.measurement_points if prior is not None or count == 0 else 0
+    for step in range(settings.steps):
+        rate = settings.learning_rate * (0.01 + 0.495 * (1.0 + math.cos(math.pi * step / settings.steps)))
+        for group in state.optimiser.param_groups:
+            group["lr"] = rate
+        rows = _rows(count, settings.batch, generator)
+        others = count + torch.randint(len(pool), (points,), generator=generator)
+        _step(network, state, everything, targets, rows.to(device), others.to(device), prior, settings)
+        if (step + 1) % CHECKED_EVERY == 0:
+            progress(step + 1)
+    if not torch.isfinite(state.networks).all():
+        raise DataError("The fit diverged; fit again with a smaller learning rate.")
+    return Posterior(network, state.networks, state.log_noise.exp().clamp_min(LEAST_NOISE), normaliser)
+
+
+def _rows(count: int, batch: int, generator: torch.Generator) -> Tensor:
+    if count <= batch:
+        return torch.arange(count)
+    return torch.randint(count, (batch,), generator=generator)
+
+
+def _step(
+    network: Network,
+    state: _State,
+    everything: Tensor,
+    targets: Tensor,
+    rows: Tensor,
+    others: Tensor,
+    prior: FunctionPrior | None,
+    settings: FsvgdSettings,
+) -> None:
+    """One step of the optimiser at the measurement set of data ``rows`` and of ``others`` in ``everything``."""
+    chosen = torch.cat([rows, others])
+    values, pullback = network.values_and_pullback(state.networks, everything[chosen])
+    score = torch.zeros_like(values) if prior is None else prior.marginal(chosen).score(values)
+    if len(rows):
+        noise = state.log_noise.exp().clamp_min(LEAST_NOISE)
+        off = targets[rows] - values[:, : len(rows)]
+        weight = settings.likelihood_exponent * len(targets) / len(rows)
+        score[:, : len(rows)] += weight * off / noise**2
+        if settings.learn_noise:
+            # Gradient of the particles' mean negative log-likelihood by the logarithm of the noise.
+            square = (off * off).mean(dim=0).sum(dim=0) / noise**2
+            state.log_noise.grad = weight * (len(rows) - square)
+    kernel = RbfKernel(settings.bandwidth or median_bandwidth(values.flatten(1)))
+    state.networks.grad = -pullback(stein_direction(values, score, kernel))
+    state.optimiser.step()
+
+
+__all__ = ["FsvgdSettings", "FunctionPrior", "GaussianProcessPrior", "Posterior", "SimulatorPrior", "fit"]

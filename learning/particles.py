@@ -1,0 +1,121 @@
+"""Particles of a Bayesian neural network: many small networks of one shape as one tensor of parameters.
+
+Every particle is an MLP with leaky ReLUs and a linear head. Parameters of all particles lie in one tensor (L, P), so
+that one batched product runs all of them and an optimiser sees one leaf.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+SLOPE = 0.01
+"""Of the leaky ReLU below zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """Shape of a particle.
+
+    Attributes:
+        inputs: number of inputs.
+        outputs: number of outputs.
+        hidden: width of each hidden layer; the authors use three of 64.
+    """
+
+    inputs: int
+    outputs: int
+    hidden: tuple[int, ...] = (64, 64, 64)
+
+    @property
+    def layers(self) -> tuple[tuple[int, int], ...]:
+        """Inputs and outputs of each layer."""
+        sizes = (self.inputs, *self.hidden, self.outputs)
+        return tuple(pairwise(sizes))
+
+    @property
+    def parameters(self) -> int:
+        """Numbers of one particle."""
+        return sum((fan_in + 1) * fan_out for fan_in, fan_out in self.layers)
+
+    def initial(self, particles: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Tensor:
+        """Parameters (L, P): He-uniform hidden weights, small uniform biases, a head without bias.
+
+        Drawn on the generator's device and moved, so that a seed means the same numbers everywhere.
+        """
+        parts: list[Tensor] = []
+        last = len(self.layers) - 1
+        for k, (fan_in, fan_out) in enumerate(self.layers):
+            spread = math.sqrt((3.0 if k == last else 6.0) / fan_in)
+            weights = torch.rand((particles, fan_in * fan_out), generator=generator) * 2.0 - 1.0
+            biases = torch.rand((particles, fan_out), generator=generator) * 2.0 - 1.0
+            parts += [weights * spread, biases * (0.0 if k == last else 1.0 / math.sqrt(fan_in))]
+        return torch.cat(parts, dim=1).to(device)
+
+    def split(self, parameters: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Weights (L, in, out) and biases (L, 1, out) of each layer, as views of the parameters (L, P)."""
+        found, begin = [], 0
+        for fan_in, fan_out in self.layers:
+            weights = parameters[:, begin : begin + fan_in * fan_out].view(-1, fan_in, fan_out)
+            begin += fan_in * fan_out
+            found.append((weights, parameters[:, begin : begin + fan_out].unsqueeze(1)))
+            begin += fan_out
+        return found
+
+    def __call__(self, parameters: Tensor, inputs: Tensor) -> Tensor:
+        """Outputs (L, N, O) of all particles at inputs (N, D), or at inputs of their own (L, N, D)."""
+        values = inputs if inputs.ndim == 3 else inputs.expand(len(parameters), *inputs.shape)
+        *hidden, (weights, biases) = self.split(parameters)
+        for w, b in hidden:
+            values = functional.leaky_relu(torch.baddbmm(b, values, w), SLOPE)
+        return torch.baddbmm(biases, values, weights)
+
+    def gradient(self, parameters: Tensor, inputs: Tensor, direction: Tensor) -> Tensor:
+        """``sum(direction * outputs)`` differentiated by the parameters (L, P), without a tape.
+
+        The chain rule by hand costs a fraction of what autograd's bookkeeping does at these sizes.
+
+        Args:
+            parameters: (L, P).
+            inputs: (N, D).
+            direction: by outputs (L, N, O).
+        """
+        return self.values_and_pullback(parameters, inputs)[1](direction)
+
+    def values_and_pullback(self, parameters: Tensor, inputs: Tensor) -> tuple[Tensor, Pullback]:
+        """Outputs (L, N, O), and what turns a direction on them into one on the parameters."""
+        layers = self.split(parameters)
+        seen = [inputs.expand(len(parameters), *inputs.shape)]
+        for w, b in layers[:-1]:
+            seen.append(functional.leaky_relu(torch.baddbmm(b, seen[-1], w), SLOPE))
+        outputs = torch.baddbmm(layers[-1][1], seen[-1], layers[-1][0])
+        return outputs, Pullback(parameters, layers, seen)
+
+
+@dataclass(frozen=True, slots=True)
+class Pullback:
+    """The derivative of a forward pass: parameters (L, P), its layers, and what each layer was given."""
+
+    parameters: Tensor
+    layers: Sequence[tuple[Tensor, Tensor]]
+    seen: Sequence[Tensor]
+
+    def __call__(self, direction: Tensor) -> Tensor:
+        """Gradient (L, P) of ``sum(direction * outputs)``."""
+        parts: list[Tensor] = []
+        for k in range(len(self.layers) - 1, -1, -1):
+            weights, given = self.layers[k][0], self.seen[k]
+            parts += [direction.sum(dim=1), torch.bmm(given.transpose(1, 2), direction).flatten(1)]
+            if k:
+                direction = torch.bmm(direction, weights.transpose(1, 2))
+                direction = torch.where(given > 0.0, direction, SLOPE * direction)
+        return torch.cat(parts[::-1], dim=1)
+
+
+__all__ = ["Network", "Pullback"]

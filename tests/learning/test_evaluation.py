@@ -1,0 +1,42 @@
+"""Figures of merit against scipy and against draws."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from learning.evaluation import Mixture, calibration_error, negative_log_likelihood, root_mean_square_error
+
+
+def random(*shape, seed=0):
+    return torch.tensor(np.random.default_rng(seed).normal(size=shape))
+
+
+def test_the_joint_density_of_a_mixture_is_scipys():
+    prediction = Mixture(random(4, 5, 3), random(1, 1, 3, seed=1).exp())
+    targets = random(5, 3, seed=2)
+    each = norm(prediction.means.numpy(), prediction.stds.numpy()).pdf(targets.numpy()).prod(axis=2)
+    assert np.allclose(prediction.log_density(targets), np.log(each.mean(axis=0)), atol=1e-12)
+    assert negative_log_likelihood(prediction, targets) == pytest.approx(-np.log(each.mean(axis=0)).mean())
+
+
+def test_the_spread_is_that_of_draws_from_it():
+    prediction = Mixture(random(3, 2, 2), random(3, 1, 2, seed=1).exp())
+    rng = np.random.default_rng(3)
+    which = rng.integers(3, size=400_000)
+    stds = prediction.stds.expand_as(prediction.means).numpy()
+    draws = prediction.means.numpy()[which] + stds[which] * rng.normal(size=(len(which), 2, 2))
+    assert np.allclose(prediction.mean, draws.mean(axis=0), atol=0.02)
+    assert np.allclose(prediction.std, draws.std(axis=0), rtol=0.01)
+
+
+def test_the_error_is_summed_over_outputs():
+    prediction = Mixture(torch.zeros(2, 4, 3), torch.ones(1, 1, 3))
+    assert root_mean_square_error(prediction, torch.full((4, 3), 2.0)) == pytest.approx(np.sqrt(12.0))
+
+
+@pytest.mark.parametrize(("factor", "least", "most"), [(1.0, 0.0, 0.01), (3.0, 0.15, 0.4), (1 / 3, 0.3, 0.8)])
+def test_calibration_sees_spreads_that_are_too_wide_or_too_narrow(factor, least, most):
+    truth = random(20_000, 2)
+    error = calibration_error(Mixture(torch.zeros(1, 20_000, 2).double(), factor * torch.ones(1, 1, 2)), truth)
+    assert least <= error <= most

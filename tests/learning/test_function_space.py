@@ -1,0 +1,160 @@
+"""Networks, Stein directions and priors over functions against autograd, finite differences and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+from scipy.stats import multivariate_normal
+
+from learning.function_prior import RbfCovariance, gaussian_process, simulator_marginal
+from learning.particles import SLOPE, Network
+from learning.stein import RbfKernel, median_bandwidth, stein_direction
+
+torch.set_default_dtype(torch.float32)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def normal(*shape, seed=0):
+    return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+class TestNetwork:
+    network = Network(3, 2, (8, 5))
+
+    def test_each_particle_is_an_ordinary_network(self):
+        parameters, inputs = self.network.initial(4, generator()).double(), normal(6, 3)
+        ours = self.network(parameters, inputs)
+        for particle in range(4):
+            layers, begin = [], 0
+            for fan_in, fan_out in ((3, 8), (8, 5), (5, 2)):
+                layer = torch.nn.Linear(fan_in, fan_out).double()
+                weights = parameters[particle, begin : begin + fan_in * fan_out].reshape(fan_in, fan_out)
+                begin += fan_in * fan_out
+                with torch.no_grad():
+                    layer.weight.copy_(weights.T)
+                    layer.bias.copy_(parameters[particle, begin : begin + fan_out])
+                begin += fan_out
+                layers += [layer, torch.nn.LeakyReLU(SLOPE)]
+            theirs = torch.nn.Sequential(*layers[:-1])(inputs)
+            assert torch.allclose(ours[particle], theirs, atol=1e-12)
+        assert begin == self.network.parameters
+
+    def test_particles_may_have_inputs_of_their_own(self):
+        parameters, inputs = self.network.initial(4, generator()).double(), normal(4, 6, 3)
+        ours = self.network(parameters, inputs)
+        for particle in range(4):
+            alone = self.network(parameters[particle : particle + 1], inputs[particle])
+            assert torch.allclose(ours[particle], alone[0], atol=1e-12)
+
+    def test_the_gradient_without_a_tape_is_autograds(self):
+        parameters = self.network.initial(4, generator()).double().requires_grad_()
+        inputs, direction = normal(6, 3), normal(4, 6, 2, seed=1)
+        (self.network(parameters, inputs) * direction).sum().backward()
+        with torch.no_grad():
+            ours = self.network.gradient(parameters, inputs, direction)
+        assert torch.allclose(ours, parameters.grad, atol=1e-12)
+
+    def test_a_seed_means_the_same_numbers_and_particles_differ(self):
+        first, second = self.network.initial(3, generator(4)), self.network.initial(3, generator(4))
+        assert torch.equal(first, second)
+        assert not torch.equal(first[0], first[1])
+
+    def test_signals_keep_their_size_through_many_layers(self):
+        """He et al. 2015: the variance of a layer's output is that of its input."""
+        deep = Network(64, 64, (64,) * 8)
+        out = deep(deep.initial(20, generator()), torch.randn(256, 64, generator=generator(1)))
+        assert 0.3 < float(out.std()) < 3.0
+
+
+class TestStein:
+    def test_the_kernel_is_scipys_distance(self):
+        values = normal(5, 7)
+        theirs = np.exp(-0.5 * cdist(values, values, "sqeuclidean") / 1.7**2)
+        assert np.allclose(RbfKernel(1.7)(values), theirs, atol=1e-12)
+
+    def test_the_repulsion_is_the_kernels_gradient_by_finite_differences(self):
+        values, kernel, step = normal(4, 3), RbfKernel(1.3), 1e-6
+        ours = kernel.repulsion(values, kernel(values))
+        for which in range(4):
+            for k in range(3):
+                total = 0.0
+                for i in range(4):
+                    up, down = values[i].clone(), values[i].clone()
+                    up[k] += step
+                    down[k] -= step
+                    of = [math.exp(-0.5 * float(((v - values[which]) ** 2).sum()) / 1.3**2) for v in (up, down)]
+                    total += (of[0] - of[1]) / (2 * step)
+                assert float(ours[which, k]) == pytest.approx(total, abs=1e-7)
+
+    def test_one_particle_climbs_to_the_mode(self):
+        values, score = normal(1, 4, 2), normal(1, 4, 2, seed=1)
+        assert torch.allclose(stein_direction(values, score, RbfKernel(0.7)), score)
+
+    def test_particles_become_a_sample_of_a_gaussian(self):
+        """Mean and covariance of a correlated Gaussian in three dimensions."""
+        root = torch.tensor([[1.0, 0, 0], [0.8, 0.6, 0], [-0.3, 0.4, 0.7]], dtype=torch.float64)
+        covariance, mean = root @ root.T, torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+        values = 0.3 * normal(150, 3)
+        precision = torch.linalg.inv(covariance)
+        for _ in range(1500):
+            kernel = RbfKernel(median_bandwidth(values))
+            values = values + 0.3 * stein_direction(values, -(values - mean) @ precision, kernel)
+        assert torch.allclose(values.mean(dim=0), mean, atol=0.02)
+        assert torch.allclose(torch.cov(values.T), covariance, atol=0.12)
+
+
+class TestPriors:
+    inputs = normal(6, 2)
+    covariance = RbfCovariance((0.7, 1.9), (0.8, 1.5))
+
+    def test_a_gaussian_process_has_the_score_and_density_of_its_marginal(self):
+        values = normal(3, 6, 2, seed=2).requires_grad_()
+        prior = gaussian_process(self.inputs, self.covariance, jitter=1e-3)
+        scaled = (self.inputs / torch.tensor([0.8, 1.5])).numpy()
+        shape = np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean"))
+        theirs = sum(
+            multivariate_normal(np.zeros(6), s**2 * shape + 1e-3 * np.eye(6)).logpdf(values.detach().numpy()[:, :, k])
+            for k, s in enumerate((0.7, 1.9))
+        )
+        density = prior.log_density(values)
+        assert np.allclose(density.detach(), theirs, atol=1e-9)
+        density.sum().backward()
+        assert torch.allclose(prior.score(values.detach()), values.grad, atol=1e-8)
+
+    def test_a_linear_simulator_has_the_score_of_its_closed_form(self):
+        """y = a x + b with Gaussian a, b: the marginal has covariance x x' s_a^2 + s_b^2, exactly."""
+        draws = normal(40_000, 2) * torch.tensor([0.5, 0.2]) + torch.tensor([1.0, -0.3])
+        x = self.inputs[:, :1]
+        outputs = (draws[:, None, :1] * x + draws[:, None, 1:]).view(-1, 6, 1)
+        gap = RbfCovariance((0.3,), (1.0, 1.0))
+        prior = simulator_marginal(outputs, self.inputs, gap, jitter=0.05)
+        distance = cdist(self.inputs, self.inputs, "sqeuclidean")
+        exact = 0.25 * (x @ x.T).numpy() + 0.04 + 0.09 * np.exp(-0.5 * distance) + 0.05 * np.eye(6)
+        values = normal(3, 6, 1, seed=3)
+        off = values[:, :, 0].numpy() - (1.0 * x[:, 0].numpy() - 0.3)
+        assert np.allclose(prior.score(values)[:, :, 0], -np.linalg.solve(exact, off.T).T, rtol=0.05, atol=0.05)
+
+    def test_the_posterior_of_bayesian_linear_regression_is_reached(self):
+        """Function-space particles with the exact prior score and a likelihood against the conjugate posterior."""
+        x = torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]
+        features = torch.cat([x, torch.ones_like(x)], dim=1)
+        noise, seen = 0.3, torch.tensor([-0.9, 0.2, 1.4], dtype=torch.float64)
+        measured = [0, 2, 4]
+        prior = features @ features.T + 0.3**2 * torch.eye(5, dtype=torch.float64)
+        pick = torch.eye(5, dtype=torch.float64)[measured]
+        gain = prior @ pick.T @ torch.linalg.inv(pick @ prior @ pick.T + noise**2 * torch.eye(3, dtype=torch.float64))
+        mean, covariance = gain @ seen, prior - gain @ pick @ prior
+        values = normal(120, 5)
+        precision = torch.linalg.inv(prior)
+        for _ in range(1500):
+            score = -values @ precision
+            score[:, measured] += (seen - values[:, measured]) / noise**2
+            kernel = RbfKernel(median_bandwidth(values))
+            values = values + 0.03 * stein_direction(values[:, :, None], score[:, :, None], kernel)[:, :, 0]
+        assert torch.allclose(values.mean(dim=0), mean, atol=0.05)
+        assert torch.allclose(values.var(dim=0), covariance.diagonal(), rtol=0.35)
