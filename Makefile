@@ -25,7 +25,7 @@ lint: $(VENV)/.installed
 	$(BIN)/lint-imports
 
 # Tests that only compute run side by side, one to a core; the others watch the clock and have the machine to themselves.
-COMPUTING := tests/concealment tests/diagnosis tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py
+COMPUTING := tests/concealment tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py
 
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)

@@ -23,9 +23,11 @@ from learning.evaluation import Mixture
 from learning.function_prior import JITTER, Marginal, RbfCovariance, gaussian_process, simulator_marginal
 from learning.normaliser import Normaliser
 from learning.particles import Network
-from learning.stein import RbfKernel, median_bandwidth, stein_direction
+from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
 CHECKED_EVERY = 500
+NOISE_FASTER = 5.0
+"""Learning rate of the noise over that of the networks."""
 LEAST_NOISE = 1e-4
 """Floor of the likelihood's standard deviation, in normalised units."""
 
@@ -81,7 +83,9 @@ class FsvgdSettings:
         steps: of the optimiser.
         batch: rows of data in a measurement set; all of them where there are fewer.
         measurement_points: points of the domain in a measurement set.
-        bandwidth: of the kernel on flattened normalised function values; by the median heuristic at each step if None.
+        bandwidth: of the kernel; by the median heuristic at each step if None.
+        natural: precondition by the posterior's covariance on the measurement set (a matrix-valued kernel). False is
+            the update of the paper.
         learning_rate: of Adam at the start; it falls to a hundredth along a half cosine.
         weight_decay: of AdamW, on the networks alone.
         noise_std: standard deviation of the likelihood at the start, normalised, one or one for each output.
@@ -96,6 +100,7 @@ class FsvgdSettings:
     batch: int = 32
     measurement_points: int = 16
     bandwidth: float | None = None
+    natural: bool = True
     learning_rate: float = 1e-3
     weight_decay: float = 1e-3
     noise_std: float | tuple[float, ...] = 0.1
@@ -140,7 +145,7 @@ class _State:
     def prepare(self, settings: FsvgdSettings) -> None:
         groups = [{"params": [self.networks], "weight_decay": settings.weight_decay}]
         if settings.learn_noise:
-            groups.append({"params": [self.log_noise], "weight_decay": 0.0})
+            groups.append({"params": [self.log_noise], "weight_decay": 0.0, "faster": NOISE_FASTER})
         self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
 
 
@@ -189,7 +194,7 @@ def fit(
     for step in range(settings.steps):
         rate = settings.learning_rate * (0.01 + 0.495 * (1.0 + math.cos(math.pi * step / settings.steps)))
         for group in state.optimiser.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group.get("faster", 1.0)
         rows = _rows(count, settings.batch, generator)
         others = count + torch.randint(len(pool), (points,), generator=generator)
         _step(network, state, everything, targets, rows.to(device), others.to(device), prior, settings)
@@ -219,18 +224,26 @@ def _step(
     """One step of the optimiser at the measurement set of data ``rows`` and of ``others`` in ``everything``."""
     chosen = torch.cat([rows, others])
     values, pullback = network.values_and_pullback(state.networks, everything[chosen])
-    score = torch.zeros_like(values) if prior is None else prior.marginal(chosen).score(values)
+    marginal = None if prior is None else prior.marginal(chosen)
+    score = torch.zeros_like(values) if marginal is None else marginal.score(values)
+    known = torch.zeros(values.shape[2], values.shape[1], dtype=values.dtype, device=values.device)
     if len(rows):
         noise = state.log_noise.exp().clamp_min(LEAST_NOISE)
         off = targets[rows] - values[:, : len(rows)]
         weight = settings.likelihood_exponent * len(targets) / len(rows)
         score[:, : len(rows)] += weight * off / noise**2
+        known[:, : len(rows)] = weight / noise[:, None] ** 2
         if settings.learn_noise:
             # Gradient of the particles' mean negative log-likelihood by the logarithm of the noise.
             square = (off * off).mean(dim=0).sum(dim=0) / noise**2
             state.log_noise.grad = weight * (len(rows) - square)
     kernel = RbfKernel(settings.bandwidth or median_bandwidth(values.flatten(1)))
-    state.networks.grad = -pullback(stein_direction(values, score, kernel))
+    if settings.natural:
+        precision = torch.diag_embed(known) if marginal is None else torch.diag_embed(known) + marginal.precision()
+        direction = natural_direction(values, score, precision, kernel)
+    else:
+        direction = stein_direction(values, score, kernel)
+    state.networks.grad = -pullback(direction)
     state.optimiser.step()
 
 

@@ -24,6 +24,11 @@ class Marginal:
     mean: Tensor
     factor: Tensor
 
+    def precision(self) -> Tensor:
+        """Inverse of the covariance of each output (O, N, N)."""
+        inverse: Tensor = torch.cholesky_inverse(self.factor)
+        return inverse
+
     def score(self, values: Tensor) -> Tensor:
         """Gradient of the log density by values (L, N, O): ``-K^-1 (h - m)``, output by output."""
         off = (values - self.mean).permute(2, 1, 0)  # (O, N, L)

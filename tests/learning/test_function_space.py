@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from learning.function_prior import RbfCovariance, gaussian_process, simulator_marginal
 from learning.particles import SLOPE, Network
-from learning.stein import RbfKernel, median_bandwidth, stein_direction
+from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
 torch.set_default_dtype(torch.float32)
 
@@ -94,6 +94,15 @@ class TestStein:
     def test_one_particle_climbs_to_the_mode(self):
         values, score = normal(1, 4, 2), normal(1, 4, 2, seed=1)
         assert torch.allclose(stein_direction(values, score, RbfKernel(0.7)), score)
+
+    def test_one_particle_with_a_precision_takes_newtons_step(self):
+        """To the mean of a Gaussian at once, however narrow it is in one direction."""
+        root = torch.tensor([[1.0, 0, 0], [0.9, 1e-3, 0], [-0.3, 0.4, 0.7]], dtype=torch.float64)
+        precision = torch.linalg.inv(root @ root.T)
+        values, mean = normal(1, 3, 1), normal(3, 1, seed=1)
+        score = -(precision @ (values - mean)[0])[None]
+        step = natural_direction(values, score, precision[None], RbfKernel(1.0))
+        assert torch.allclose(values + step, mean[None], atol=1e-6)
 
     def test_particles_become_a_sample_of_a_gaussian(self):
         """Mean and covariance of a correlated Gaussian in three dimensions."""

@@ -1,0 +1,174 @@
+"""Simulators with unknown parameters, as priors over functions: the studies of the Sim-FSVGD paper.
+
+Each maps inputs (N, D) and P parameter draws to outputs (P, N, O). Ranges, domains and step sizes are those of the
+authors' public code (lasgroup/simulation_transfer, commit 547fa14, MIT), restated from its facts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+Range = tuple[float, float]
+
+
+class DomainModel(Protocol):
+    """A simulator whose parameters are only known as a distribution."""
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """Inputs (N, D), uniform in the domain."""
+        ...
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Parameter draws (P, K)."""
+        ...
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Outputs (P, N, O) at inputs (N, D) for parameters (P, K)."""
+        ...
+
+
+def uniform(ranges: tuple[Range, ...], count: int, generator: torch.Generator) -> Tensor:
+    """Draws (count, K), uniform in each range."""
+    low = torch.tensor([r[0] for r in ranges])
+    high = torch.tensor([r[1] for r in ranges])
+    return low + (high - low) * torch.rand((count, len(ranges)), generator=generator)
+
+
+@dataclass(frozen=True, slots=True)
+class Sinusoids:
+    """``a sin(w x) + b x`` with a ~ N(2, 0.4^2), w ~ U(1.7, 2.3), b ~ N(2, 1), for x in [-5, 5]."""
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """Places x (N, 1)."""
+        return uniform(((-5.0, 5.0),), count, generator)
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draws of (a, w, b)."""
+        normal = torch.randn((count, 2), generator=generator)
+        frequency = 1.7 + 0.6 * torch.rand((count, 1), generator=generator)
+        return torch.cat([2.0 + 0.4 * normal[:, :1], frequency, 2.0 + normal[:, 1:]], dim=1)
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Values (P, N, 1)."""
+        a, w, b = (parameters[:, k, None] for k in range(3))
+        x = inputs[None, :, 0]
+        return (a * torch.sin(w * x) + b * x)[:, :, None]
+
+
+@dataclass(frozen=True, slots=True)
+class Pendulum:
+    """Change of (sin, cos, rate) of a pendulum over 50 ms: ``theta'' = (g/l) sin theta + u / (m l^2) - friction``.
+
+    Explicit Euler in ten substeps, as the authors integrate it. Friction is ``nu rate / (m l) + drag / m rate^2`` as in
+    their code (its square does not change sign with the rate) or, with ``dissipative``, ``rate |rate|``.
+
+    Attributes:
+        masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu and drag.
+    """
+
+    masses: Range = (0.5, 1.5)
+    lengths: Range = (0.5, 1.5)
+    gravities: Range = (5.0, 15.0)
+    frictions: Range = (0.0, 0.0)
+    drags: Range = (0.0, 0.0)
+    dissipative: bool = False
+    period_s: float = 0.05
+    substeps: int = 10
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """Sine and cosine of angles all around, rates within 5 rad/s, torques within 2.5 N m: (N, 4)."""
+        drawn = uniform(((-math.pi, math.pi), (-5.0, 5.0), (-2.5, 2.5)), count, generator)
+        return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draws of (m, l, g, nu, drag)."""
+        ranges = (self.masses, self.lengths, self.gravities, self.frictions, self.drags)
+        return uniform(ranges, count, generator)
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Changes (P, N, 3)."""
+        mass, length, gravity, friction, drag = (parameters[:, k, None] for k in range(5))
+        angle = torch.atan2(inputs[:, 0], inputs[:, 1])[None]
+        rate, torque = inputs[None, :, 2], inputs[None, :, 3]
+        step = self.period_s / self.substeps
+        theta, omega = angle.expand(len(parameters), -1), rate.expand(len(parameters), -1)
+        for _ in range(self.substeps):
+            square = omega * omega.abs() if self.dissipative else omega * omega
+            resistance = friction * omega / (mass * length) + drag / mass * square
+            acceleration = gravity / length * torch.sin(theta) + torque / (mass * length**2) - resistance
+            theta, omega = theta + step * omega, omega + step * acceleration
+        after = torch.stack([torch.sin(theta), torch.cos(theta), omega], dim=-1)
+        return after - inputs[None, :, :3]
+
+
+@dataclass(frozen=True, slots=True)
+class KinematicCar:
+    """Change over 1/30 s of (x, y, sin yaw, cos yaw, vx, vy in the world, yaw rate) of a car whose wheels do not slip.
+
+    ``beta = atan(l_r tan(d) / L)`` at the centre of mass; side velocity and yaw rate are there within a step. The body
+    is turned by an unknown angle against what motion capture calls its heading.
+    """
+
+    masses: Range = (1.6, 1.7)
+    front_axles: Range = (0.11, 0.15)
+    rear_axles: Range = (0.15, 0.19)
+    offsets: Range = (-0.15, 0.15)
+    drives: Range = (6.0, 10.0)
+    dampings: Range = (1.0, 1.8)
+    steerings: Range = (0.15, 0.4)
+    period_s: float = 1.0 / 30.0
+    substeps: int = 3
+    place_m: float = 2.0
+    speed_mps: float = 2.0
+    rate_radps: float = 3.0
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """x, y [m], sin, cos of yaw, vx, vy [m/s, world], yaw rate [rad/s], steering, throttle: (N, 9)."""
+        spans = (self.place_m, self.place_m, math.pi, self.speed_mps, self.speed_mps, self.rate_radps, 1.0, 1.0)
+        drawn = uniform(tuple((-v, v) for v in spans), count, generator)
+        yaw = drawn[:, 2:3]
+        return torch.cat([drawn[:, :2], torch.sin(yaw), torch.cos(yaw), drawn[:, 3:]], dim=1)
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """Draws of (m, l_f, l_r, offset, drive gain, root of the damping, steering at full lock)."""
+        ranges = (self.masses, self.front_axles, self.rear_axles, self.offsets, self.drives, self.dampings)
+        return uniform((*ranges, self.steerings), count, generator)
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Changes (P, N, 7)."""
+        mass, front, rear, offset, drive, damping, lock = (parameters[:, k, None] for k in range(7))
+        yaw = torch.atan2(inputs[:, 2], inputs[:, 3])[None] + offset
+        throttle = inputs[None, :, 8].clamp(-1.0, 1.0)
+        tangent = torch.tan(lock * inputs[None, :, 7].clamp(-1.0, 1.0))
+        sin, cos = torch.sin(yaw), torch.cos(yaw)
+        ahead = inputs[None, :, 4] * cos + inputs[None, :, 5] * sin
+        left = inputs[None, :, 5] * cos - inputs[None, :, 4] * sin
+        rate = inputs[None, :, 6].expand_as(ahead)
+        x, y = (inputs[None, :, k].expand_as(ahead) for k in (0, 1))
+        step = self.period_s / self.substeps
+        kept = math.exp(-1.0)  # what is left of a deviation from rolling after one substep
+        for _ in range(self.substeps):
+            faster = ahead + step * (drive * throttle - damping**2 * ahead) / mass
+            mean = 0.5 * (ahead + faster)
+            rolling_rate = faster * tangent / (front + rear)
+            new_rate = rolling_rate + kept * (rate - rolling_rate)
+            new_left = rear * rolling_rate + kept * (left - rear * rolling_rate)
+            half = yaw + 0.25 * step * (rate + new_rate)
+            across = 0.5 * (left + new_left)
+            x = x + step * (mean * torch.cos(half) - across * torch.sin(half))
+            y = y + step * (mean * torch.sin(half) + across * torch.cos(half))
+            yaw = yaw + 0.5 * step * (rate + new_rate)
+            ahead, left, rate = faster, new_left, new_rate
+        seen = yaw - offset
+        velocity_x = ahead * torch.cos(yaw) - left * torch.sin(yaw)
+        velocity_y = ahead * torch.sin(yaw) + left * torch.cos(yaw)
+        after = torch.stack([x, y, torch.sin(seen), torch.cos(seen), velocity_x, velocity_y, rate], dim=-1)
+        return after - inputs[None, :, :7]
+
+
+__all__ = ["DomainModel", "KinematicCar", "Pendulum", "Sinusoids", "uniform"]

@@ -1,0 +1,100 @@
+"""Fitting particles: to a prior alone, to data alone, and to both where the posterior is known."""
+
+import pytest
+import torch
+
+from carlab.core.errors import DataError
+from learning.evaluation import negative_log_likelihood
+from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit
+from learning.function_prior import RbfCovariance
+from learning.normaliser import Normaliser
+
+UNIT = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
+EMPTY = torch.zeros(0, 1)
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def lines(x, count=400, seed=0):
+    """Draws a x + b, a ~ N(1, 0.5^2), b ~ N(0, 0.3^2)."""
+    drawn = torch.randn(count, 2, generator=generator(seed)) * torch.tensor([0.5, 0.3]) + torch.tensor([1.0, 0.0])
+    return (drawn[:, :1] * x[:, 0] + drawn[:, 1:])[:, :, None]
+
+
+def test_fitted_to_a_simulator_alone_it_predicts_like_its_draws():
+    pool = torch.linspace(-2, 2, 64)[:, None]
+    prior = SimulatorPrior(lines(pool), pool)
+    settings = FsvgdSettings(steps=1500, hidden=(32, 32), learn_noise=False, noise_std=0.05)
+    prediction = fit(EMPTY, EMPTY, pool, prior, UNIT, settings).predict(pool)
+    assert torch.allclose(prediction.mean[:, 0], pool[:, 0], atol=0.25)
+    exact = (0.25 * pool[:, 0] ** 2 + 0.09).sqrt()
+    assert torch.allclose(prediction.epistemic_std[:, 0], exact, rtol=0.4, atol=0.05)
+
+
+def test_with_data_it_comes_near_the_conjugate_posterior():
+    """Two points on a line of unknown slope and height: Bayesian linear regression in closed form."""
+    pool = torch.linspace(-2, 2, 64)[:, None]
+    x, y = torch.tensor([[-1.0], [0.5]]), torch.tensor([[-1.6], [0.9]])
+    noise = 0.2
+    prior = SimulatorPrior(lines(torch.cat([x, pool]), 4000), torch.cat([x, pool]))
+    settings = FsvgdSettings(steps=3000, hidden=(32, 32), learn_noise=False, noise_std=noise)
+    prediction = fit(x, y, pool, prior, UNIT, settings).predict(pool)
+    features = torch.cat([x, torch.ones_like(x)], dim=1)
+    precision = torch.diag(torch.tensor([4.0, 1 / 0.09])) + features.T @ features / noise**2
+    mean = torch.linalg.solve(precision, torch.tensor([[4.0], [0.0]]) + features.T @ y / noise**2)
+    at = torch.cat([pool, torch.ones_like(pool)], dim=1)
+    exact_std = (at @ torch.linalg.inv(precision) * at).sum(dim=1).sqrt()
+    assert torch.allclose(prediction.mean, at @ mean, atol=0.12)
+    assert torch.allclose(prediction.epistemic_std[:, 0], exact_std, rtol=0.5, atol=0.04)
+
+
+def test_one_particle_finds_the_most_probable_function():
+    """With a Gaussian-process prior that is kernel ridge regression at the data."""
+    x = torch.linspace(-1, 1, 9)[:, None]
+    y = torch.sin(3 * x)
+    covariance = RbfCovariance((1.0,), (0.7,))
+    prior = GaussianProcessPrior(torch.cat([x, x]), covariance, jitter=1e-2)
+    settings = FsvgdSettings(
+        particles=1,
+        steps=4000,
+        measurement_points=0,
+        learn_noise=False,
+        noise_std=0.3,
+        weight_decay=0.0,
+        hidden=(64, 64),
+    )
+    found = fit(x, y, x, prior, UNIT, settings).predict(x).mean
+    kernel = covariance(x)[0] + 1e-2 * torch.eye(9)
+    ridge = kernel @ torch.linalg.solve(kernel + 0.3**2 * torch.eye(9), y)
+    assert torch.allclose(found, ridge, atol=0.02)
+
+
+def test_the_noise_of_the_data_is_found():
+    x = 2.0 * torch.rand(400, 1, generator=generator()) - 1.0
+    y = 0.5 * x + 0.15 * torch.randn(400, 1, generator=generator(1))
+    settings = FsvgdSettings(steps=1500, hidden=(16,), noise_std=0.6, particles=5)
+    posterior = fit(x, y, x, GaussianProcessPrior(torch.cat([x, x]), RbfCovariance((1.0,), (0.8,))), UNIT, settings)
+    assert float(posterior.noise_std) == pytest.approx(0.15, rel=0.1)
+    assert negative_log_likelihood(posterior.predict(x), y) < -0.4
+
+
+def test_the_same_seed_gives_the_same_model():
+    pool = torch.linspace(-2, 2, 16)[:, None]
+    settings = FsvgdSettings(steps=50, hidden=(8,))
+    first, second = (fit(EMPTY, EMPTY, pool, SimulatorPrior(lines(pool), pool), UNIT, settings) for _ in range(2))
+    assert torch.equal(first.parameters, second.parameters)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "prior", "said"),
+    [
+        (EMPTY, EMPTY, None, "neither data nor a prior"),
+        (torch.ones(3, 1), torch.ones(2, 1), None, "3 rows of inputs and 2 of outputs"),
+        (torch.tensor([[1.0], [float("nan")]]), torch.ones(2, 1), None, "missing or infinite"),
+    ],
+)
+def test_what_cannot_be_fitted_is_said(inputs, outputs, prior, said):
+    with pytest.raises(DataError, match=said):
+        fit(inputs, outputs, torch.ones(4, 1), prior, UNIT, FsvgdSettings(steps=1))
