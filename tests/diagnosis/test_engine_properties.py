@@ -13,11 +13,13 @@ from carlab.concealment.case import Case
 from carlab.concealment.measurement import read_csv, write_csv
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.fit import Fitter, Scale, base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.duels import pruned
+from carlab.diagnosis.fit import Fit, Fitter, Scale, base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.judge import Texts
 from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separating_drive
 from carlab.diagnosis.residual_terms import TERMS, responses
+from carlab.diagnosis.search import Search
 from carlab.diagnosis.shots import Shots, cut, estimate_noise, tracks_of
 from carlab.recording.foreign_csv import import_csv
 from sim_backends.effects import EFFECTS
@@ -139,6 +141,19 @@ def test_a_name_is_not_given_to_what_something_outside_the_catalogue_explains_be
     assert {e for e in whole.model.effects if not EFFECTS[e].catalogued}
     told = outcome(folder, effects=(taken_for,)).diagnosis
     assert [e.id for e in told.effects] == [taken_for]
+
+
+def test_an_effect_that_unseen_blocks_do_not_miss_is_taken_out_again(drag: tuple[Path, float], shots: Shots) -> None:
+    car = load_car_file(drag[0] / "car.toml").simulator
+    floor = np.array([0.006, 0.006, 0.005, 0.015, 0.015, 0.04])
+    search = Search(car, shots, floor, LOOK_ALIKES)
+    scale = Scale.of(errors(Predictor(shots, car)(), shots)[0], floor, 0.2)
+    named = ("aerodynamic_drag", "steering_asymmetry", "torque_steer")
+    fit = search.refit(named, search.refit((), Fit(car, (), np.zeros(0), 0.0, np.zeros(0)), scale), scale)
+    kept, best, apart = pruned(search, named, fit, scale)
+    assert kept == ("aerodynamic_drag",)
+    assert set(best.config.effects) == {"aerodynamic_drag"}
+    assert apart["aerodynamic_drag"].standard_errors > 2.0
 
 
 def test_impulse_responses_add_up_to_what_the_simulator_does(drag: tuple[Path, float], shots: Shots) -> None:
