@@ -1,0 +1,75 @@
+"""Ridge regression with a full Gaussian likelihood: the baseline that every learned model must beat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+
+PENALTIES = tuple(float(p) for p in np.geomspace(1e-4, 1e3, 22))
+
+
+@dataclass(frozen=True, slots=True)
+class Ridge:
+    """A linear model of normalised inputs with independent Gaussian errors.
+
+    Attributes:
+        weights: (D + 1, O) with the constant last.
+        mean, scale: of the inputs (D,).
+        std: of the errors (O,), by leaving each row out in turn.
+    """
+
+    weights: FloatArray
+    mean: FloatArray
+    scale: FloatArray
+    std: FloatArray
+
+    @classmethod
+    def fit(cls, inputs: FloatArray, targets: FloatArray) -> Ridge:
+        """Fit with the penalty of each output that leaves the least error on rows left out, in closed form.
+
+        Args:
+            inputs: (n, D).
+            targets: (n, O).
+
+        Raises:
+            DataError: fewer than three rows.
+        """
+        if len(inputs) < 3:
+            raise DataError(f"A regression needs three rows at least, not {len(inputs)}; record more.")
+        mean, scale = inputs.mean(axis=0), inputs.std(axis=0)
+        scale = np.where(scale > 1e-9, scale, 1.0)
+        design = (inputs - mean) / scale
+        middle = targets.mean(axis=0)
+        left, singular, right = np.linalg.svd(design, full_matrices=False)
+        turned = left.T @ (targets - middle)
+        best = np.full(targets.shape[1], np.inf)
+        weights = np.zeros((inputs.shape[1] + 1, targets.shape[1]))
+        for penalty in PENALTIES:
+            shrink = singular**2 / (singular**2 + penalty)
+            fitted = left @ (shrink[:, None] * turned)
+            leverage = np.minimum((left**2 * shrink).sum(axis=1) + 1.0 / len(inputs), 0.999)
+            # The error of a row left out is its residual over one less its leverage (Allen 1974).
+            error = (targets - middle - fitted) / (1.0 - leverage)[:, None]
+            square = (error**2).mean(axis=0)
+            better = square < best
+            best = np.where(better, square, best)
+            slopes = right.T @ ((singular / (singular**2 + penalty))[:, None] * turned)
+            weights[:-1, better] = slopes[:, better]
+        weights[-1] = middle
+        return cls(weights, mean, scale, np.sqrt(np.maximum(best, 1e-18)))
+
+    def __call__(self, inputs: FloatArray) -> FloatArray:
+        """Mean (n, O) at inputs (n, D)."""
+        return np.asarray((inputs - self.mean) / self.scale @ self.weights[:-1] + self.weights[-1])
+
+    def negative_log_likelihood(self, inputs: FloatArray, targets: FloatArray) -> float:
+        """Mean joint negative log density of the targets [nat]."""
+        white = (targets - self(inputs)) / self.std
+        return float((0.5 * white**2 + np.log(self.std) + 0.5 * np.log(2 * np.pi)).sum(axis=1).mean())
+
+
+__all__ = ["Ridge"]

@@ -1,0 +1,150 @@
+"""Rows for a model: which command belongs to which step, frames, gaps; and ridge regression against brute force."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from carlab.cars import choose_car
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import Action
+from carlab.core.task import ParkingTask
+from carlab.experiment.episode import run_episode
+from learning.ridge import PENALTIES, Ridge
+from learning.transitions import OUTPUTS, transitions_of
+
+
+def episode(ticks=30, seed=0):
+    """An episode whose every number tells where it stands."""
+    rng = np.random.default_rng(seed)
+    sent = np.stack([np.arange(ticks) / 100.0, -np.arange(ticks) / 100.0], axis=1)
+    states = rng.normal(size=(ticks + 1, 6))
+    return EpisodeData(np.arange(ticks + 1) / 30.0, states, sent, sent, np.zeros(ticks))
+
+
+def test_the_row_of_tick_t_ends_in_the_command_sent_at_t():
+    whole = transitions_of([episode()], 3)
+    assert whole.inputs.shape == (27, 3 + 8)
+    assert whole.targets.shape == (27, len(OUTPUTS))
+    for row, tick in zip(whole.inputs, whole.tick, strict=True):
+        assert row[3:].reshape(4, 2)[:, 0] == pytest.approx([(tick - back) / 100.0 for back in (3, 2, 1, 0)])
+        assert row[-1] == pytest.approx(-tick / 100.0)
+
+
+def test_targets_are_changes_seen_from_the_car():
+    """A car that faces north and moves north has moved ahead, one that drifts west has moved left."""
+    base = episode(2)
+    states = np.zeros((3, 6))
+    states[0] = [1.0, 2.0, math.pi / 2, 1.0, 0.0, 0.5]
+    states[1] = [0.9, 2.3, math.pi / 2 + 0.1, 1.2, 0.1, 0.4]
+    states[2] = [0.9, 2.3, math.pi / 2 + 0.1 - 2 * math.pi, 1.2, 0.1, 0.4]
+    whole = transitions_of([dataclasses.replace(base, states=states)], 0)
+    assert whole.targets[0] == pytest.approx([0.3, 0.1, 0.1, 0.2, 0.1, -0.1])
+    assert whole.targets[1] == pytest.approx(np.zeros(6), abs=1e-12)
+
+
+def test_turning_and_shifting_the_room_changes_nothing():
+    base = episode()
+    turn, states = 1.2, base.states.copy()
+    c, s = math.cos(turn), math.sin(turn)
+    states[:, :2] = base.states[:, :2] @ np.array([[c, s], [-s, c]]) + [4.0, -2.0]
+    states[:, 2] += turn
+    ours, theirs = transitions_of([base], 2), transitions_of([dataclasses.replace(base, states=states)], 2)
+    assert np.allclose(ours.inputs, theirs.inputs)
+    assert np.allclose(ours.targets, theirs.targets)
+
+
+def test_steps_across_gaps_and_rows_with_missing_numbers_are_left_out():
+    base = episode()
+    times, states = base.times_s.copy(), base.states.copy()
+    times[11:] += 0.5  # between rows 10 and 11
+    states[20, 3] = math.nan
+    whole = transitions_of([dataclasses.replace(base, times_s=times, states=states)], 3)
+    assert set(range(3, 30)) - set(whole.tick) == {10, 11, 12, 13, 19, 20}
+
+
+def test_episodes_do_not_flow_into_each_other():
+    whole = transitions_of([episode(10), episode(12, seed=1)], 4)
+    assert [(whole.episode == k).sum() for k in (0, 1)] == [6, 8]
+    assert whole.tick.min() == 4
+
+
+@pytest.mark.parametrize(("history", "said"), [(-1, "0 or more"), (40, "shorter history")])
+def test_what_makes_no_row_is_said(history, said):
+    with pytest.raises(DataError, match=said):
+        transitions_of([episode()], history)
+
+
+class Noise:
+    """Small random actions, remembered."""
+
+    name = "noise"
+
+    def __init__(self):
+        self.given = []
+
+    def reset(self):
+        self.given = []
+
+    def act(self, view):
+        rng = np.random.default_rng(view.step)
+        self.given.append(Action(float(rng.uniform(-0.3, 0.3)), float(rng.uniform(-0.1, 0.4))))
+        return self.given[-1]
+
+
+def test_in_simulation_a_row_holds_the_command_of_its_tick_and_the_one_that_moves_the_car():
+    choice = choose_car("sim", seed=0)
+    delay = round(choice.simulator.command_delay_s / choice.control_period_s)
+    task, policy = ParkingTask(), Noise()
+    with choice.car as car:
+        car.place(task.sample_start(np.random.default_rng(0)))
+        driven = run_episode(car, policy, task, choice.envelope, period_s=choice.control_period_s, max_ticks=90)
+    whole = transitions_of([driven], 5)
+    assert len(whole) > 40
+    for row, tick in zip(whole.inputs, whole.tick, strict=True):
+        assert tuple(row[-2:]) == (policy.given[tick].steering, policy.given[tick].throttle)
+    throttle = whole.inputs[:, 3:].reshape(-1, 6, 2)[:, :, 1]
+    design = np.hstack([throttle, whole.inputs[:, :1], np.ones((len(whole), 1))])
+    slopes = np.linalg.lstsq(design, whole.targets[:, 3], rcond=None)[0][:6]
+    # What is seen of it is older still by motion capture's latency and the velocity filter.
+    assert delay <= 5 - int(np.argmax(np.abs(slopes))) <= delay + 2
+    assert slopes[-1] == pytest.approx(0.0, abs=0.2 * np.abs(slopes).max())  # it has not arrived yet
+
+
+def test_ridge_is_the_normal_equations_and_its_spread_is_that_of_rows_left_out():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(25, 4)) * [1.0, 3.0, 0.2, 1.0] + [0.0, 5.0, -1.0, 0.0]
+    y = x @ rng.normal(size=(4, 2)) + rng.normal(size=(25, 2)) * [0.3, 1.0]
+    model = Ridge.fit(x, y)
+    z = (x - x.mean(axis=0)) / x.std(axis=0)
+    best = []
+    for output in range(2):
+        errors = []
+        for penalty in PENALTIES:
+            left = []
+            for k in range(25):
+                others = np.arange(25) != k
+                # The penalty is on slopes alone; the constant is the mean of all rows.
+                design = np.hstack([z, np.ones((25, 1))])
+                lhs = design[others].T @ design[others] + np.diag([penalty] * 4 + [0.0])
+                left.append(y[k, output] - design[k] @ np.linalg.solve(lhs, design[others].T @ y[others, output]))
+            errors.append(np.mean(np.square(left)))
+        best.append(PENALTIES[int(np.argmin(errors))])
+        assert model.std[output] == pytest.approx(math.sqrt(min(errors)), rel=0.02)
+    for output, penalty in enumerate(best):
+        slopes = np.linalg.solve(z.T @ z + penalty * np.eye(4), z.T @ (y[:, output] - y[:, output].mean()))
+        assert model(x)[:, output] == pytest.approx(z @ slopes + y[:, output].mean(), abs=1e-9)
+
+
+def test_the_likelihood_of_a_regression_is_scipys():
+    from scipy.stats import norm
+
+    rng = np.random.default_rng(1)
+    x, y = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
+    model = Ridge.fit(x, y)
+    theirs = -norm(model(x), model.std).logpdf(y).sum(axis=1).mean()
+    assert model.negative_log_likelihood(x, y) == pytest.approx(theirs)
+    with pytest.raises(DataError, match="three rows"):
+        Ridge.fit(x[:2], y[:2])
