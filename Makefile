@@ -24,12 +24,12 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Tests that only compute run side by side, one to a core; the others watch the clock and have the machine to themselves.
+# Tests that only compute run side by side, one to a core; the others wait for the clock most of the time, two at once.
 COMPUTING := tests/concealment tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py
 
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
-	$(BIN)/pytest $(addprefix --ignore=,$(COMPUTING))
+	$(BIN)/pytest --numprocesses 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
