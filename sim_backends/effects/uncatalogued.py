@@ -50,36 +50,42 @@ class Wind(DynamicsEffect):
         forces.force_y = forces.force_y - values["coefficient"] * (moving * air_y - still * forces.vy)
 
 
-class FrontSideForce(DynamicsEffect):
+class _SideForce(DynamicsEffect):
+    """A constant side force of one axle's wheels while they roll, in their own frame."""
+
+    catalogued = False
+    order = 80
+    parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
+    look_alikes = ("steering_offset", "lateral_bias")
+
+    @staticmethod
+    def push(ops: Ops, forces: Forces, values: Parameters) -> Value:
+        """To the left [N]."""
+        return values["force"] * ops.tanh(ops.abs(forces.vx) * (1.0 / AT_REST_MPS))
+
+
+class FrontSideForce(_SideForce):
     """``F_y,front += force tanh(|vx| / 0.2 m/s)`` in the front wheels' frame: toe or camber of the front wheels."""
 
     id = "front_side_force"
-    catalogued = False
-    order = 80
     sentence = "Toe or camber of the front wheels pushes them to one side."
     class_statement = "constant: a bias of the front wheels' side force, even in steering, as of toe or camber"
-    parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
-    look_alikes = ("steering_offset", "lateral_bias")
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Push to the left."""
-        forces.side_front = forces.side_front + values["force"] * ops.tanh(ops.abs(forces.vx) * (1.0 / AT_REST_MPS))
+        """Push the front."""
+        forces.side_front = forces.side_front + self.push(ops, forces, values)
 
 
-class RearSideForce(DynamicsEffect):
+class RearSideForce(_SideForce):
     """``F_y,rear += force tanh(|vx| / 0.2 m/s)``: toe or camber of the rear wheels."""
 
     id = "rear_side_force"
-    catalogued = False
-    order = 80
     sentence = "Toe or camber of the rear wheels pushes them to one side."
     class_statement = "constant: a bias of the rear wheels' side force, even in steering, as of toe or camber"
-    parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
-    look_alikes = ("steering_offset", "lateral_bias")
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Push to the left."""
-        forces.side_rear = forces.side_rear + values["force"] * ops.tanh(ops.abs(forces.vx) * (1.0 / AT_REST_MPS))
+        """Push the rear."""
+        forces.side_rear = forces.side_rear + self.push(ops, forces, values)
 
 
 class LockedAxle(DynamicsEffect):
