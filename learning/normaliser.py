@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 
@@ -16,17 +15,6 @@ class Normaliser:
     input_std: Tensor
     output_mean: Tensor
     output_std: Tensor
-
-    @classmethod
-    def of(cls, inputs: Tensor, outputs: Tensor, least: float = 1e-6) -> Normaliser:
-        """From examples: inputs (..., D) and outputs (..., O); what never changes keeps its size."""
-
-        def moments(rows: Tensor) -> tuple[Tensor, Tensor]:
-            flat = rows.reshape(-1, rows.shape[-1])
-            std = flat.std(dim=0, correction=0)
-            return flat.mean(dim=0), torch.where(std > least, std, torch.ones_like(std))
-
-        return cls(*moments(inputs), *moments(outputs))
 
     def inputs(self, raw: Tensor) -> Tensor:
         """Normalised inputs."""

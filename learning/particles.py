@@ -76,20 +76,11 @@ class Network:
             values = functional.leaky_relu(torch.baddbmm(b, values, w), SLOPE)
         return torch.baddbmm(biases, values, weights)
 
-    def gradient(self, parameters: Tensor, inputs: Tensor, direction: Tensor) -> Tensor:
-        """``sum(direction * outputs)`` differentiated by the parameters (L, P), without a tape.
-
-        The chain rule by hand costs a fraction of what autograd's bookkeeping does at these sizes.
-
-        Args:
-            parameters: (L, P).
-            inputs: (N, D).
-            direction: by outputs (L, N, O).
-        """
-        return self.values_and_pullback(parameters, inputs)[1](direction)
-
     def values_and_pullback(self, parameters: Tensor, inputs: Tensor) -> tuple[Tensor, Pullback]:
-        """Outputs (L, N, O), and what turns a direction on them into one on the parameters."""
+        """Outputs (L, N, O) at inputs (N, D), and what turns a direction on them into one on the parameters.
+
+        No tape: at these sizes the chain rule by hand costs a fraction of what autograd's bookkeeping does.
+        """
         layers = self.split(parameters)
         seen = [inputs.expand(len(parameters), *inputs.shape)]
         for w, b in layers[:-1]:

@@ -10,9 +10,8 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from carlab.diagnosis.duels import SCREENED_SHOTS
 from carlab.diagnosis.fit import Fit, Fitter, effect_parameters
-from carlab.diagnosis.screen import Promise, Screen
+from carlab.diagnosis.screen import SCREENED_SHOTS, Promise, Screen
 from carlab.diagnosis.search import Candidate, Search, SearchResult
 from sim_backends.effects import EFFECTS
 from sim_backends.effects.uncatalogued import UNCATALOGUED

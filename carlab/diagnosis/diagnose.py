@@ -37,6 +37,8 @@ MAX_SCORED = 1200
 MIN_SECONDS = 8.0
 HOLD_OUT_SHARE = 0.3
 MIN_SHARE = 0.1
+SPOILT_SHARE = 0.5
+"""Faults that leave less of a recording than this have spoilt it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ def diagnose(
     except Inconclusive as error:
         error.data_faults = tuple(data_faults)
         left_s = sum(len(track.t_s) * track.period_s for track in tracks_of(fit))
-        if data_faults and recorded_s >= MIN_SECONDS > left_s:
+        if data_faults and left_s < MIN_SECONDS and left_s < SPOILT_SHARE * recorded_s:
             error.verdict = "data"
         raise
     noise = estimate_noise(fit_tracks)

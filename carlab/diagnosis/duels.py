@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from carlab.diagnosis.fit import Fit, Fitter, Scale, clustered_gain, effect_parameters, inflation_of
-from carlab.diagnosis.screen import Screen
+from carlab.diagnosis.screen import SCREENED_SHOTS, Screen
 
 if TYPE_CHECKING:
     from carlab.diagnosis.search import Search
 
 log = logging.getLogger(__name__)
 
-SCREENED_SHOTS = 180
 UNSEEN_AT_MOST = 12.0
 """Standard deviations beyond which an error on an unseen block counts no more: one spin must not decide."""
 KEEP_STANDARD_ERRORS = 1.2
@@ -98,4 +97,4 @@ def duels(
     return chi2, rivals
 
 
-__all__ = ["CLOSE", "SCREENED_SHOTS", "UNSEEN_AT_MOST", "Deletion", "deletions", "duels", "pruned"]
+__all__ = ["CLOSE", "UNSEEN_AT_MOST", "Deletion", "deletions", "duels", "pruned"]

@@ -32,9 +32,6 @@ BESIDE_CHI2 = 20.0
 """Physics outside the catalogue that gains so much beside the names is reported."""
 WEAK_CHI2 = 14.0
 """Where something is missing for certain, terms of this strength are good enough to describe it."""
-FLOOR_BIAS = np.array([0.92, 0.92, 0.94, 1.14, 1.11, 1.18])
-"""Estimated noise floor over the true one by channel, median over development cases. What is missing is ranked by
-channel without this bias."""
 AS_GOOD = 0.85
 """Physics outside the catalogue describes what is left where it gains this share of what free terms gain."""
 
@@ -127,7 +124,6 @@ def unexplained(
             formula, model = outside.formula(), outside.fit.config
     if fall.max() <= 0.0:
         fall = np.maximum(squared.mean(axis=0) - 1.0, 0.0)
-    fall = fall * FLOOR_BIAS**2
     size: FloatArray = np.sqrt(squared.mean(axis=1))
     return describe(share, words, formula, fall, size, start_features(held_out.shots)), model
 

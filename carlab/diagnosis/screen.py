@@ -24,6 +24,8 @@ SIZES = (0.15, 0.6, 2.4)
 RATIOS = (0.15, 0.25, 0.4, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0)
 """Shares of the typical size at which a candidate whose identity is infinite is tried."""
 STARTS = 3
+SCREENED_SHOTS = 180
+"""Enough shots to tell which candidates deserve a fit."""
 NEARLY = 0.75
 """Further starts promise at least this share of the best."""
 _PROBE = 0.03

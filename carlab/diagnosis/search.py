@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.duels import CLOSE, SCREENED_SHOTS, UNSEEN_AT_MOST, deletions, duels, pruned
+from carlab.diagnosis.duels import CLOSE, UNSEEN_AT_MOST, deletions, duels, pruned
 from carlab.diagnosis.fit import (
     Fit,
     Fitter,
@@ -28,7 +28,7 @@ from carlab.diagnosis.fit import (
     with_effect,
 )
 from carlab.diagnosis.prediction import Predictor, errors
-from carlab.diagnosis.screen import Promise, Screen, usable
+from carlab.diagnosis.screen import SCREENED_SHOTS, Promise, Screen, usable
 from carlab.diagnosis.shots import Shots
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS

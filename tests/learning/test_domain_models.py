@@ -64,7 +64,7 @@ def test_a_rolling_car_drives_the_circle_of_its_wheels():
     """At rest of all transients, r = v tan(d) / L, and the centre of mass goes round on the rear axle's arm."""
     model = KinematicCar()
     parameters = model.sample(6, generator()).double()
-    mass, front, rear, _, drive, damping, lock = (parameters[:, k] for k in range(7))
+    _, front, rear, _, drive, damping, lock = (parameters[:, k] for k in range(7))
     parameters[:, 3] = 0.0
     steering, throttle = 0.6, 0.4
     speed = drive * throttle / damping**2
@@ -79,7 +79,6 @@ def test_a_rolling_car_drives_the_circle_of_its_wheels():
         assert math.hypot(float(change[0]), float(change[1])) == pytest.approx(chord, rel=1e-4)
         assert math.atan2(float(change[2]), 1.0 + float(change[3])) == pytest.approx(turned, rel=1e-6)
         assert float(change[6]) == pytest.approx(0.0, abs=1e-9)
-    assert mass.min() > 1.5
 
 
 def test_turning_the_world_turns_the_car_with_it():
