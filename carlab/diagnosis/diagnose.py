@@ -20,11 +20,15 @@ from carlab.diagnosis.findings import (
     Verdict,
 )
 from carlab.diagnosis.judge import HORIZON_S, Judge, Texts
+from carlab.diagnosis.measurement_noise import estimate_noise
 from carlab.diagnosis.naming import Believed, believed, unexplained
 from carlab.diagnosis.scoring import HeldOut, noise_floor
 from carlab.diagnosis.search import Progress, Search
-from carlab.diagnosis.shots import Shots, Track, cut, estimate_noise, tracks_of
+from carlab.diagnosis.shots import Shots, Track, cut, tracks_of
+from carlab.diagnosis.starts import corrected
 from carlab.diagnosis.unexplained import missing_terms
+from carlab.diagnosis.velocity_window import smear_s2
+from carlab.diagnosis.vibration import find_vibration
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -109,7 +113,9 @@ def diagnose(
         if data_faults and left_s < MIN_SECONDS and left_s < SPOILT_SHARE * recorded_s:
             error.verdict = "data"
         raise
-    noise = estimate_noise(fit_tracks)
+    smear = smear_s2(shots, nominal)
+    shots, held_shots = (corrected(replace(s, smear_s2=smear), nominal) for s in (shots, held_shots))
+    noise = estimate_noise(fit_tracks, shots.bent)
     floor = np.sqrt(np.mean(noise_floor(shots, noise, nominal)[1:] ** 2, axis=0))
     search = Search(
         nominal,
@@ -122,11 +128,13 @@ def diagnose(
     )
     found = search.run()
     progress("looking for what has no name", 0.8)
-    held = HeldOut.of(held_shots, noise, found.best.config)
+    vibration = find_vibration(fit_tracks)
+    quiet = noise if vibration is None else estimate_noise(fit_tracks, shots.bent, slowest=True)
+    held = HeldOut.of(held_shots, quiet, found.best.config)
     if effects is None:
-        what = believed(search, found, held)
+        what = believed(search, found, held, vibration)
     else:
-        what = Believed(found, missing_terms(shots, found.best, found.scale), None)
+        what = Believed(found, missing_terms(shots, found.best, found.scale), None, vibration)
     found = what.found
     progress("judging on held-out recordings", 0.82)
     judge = Judge(search, found, held, texts)
@@ -199,6 +207,7 @@ def _part(track: Track, rows: slice) -> Track:
         t_s=track.t_s[rows],
         states=track.states[rows],
         smooth=track.smooth[rows],
+        bent=track.bent[rows],
         commands=track.commands[rows],
     )
 

@@ -12,7 +12,8 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault
-from carlab.diagnosis.shots import Shots, cut, estimate_noise, tracks_of
+from carlab.diagnosis.measurement_noise import estimate_noise
+from carlab.diagnosis.shots import Shots, cut, tracks_of
 from sim_backends.batch_rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.integrate import MAX_STEP_S
@@ -37,7 +38,7 @@ def check_integration(
     except DataError:
         return []
     shots = shots.take(np.unique(np.linspace(0, len(shots) - 1, SHOTS).round().astype(np.int64)))
-    noise = estimate_noise(tracks).measured
+    noise = estimate_noise(tracks, shots.bent).measured
     with np.errstate(all="ignore"):  # a step that is far too coarse overflows, which is what is looked for
         difference = np.abs(_ends(shots, nominal, max_step_s) - _ends(shots, nominal, 0.25 * max_step_s))
     difference = np.where(np.isfinite(difference), difference, np.inf)

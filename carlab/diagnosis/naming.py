@@ -19,6 +19,7 @@ from carlab.diagnosis.fit import Fitter
 from carlab.diagnosis.scoring import HeldOut
 from carlab.diagnosis.search import Search, SearchResult
 from carlab.diagnosis.unexplained import Rest, describe, missing_terms, start_features
+from carlab.diagnosis.vibration import Vibration
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -38,19 +39,20 @@ AS_GOOD = 0.85
 
 @dataclass(frozen=True, slots=True)
 class Believed:
-    """The names that stand, terms without a name that are left, and physics outside the catalogue if called for."""
+    """The names that stand, and beside them terms without a name, physics outside the catalogue, and vibration."""
 
     found: SearchResult
     left: Rest
     outside: Outside | None
+    vibration: Vibration | None
 
     @property
     def something(self) -> bool:
         """Whether anything is called for beside the names."""
-        return bool(self.left.chosen) or self.outside is not None
+        return bool(self.left.chosen) or self.outside is not None or self.vibration is not None
 
 
-def believed(search: Search, found: SearchResult, held_out: HeldOut) -> Believed:
+def believed(search: Search, found: SearchResult, held_out: HeldOut, vibration: Vibration | None) -> Believed:
     """Question the names of ``found``."""
     names = found.effects
     outside = instead(search, found)
@@ -68,7 +70,7 @@ def believed(search: Search, found: SearchResult, held_out: HeldOut) -> Believed
         log.info("%s would be a forced name", ", ".join(names))
         left = missing_terms(search.shots, found.best, found.scale)
         outside = outside if outside is not None and not outside.names else beside(search, found, BESIDE_CHI2)
-    return Believed(found, left, outside)
+    return Believed(found, left, outside, vibration)
 
 
 def _forced(search: Search, found: SearchResult, left: Rest, outside: Outside | None) -> bool:
@@ -122,8 +124,12 @@ def unexplained(
             before_score, after_score = held_out.score(error), held_out.score(after)
             words = f"{outside.words()} (with it in model.toml the score is {after_score:.3g}, not {before_score:.3g})"
             formula, model = outside.formula(), outside.fit.config
+    over = np.maximum(squared.mean(axis=0) - 1.0, 0.0)
+    if what.vibration is not None:
+        words = ". ".join([what.vibration.words(), words][: 2 if formula else 1])
+        formula, fall = "; ".join([what.vibration.formula(), *filter(None, [formula])]), over
     if fall.max() <= 0.0:
-        fall = np.maximum(squared.mean(axis=0) - 1.0, 0.0)
+        fall = over
     size: FloatArray = np.sqrt(squared.mean(axis=1))
     return describe(share, words, formula, fall, size, start_features(held_out.shots)), model
 

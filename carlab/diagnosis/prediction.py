@@ -99,6 +99,8 @@ class Predictor:
             states[..., 2] += turned
             states[..., 3] = cos * vx + sin * vy
             states[..., 4] = cos * vy - sin * vx
+        if self.shots.smear_s2 > 0.0:
+            states[..., 3:] += 0.5 * self.shots.smear_s2 * bend_of(states, self.shots.period_s)
         lag = seen[FILTER]
         if np.any(lag > 0):
             self._filter(states, lag)
@@ -110,7 +112,7 @@ class Predictor:
         span = dt / np.maximum(lag_s, 1e-9)
         decay = np.exp(-span)[:, None, None]
         ramp = (1.0 - (1.0 - np.exp(-span)) / span)[:, None, None]
-        past = self.shots.velocities_before[None]
+        past = self.shots.before[None, :, :, 3:]
         out = np.repeat(past[:, :, 0], len(lag_s), axis=0)
         inputs = [past[:, :, k] for k in range(past.shape[2])]
         previous = inputs[0]
@@ -122,6 +124,24 @@ class Predictor:
             out = out * decay + (1.0 - decay) * previous + ramp * (value - previous)
             previous = value
             states[:, :, k, 3:] = out
+
+
+def bend_of(states: FloatArray, period_s: float) -> FloatArray:
+    """Second derivative (..., K + 1, 3) of the velocities of (..., K + 1, 6) in the world, turned into the body frame.
+
+    From central differences; 0 at both ends.
+    """
+    turn = np.diff(states[..., 2], axis=-1)
+    cos, sin = np.cos(turn), np.sin(turn)
+    vx, vy, rate = states[..., 3], states[..., 4], states[..., 5]
+    bend = np.zeros((*states.shape[:-1], 3))
+    # The velocities of the next and of the last tick as the body sees them now.
+    bend[..., 1:-1, 0] = cos[..., 1:] * vx[..., 2:] - sin[..., 1:] * vy[..., 2:] - 2.0 * vx[..., 1:-1]
+    bend[..., 1:-1, 1] = sin[..., 1:] * vx[..., 2:] + cos[..., 1:] * vy[..., 2:] - 2.0 * vy[..., 1:-1]
+    bend[..., 1:-1, 0] += cos[..., :-1] * vx[..., :-2] + sin[..., :-1] * vy[..., :-2]
+    bend[..., 1:-1, 1] += cos[..., :-1] * vy[..., :-2] - sin[..., :-1] * vx[..., :-2]
+    bend[..., 1:-1, 2] = rate[..., 2:] - 2.0 * rate[..., 1:-1] + rate[..., :-2]
+    return bend / period_s**2
 
 
 def _broadcast(value: float | FloatArray, sets: int) -> FloatArray:

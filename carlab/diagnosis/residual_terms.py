@@ -172,14 +172,14 @@ def responses(shots: Shots, config: SimulatorConfig, scale: Scale) -> Responses:
 def _rest_of(shots: Shots, predicted: FloatArray, begin: int, start: FloatArray) -> Shots:
     past = shots.history.shape[1]
     commands = np.concatenate([shots.history, shots.commands], axis=1)
-    velocities = np.concatenate([shots.velocities_before, predicted[:, :begin, 3:]], axis=1)
+    before = np.concatenate([shots.before, predicted[:, :begin]], axis=1)
     return replace(
         shots,
         start=start,
         history=commands[:, begin : begin + past],
         commands=shots.commands[:, begin:],
         measured=shots.measured[:, begin:],
-        velocities_before=velocities[:, -past:],
+        before=before[:, -past:],
         t0_s=shots.t0_s + begin * shots.period_s,
     )
 
@@ -195,7 +195,7 @@ def features(shots: Shots, predicted: FloatArray, config: SimulatorConfig, at: n
     long_ago = np.clip(now - 3 * back, 0, None)
     state = predicted[:, at]
     span = (np.clip(now, 0, None) - earlier) * period_s
-    work = np.abs(shots.velocities_before[:, :, 2] * shots.velocities_before[:, :, 0]).mean(axis=1) / 3.0
+    work = np.abs(shots.before[:, :, 5] * shots.before[:, :, 3]).mean(axis=1) / 3.0
     return {
         "v": state[:, :, 3],
         "w": state[:, :, 4],

@@ -9,8 +9,9 @@ import numpy as np
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.fit import clustered_gain, huber
+from carlab.diagnosis.measurement_noise import Noise
 from carlab.diagnosis.prediction import Predictor, errors
-from carlab.diagnosis.shots import Noise, Shots
+from carlab.diagnosis.shots import Shots
 from sim_backends.car_parameters import SimulatorConfig
 
 CERTAIN = 0.99

@@ -191,4 +191,7 @@ def _tyres(config: SimulatorConfig, free: tuple[Free, ...]) -> FloatArray:
 
 def usable(config: SimulatorConfig, effect: str) -> bool:
     """Whether the effect says anything new about this simulator."""
-    return not (effect == "tyre_saturation" and config.kind == "dynamic")
+    if effect == "tyre_saturation":
+        return config.kind != "dynamic"
+    # Where tyres do not saturate, the loss of grip by roll would stand for that.
+    return not (effect == "roll_dynamics" and config.kind == "linear_tyre")

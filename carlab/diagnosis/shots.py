@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.signal import savgol_filter
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
@@ -23,6 +23,8 @@ IndexArray = NDArray[np.int64]
 START_SPAN_S = 0.27
 """Poses that the start of a shot is estimated from: nine at 30 Hz."""
 HISTORY_S = 0.6
+QUINTIC_WIDTH = 7
+"""Fewest poses under the quintic that the start is held against."""
 COARSEST_S = 0.034
 """Longest period to which a faster recording is thinned."""
 MIN_MOTION_MPS = 0.15
@@ -37,6 +39,8 @@ class Track:
     smooth     (n, 6)   local cubic through the poses: pose, and body velocities from it
     commands   (n, 2)   mean over each cell of the commands held as recorded
     residual   (m, 6)   what the local cubic leaves of the states while the car moves, at the recording's own period
+    speed      (m,)     there
+    bent       (n, 6)   what a quintic makes of ``smooth``, less ``smooth``
     sampled_s           that period
     """
 
@@ -47,24 +51,20 @@ class Track:
     smooth: FloatArray
     commands: FloatArray
     residual: FloatArray
+    speed: FloatArray
+    bent: FloatArray
     sampled_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Standard deviations of what was measured, by channel x, y, yaw, vx, vy, yaw rate (6,), and of shot starts."""
-
-    measured: FloatArray
-    start: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Shots:
     """S shots of K steps with H commands of history.
 
-    start (S, 6); history (S, H, 2); commands (S, K, 2); measured (S, K + 1, 6) with the yaw unwrapped; velocities
-    before the start (S, H, 3); t0_s (S,); recording (S,) and block (S,), stretches of a few seconds that are treated
-    as independent of one another; row (S,) into the recording's grid.
+    start (S, 6); history (S, H, 2); commands (S, K, 2); measured (S, K + 1, 6) with the yaw unwrapped; smooth states
+    before the start (S, H, 6); bent (S, 6), by how much a quintic through the poses about it differs from the start;
+    t0_s (S,); recording (S,) and block (S,), stretches of a few seconds that are treated
+    as independent of one another; row (S,) into the recording's grid. ``smear_s2`` is the variance in time [s2] of the
+    window by which the recording's velocities were differentiated, 0 where they are taken to be of the moment.
     """
 
     period_s: float
@@ -72,11 +72,13 @@ class Shots:
     history: FloatArray
     commands: FloatArray
     measured: FloatArray
-    velocities_before: FloatArray
+    before: FloatArray
+    bent: FloatArray
     t0_s: FloatArray
     recording: IndexArray
     block: IndexArray
     row: IndexArray
+    smear_s2: float = 0.0
 
     def __len__(self) -> int:
         return len(self.start)
@@ -94,11 +96,13 @@ class Shots:
             self.history[which],
             self.commands[which],
             self.measured[which],
-            self.velocities_before[which],
+            self.before[which],
+            self.bent[which],
             self.t0_s[which],
             self.recording[which],
             self.block[which],
             self.row[which],
+            self.smear_s2,
         )
 
 
@@ -148,26 +152,38 @@ def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every
     commands = np.vstack([episode.sent, episode.sent[-1:]])[rows]
     count = int(np.floor((t[-1] - t[0]) / period_s + 1e-6)) + 1
     grid = t[0] + period_s * np.arange(count)
-    width = _odd(START_SPAN_S / period_s)
-    if count < width + 2:
+    width = start_width(period_s)
+    if count < max(width, QUINTIC_WIDTH) + 2:
         return None
     if np.abs(np.diff(t) - period_s).max() > 0.02 * period_s or count != len(t):
         states = np.stack([np.interp(grid, t, column) for column in states.T], axis=1)
         commands = _cell_means(t, commands, grid, period_s)
-    pose = savgol_filter(states[:, :3], width, 3, axis=0)
-    rate = savgol_filter(states[:, :3], width, 3, deriv=1, delta=period_s, axis=0)
-    sin, cos = np.sin(pose[:, 2]), np.cos(pose[:, 2])
-    forward, left = cos * rate[:, 0] + sin * rate[:, 1], cos * rate[:, 1] - sin * rate[:, 0]
-    smooth = np.column_stack([pose, forward, left, rate[:, 2]])
-    residual = states - savgol_filter(states, width, 3, axis=0)
-    moving = np.hypot(forward, left) > MIN_MOTION_MPS
-    residual = residual[moving] if moving.sum() >= 20 else residual
+    smooth = _smoothed(states, width, 3, period_s)
+    speed = np.hypot(smooth[:, 3], smooth[:, 4])
+    moving = speed > MIN_MOTION_MPS
+    moving = moving if moving.sum() >= 20 else np.ones_like(moving)
+    residual = (states - savgol_filter(states, width, 3, axis=0))[moving]
+    speed = speed[moving]
+    bent = _smoothed(states, max(width, QUINTIC_WIDTH), 5, period_s) - smooth
     if every > 1:
         whole = len(grid) // every * every
         commands = commands[:whole].reshape(-1, every, 2).mean(axis=1)
-        grid, states, smooth = grid[:whole:every], states[:whole:every], smooth[:whole:every]
+        grid, states, smooth, bent = (rows[:whole:every] for rows in (grid, states, smooth, bent))
     begin_s = episode.times_s[0]
-    return Track(index, every * period_s, grid - begin_s, states, smooth, commands, residual, period_s)
+    return Track(index, every * period_s, grid - begin_s, states, smooth, commands, residual, speed, bent, period_s)
+
+
+def _smoothed(states: FloatArray, width: int, order: int, period_s: float) -> FloatArray:
+    """Pose and body velocities (n, 6) by a local polynomial through the poses of (n, 6)."""
+    pose = savgol_filter(states[:, :3], width, order, axis=0)
+    return body_states(pose, savgol_filter(states[:, :3], width, order, deriv=1, delta=period_s, axis=0))
+
+
+def body_states(pose: FloatArray, rate: FloatArray) -> FloatArray:
+    """States (n, 6) of poses (n, 3) and their rates in the world (n, 3)."""
+    sin, cos = np.sin(pose[:, 2]), np.cos(pose[:, 2])
+    forward, left = cos * rate[:, 0] + sin * rate[:, 1], cos * rate[:, 1] - sin * rate[:, 0]
+    return np.column_stack([pose, forward, left, rate[:, 2]])
 
 
 def _cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: float) -> FloatArray:
@@ -183,26 +199,9 @@ def _cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: flo
     return (upto(grid + period_s) - upto(grid)) / period_s
 
 
-def _odd(samples: float) -> int:
-    return max(2 * round((samples - 1) / 2) + 1, 5)
-
-
-def estimate_noise(tracks: Sequence[Track]) -> Noise:
-    """Noise of each channel from what a local cubic leaves of it (a median, so that hard manoeuvres count little).
-
-    An estimate: whatever in the recording is faster than the cubic counts as noise.
-    """
-    period_s = tracks[0].sampled_s
-    width = _odd(START_SPAN_S / period_s)
-    value = savgol_coeffs(width, 3)
-    slope = savgol_coeffs(width, 3, deriv=1, delta=period_s)
-    residual = np.concatenate([t.residual for t in tracks])
-    spread = 1.4826 * np.median(np.abs(residual), axis=0)
-    measured = spread / np.sqrt(max(1.0 - value[width // 2], 0.1))
-    measured[:2] = np.sqrt(np.mean(measured[:2] ** 2))
-    measured = np.maximum(measured, [1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4])
-    pose, rate = np.linalg.norm(value), np.linalg.norm(slope)
-    return Noise(measured, np.concatenate([pose * measured[:3], rate * measured[:3]]))
+def start_width(period_s: float) -> int:
+    """Number of poses, odd and at least 5, that the start of a shot is estimated from."""
+    return max(2 * round((START_SPAN_S / period_s - 1) / 2) + 1, 5)
 
 
 def cut(tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: float = 5.0) -> Shots:
@@ -211,7 +210,8 @@ def cut(tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: flo
     steps = max(round(horizon_s / period_s), 1)
     stride = max(round(stride_s / period_s), 1)
     past = max(round(HISTORY_S / period_s), 1)
-    parts: dict[str, list[FloatArray]] = {name: [] for name in ("start", "history", "commands", "measured", "before")}
+    names = ("start", "history", "commands", "measured", "before", "bent")
+    parts: dict[str, list[FloatArray]] = {name: [] for name in names}
     t0, recordings, blocks, rows = [], [], [], []
     for track in tracks:
         speed = np.hypot(track.smooth[:, 3], track.smooth[:, 4])
@@ -222,7 +222,8 @@ def cut(tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: flo
             parts["history"].append(track.commands[row - past : row])
             parts["commands"].append(track.commands[row : row + steps])
             parts["measured"].append(track.states[row : row + steps + 1])
-            parts["before"].append(track.smooth[row - past : row, 3:])
+            parts["before"].append(track.smooth[row - past : row])
+            parts["bent"].append(track.bent[row])
             t0.append(track.t_s[row])
             recordings.append(track.recording)
             blocks.append(track.recording * 1_000_000 + int(track.t_s[row] / block_s))
@@ -237,7 +238,8 @@ def cut(tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: flo
         history=np.stack(parts["history"]),
         commands=np.stack(parts["commands"]),
         measured=np.stack(parts["measured"]),
-        velocities_before=np.stack(parts["before"]),
+        before=np.stack(parts["before"]),
+        bent=np.stack(parts["bent"]),
         t0_s=np.array(t0),
         recording=np.array(recordings),
         block=np.array(blocks),

@@ -8,9 +8,13 @@ from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import GRAVITY_MPS2, DynamicsEffect, EffectParameter, Forces, Parameters
 
 ROLL_SENSITIVITY = 0.3
-"""Share of an axle's side force that is lost when its inner wheels carry nothing (tyre load sensitivity)."""
+"""Share of an axle's side force that is lost when its inner wheels carry nothing, unless the car file gives another."""
 FASTEST_ROLL_HZ = 25.0
-"""Above it the roll is too quick for steps of 10 ms: its deviation is scaled by ``FASTEST_ROLL_HZ / frequency``."""
+"""Above it the roll is too quick for steps of 10 ms: its loss is scaled by ``FASTEST_ROLL_HZ / frequency``."""
+
+
+LEAST_KEPT = 0.1
+"""Share of the side force that the roll leaves at least."""
 
 
 class AerodynamicDownforce(DynamicsEffect):
@@ -53,14 +57,13 @@ class LoadTransfer(DynamicsEffect):
 
 
 class RollDynamics(DynamicsEffect):
-    """Second-order roll that shifts load, and so grip, between the sides, later than the base model has it.
+    """Second-order roll that shifts load between the sides, which costs grip, later than the side force changes.
 
-    ``rho`` is the share of the load that has moved from the inner to the outer wheels. It is 1 in steady cornering at
-    the limit of grip: ``rho_steady = ay / (mu g)`` with ``mu g = (mu_f F_z,f + mu_r F_z,r) / m`` and ay of the steady
-    side forces; ``rho'' + 2 damping w rho' + w^2 rho = w^2 rho_steady``, ``w = 2 pi frequency``. By the tyres' load
-    sensitivity an axle's side force is scaled by ``1 - 0.3 (rho^2 - rho_steady^2)``: the base model's tyres are those
-    of steady cornering, and an infinite frequency is the base model. Source: the second-order roll of Milliken and
-    Milliken 1995, "Race Car Vehicle Dynamics"; the size of the load sensitivity is our choice.
+    ``rho`` is the share of the load that has moved from the inner to the outer wheels, 1 where all of the grip is used:
+    ``rho'' + 2 damping w rho' + w^2 rho = w^2 ay / (mu g)``, ``w = 2 pi frequency``, with ay of the side forces and
+    ``mu g = (mu_f F_z,f + mu_r F_z,r) / m``. By the tyres' load sensitivity both axles keep ``1 - sensitivity rho^2`` of
+    their side force. Above ``FASTEST_ROLL_HZ`` the loss fades, so that an infinite frequency is the base model. Source:
+    roll and load sensitivity of Milliken and Milliken 1995, "Race Car Vehicle Dynamics".
     """
 
     id = "roll_dynamics"
@@ -70,29 +73,34 @@ class RollDynamics(DynamicsEffect):
     parameters = (
         EffectParameter("frequency", "Hz", math.inf, 0.0, math.inf, 2.5, positive=True),
         EffectParameter("damping", "1", 0.5, 0.0, 5.0, 0.3),
+        EffectParameter("sensitivity", "1", ROLL_SENSITIVITY, 0.0, 20.0, 0.5),
     )
     look_alikes = ("load_transfer",)
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale both side forces and set the rates of the roll."""
-        steady = _steady_shift(ops, forces)
         shift, rate = forces.states["roll_dynamics.shift"], forces.states["roll_dynamics.shift_rate"]
-        slow = values["frequency"] < FASTEST_ROLL_HZ
-        frequency = ops.where(slow, values["frequency"], FASTEST_ROLL_HZ)
-        omega = 2.0 * math.pi * frequency
+        kept = ops.floor(1.0 - _loss(ops, values) * shift * shift, LEAST_KEPT)
+        forces.side_front, forces.side_rear = forces.side_front * kept, forces.side_rear * kept
+        omega = 2.0 * math.pi * ops.where(values["frequency"] < FASTEST_ROLL_HZ, values["frequency"], FASTEST_ROLL_HZ)
         forces.rates["roll_dynamics.shift"] = rate
-        forces.rates["roll_dynamics.shift_rate"] = omega * (omega * (steady - shift) - 2.0 * values["damping"] * rate)
-        size = ROLL_SENSITIVITY * (frequency / values["frequency"])
-        factor = 1.0 - size * (shift * shift - steady * steady)
-        forces.side_front, forces.side_rear = forces.side_front * factor, forces.side_rear * factor
+        forces.rates["roll_dynamics.shift_rate"] = omega * (
+            omega * (_used_grip(ops, forces) - shift) - 2.0 * values["damping"] * rate
+        )
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
-        """Rolled as in steady cornering."""
-        steady = _steady_shift(ops, forces)
+        """Rolled as in steady cornering: ``rho = (1 - loss rho^2) rho_0``, rho_0 being that of the unscaled forces."""
+        alone = _used_grip(ops, forces)
+        steady = 2.0 * alone / (1.0 + ops.sqrt(1.0 + 4.0 * _loss(ops, values) * alone * alone))
         return {"roll_dynamics.shift": steady, "roll_dynamics.shift_rate": 0.0 * steady}
 
 
-def _steady_shift(ops: Ops, forces: Forces) -> Value:
+def _loss(ops: Ops, values: Parameters) -> Value:
+    slow = values["frequency"] < FASTEST_ROLL_HZ
+    return values["sensitivity"] * ops.where(slow, 1.0, FASTEST_ROLL_HZ / values["frequency"])
+
+
+def _used_grip(ops: Ops, forces: Forces) -> Value:
     side = forces.side_front * forces.wheel_cos + forces.side_rear
     grip = forces.grip_front * forces.load_front + forces.grip_rear * forces.load_rear
     return ops.clip(side / ops.floor(grip, 1e-6), -1.0, 1.0)

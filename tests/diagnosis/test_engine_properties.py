@@ -16,11 +16,12 @@ from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.duels import pruned
 from carlab.diagnosis.fit import Fit, Fitter, Scale, base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.judge import Texts
+from carlab.diagnosis.measurement_noise import estimate_noise
 from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separating_drive
 from carlab.diagnosis.residual_terms import TERMS, responses
 from carlab.diagnosis.search import Search
-from carlab.diagnosis.shots import Shots, cut, estimate_noise, tracks_of
+from carlab.diagnosis.shots import Shots, cut, tracks_of
 from carlab.recording.foreign_csv import import_csv
 from sim_backends.effects import EFFECTS
 
@@ -181,7 +182,7 @@ def test_impulse_responses_add_up_to_what_the_simulator_does(drag: tuple[Path, f
 def test_leaving_a_fold_out_by_one_step_is_as_good_as_a_refit(drag: tuple[Path, float], shots: Shots) -> None:
     car = with_effect(load_car_file(drag[0] / "car.toml").simulator, "aerodynamic_drag")
     free = (*base_parameters(car), *effect_parameters("aerodynamic_drag", car))
-    noise = estimate_noise(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)))
+    noise = estimate_noise(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), shots.bent)
     fitter = Fitter(shots, Scale(np.array([8, 16, 24]), np.tile(3.0 * noise.measured, (3, 1))))
     fit = fitter.fit(car, free, iterations=30)
     folds = (shots.block // 2) % 3

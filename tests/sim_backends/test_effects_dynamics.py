@@ -28,6 +28,7 @@ CASES = {
     "traction_limit_all": {"traction_limit": {"share": 0.5, "axle": "all"}},
     "low_friction_patch": {"low_friction_patch": {"x": 0.9, "y": 0.5, "radius": 0.4, "loss": 0.6}},
     "slow_roll": {"roll_dynamics": {"frequency": 1.2, "damping": 0.2}},
+    "soft_roll": {"roll_dynamics": {"frequency": 2.0, "damping": 0.4, "sensitivity": 2.5}},
     "long_relaxation": {"tyre_relaxation": {"length": 0.6}},
     "heavy_wheels": {"longitudinal_slip": {"inertia": 2e-3, "stiffness": 25.0}},
     "ellipse_with_transfer": {"friction_ellipse": {"scale": 0.6}, "load_transfer": {"height": 0.08}},
@@ -134,10 +135,10 @@ def reference_rates(t, s, d, u, p, e):
     roll_acc = 0.0
     if has("roll_dynamics"):
         q = e["roll_dynamics"]
-        steady = (f_front * math.cos(d) + f_rear) / (mu_front * z_front + mu_rear * z_rear)
+        f_front, f_rear = (f * (1 - q.get("sensitivity", 0.3) * roll**2) for f in (f_front, f_rear))
+        used = (f_front * math.cos(d) + f_rear) / (mu_front * z_front + mu_rear * z_rear)
         w = 2 * math.pi * q["frequency"]
-        roll_acc = w**2 * (steady - roll) - 2 * q["damping"] * w * roll_rate
-        f_front, f_rear = (f * (1 - 0.3 * (roll**2 - steady**2)) for f in (f_front, f_rear))
+        roll_acc = w**2 * (used - roll) - 2 * q["damping"] * w * roll_rate
     if has("front_side_force"):
         f_front += e["front_side_force"]["force"] * math.tanh(abs(vx) / 0.2)
     if has("rear_side_force"):

@@ -157,7 +157,7 @@ def index_of(plant, name):
 
 def test_roll_swings_at_its_damped_frequency():
     frequency, damping = 2.0, 0.1
-    cfg = config({"roll_dynamics": {"frequency": frequency, "damping": damping}}, **STRAIGHT_ON)
+    cfg = config({"roll_dynamics": {"frequency": frequency, "damping": damping, "sensitivity": 0.0}}, **STRAIGHT_ON)
     plant = Plant(cfg)
     plant.reset(CarState(0, 0, 0, 3.0, 0, 0), 0.0)
     plant.command(0.0, Action(0.2, 0.0))
@@ -173,6 +173,19 @@ def test_roll_swings_at_its_damped_frequency():
     assert np.allclose(shift, steady * swing, atol=1e-4)
     peak = t[int(np.argmax(shift))]
     assert peak == pytest.approx(math.pi / damped, abs=2e-3)  # half a period of the damped frequency
+
+
+@pytest.mark.parametrize("sensitivity", [0.3, 4.0])
+def test_roll_settles_where_loss_and_side_force_agree(sensitivity):
+    """The side force F0 (1 - s rho^2) holds the roll rho = F / grip: a quadratic."""
+    cfg = config({"roll_dynamics": {"frequency": 4.0, "damping": 1.0, "sensitivity": sensitivity}}, **STRAIGHT_ON)
+    plant = Plant(cfg)
+    plant.reset(CarState(0, 0, 0, 3.0, 0, 0), 0.0)
+    plant.command(0.0, Action(0.2, 0.0))
+    plant.advance(2.0)
+    alone = math.sin(P.front_c * math.atan(P.front_b * 0.12)) * math.cos(0.12) * 0.17 / 0.3
+    (steady,) = [r for r in np.roots([sensitivity * alone, 1.0, -alone]) if r > 0]
+    assert plant._state[6 + index_of(plant, "roll_dynamics.shift")] == pytest.approx(steady, rel=1e-4)
 
 
 def test_wheel_slip_balances_the_drive_at_steady_slip():
