@@ -1,0 +1,146 @@
+"""What a recording tells of itself: its noise, the bias of estimated starts, the window of its velocities, vibration.
+
+The truth is the concealed generator's, which shares no code with the diagnosis and keeps what noise was added.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.cars import load_car_file
+from carlab.concealment import make_case
+from carlab.concealment.case import Case
+from carlab.concealment.driver import HumanDriver
+from carlab.concealment.driver import Track as Course
+from carlab.concealment.measurement import Noise, as_table, record, write_csv
+from carlab.concealment.physics import World
+from carlab.concealment.simulation import drive as simulated_drive
+from carlab.diagnosis.diagnose import diagnose
+from carlab.diagnosis.judge import Texts
+from carlab.diagnosis.measurement_noise import estimate_noise
+from carlab.diagnosis.prediction import Predictor
+from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separating_drive
+from carlab.diagnosis.scoring import noise_floor
+from carlab.diagnosis.shots import Shots, Track, cut, tracks_of
+from carlab.diagnosis.starts import corrected
+from carlab.diagnosis.velocity_window import smear_s2
+from carlab.diagnosis.vibration import find_vibration
+from carlab.recording.foreign_csv import import_csv
+from sim_backends.car_parameters import SimulatorConfig
+
+TEXTS = Texts(effect_sentence, separating_drive, LOOK_ALIKES)
+SEEDS = (61, 62, 63)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A case with its recording to fit as the diagnosis sees it."""
+
+    case: Case
+    folder: Path
+    tracks: list[Track]
+    nominal: SimulatorConfig
+
+    def clean_at(self, shots: Shots) -> np.ndarray:
+        """Noise-free states at the starts of shots (S, 6)."""
+        recording = self.case.recordings[0]
+        rows = np.round(shots.t0_s * 30.0).astype(int)
+        assert np.allclose(recording.t_s[rows] - recording.t_s[0], shots.t0_s, atol=1e-3)
+        return recording.clean[rows]
+
+
+def drive(folder: Path, case: Case) -> Drive:
+    write_csv(folder / "fit.csv", case.fit)
+    write_csv(folder / "hold.csv", case.hold)
+    case.nominal.write(folder / "car.toml")
+    tracks = tracks_of(list(import_csv(folder / "fit.csv").episodes))
+    return Drive(case, folder, tracks, load_car_file(folder / "car.toml").simulator)
+
+
+@pytest.fixture(scope="module", params=SEEDS)
+def plain(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    """Nothing concealed but base parameters that are off."""
+    return drive(tmp_path_factory.mktemp("plain"), make_case("parameters", request.param))
+
+
+@pytest.fixture(scope="module")
+def shaking(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    """A bent wheel of 60 mm radius."""
+    return drive(tmp_path_factory.mktemp("shaking"), make_case("outside", 64, effects=("wheel_imbalance",)))
+
+
+def test_noise_is_what_was_added(plain: Drive) -> None:
+    """Differentiated velocities have noise that is not white; a white noise's formula would be 15 % too high."""
+    shots = cut(plain.tracks, 0.8, 0.3)
+    found = estimate_noise(plain.tracks, shots.bent).measured
+    added = np.std(plain.case.recordings[0].error, axis=0)
+    assert np.allclose(found[:3] / added[:3], 1.0, atol=0.1)
+    assert np.allclose(found[3:] / added[3:], 1.0, atol=0.15)
+    assert np.mean(found[3:] / added[3:]) == pytest.approx(1.0, abs=0.08)
+
+
+def test_floor_is_the_generators(plain: Drive) -> None:
+    """The floor after a second against what the generator's own truth and shot starts give."""
+    shots = cut(plain.tracks, 1.0, 0.25)
+    floor = noise_floor(shots, estimate_noise(plain.tracks, shots.bent), plain.nominal)[-1]
+    assert np.exp(np.mean(np.log(floor / np.array(plain.case.floor)))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_starts_are_nearer_the_truth_without_their_bias(plain: Drive) -> None:
+    shots = cut(plain.tracks, 0.8, 0.3)
+    better = corrected(shots, plain.nominal)
+    truth = plain.clean_at(shots)
+    before, after = (np.sqrt(np.mean((s.start - truth) ** 2, axis=0)) for s in (shots, better))
+    assert np.all(after[3:] < before[3:])
+    assert after[5] < 0.95 * before[5]
+    noise = estimate_noise(plain.tracks, better.bent).start
+    assert np.allclose(noise[[0, 1, 3, 4]] / after[[0, 1, 3, 4]], 1.0, atol=0.25)
+
+
+def test_a_simulator_without_its_steering_takes_less_away(plain: Drive) -> None:
+    """Bent commands have no counterpart in the recording, and so hardly move the starts."""
+    shots = cut(plain.tracks, 0.8, 0.3)
+    rng = np.random.default_rng(0)
+    shuffled = rng.permutation(len(shots))
+    wrong = replace(shots, history=shots.history[shuffled], commands=shots.commands[shuffled])
+    moved = np.sqrt(np.mean((corrected(wrong, plain.nominal).start - shots.start) ** 2, axis=0))
+    right = np.sqrt(np.mean((corrected(shots, plain.nominal).start - shots.start) ** 2, axis=0))
+    assert moved[5] < 0.3 * right[5]
+
+
+@pytest.mark.parametrize("window_s", [0.06, 0.075, 0.09])
+def test_window_of_velocities_is_found(plain: Drive, tmp_path: Path, window_s: float) -> None:
+    """One drive, captured at 120 Hz and differentiated over windows of several widths (parabolas: width^2 / 20)."""
+    car = plain.case.true_car
+    world, course = World(car), Course(np.random.default_rng(5))
+    human = HumanDriver(car, course, np.random.default_rng(6))
+    what = simulated_drive(world, human, 60.0, start=human.start())
+    noise = Noise(car.position_std, car.yaw_std, window_s)
+    write_csv(tmp_path / "drive.csv", as_table(record(what, world, noise, np.random.default_rng(7))))
+    shots = cut(tracks_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
+    assert np.sqrt(20.0 * smear_s2(shots, plain.nominal)) == pytest.approx(window_s, abs=0.025)
+
+
+def test_velocities_of_the_moment_have_no_window(plain: Drive) -> None:
+    shots = cut(plain.tracks, 0.8, 0.3)
+    exact = replace(shots, measured=Predictor(shots, plain.nominal)()[0])
+    assert np.sqrt(20.0 * smear_s2(exact, plain.nominal)) < 0.03
+
+
+def test_vibration_of_a_wheel_is_found_with_its_radius(shaking: Drive, plain: Drive) -> None:
+    found = find_vibration(shaking.tracks)
+    assert found is not None
+    assert 1.0 / (2.0 * np.pi * found.periods_per_m) == pytest.approx(0.06, rel=0.02)
+    assert "60 mm" in found.words() or "61 mm" in found.words()
+    assert find_vibration(plain.tracks) is None
+
+
+def test_vibration_is_said_and_named_nothing_else(shaking: Drive) -> None:
+    fit, hold = (list(import_csv(shaking.folder / name).episodes) for name in ("fit.csv", "hold.csv"))
+    told = diagnose(fit, hold, shaking.nominal, TEXTS).diagnosis
+    assert told.verdict == "unexplained"
+    assert told.unexplained is not None
+    assert told.unexplained.kind.startswith("vibration")
+    assert told.unexplained.channels[0] in shaking.case.answer()["main_channels"]
