@@ -50,6 +50,8 @@ def corrected(shots: Shots, config: SimulatorConfig) -> Shots:
     quintic = _start(simulated[..., :3], 2 * half + 1, 5, shots.period_s)
     turn = shots.start[:, 2] - true[:, 2]
     bias, bent = _turned(cubic - true, turn), _turned(quintic - cubic, turn)
+    lost = ~np.isfinite(np.concatenate([bias, bent], axis=1)).all(axis=1)
+    bias[lost], bent[lost] = 0.0, 0.0
     share = np.zeros(6)
     for group in _GROUPS:
         both, own = float(np.sum(bent[:, group] * shots.bent[:, group])), float(np.sum(bent[:, group] ** 2))

@@ -1,9 +1,12 @@
 """Fitting particles: to a prior alone, to data alone, and to both where the posterior is known."""
 
+import math
+
 import pytest
 import torch
 
 from carlab.core.errors import DataError
+from learning.ensemble import deep_ensemble
 from learning.evaluation import negative_log_likelihood
 from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit
 from learning.function_prior import RbfCovariance
@@ -78,6 +81,25 @@ def test_the_noise_of_the_data_is_found():
     posterior = fit(x, y, x, GaussianProcessPrior(torch.cat([x, x]), RbfCovariance((1.0,), (0.8,))), UNIT, settings)
     assert float(posterior.noise_std) == pytest.approx(0.15, rel=0.1)
     assert negative_log_likelihood(posterior.predict(x), y) < -0.4
+
+
+def test_members_of_an_ensemble_do_not_feel_each_other():
+    """The first member of three is what it is alone; Adam makes its step free of the number of members."""
+    x = torch.linspace(-1, 1, 20)[:, None]
+    y = torch.sin(3 * x)
+    settings = FsvgdSettings(particles=3, steps=300, hidden=(8,), learn_noise=False)
+    three = deep_ensemble(x, y, UNIT, settings).parameters
+    network = deep_ensemble(x, y, UNIT, settings).network
+    start = network.initial(3, generator(), "cpu")
+    alone = start[:1].clone().requires_grad_()
+    optimiser = torch.optim.AdamW([alone], lr=settings.learning_rate, weight_decay=settings.weight_decay)
+    for step in range(settings.steps):
+        optimiser.param_groups[0]["lr"] = 1e-3 * (0.01 + 0.495 * (1 + math.cos(math.pi * step / settings.steps)))
+        optimiser.zero_grad()
+        (0.5 * ((network(alone, x)[0] - y) ** 2).sum() / 0.1**2 / 3).backward()
+        optimiser.step()
+    assert torch.allclose(three[:1], alone.detach(), atol=1e-3)
+    assert not torch.allclose(three[0], three[1], atol=1e-2)
 
 
 def test_the_same_seed_gives_the_same_model():

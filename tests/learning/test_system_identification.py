@@ -1,0 +1,72 @@
+"""Identified parameters against least squares by scipy and against the truth that made the data."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+
+from carlab.core.errors import DataError
+from learning.domain_models import Pendulum, Sinusoids
+from learning.evaluation import negative_log_likelihood
+from learning.fsvgd import FsvgdSettings
+from learning.function_prior import RbfCovariance
+from learning.normaliser import Normaliser
+from learning.system_identification import grey_box, identify
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def pendulum(count, noise, seed=0, **friction):
+    model = Pendulum(**friction)
+    inputs = model.inputs(count, generator(seed))
+    truth = model.sample(1, generator(seed + 1))
+    outputs = model(inputs, truth)[0]
+    return inputs, outputs + noise * torch.randn(outputs.shape, generator=generator(seed + 2)), truth[0]
+
+
+def test_parameters_of_a_pendulum_are_those_of_nonlinear_least_squares():
+    inputs, outputs, truth = pendulum(60, 0.02)
+    found = identify(Pendulum(), inputs, outputs, torch.full((3,), 0.02))
+    identifiable = found.parameters[2] / found.parameters[1], 1.0 / (found.parameters[0] * found.parameters[1] ** 2)
+
+    def residual(x):
+        """In the two numbers that the motion depends on: g / l and 1 / (m l^2)."""
+        length = 1.0
+        parameters = torch.tensor([[1.0 / (x[1] * length**2), length, x[0] * length, 0.0, 0.0]], dtype=torch.float64)
+        return (Pendulum()(inputs.double(), parameters)[0] - outputs.double()).numpy().ravel()
+
+    exact = least_squares(residual, [10.0, 1.0]).x
+    assert np.allclose([float(v) for v in identifiable], exact, rtol=2e-2)
+    assert float(found.noise_std.mean()) == pytest.approx(0.02, rel=0.15)
+    assert float(truth[2] / truth[1]) == pytest.approx(exact[0], rel=0.1)
+
+
+def test_several_starts_find_the_frequency():
+    """A sinusoid's likelihood has many local maxima."""
+    model = Sinusoids()
+    x = torch.linspace(-5, 5, 40)[:, None]
+    truth = torch.tensor([[2.1, 2.25, 1.5]])
+    found = identify(model, x, model(x, truth)[0], torch.tensor([0.01]))
+    assert torch.allclose(found.parameters, truth[0], atol=1e-2)
+
+
+def test_grey_box_takes_up_what_the_simulator_lacks():
+    inputs, outputs, _ = pendulum(300, 0.02, frictions=(0.5, 0.5), drags=(0.5, 0.5))
+    noise = torch.full((3,), 0.02)
+    simulator = identify(Pendulum(), inputs[:200], outputs[:200], noise)
+    zero, one = torch.zeros(4), torch.tensor([1.0, 1.0, 3.5, 2.0])
+    normaliser = Normaliser(zero, one, torch.zeros(3), torch.tensor([0.1, 0.1, 0.3]))
+    settings = FsvgdSettings(particles=10, steps=1500, hidden=(32, 32), noise_std=0.2, measurement_points=16)
+    covariance = RbfCovariance((1.0, 1.0, 1.0), (1.0,))
+    pool = Pendulum().inputs(256, generator(9))
+    model = grey_box(simulator, inputs[:200], outputs[:200], pool, covariance, normaliser, settings)
+    held = inputs[200:], outputs[200:]
+    alone, together = (negative_log_likelihood(m.predict(held[0]), held[1]) for m in (simulator, model))
+    assert together < alone - 0.5
+
+
+def test_nothing_can_be_identified_without_data():
+    with pytest.raises(DataError, match="record an episode"):
+        identify(Sinusoids(), torch.zeros(0, 1), torch.zeros(0, 1), torch.ones(1))
