@@ -69,6 +69,8 @@ class Pendulum:
 
     Attributes:
         masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu and drag.
+        rate_gap: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] in a missing angular
+            acceleration: a Gaussian process for the gap that acts inside the dynamics, with a polynomial kernel.
     """
 
     masses: Range = (0.5, 1.5)
@@ -77,6 +79,7 @@ class Pendulum:
     frictions: Range = (0.0, 0.0)
     drags: Range = (0.0, 0.0)
     dissipative: bool = False
+    rate_gap: tuple[float, float, float] = (0.0, 0.0, 0.0)
     period_s: float = 0.05
     substeps: int = 10
 
@@ -86,13 +89,15 @@ class Pendulum:
         return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
 
     def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws of (m, l, g, nu, drag)."""
+        """Draws of (m, l, g, nu, drag, and three coefficients of the gap)."""
         ranges = (self.masses, self.lengths, self.gravities, self.frictions, self.drags)
-        return uniform(ranges, count, generator)
+        known = uniform(ranges, count, generator)
+        gap = torch.randn((count, 3), generator=generator) * torch.tensor(self.rate_gap)
+        return torch.cat([known, gap], dim=1)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
         """Changes (P, N, 3)."""
-        mass, length, gravity, friction, drag = (parameters[:, k, None] for k in range(5))
+        mass, length, gravity, friction, drag, linear, odd, even = (parameters[:, k, None] for k in range(8))
         angle = torch.atan2(inputs[:, 0], inputs[:, 1])[None]
         rate, torque = inputs[None, :, 2], inputs[None, :, 3]
         step = self.period_s / self.substeps
@@ -100,7 +105,8 @@ class Pendulum:
         for _ in range(self.substeps):
             square = omega * omega.abs() if self.dissipative else omega * omega
             resistance = friction * omega / (mass * length) + drag / mass * square
-            acceleration = gravity / length * torch.sin(theta) + torque / (mass * length**2) - resistance
+            missing = (linear + odd * omega.abs() + even * omega) * omega
+            acceleration = gravity / length * torch.sin(theta) + torque / (mass * length**2) - resistance + missing
             theta, omega = theta + step * omega, omega + step * acceleration
         after = torch.stack([torch.sin(theta), torch.cos(theta), omega], dim=-1)
         return after - inputs[None, :, :3]

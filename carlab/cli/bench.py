@@ -3,34 +3,61 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from tyro.conf import Positional
 
-from carlab.cli.console import console, table
+from carlab.cli.console import console, progress, table
 from carlab.cli.options import above_zero
 
 
 @dataclass
 class Bench:
-    """Measure how fast the parts are, as ratios taken in one run."""
+    """Measure how fast the parts are, or how well models learn from few rows."""
 
-    what: Positional[Literal["speed"]] = "speed"
-    """speed: simulator, gradients, NatNet decoding, lateness of the command sender."""
+    what: Positional[Literal["speed", "regression"]] = "speed"
+    """speed: simulator, gradients, NatNet decoding, lateness of the command sender, as ratios taken in one run.
+    regression: Sim-FSVGD and its baselines on the cases of the paper."""
 
     out: Path | None = None
-    """Write the figures as JSON."""
+    """Write the figures as JSON; regression draws a picture of the same name beside it."""
 
     seconds: float = 10.0
     """Length of each condition of the sender's measurement [s]."""
+
+    case: Literal["1d", "pendulum", "car", "racecar"] = "1d"
+    """What is learned. 1d: sinusoids, two points. pendulum: friction and drag hidden from the prior. car: one step of a
+    car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of theirs (with --data)."""
+
+    rows: tuple[int, ...] = ()
+    """Numbers of rows to learn from; those of the paper's figure unless given."""
+
+    seeds: int = 3
+    """How many true systems and fits."""
+
+    methods: tuple[str, ...] = ()
+    """Some of: Sim-FSVGD, "Sim-FSVGD without gap", FSVGD, SysID, GreyBox, ensemble, ridge. All unless given."""
+
+    way: Literal["ours", "authors"] = "ours"
+    """How particles are fitted: as carlab does, or with the update and the sizes of the authors' code."""
+
+    data: Path | None = None
+    """Folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it."""
+
+    steps: int | None = None
+    """Steps of the optimiser; those of the way unless given."""
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
         """Measure and print."""
+        return self._speed() if self.what == "speed" else self._regression()
+
+    def _speed(self) -> int:
         from carlab.experiment.speed import measure_speed
 
         above_zero(seconds=self.seconds)
@@ -41,6 +68,45 @@ class Bench:
             self.out.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
             console.print(f"{self.out}")
         return 0
+
+    def _regression(self) -> int:
+        from carlab.experiment.interrupts import Interrupts
+        from carlab.experiment.regression_picture import draw
+        from carlab.experiment.regression_study import Score, as_json, run_study, summarised
+
+        above_zero(seeds=self.seeds, steps=self.steps, **{"rows": min(self.rows)} if self.rows else {})
+        scores: list[Score] = []
+        with Interrupts() as interrupts, progress(speed_estimate_period_s=MINUTES_S) as bar:
+            task = bar.add_task(self.case, total=None, note="")
+            study = run_study(
+                self.case, rows=self.rows, seeds=self.seeds, methods=self.methods, way=self.way, data=self.data,
+                steps=self.steps,
+                progress=lambda what, done, total: bar.update(task, completed=done, total=total, note=what),
+            )  # fmt: skip
+            for score in study:
+                scores.append(score)
+                if interrupts.requested.is_set():
+                    break
+        found = summarised(scores)
+        table(
+            f"{self.case}, {self.seeds} seeds, {self.way}",
+            ["rows", "method", "NLL [nat]", "+-", "RMSE", "calibration error", "seconds"],
+            [
+                [f"{r.rows}", r.method, f"{r.nll:.2f}", f"{r.nll_standard_error:.2f}", f"{r.rmse:.3g}",
+                 f"{r.calibration:.3f}", f"{r.seconds:.1f}"]
+                for r in found
+            ],
+        )  # fmt: skip
+        if self.out is not None:
+            command = " ".join(["carlab", *sys.argv[1:]])
+            self.out.write_text(json.dumps(as_json(scores, command), indent=2) + "\n", encoding="utf-8")
+            picture = self.out.with_suffix(".png")
+            draw(found, picture)
+            console.print(f"{self.out}, {picture}")
+        return 0
+
+
+MINUTES_S = 600.0
 
 
 def _flat(values: object, prefix: str = "") -> list[tuple[str, float]]:

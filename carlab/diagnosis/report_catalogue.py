@@ -150,7 +150,7 @@ EFFECT_TEXTS: dict[str, EffectText] = {
     ),
     "roll_dynamics": EffectText(
         "a body that rolls",
-        "the body rolls at {frequency} with a damping ratio of {damping}, and costs grip as load moves between the sides",
+        "the body rolls at {frequency} with a damping ratio of {damping}, and costs grip as load changes sides",
         "fast weaving shows no resonance near that frequency",
     ),
     "friction_drift": EffectText(

@@ -29,17 +29,19 @@ def test_shapes_and_draws_of_their_own(model, inputs, outputs):
 
 
 def test_a_pendulum_follows_its_equation_in_small_steps():
-    model = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6), dissipative=True, substeps=2000)
+    model = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6), dissipative=True, rate_gap=(0.8, 0.3, 0.3), substeps=2000)
     x, parameters = model.inputs(3, generator()).double(), model.sample(2, generator(1)).double()
     ours = model(x, parameters)
     for k in range(2):
-        m, length, g, nu, drag = parameters[k].tolist()
+        m, length, g, nu, drag, linear, odd, even = parameters[k].tolist()
         for n in range(3):
             torque = float(x[n, 3])
 
-            def rates(t, s, torque=torque, m=m, length=length, g=g, nu=nu, drag=drag):
+            def rates(t, s, p=(torque, m, length, g, nu, drag, linear, odd, even)):
+                torque, m, length, g, nu, drag, linear, odd, even = p
                 resistance = nu * s[1] / (m * length) + drag / m * s[1] * abs(s[1])
-                return [s[1], g / length * math.sin(s[0]) + torque / (m * length**2) - resistance]
+                missing = linear * s[1] + odd * s[1] * abs(s[1]) + even * s[1] ** 2
+                return [s[1], g / length * math.sin(s[0]) + torque / (m * length**2) - resistance + missing]
 
             start = [math.atan2(x[n, 0], x[n, 1]), float(x[n, 2])]
             end = solve_ivp(rates, (0, 0.05), start, rtol=1e-10, atol=1e-12).y[:, -1]

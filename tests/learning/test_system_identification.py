@@ -34,7 +34,7 @@ def test_parameters_of_a_pendulum_are_those_of_nonlinear_least_squares():
     def residual(x):
         """In the two numbers that the motion depends on: g / l and 1 / (m l^2)."""
         length = 1.0
-        parameters = torch.tensor([[1.0 / (x[1] * length**2), length, x[0] * length, 0.0, 0.0]], dtype=torch.float64)
+        parameters = torch.tensor([[1.0 / (x[1] * length**2), length, x[0] * length, *[0.0] * 5]], dtype=torch.float64)
         return (Pendulum()(inputs.double(), parameters)[0] - outputs.double()).numpy().ravel()
 
     exact = least_squares(residual, [10.0, 1.0]).x

@@ -1,0 +1,204 @@
+"""Cases of the regression study: what is learned, from how little, and which simulator is the prior.
+
+Each is the paper's (Rothfuss et al., arXiv 2403.16644, section 6.1) with the domains, priors and units of the authors'
+public code. Data is drawn here, or read from arrays that their code made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from learning.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids
+from learning.function_prior import RbfCovariance
+from learning.normaliser import Normaliser
+from learning.simulator_model import CarModel
+from sim_backends.car_parameters import MocapParameters, SimulatorConfig
+
+TEST_ROWS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """Rows to learn from and rows to be judged by: inputs (n, D), outputs (n, O), which are changes of a state."""
+
+    inputs: Tensor
+    outputs: Tensor
+    test_inputs: Tensor
+    test_outputs: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One case.
+
+    Attributes:
+        name: as on the command line, and of the authors' arrays.
+        prior: the simulator that is known.
+        process: the same with a gap inside its dynamics, as the prior of Sim-FSVGD; ``prior`` where it is None.
+        truth: the simulator that makes the data, with a distribution of its parameters; None where only the authors'
+            arrays have it.
+        counts: numbers of rows that are tried.
+        noise_std: of the measured outputs (O,), raw.
+        likelihood_std: expected noise at the start of a fit (O,), raw.
+        learn_noise: whether it is learned.
+        input_std: units of the inputs (D,).
+        output_std: units of the outputs (O,).
+        gap_std: of the Gaussian process between simulator and reality (O,), raw; none where the simulator is right.
+        gap_lengthscale: of that process on raw inputs.
+        function_lengthscale: of the Gaussian-process prior of FSVGD and of a grey box, on normalised inputs.
+    """
+
+    name: str
+    prior: DomainModel
+    process: DomainModel | None
+    truth: DomainModel | None
+    counts: tuple[int, ...]
+    noise_std: tuple[float, ...]
+    likelihood_std: tuple[float, ...]
+    learn_noise: bool
+    input_std: tuple[float, ...]
+    output_std: tuple[float, ...]
+    gap_std: tuple[float, ...] | None
+    gap_lengthscale: float
+    function_lengthscale: float
+
+    @property
+    def normaliser(self) -> Normaliser:
+        """Of inputs and outputs; fixed, not of the data."""
+        inputs, outputs = torch.tensor(self.input_std), torch.tensor(self.output_std)
+        return Normaliser(torch.zeros_like(inputs), inputs, torch.zeros_like(outputs), outputs)
+
+    def gap(self) -> RbfCovariance | None:
+        """Covariance of the gap in normalised outputs on raw inputs."""
+        if self.gap_std is None:
+            return None
+        scales = [g / o for g, o in zip(self.gap_std, self.output_std, strict=True)]
+        return RbfCovariance(tuple(scales), (self.gap_lengthscale,))
+
+    def data(self, count: int, seed: int) -> Data:
+        """Draw ``count`` rows of one true system and ``TEST_ROWS`` others of the same.
+
+        Noise is added to the outputs, which are changes: the state before is known exactly, as in the authors' data.
+
+        Raises:
+            DataError: this case has no true system here.
+        """
+        if self.truth is None:
+            raise DataError(f"The rows of '{self.name}' are the authors' arrays alone; give their folder with --data.")
+        generator = torch.Generator().manual_seed(10_000 + seed)
+        system = self.truth.sample(1, generator)
+        inputs = self.truth.inputs(count + TEST_ROWS, generator)
+        outputs = self.truth(inputs, system)[0]
+        outputs = outputs + torch.tensor(self.noise_std) * torch.randn(outputs.shape, generator=generator)
+        return Data(inputs[:count], outputs[:count], inputs[count:], outputs[count:])
+
+    def recorded(self, folder: Path, count: int, seed: int) -> Data:
+        """The authors' arrays of this case. Raises DataError where there is no such file."""
+        name = "sinusoid_n2" if self.name == "1d" else f"{self.name}_seed{seed}_n{count}"
+        path = folder / f"{name}.npz"
+        if not path.is_file():
+            raise DataError(f"{path} does not exist; leave out --data to draw the data here, or choose other rows.")
+        with np.load(path) as arrays:
+            x, y, tx, ty = (torch.from_numpy(arrays[k].astype(np.float32)) for k in ("x", "y", "x_test", "y_test"))
+        if self.name == "1d":
+            return Data(x, y, tx, ty)
+        width = y.shape[1]
+        return Data(x, y - x[:, :width], tx, ty - tx[:, :width])
+
+
+_CAR_NOISE = (0.0011, 0.0011, 0.0018, 0.0018, 0.0082, 0.0082, 0.0368)
+
+CAR_HISTORY = 3
+"""Commands before the last one; the delay of 80 ms is two and a half periods."""
+_STILL = MocapParameters(latency_s=0.0)
+PACEJKA = SimulatorConfig(mocap=_STILL)
+PACEJKA_RANGES = {
+    "tyre.front.mu": (0.6, 1.0),
+    "tyre.rear.mu": (0.6, 1.0),
+    "tyre.front.B": (2.0, 4.0),
+    "tyre.rear.B": (3.0, 10.0),
+    "motor.drive_gain": (6.5, 10.0),
+    "motor.damping": (1.0, 2.2),
+    "vehicle.yaw_inertia": (0.03, 0.18),
+    "steering.max_angle": (0.4, 0.7),
+}
+KINEMATIC = SimulatorConfig(kind="kinematic", mocap=_STILL)
+KINEMATIC_RANGES = {
+    "motor.drive_gain": (6.0, 10.0),
+    "motor.damping": (1.0, 3.2),
+    "steering.max_angle": (0.3, 0.7),
+}
+
+CASES = {
+    case.name: case
+    for case in (
+        Case(
+            name="1d",
+            prior=Sinusoids(),
+            process=None,
+            truth=Sinusoids(),
+            counts=(2,),
+            noise_std=(0.0,),
+            likelihood_std=(0.4,),
+            learn_noise=False,
+            input_std=(5.0,),
+            output_std=(8.0,),
+            gap_std=None,
+            gap_lengthscale=1.0,
+            function_lengthscale=0.2,
+        ),
+        Case(
+            name="pendulum",
+            prior=Pendulum(),
+            process=Pendulum(rate_gap=(0.8, 0.25, 0.25)),
+            truth=Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6)),
+            counts=(5, 10, 20, 50),
+            noise_std=(0.02, 0.02, 0.02),
+            likelihood_std=(0.05, 0.05, 0.5),
+            learn_noise=True,
+            input_std=(1.0, 1.0, 3.5, 2.0),
+            output_std=(0.158, 0.150, 0.951),
+            gap_std=(0.025, 0.025, 0.25),
+            gap_lengthscale=10.0,
+            function_lengthscale=0.4,
+        ),
+        Case(
+            name="car",
+            prior=CarModel(KINEMATIC, CAR_HISTORY, KINEMATIC_RANGES),
+            process=None,
+            truth=CarModel(PACEJKA, CAR_HISTORY, PACEJKA_RANGES),
+            counts=(20, 50, 100, 200, 400),
+            noise_std=(0.001, 0.001, 0.002, 0.008, 0.008, 0.04),
+            likelihood_std=(0.01, 0.01, 0.02, 0.05, 0.05, 0.3),
+            learn_noise=True,
+            input_std=(1.5, 0.5, 3.0, *(0.6,) * (2 * CAR_HISTORY + 2)),
+            output_std=(0.05, 0.02, 0.1, 0.1, 0.1, 0.6),
+            gap_std=(0.01, 0.01, 0.03, 0.05, 0.05, 0.4),
+            gap_lengthscale=3.0,
+            function_lengthscale=3.0,
+        ),
+        Case(
+            name="racecar",
+            prior=KinematicCar(place_m=4.0, speed_mps=6.0, rate_radps=8.0),
+            process=None,
+            truth=None,
+            counts=(20, 50, 100, 200, 400),
+            noise_std=_CAR_NOISE,
+            likelihood_std=tuple(20.0 * s for s in _CAR_NOISE),
+            learn_noise=True,
+            input_std=(3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0, 1.0, 1.0),
+            output_std=(0.127, 0.123, 0.060, 0.056, 2.86, 2.86, 5.65),
+            gap_std=(0.004, 0.004, 0.015, 0.015, 0.15, 0.15, 0.75),
+            gap_lengthscale=10.0,
+            function_lengthscale=0.4,
+        ),
+    )
+}
+
+__all__ = ["CASES", "TEST_ROWS", "Case", "Data"]

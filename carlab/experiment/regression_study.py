@@ -1,0 +1,255 @@
+"""Learning from few rows: Sim-FSVGD and its baselines on the cases of the paper, with likelihood, error, calibration.
+
+Two ways of fitting: ``ours`` (measurement sets preconditioned by the posterior's precision, prior moments from a bank
+of draws), and ``authors`` (the update and the sizes of the authors' public code, for laying the two side by side).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from carlab.core.clock import MonotonicClock
+from carlab.core.errors import ConfigError
+from carlab.experiment.regression_cases import CASES, Case, Data
+from learning.ensemble import deep_ensemble
+from learning.evaluation import Mixture, calibration_error, negative_log_likelihood, root_mean_square_error
+from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit
+from learning.function_prior import RbfCovariance
+from learning.ridge import Ridge
+from learning.system_identification import grey_box, identify
+
+Way = Literal["ours", "authors"]
+Progress = Callable[[str, int, int], None]
+POOL = 1024
+DRAWS = 2048
+LEAST_RIDGE = 3
+
+
+class Model(Protocol):
+    """What every method gives."""
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Prediction at inputs (N, D)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One method, fitted once.
+
+    Attributes:
+        case, method, rows, seed: what was fitted.
+        nll: mean joint negative log density of all outputs [nat].
+        rmse: root of the squared error summed over outputs, in mixed units.
+        calibration: mean absolute difference of coverage.
+        seconds: that the fit took.
+    """
+
+    case: str
+    method: str
+    rows: int
+    seed: int
+    nll: float
+    rmse: float
+    calibration: float
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    case: Case
+    data: Data
+    seed: int
+    way: Way
+    steps: int | None
+
+    def settings(self) -> FsvgdSettings:
+        """How particles are fitted."""
+        case, rows = self.case, len(self.data.inputs)
+        noise = tuple(s / o for s, o in zip(case.likelihood_std, case.output_std, strict=True))
+        if self.way == "ours":
+            steps = self.steps or 3000
+            return FsvgdSettings(steps=steps, noise_std=noise, learn_noise=case.learn_noise, seed=self.seed)
+        steps = self.steps or min(60 * rows // 8 + 5000, 100_000) // 1000 * 1000
+        if case.name == "1d":
+            return FsvgdSettings(
+                steps=self.steps or 20_000, batch=4, measurement_points=8, bandwidth=1.0, natural=False,
+                noise_std=noise, learn_noise=False, seed=self.seed,
+            )  # fmt: skip
+        return FsvgdSettings(
+            steps=steps, batch=8, measurement_points=32, bandwidth=2.0, natural=False, noise_std=noise, seed=self.seed
+        )
+
+    def pool(self) -> Tensor:
+        """Inputs of the domain."""
+        return self.case.prior.inputs(POOL, torch.Generator().manual_seed(20_000 + self.seed))
+
+    def function_prior(self) -> RbfCovariance:
+        """Of FSVGD and of a grey box: one normalised unit everywhere."""
+        return RbfCovariance((1.0,) * len(self.case.output_std), (self.case.function_lengthscale,))
+
+    def sim_fsvgd(self, *, gap: bool) -> Model:
+        """Particles under draws of the simulator."""
+        case, normaliser, pool = self.case, self.case.normaliser, self.pool()
+        generator = torch.Generator().manual_seed(30_000 + self.seed)
+        process = case.process if gap and case.process is not None and self.way == "ours" else case.prior
+        everything = torch.cat([self.data.inputs, pool])
+        with torch.no_grad():
+            draws = normaliser.outputs(process(everything, process.sample(DRAWS, generator)))
+        prior = SimulatorPrior(draws, everything, case.gap() if gap else None)
+        return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings())
+
+    def fsvgd(self) -> Model:
+        """Particles under a Gaussian process, properly weighted."""
+        normaliser, pool = self.case.normaliser, self.pool()
+        prior = GaussianProcessPrior(normaliser.inputs(torch.cat([self.data.inputs, pool])), self.function_prior())
+        return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings())
+
+    def sysid(self) -> Model:
+        """The simulator with its parameters at maximum likelihood."""
+        noise = torch.tensor(self.case.likelihood_std)
+        return identify(self.case.prior, self.data.inputs, self.data.outputs, noise, self.seed)
+
+    def grey_box(self) -> Model:
+        """The same and particles for what it leaves."""
+        noise = torch.tensor(self.case.likelihood_std)
+        simulator = identify(self.case.prior, self.data.inputs, self.data.outputs, noise, self.seed)
+        return grey_box(
+            simulator, self.data.inputs, self.data.outputs, self.pool(), self.function_prior(), self.case.normaliser,
+            self.settings(),
+        )  # fmt: skip
+
+    def ensemble(self) -> Model:
+        """Networks that differ by their start."""
+        return deep_ensemble(self.data.inputs, self.data.outputs, self.case.normaliser, self.settings())
+
+    def ridge(self) -> Model:
+        """Linear regression."""
+        return _Linear(Ridge.fit(self.data.inputs.double().numpy(), self.data.outputs.double().numpy()))
+
+
+@dataclass(frozen=True, slots=True)
+class _Linear:
+    ridge: Ridge
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        mean = torch.from_numpy(self.ridge(inputs.double().numpy()))
+        return Mixture(mean[None], torch.from_numpy(self.ridge.std).expand(1, 1, -1))
+
+
+METHODS: dict[str, Callable[[_Task], Model]] = {
+    "Sim-FSVGD": lambda task: task.sim_fsvgd(gap=True),
+    "Sim-FSVGD without gap": lambda task: task.sim_fsvgd(gap=False),
+    "FSVGD": _Task.fsvgd,
+    "SysID": _Task.sysid,
+    "GreyBox": _Task.grey_box,
+    "ensemble": _Task.ensemble,
+    "ridge": _Task.ridge,
+}
+
+
+def run_study(
+    case: str,
+    *,
+    rows: Sequence[int] = (),
+    seeds: int = 3,
+    methods: Sequence[str] = (),
+    way: Way = "ours",
+    data: Path | None = None,
+    steps: int | None = None,
+    progress: Progress = lambda what, done, total: None,
+) -> Iterator[Score]:
+    """Fit every method to every number of rows with every seed, and score it as soon as it is fitted.
+
+    Args:
+        case: of ``CASES``.
+        rows: numbers of rows; those of the case unless given.
+        seeds: how many; data and fit have the same one.
+        methods: of ``METHODS``; all unless given.
+        way: how particles are fitted.
+        data: folder of the authors' arrays; the data is drawn here without it.
+        steps: of the optimiser; those of the way unless given.
+        progress: told what is fitted, how many fits are done, and of how many.
+
+    Raises:
+        ConfigError: an unknown case or method.
+        DataError: arrays are missing.
+    """
+    if case not in CASES:
+        raise ConfigError(f"There is no case '{case}'; choose {', '.join(CASES)}.")
+    if unknown := [m for m in methods if m not in METHODS]:
+        raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(METHODS)}.")
+    chosen, counts = CASES[case], tuple(rows) or CASES[case].counts
+    names = tuple(methods) or tuple(METHODS)
+    plan = [p for p in itertools.product(counts, range(seeds), names) if not (p[2] == "ridge" and p[0] < LEAST_RIDGE)]
+    clock = MonotonicClock()
+    for done, (count, seed, name) in enumerate(plan):
+        progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
+        found = chosen.data(count, seed) if data is None else chosen.recorded(data, count, seed)
+        began_s = clock.now_s()
+        model = METHODS[name](_Task(chosen, found, seed, way, steps))
+        seconds = clock.now_s() - began_s
+        prediction = model.predict(found.test_inputs)
+        yield Score(
+            case, name, count, seed,
+            negative_log_likelihood(prediction, found.test_outputs),
+            root_mean_square_error(prediction, found.test_outputs),
+            calibration_error(prediction, found.test_outputs),
+            seconds,
+        )  # fmt: skip
+    progress("", len(plan), len(plan))
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Scores of one method at one number of rows over the seeds: means, and the standard error of the likelihood."""
+
+    method: str
+    rows: int
+    seeds: int
+    nll: float
+    nll_standard_error: float
+    rmse: float
+    calibration: float
+    seconds: float
+
+
+def summarised(scores: Sequence[Score]) -> list[Row]:
+    """One row for each method and number of rows, in the order in which they were fitted."""
+    groups: dict[tuple[int, str], list[Score]] = {}
+    for score in scores:
+        groups.setdefault((score.rows, score.method), []).append(score)
+    found = []
+    for (count, method), own in groups.items():
+        nll, rmse, off, seconds = (np.array([getattr(s, k) for s in own]) for k in _FIGURES)
+        spread = float(nll.std(ddof=1) / np.sqrt(len(own))) if len(own) > 1 else float("nan")
+        found.append(
+            Row(method, count, len(own), float(nll.mean()), spread, float(rmse.mean()), float(off.mean()),
+                float(seconds.mean()))
+        )  # fmt: skip
+    return found
+
+
+_FIGURES = ("nll", "rmse", "calibration", "seconds")
+
+
+def as_json(scores: Sequence[Score], command: str) -> dict[str, object]:
+    """Everything that was measured, and what made it."""
+    return {
+        "schema": "carlab.regression/1",
+        "command": command,
+        "torch_threads": torch.get_num_threads(),
+        "rows": [asdict(row) for row in summarised(scores)],
+        "scores": [asdict(score) for score in scores],
+    }
+
+
+__all__ = ["METHODS", "Row", "Score", "Way", "as_json", "run_study", "summarised"]

@@ -1,0 +1,72 @@
+"""``carlab bench regression``: figures that follow from the definition, files that hold what was printed."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from carlab.cli import run
+from carlab.core.errors import ConfigError, DataError
+from carlab.experiment.regression_cases import CASES
+from carlab.experiment.regression_study import run_study, summarised
+from learning.ridge import Ridge
+
+
+def test_ridge_in_the_study_is_scipys_likelihood_of_the_same_rows():
+    (score,) = run_study("car", rows=(50,), seeds=1, methods=("ridge",))
+    data = CASES["car"].data(50, 0)
+    model = Ridge.fit(data.inputs.double().numpy(), data.outputs.double().numpy())
+    mean, truth = model(data.test_inputs.double().numpy()), data.test_outputs.double().numpy()
+    assert score.nll == pytest.approx(-norm.logpdf(truth, mean, model.std).sum(axis=1).mean(), rel=1e-6)
+    assert score.rmse == pytest.approx(np.sqrt(((truth - mean) ** 2).sum(axis=1).mean()), rel=1e-6)
+
+
+def test_true_parameters_leave_the_noise_that_was_added():
+    """The simulator that made a case's rows, with its parameters found again, is at the noise of the case."""
+    case = CASES["pendulum"]
+    data = case.data(50, 1)
+    system = case.truth.sample(1, torch.Generator().manual_seed(10_001))
+    left = (case.truth(data.test_inputs, system)[0] - data.test_outputs).std(dim=0)
+    assert torch.allclose(left, torch.tensor(case.noise_std), rtol=0.1)
+
+
+def test_what_is_printed_is_written(tmp_path, capsys, monkeypatch):
+    out = tmp_path / "study.json"
+    arguments = ["bench", "regression", "--case", "1d", "--seeds", "2", "--methods", "SysID", "FSVGD", "--steps", "40"]
+    monkeypatch.setattr("sys.argv", ["carlab", *arguments, "--out", str(out)])
+    assert run([*arguments, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    told = json.loads(out.read_text())
+    assert told["schema"] == "carlab.regression/1"
+    assert told["command"].startswith("carlab bench regression --case 1d")
+    assert [(s["method"], s["seed"]) for s in told["scores"]] == [
+        ("SysID", 0),
+        ("FSVGD", 0),
+        ("SysID", 1),
+        ("FSVGD", 1),
+    ]
+    for row in told["rows"]:
+        own = [s["nll"] for s in told["scores"] if s["method"] == row["method"]]
+        assert row["nll"] == pytest.approx(np.mean(own))
+        assert row["nll_standard_error"] == pytest.approx(np.std(own, ddof=1) / np.sqrt(2))
+        assert f"{row['nll']:.2f}" in printed
+    assert out.with_suffix(".png").stat().st_size > 10_000
+
+
+def test_a_study_is_the_same_again():
+    first, second = (list(run_study("1d", seeds=1, methods=("Sim-FSVGD",), steps=30)) for _ in range(2))
+    assert (first[0].nll, first[0].rmse) == (second[0].nll, second[0].rmse)
+    assert np.isnan(summarised(first)[0].nll_standard_error)
+
+
+def test_what_cannot_be_studied_is_said(tmp_path):
+    with pytest.raises(ConfigError, match="no method 'SVGD'"):
+        list(run_study("1d", methods=("SVGD",)))
+    with pytest.raises(ConfigError, match="no case '2d'"):
+        list(run_study("2d"))
+    with pytest.raises(DataError, match="with --data"):
+        list(run_study("racecar", rows=(20,), seeds=1, methods=("ridge",)))
+    with pytest.raises(DataError, match=r"pendulum_seed0_n5\.npz does not exist"):
+        list(run_study("pendulum", rows=(5,), seeds=1, methods=("ridge",), data=tmp_path))

@@ -1,0 +1,83 @@
+"""The simulator as a one-step model against whole drives of it, and the rows that are learned from them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ConfigError
+from learning.simulator_model import CarModel
+from learning.system_identification import identify
+from learning.transitions import transitions_of
+from sim_backends.batch_rollout import rollout
+from sim_backends.car_parameters import MocapParameters, SimulatorConfig
+
+QUIET = MocapParameters(latency_s=0.0)
+HISTORY = 4
+
+
+def drive(config: SimulatorConfig, ticks: int = 60, seed: int = 0, *, measured: bool = False) -> EpisodeData:
+    """A random drive without noise."""
+    rng = np.random.default_rng(seed)
+    sent = np.repeat(rng.uniform(-1, 1, size=(ticks // 6, 2)), 6, axis=0)
+    sent[:, 1] = np.abs(sent[:, 1])
+    start = torch.tensor([[0.3, -0.2, 0.7, 1.5, 0.0, 0.0]], dtype=torch.float64)
+    out = rollout(config, start, torch.from_numpy(sent[None]), measured=measured)
+    states = (out.measured if measured else out.states)[0].numpy()
+    return EpisodeData(np.arange(len(sent) + 1) * config.control_period_s, states, sent, sent, np.zeros(len(sent)))
+
+
+@pytest.mark.parametrize("kind", ["dynamic", "kinematic"])
+def test_every_row_of_a_drive_is_one_step_of_the_model(kind):
+    config = SimulatorConfig(kind=kind, mocap=QUIET)
+    rows = transitions_of([drive(config)], HISTORY)
+    model = CarModel(config, HISTORY, {"vehicle.mass": (2.0, 2.0)})
+    given = torch.tensor([[config.values()["vehicle.mass"]]], dtype=torch.float64)
+    found = model(torch.from_numpy(rows.inputs), given)[0].numpy()
+    assert np.allclose(found, rows.targets, atol=1e-9)
+
+
+def test_commands_act_later_as_seen_from_old_measurements():
+    """States that are 20 ms old: the prior must predict the measured rows of steady stretches' ends as well."""
+    config = SimulatorConfig(mocap=MocapParameters(latency_s=0.02))
+    rows = transitions_of([drive(config, measured=True)], HISTORY)
+    right = CarModel(config, HISTORY, {"vehicle.mass": (2.0, 2.0)})
+    wrong = CarModel(replace(config, mocap=QUIET), HISTORY, {"vehicle.mass": (2.0, 2.0)})
+    given = torch.tensor([[config.values()["vehicle.mass"]]], dtype=torch.float64)
+    error, other = (
+        np.sqrt(np.mean((m(torch.from_numpy(rows.inputs), given)[0].numpy() - rows.targets)[:, 3:] ** 2))
+        for m in (right, wrong)
+    )
+    assert error < 0.3 * other
+
+
+def test_draws_are_within_their_ranges_and_inputs_are_drives():
+    ranges = {"motor.drive_gain": (6.0, 10.0), "tyre.front.mu": (0.5, 1.0)}
+    model = CarModel(SimulatorConfig(mocap=QUIET), HISTORY, ranges)
+    generator = torch.Generator().manual_seed(0)
+    drawn = model.sample(500, generator)
+    for k, (low, high) in enumerate(ranges.values()):
+        assert low <= float(drawn[:, k].min()) < low + 0.1 * (high - low)
+        assert high >= float(drawn[:, k].max()) > high - 0.1 * (high - low)
+    inputs = model.inputs(403, generator)
+    assert inputs.shape == (403, 3 + 2 * (HISTORY + 1))
+    assert torch.isfinite(inputs).all()
+    assert inputs[:, 3:].abs().max() <= 1.0
+    held = (inputs[:, 3:5] == inputs[:, 5:7]).all(dim=1).float().mean()
+    assert float(held) == pytest.approx(1 - 1 / 8, abs=0.06)
+
+
+def test_identification_finds_the_car_that_drove():
+    truth = SimulatorConfig(mocap=QUIET).with_values({"motor.drive_gain": 9.1, "tyre.rear.mu": 0.62})
+    rows = transitions_of([drive(truth, 240)], HISTORY)
+    ranges = {"motor.drive_gain": (6.0, 11.0), "tyre.rear.mu": (0.3, 1.2)}
+    model = CarModel(SimulatorConfig(mocap=QUIET), HISTORY, ranges)
+    found = identify(model, torch.from_numpy(rows.inputs), torch.from_numpy(rows.targets), torch.full((6,), 1e-3))
+    assert found.parameters.tolist() == pytest.approx([9.1, 0.62], rel=1e-2)
+
+
+def test_a_range_for_nothing_is_refused():
+    with pytest.raises(ConfigError, match=r"'motor\.gain' is no number"):
+        CarModel(SimulatorConfig(), 3, {"motor.gain": (1.0, 2.0)})
