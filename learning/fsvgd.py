@@ -90,6 +90,8 @@ class FsvgdSettings:
         weight_decay: of AdamW, on the networks alone.
         noise_std: standard deviation of the likelihood at the start, normalised, one or one for each output.
         learn_noise: whether it is fitted too.
+        noise_rows: rows of data that ``noise_std`` counts for then (an inverse-gamma prior): a handful of rows that a
+            network meets exactly says nothing of their noise.
         likelihood_exponent: power of the likelihood.
         seed: of everything that is drawn.
     """
@@ -105,6 +107,7 @@ class FsvgdSettings:
     weight_decay: float = 1e-3
     noise_std: float | tuple[float, ...] = 0.1
     learn_noise: bool = True
+    noise_rows: float = 0.0
     likelihood_exponent: float = 1.0
     seed: int = 0
 
@@ -140,9 +143,11 @@ class _State:
 
     networks: Tensor
     log_noise: Tensor
+    expected_noise: Tensor = field(init=False)
     optimiser: torch.optim.Optimizer = field(init=False)
 
     def prepare(self, settings: FsvgdSettings) -> None:
+        self.expected_noise = self.log_noise.exp()
         groups = [{"params": [self.networks], "weight_decay": settings.weight_decay}]
         if settings.learn_noise:
             groups.append({"params": [self.log_noise], "weight_decay": 0.0, "faster": NOISE_FASTER})
@@ -234,9 +239,10 @@ def _step(
         score[:, : len(rows)] += weight * off / noise**2
         known[:, : len(rows)] = weight / noise[:, None] ** 2
         if settings.learn_noise:
-            # Gradient of the particles' mean negative log-likelihood by the logarithm of the noise.
+            # Gradient by the logarithm of the noise: the particles' mean negative log-likelihood, and the prior's.
             square = (off * off).mean(dim=0).sum(dim=0) / noise**2
-            state.log_noise.grad = weight * (len(rows) - square)
+            expected = settings.noise_rows * (1.0 - (state.expected_noise / noise) ** 2)
+            state.log_noise.grad = weight * (len(rows) - square) + expected
     kernel = RbfKernel(settings.bandwidth or median_bandwidth(values.flatten(1)))
     if settings.natural:
         precision = torch.diag_embed(known) if marginal is None else torch.diag_embed(known) + marginal.precision()

@@ -45,7 +45,7 @@ class Case:
             arrays have it.
         counts: numbers of rows that are tried.
         noise_std: of the measured outputs (O,), raw.
-        likelihood_std: expected noise at the start of a fit (O,), raw.
+        likelihood_std: the authors' noise at the start of a fit (O,), raw.
         learn_noise: whether it is learned.
         input_std: units of the inputs (D,).
         output_std: units of the outputs (O,).
@@ -67,6 +67,11 @@ class Case:
     gap_std: tuple[float, ...] | None
     gap_lengthscale: float
     function_lengthscale: float
+
+    @property
+    def expected_noise_std(self) -> tuple[float, ...]:
+        """Twice the noise of the sensor, which is known; the authors' where it has none."""
+        return tuple(2.0 * n or s for n, s in zip(self.noise_std, self.likelihood_std, strict=True))
 
     @property
     def normaliser(self) -> Normaliser:

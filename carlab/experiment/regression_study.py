@@ -31,6 +31,7 @@ Progress = Callable[[str, int, int], None]
 POOL = 1024
 DRAWS = 2048
 LEAST_RIDGE = 3
+NOISE_ROWS = 2.0
 
 
 class Model(Protocol):
@@ -74,10 +75,13 @@ class _Task:
     def settings(self) -> FsvgdSettings:
         """How particles are fitted."""
         case, rows = self.case, len(self.data.inputs)
-        noise = tuple(s / o for s, o in zip(case.likelihood_std, case.output_std, strict=True))
         if self.way == "ours":
-            steps = self.steps or 3000
-            return FsvgdSettings(steps=steps, noise_std=noise, learn_noise=case.learn_noise, seed=self.seed)
+            noise = tuple(s / o for s, o in zip(case.expected_noise_std, case.output_std, strict=True))
+            return FsvgdSettings(
+                steps=self.steps or 3000, noise_std=noise, learn_noise=case.learn_noise, noise_rows=NOISE_ROWS,
+                seed=self.seed,
+            )  # fmt: skip
+        noise = tuple(s / o for s, o in zip(case.likelihood_std, case.output_std, strict=True))
         steps = self.steps or min(60 * rows // 8 + 5000, 100_000) // 1000 * 1000
         if case.name == "1d":
             return FsvgdSettings(
@@ -115,12 +119,12 @@ class _Task:
 
     def sysid(self) -> Model:
         """The simulator with its parameters at maximum likelihood."""
-        noise = torch.tensor(self.case.likelihood_std)
+        noise = torch.tensor(self.case.expected_noise_std)
         return identify(self.case.prior, self.data.inputs, self.data.outputs, noise, self.seed)
 
     def grey_box(self) -> Model:
         """The same and particles for what it leaves."""
-        noise = torch.tensor(self.case.likelihood_std)
+        noise = torch.tensor(self.case.expected_noise_std)
         simulator = identify(self.case.prior, self.data.inputs, self.data.outputs, noise, self.seed)
         return grey_box(
             simulator, self.data.inputs, self.data.outputs, self.pool(), self.function_prior(), self.case.normaliser,

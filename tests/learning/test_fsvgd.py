@@ -83,6 +83,14 @@ def test_the_noise_of_the_data_is_found():
     assert negative_log_likelihood(posterior.predict(x), y) < -0.4
 
 
+def test_expected_noise_counts_for_its_rows():
+    """Three rows met exactly: the most probable variance is the expected one times its rows over all rows."""
+    x = torch.tensor([[-1.0], [0.0], [1.0]])
+    settings = FsvgdSettings(steps=3000, hidden=(32,), noise_std=0.1, noise_rows=2.0, particles=3, weight_decay=0.0)
+    found = deep_ensemble(x, torch.sin(3 * x), UNIT, settings)
+    assert float(found.noise_std) == pytest.approx(0.1 * math.sqrt(2.0 / 5.0), rel=0.05)
+
+
 def test_members_of_an_ensemble_do_not_feel_each_other():
     """The first member of three is what it is alone; Adam makes its step free of the number of members."""
     x = torch.linspace(-1, 1, 20)[:, None]
