@@ -9,9 +9,6 @@ from torch import Tensor
 from learning.fsvgd import FsvgdSettings, Posterior, fit
 from learning.normaliser import Normaliser
 
-APART = 1e-6
-"""Bandwidth of a kernel that no two particles feel."""
-
 
 def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, settings: FsvgdSettings) -> Posterior:
     """Fit every particle by itself to the likelihood, with the optimiser's weight decay as the only prior.
@@ -22,7 +19,7 @@ def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, setti
         normaliser: of both.
         settings: of the fit; kernel and preconditioning are left out.
     """
-    alone = replace(settings, natural=False, bandwidth=APART)
+    alone = replace(settings, together=False)
     return fit(inputs, outputs, inputs, None, normaliser, alone)
 
 

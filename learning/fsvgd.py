@@ -84,6 +84,7 @@ class FsvgdSettings:
         batch: rows of data in a measurement set; all of them where there are fewer.
         measurement_points: points of the domain in a measurement set.
         bandwidth: of the kernel; by the median heuristic at each step if None.
+        together: whether particles feel each other; without it each finds a most probable function, an ensemble.
         natural: precondition by the posterior's covariance on the measurement set (a matrix-valued kernel). False is
             the update of the paper.
         learning_rate: of Adam at the start; it falls to a hundredth along a half cosine.
@@ -102,6 +103,7 @@ class FsvgdSettings:
     batch: int = 32
     measurement_points: int = 16
     bandwidth: float | None = None
+    together: bool = True
     natural: bool = True
     learning_rate: float = 1e-3
     weight_decay: float = 1e-3
@@ -243,6 +245,10 @@ def _step(
             square = (off * off).mean(dim=0).sum(dim=0) / noise**2
             expected = settings.noise_rows * (1.0 - (state.expected_noise / noise) ** 2)
             state.log_noise.grad = weight * (len(rows) - square) + expected
+    if not settings.together:
+        state.networks.grad = -pullback(score)
+        state.optimiser.step()
+        return
     kernel = RbfKernel(settings.bandwidth or median_bandwidth(values.flatten(1)))
     if settings.natural:
         precision = torch.diag_embed(known) if marginal is None else torch.diag_embed(known) + marginal.precision()

@@ -28,7 +28,8 @@ class RbfKernel:
 
     def repulsion(self, values: Tensor, matrix: Tensor) -> Tensor:
         """``sum_i`` of the gradient of ``k(h_i, h_l)`` by ``h_i``, for each l: (L, F)."""
-        weight = matrix / self.bandwidth**2
+        # A particle does not push itself: left in, its two equal terms would cancel only up to rounding.
+        weight = (matrix - torch.diag(matrix.diagonal())) / self.bandwidth**2
         return weight.sum(dim=1, keepdim=True) * values - weight @ values
 
 
