@@ -33,6 +33,8 @@ BESIDE_CHI2 = 20.0
 """Physics outside the catalogue that gains so much beside the names is reported."""
 WEAK_CHI2 = 14.0
 """Where something is missing for certain, terms of this strength are good enough to describe it."""
+SHAKEN_SHARE = 0.02
+"""Vibration is what is missing, and not just there too, where its lower bound is this share of the squared excess."""
 AS_GOOD = 0.85
 """Physics outside the catalogue describes what is left where it gains this share of what free terms gain."""
 
@@ -126,8 +128,12 @@ def unexplained(
             formula, model = outside.formula(), outside.fit.config
     over = np.maximum(squared.mean(axis=0) - 1.0, 0.0)
     if what.vibration is not None:
-        words = ". ".join([what.vibration.words(), words][: 2 if formula else 1])
-        formula, fall = "; ".join([what.vibration.formula(), *filter(None, [formula])]), over
+        shaken = 0.5 * (what.vibration.amplitude / held_out.floor) ** 2
+        first = bool(shaken.max() > SHAKEN_SHARE * over.max())
+        parts = [(what.vibration.words(), what.vibration.formula())]
+        parts = parts + [(words, formula)] * bool(formula) if first else [(words, formula), *parts]
+        words, formula = ". ".join(w for w, _ in parts), "; ".join(f for _, f in parts if f)
+        fall = over if first else fall
     if fall.max() <= 0.0:
         fall = over
     size: FloatArray = np.sqrt(squared.mean(axis=1))

@@ -150,7 +150,8 @@ EFFECT_TEXTS: dict[str, EffectText] = {
     ),
     "roll_dynamics": EffectText(
         "a body that rolls",
-        "the body rolls at {frequency} with a damping ratio of {damping}, and costs grip as load changes sides",
+        "the body rolls at {frequency} with a damping ratio of {damping}, and load that changes sides costs grip, "
+        "with a sensitivity of {sensitivity}",
         "fast weaving shows no resonance near that frequency",
     ),
     "friction_drift": EffectText(
