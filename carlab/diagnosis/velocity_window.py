@@ -13,7 +13,7 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.prediction import Predictor, bend_of
-from carlab.diagnosis.shots import Shots
+from carlab.diagnosis.shots import Shots, body_states
 from sim_backends.car_parameters import SimulatorConfig
 
 COARSEST_S = 0.06
@@ -60,7 +60,4 @@ def _box_velocities(shots: Shots) -> FloatArray:
     """States (S, K - 1, 6) of the inner ticks with velocities from the poses before and after."""
     pose = shots.measured[..., :3]
     rate = (pose[:, 2:] - pose[:, :-2]) / (2.0 * shots.period_s)
-    yaw = pose[:, 1:-1, 2]
-    sin, cos = np.sin(yaw), np.cos(yaw)
-    forward, left = cos * rate[..., 0] + sin * rate[..., 1], cos * rate[..., 1] - sin * rate[..., 0]
-    return np.concatenate([pose[:, 1:-1], np.stack([forward, left, rate[..., 2]], axis=-1)], axis=-1)
+    return body_states(pose[:, 1:-1].reshape(-1, 3), rate.reshape(-1, 3)).reshape(*rate.shape[:2], 6)
