@@ -40,7 +40,7 @@ class CarModel:
     ranges: Mapping[str, tuple[float, float]]
 
     def __post_init__(self) -> None:
-        known = {**self.config.values(), DELAY: 0.0, LATENCY: 0.0}
+        known = self.config.values()
         for name in self.ranges:
             if name not in known:
                 raise ConfigError(f"'{name}' is no number of this simulator; give a range to one that it has.")

@@ -38,14 +38,14 @@ class Noise:
 def estimate_noise(tracks: Sequence[Track], bent: FloatArray, *, slowest: bool = False) -> Noise:
     """Noise of each channel and of shot starts.
 
+    An estimate: whatever in the recording is faster than the cubic counts as noise, hard manoeuvres only a little
+    (medians). The error of a start is the noise that its cubic lets through and its bias where the motion bends more
+    than a cubic does, by what a quintic finds beyond its own noise.
+
     Args:
         tracks: the recordings.
         bent: (S, 6) what a quintic makes of shot starts, less what they are.
         slowest: whether the slowest rows alone tell the noise of the channels.
-
-    An estimate: whatever in the recording is faster than the cubic counts as noise, hard manoeuvres only a little
-    (medians). The error of a start is the noise that its cubic lets through and its bias where the motion bends more
-    than a cubic does, by what a quintic finds beyond its own noise.
     """
     period_s = tracks[0].sampled_s
     width = start_width(period_s)

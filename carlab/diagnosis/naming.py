@@ -130,9 +130,10 @@ def unexplained(
     if what.vibration is not None:
         shaken = 0.5 * (what.vibration.amplitude / held_out.floor) ** 2
         first = bool(shaken.max() > SHAKEN_SHARE * over.max())
-        parts = [(what.vibration.words(), what.vibration.formula())]
-        parts = parts + [(words, formula)] * bool(formula) if first else [(words, formula), *parts]
-        words, formula = ". ".join(w for w, _ in parts), "; ".join(f for _, f in parts if f)
+        shaking = [(what.vibration.words(), what.vibration.formula())]
+        terms = [(words, formula)] if formula else []
+        parts = shaking + terms if first else terms + shaking
+        words, formula = ". ".join(w for w, _ in parts), "; ".join(f for _, f in parts)
         fall = over if first else fall
     if fall.max() <= 0.0:
         fall = over

@@ -1,7 +1,9 @@
 """Learning from few rows: Sim-FSVGD and its baselines on the cases of the paper, with likelihood, error, calibration.
 
-Two ways of fitting: ``ours`` (measurement sets preconditioned by the posterior's precision, prior moments from a bank
-of draws), and ``authors`` (the update and the sizes of the authors' public code, for laying the two side by side).
+Two ways of fitting: ``ours`` (Stein's direction preconditioned by the posterior's precision, the gap inside the
+dynamics where a case has one, the sensor's noise as a prior), and ``authors`` (the plain direction with the steps,
+batches, points, bandwidth and starting noise of the authors' public code). The Gaussian process of FSVGD has its full
+weight in both, and prior moments come from a bank of draws.
 """
 
 from __future__ import annotations

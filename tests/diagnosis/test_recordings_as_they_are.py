@@ -137,6 +137,21 @@ def test_vibration_of_a_wheel_is_found_with_its_radius(shaking: Drive, plain: Dr
     assert find_vibration(plain.tracks) is None
 
 
+@pytest.mark.parametrize(("of_time", "blamed"), [(True, False), (False, True)])
+def test_a_wheel_is_not_blamed_for_a_frequency_of_its_own(plain: Drive, of_time: bool, blamed: bool) -> None:
+    """The same tremble of the yaw rate, once 6 times a second and once 4 times per metre."""
+    made = []
+    for track in plain.tracks:
+        moved = 6.0 * np.arange(len(track.speed)) if of_time else 4.0 * np.cumsum(track.speed)
+        residual = track.residual.copy()
+        residual[:, 5] += 3.0 * np.std(residual[:, 5]) * np.sin(2.0 * np.pi * moved * track.sampled_s)
+        made.append(replace(track, residual=residual))
+    found = find_vibration(made)
+    assert (found is not None) == blamed
+    if found is not None:
+        assert found.periods_per_m == pytest.approx(4.0, abs=0.05)
+
+
 def test_vibration_is_said_and_named_nothing_else(shaking: Drive) -> None:
     fit, hold = (list(import_csv(shaking.folder / name).episodes) for name in ("fit.csv", "hold.csv"))
     told = diagnose(fit, hold, shaking.nominal, TEXTS).diagnosis
