@@ -7,6 +7,7 @@ authors' public code (lasgroup/simulation_transfer, commit 547fa14, MIT), restat
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -19,12 +20,17 @@ Range = tuple[float, float]
 class DomainModel(Protocol):
     """A simulator whose parameters are only known as a distribution."""
 
+    @property
+    def size(self) -> int:
+        """K, the number of parameters."""
+        ...
+
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
         """Inputs (N, D), uniform in the domain."""
         ...
 
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Parameter draws (P, K)."""
+    def parameters(self, normal: Tensor) -> Tensor:
+        """Parameters (P, K) of standard normal numbers (P, K), so that those of a draw are a draw."""
         ...
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
@@ -32,11 +38,21 @@ class DomainModel(Protocol):
         ...
 
 
-def uniform(ranges: tuple[Range, ...], count: int, generator: torch.Generator) -> Tensor:
+def draw_parameters(model: DomainModel, count: int, generator: torch.Generator) -> Tensor:
+    """Parameters (count, K) from the distribution of a model."""
+    return model.parameters(torch.randn((count, model.size), generator=generator))
+
+
+def within(ranges: Sequence[Range], shares: Tensor) -> Tensor:
+    """Values (..., K) at shares (..., K) of ranges, 0 being the low end and 1 the high one."""
+    low = torch.tensor([r[0] for r in ranges]).to(shares)
+    high = torch.tensor([r[1] for r in ranges]).to(shares)
+    return low + (high - low) * shares
+
+
+def uniform(ranges: Sequence[Range], count: int, generator: torch.Generator) -> Tensor:
     """Draws (count, K), uniform in each range."""
-    low = torch.tensor([r[0] for r in ranges])
-    high = torch.tensor([r[1] for r in ranges])
-    return low + (high - low) * torch.rand((count, len(ranges)), generator=generator)
+    return within(ranges, torch.rand((count, len(ranges)), generator=generator))
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +63,15 @@ class Sinusoids:
         """Places x (N, 1)."""
         return uniform(((-5.0, 5.0),), count, generator)
 
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws of (a, w, b)."""
-        normal = torch.randn((count, 2), generator=generator)
-        frequency = 1.7 + 0.6 * torch.rand((count, 1), generator=generator)
-        return torch.cat([2.0 + 0.4 * normal[:, :1], frequency, 2.0 + normal[:, 1:]], dim=1)
+    @property
+    def size(self) -> int:
+        """Three."""
+        return 3
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """(a, w, b)."""
+        a, w, b = normal.T
+        return torch.stack([2.0 + 0.4 * a, 1.7 + 0.6 * torch.special.ndtr(w), 2.0 + b], dim=1)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
         """Values (P, N, 1)."""
@@ -88,12 +108,16 @@ class Pendulum:
         drawn = uniform(((-math.pi, math.pi), (-5.0, 5.0), (-2.5, 2.5)), count, generator)
         return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
 
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws of (m, l, g, nu, drag, and three coefficients of the gap)."""
+    @property
+    def size(self) -> int:
+        """Five, and three coefficients of the gap."""
+        return 8
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """(m, l, g, nu, drag, and three coefficients of the gap)."""
         ranges = (self.masses, self.lengths, self.gravities, self.frictions, self.drags)
-        known = uniform(ranges, count, generator)
-        gap = torch.randn((count, 3), generator=generator) * torch.tensor(self.rate_gap)
-        return torch.cat([known, gap], dim=1)
+        known = within(ranges, torch.special.ndtr(normal[:, :5]))
+        return torch.cat([known, normal[:, 5:] * torch.tensor(self.rate_gap).to(normal)], dim=1)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
         """Changes (P, N, 3)."""
@@ -140,10 +164,15 @@ class KinematicCar:
         yaw = drawn[:, 2:3]
         return torch.cat([drawn[:, :2], torch.sin(yaw), torch.cos(yaw), drawn[:, 3:]], dim=1)
 
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Draws of (m, l_f, l_r, offset, drive gain, root of the damping, steering at full lock)."""
+    @property
+    def size(self) -> int:
+        """Seven."""
+        return 7
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """(m, l_f, l_r, offset, drive gain, root of the damping, steering at full lock)."""
         ranges = (self.masses, self.front_axles, self.rear_axles, self.offsets, self.drives, self.dampings)
-        return uniform((*ranges, self.steerings), count, generator)
+        return within((*ranges, self.steerings), torch.special.ndtr(normal))
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
         """Changes (P, N, 7)."""
@@ -177,4 +206,4 @@ class KinematicCar:
         return after - inputs[None, :, :7]
 
 
-__all__ = ["DomainModel", "KinematicCar", "Pendulum", "Sinusoids", "uniform"]
+__all__ = ["DomainModel", "KinematicCar", "Pendulum", "Sinusoids", "draw_parameters", "uniform", "within"]

@@ -123,20 +123,27 @@ class Posterior:
         parameters: (L, P).
         noise_std: of the likelihood, normalised (O,).
         normaliser: between raw and normalised units.
+        tails: of each particle, what its noise is multiplied by (L,); ones unless given. A mixture of several is a
+            noise with heavy tails.
     """
 
     network: Network
     parameters: Tensor
     noise_std: Tensor
     normaliser: Normaliser
+    tails: Tensor | None = None
+
+    @property
+    def noise_stds(self) -> Tensor:
+        """Noise of each particle, normalised (L, 1, O)."""
+        tails = torch.ones(len(self.parameters)).to(self.noise_std) if self.tails is None else self.tails
+        return tails[:, None, None] * self.noise_std
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at raw inputs (N, D), in raw units."""
         with torch.no_grad():
             values = self.network(self.parameters, self.normaliser.inputs(inputs))
-        return Mixture(
-            self.normaliser.raw_outputs(values), (self.noise_std * self.normaliser.output_std).expand(1, 1, -1)
-        )
+        return Mixture(self.normaliser.raw_outputs(values), self.noise_stds * self.normaliser.output_std)
 
 
 @dataclass

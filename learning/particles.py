@@ -15,6 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+Layers = Sequence[tuple[Tensor, Tensor]]
+"""Weights (L, in, out) and biases (L, 1, out) of each layer."""
+
 SLOPE = 0.01
 """Of the leaky ReLU below zero."""
 
@@ -27,11 +30,13 @@ class Network:
         inputs: number of inputs.
         outputs: number of outputs.
         hidden: width of each hidden layer; the authors use three of 64.
+        slope: of the leaky ReLU below zero; 0 is a ReLU.
     """
 
     inputs: int
     outputs: int
     hidden: tuple[int, ...] = (64, 64, 64)
+    slope: float = SLOPE
 
     @property
     def layers(self) -> tuple[tuple[int, int], ...]:
@@ -70,43 +75,61 @@ class Network:
 
     def __call__(self, parameters: Tensor, inputs: Tensor) -> Tensor:
         """Outputs (L, N, O) of all particles at inputs (N, D), or at inputs of their own (L, N, D)."""
-        values = inputs if inputs.ndim == 3 else inputs.expand(len(parameters), *inputs.shape)
-        *hidden, (weights, biases) = self.split(parameters)
-        for w, b in hidden:
-            values = functional.leaky_relu(torch.baddbmm(b, values, w), SLOPE)
-        return torch.baddbmm(biases, values, weights)
+        return self.through(self.split(parameters), inputs)[-1]
 
     def values_and_pullback(self, parameters: Tensor, inputs: Tensor) -> tuple[Tensor, Pullback]:
-        """Outputs (L, N, O) at inputs (N, D), and what turns a direction on them into one on the parameters.
+        """Outputs (L, N, O) at inputs (N, D), or (L, N, D), and what turns directions on them into ones on parameters.
 
         No tape: at these sizes the chain rule by hand costs a fraction of what autograd's bookkeeping does.
         """
         layers = self.split(parameters)
-        seen = [inputs.expand(len(parameters), *inputs.shape)]
-        for w, b in layers[:-1]:
-            seen.append(functional.leaky_relu(torch.baddbmm(b, seen[-1], w), SLOPE))
-        outputs = torch.baddbmm(layers[-1][1], seen[-1], layers[-1][0])
-        return outputs, Pullback(parameters, layers, seen)
+        *seen, outputs = self.through(layers, inputs)
+        return outputs, Pullback(layers, seen, self.slope)
+
+    def through(self, layers: Layers, inputs: Tensor) -> list[Tensor]:
+        """What each layer is given, and last the outputs (L, N, O)."""
+        found = [inputs if inputs.ndim == 3 else inputs.expand(len(layers[0][0]), *inputs.shape)]
+        *hidden, (weights, biases) = layers
+        for w, b in hidden:
+            summed = torch.baddbmm(b, found[-1], w)
+            found.append(functional.leaky_relu(summed, self.slope) if self.slope else torch.relu(summed))
+        found.append(torch.baddbmm(biases, found[-1], weights))
+        return found
 
 
 @dataclass(frozen=True, slots=True)
 class Pullback:
-    """The derivative of a forward pass: parameters (L, P), its layers, and what each layer was given."""
+    """The derivative of a forward pass: the layers, what each was given, and the slope below zero."""
 
-    parameters: Tensor
-    layers: Sequence[tuple[Tensor, Tensor]]
+    layers: Layers
     seen: Sequence[Tensor]
+    slope: float
 
     def __call__(self, direction: Tensor) -> Tensor:
-        """Gradient (L, P) of ``sum(direction * outputs)``."""
+        """Gradient (L, P) of ``sum(direction * outputs)`` by the parameters."""
         parts: list[Tensor] = []
         for k in range(len(self.layers) - 1, -1, -1):
-            weights, given = self.layers[k][0], self.seen[k]
-            parts += [direction.sum(dim=1), torch.bmm(given.transpose(1, 2), direction).flatten(1)]
+            parts += [direction.sum(dim=1), torch.bmm(self.seen[k].transpose(1, 2), direction).flatten(1)]
             if k:
-                direction = torch.bmm(direction, weights.transpose(1, 2))
-                direction = torch.where(given > 0.0, direction, SLOPE * direction)
+                direction = self._through(k, direction)
         return torch.cat(parts[::-1], dim=1)
 
+    def on_inputs(self, direction: Tensor) -> Tensor:
+        """Gradient (L, N, D) of ``sum(direction * outputs)`` by the inputs."""
+        for k in range(len(self.layers) - 1, 0, -1):
+            direction = self._through(k, direction)
+        return torch.bmm(direction, self.layers[0][0].transpose(1, 2))
 
-__all__ = ["Network", "Pullback"]
+    def of_first(self, count: int) -> Pullback:
+        """The derivative for the first ``count`` inputs alone."""
+        return Pullback(self.layers, [given[:, :count] for given in self.seen], self.slope)
+
+    def _through(self, k: int, direction: Tensor) -> Tensor:
+        """Direction on what layer k - 1 summed, from one on what layer k gave."""
+        back = torch.bmm(direction, self.layers[k][0].transpose(1, 2))
+        # One pass over the memory where a mask, a product and a choice would be three.
+        through: Tensor = torch.ops.aten.leaky_relu_backward(back, self.seen[k], self.slope, True)
+        return through
+
+
+__all__ = ["Layers", "Network", "Pullback"]

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import ConfigError
+from learning.domain_models import draw_parameters, within
 from sim_backends.batch_rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -50,11 +51,14 @@ class CarModel:
         """Parameters in the order of the columns of a draw."""
         return tuple(self.ranges)
 
-    def sample(self, count: int, generator: torch.Generator) -> Tensor:
-        """Parameter draws (P, K), uniform in their ranges."""
-        low = torch.tensor([r[0] for r in self.ranges.values()], dtype=torch.float32)
-        high = torch.tensor([r[1] for r in self.ranges.values()], dtype=torch.float32)
-        return low + (high - low) * torch.rand((count, len(self.ranges)), generator=generator)
+    @property
+    def size(self) -> int:
+        """One for each range."""
+        return len(self.ranges)
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """Parameters (P, K) of standard normal numbers, uniform in their ranges."""
+        return within(tuple(self.ranges.values()), torch.special.ndtr(normal))
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
         """Inputs (N, 3 + 2 (H + 1)) of random drives: commands held for a while, cars drawn from the ranges."""
@@ -67,7 +71,7 @@ class CarModel:
         commands = fresh.gather(1, last[:, :, None].expand(-1, -1, 2))
         start = torch.zeros((cars, 6))
         start[:, 3] = FASTEST_MPS * torch.rand(cars, generator=generator)
-        states = self._roll(start, commands, None, self.sample(cars, generator))
+        states = self._roll(start, commands, None, draw_parameters(self, cars, generator))
         rows = self.history + 1 + TICKS_APART * torch.arange(ROWS_A_DRIVE)
         past = rows[:, None] + torch.arange(-self.history, 1)
         found = torch.cat([states[:, rows, 3:], commands[:, past].flatten(2)], dim=2).flatten(0, 1)

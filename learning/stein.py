@@ -83,4 +83,32 @@ def stein_direction(values: Tensor, score: Tensor, kernel: RbfKernel) -> Tensor:
     return (direction / len(values)).view_as(values)
 
 
-__all__ = ["RbfKernel", "median_bandwidth", "natural_direction", "stein_direction"]
+def moment_direction(values: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
+    """Way of particles to a Gaussian, by the kernel ``k(u, v) = 1 + u . v / c`` between whitened values.
+
+    Stein's direction with a linear kernel stands still exactly where the particles have the mean and the covariance of
+    a Gaussian (Liu and Wang 2018, "Stein Variational Gradient Descent as Moment Matching", theorem 3); one with an
+    RBF kernel is too narrow as soon as there are more dimensions than a few. Whitening is the matrix-valued kernel of
+    ``natural_direction``. Many small measurement sets are better than a large one: more dimensions than particles
+    cannot have their covariance.
+
+    Args:
+        values: values of L particles at G sets of N points, one output a set (L, G, N).
+        mean: of the Gaussian (G, N).
+        factor: Cholesky factor of its covariance (G, N, N).
+
+    Returns:
+        Directions (L, G, N), in units of the values: those of far particles are nearly their way to the mean.
+    """
+    off = (values - mean).permute(1, 2, 0)  # (G, N, L)
+    white = torch.linalg.solve_triangular(factor, off, upper=False)
+    gram = white.transpose(1, 2) @ white  # (G, L, L)
+    count, points = values.shape[0], values.shape[2]
+    # The kernel's width: the particles' own mean square while they are far, as the median heuristic has it.
+    width = (gram.diagonal(dim1=1, dim2=2).sum(dim=1) / (count * points)).clamp_min(1.0)[:, None, None]
+    moved = (white - white @ gram / count) / width - white.mean(dim=2, keepdim=True)
+    way: Tensor = (factor @ moved).permute(2, 0, 1)
+    return way
+
+
+__all__ = ["RbfKernel", "median_bandwidth", "moment_direction", "natural_direction", "stein_direction"]

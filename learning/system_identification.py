@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.domain_models import DomainModel
+from learning.domain_models import DomainModel, draw_parameters
 from learning.evaluation import Mixture
-from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, fit
+from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, fit
 from learning.function_prior import RbfCovariance
 from learning.normaliser import Normaliser
 
@@ -23,6 +24,14 @@ PRIOR_WIDTHS = 4.0
 """Standard deviations of the parameters' own distribution within which they are held, softly: the data decides."""
 PSEUDO_ROWS = 1.0
 """Rows that the expected noise counts for beside the data's own."""
+
+
+class Predictor(Protocol):
+    """What predicts with its doubt."""
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Prediction at inputs (N, D)."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +62,7 @@ class GreyBox:
     """An identified simulator and particles for its error."""
 
     simulator: Identified
-    error: Posterior
+    error: Predictor
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at inputs (N, D)."""
@@ -81,7 +90,7 @@ def identify(model: DomainModel, inputs: Tensor, outputs: Tensor, noise_std: Ten
     if count == 0:
         raise DataError("Parameters cannot be identified without data; record an episode first.")
     generator = torch.Generator().manual_seed(seed)
-    drawn = model.sample(SCREENED, generator).to(inputs)
+    drawn = draw_parameters(model, SCREENED, generator).to(inputs)
     middle, width = drawn.mean(dim=0), drawn.std(dim=0)
     free = width > 1e-9
 

@@ -14,13 +14,14 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids
+from learning.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids, draw_parameters
 from learning.function_prior import RbfCovariance
 from learning.normaliser import Normaliser
 from learning.simulator_model import CarModel
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
 
 TEST_ROWS = 1000
+LEAST_NOISE = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,9 @@ class Case:
         gap_std: of the Gaussian process between simulator and reality (O,), raw; none where the simulator is right.
         gap_lengthscale: of that process on raw inputs.
         function_lengthscale: of the Gaussian-process prior of FSVGD and of a grey box, on normalised inputs.
+        expected_gap: what our way expects the simulator to be wrong by, in units of the outputs; None: it is right.
+        ours: the same case as our way sees it, where that is in other coordinates.
+        in_body_frame: whether rows are turned and moved into the frame of the step's start.
     """
 
     name: str
@@ -67,11 +71,14 @@ class Case:
     gap_std: tuple[float, ...] | None
     gap_lengthscale: float
     function_lengthscale: float
+    expected_gap: float | None = 0.3
+    ours: Case | None = None
+    in_body_frame: bool = False
 
     @property
     def expected_noise_std(self) -> tuple[float, ...]:
-        """Twice the noise of the sensor, which is known; the authors' where it has none."""
-        return tuple(2.0 * n or s for n, s in zip(self.noise_std, self.likelihood_std, strict=True))
+        """Twice the noise of the sensor, which is known, and no less than half a per cent of the output's unit."""
+        return tuple(max(2.0 * n, LEAST_NOISE * o) for n, o in zip(self.noise_std, self.output_std, strict=True))
 
     @property
     def normaliser(self) -> Normaliser:
@@ -97,7 +104,7 @@ class Case:
         if self.truth is None:
             raise DataError(f"The rows of '{self.name}' are the authors' arrays alone; give their folder with --data.")
         generator = torch.Generator().manual_seed(10_000 + seed)
-        system = self.truth.sample(1, generator)
+        system = draw_parameters(self.truth, 1, generator)
         inputs = self.truth.inputs(count + TEST_ROWS, generator)
         outputs = self.truth(inputs, system)[0]
         outputs = outputs + torch.tensor(self.noise_std) * torch.randn(outputs.shape, generator=generator)
@@ -114,7 +121,66 @@ class Case:
         if self.name == "1d":
             return Data(x, y, tx, ty)
         width = y.shape[1]
+        if self.in_body_frame:
+            return Data(*in_body_frame(x, y), *in_body_frame(tx, ty))
         return Data(x, y - x[:, :width], tx, ty - tx[:, :width])
+
+
+def in_body_frame(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+    """Rows of a car as seen from where each begins.
+
+    Pairs of outputs are turned, which leaves volumes alone: a density in these coordinates is that of the others, and
+    so is the likelihood.
+
+    Args:
+        before: x, y, sin, cos of yaw, vx, vy in the world, yaw rate, and commands (n, 7 + 2).
+        after: the first seven a step later (n, 7).
+
+    Returns:
+        The same inputs for a car at the origin that looks along x, and changes (n, 7).
+    """
+    sin, cos = before[:, 2], before[:, 3]
+
+    def turned(along_x: Tensor, along_y: Tensor) -> tuple[Tensor, Tensor]:
+        return cos * along_x + sin * along_y, cos * along_y - sin * along_x
+
+    change = after - before[:, :7]
+    none = torch.zeros_like(sin)
+    inputs = torch.stack([none, none, none, none + 1.0, *turned(before[:, 4], before[:, 5]), *before[:, 6:].T], dim=1)
+    upright, turn = turned(after[:, 3], after[:, 2])
+    outputs = [
+        *turned(change[:, 0], change[:, 1]),
+        turn,
+        upright - 1.0,
+        *turned(change[:, 4], change[:, 5]),
+        change[:, 6],
+    ]
+    return inputs, torch.stack(outputs, dim=1)
+
+
+@dataclass(frozen=True, slots=True)
+class BodyFrame:
+    """A car's domain model with its inputs seen from the car."""
+
+    model: KinematicCar
+
+    @property
+    def size(self) -> int:
+        """As the model."""
+        return self.model.size
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """The model's, from where the car is and looks."""
+        drawn = self.model.inputs(count, generator)
+        return in_body_frame(drawn, drawn[:, :7])[0]
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """As the model."""
+        return self.model.parameters(normal)
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Changes; the car looks along x, so that those in the world are its own."""
+        return self.model(inputs, parameters)
 
 
 _CAR_NOISE = (0.0011, 0.0011, 0.0018, 0.0018, 0.0082, 0.0082, 0.0368)
@@ -157,11 +223,12 @@ CASES = {
             gap_std=None,
             gap_lengthscale=1.0,
             function_lengthscale=0.2,
+            expected_gap=None,
         ),
         Case(
             name="pendulum",
             prior=Pendulum(),
-            process=Pendulum(rate_gap=(0.8, 0.25, 0.25)),
+            process=Pendulum(rate_gap=(1.0, 0.5, 0.5)),
             truth=Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6)),
             counts=(5, 10, 20, 50),
             noise_std=(0.02, 0.02, 0.02),
@@ -172,6 +239,7 @@ CASES = {
             gap_std=(0.025, 0.025, 0.25),
             gap_lengthscale=10.0,
             function_lengthscale=0.4,
+            expected_gap=0.03,
         ),
         Case(
             name="car",
@@ -202,6 +270,22 @@ CASES = {
             gap_std=(0.004, 0.004, 0.015, 0.015, 0.15, 0.15, 0.75),
             gap_lengthscale=10.0,
             function_lengthscale=0.4,
+            ours=Case(
+                name="racecar",
+                prior=BodyFrame(KinematicCar()),
+                process=None,
+                truth=None,
+                counts=(20, 50, 100, 200, 400),
+                noise_std=_CAR_NOISE,
+                likelihood_std=tuple(20.0 * s for s in _CAR_NOISE),
+                learn_noise=True,
+                input_std=(3.0, 3.0, 1.0, 1.0, 1.5, 1.5, 2.0, 0.6, 0.6),
+                output_std=(0.1, 0.06, 0.1, 0.03, 1.0, 1.0, 3.0),
+                gap_std=(0.004, 0.004, 0.015, 0.015, 0.15, 0.15, 0.75),
+                gap_lengthscale=10.0,
+                function_lengthscale=2.0,
+                in_body_frame=True,
+            ),
         ),
     )
 }

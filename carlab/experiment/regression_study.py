@@ -1,9 +1,9 @@
 """Learning from few rows: Sim-FSVGD and its baselines on the cases of the paper, with likelihood, error, calibration.
 
-Two ways of fitting: ``ours`` (Stein's direction preconditioned by the posterior's precision, the gap inside the
-dynamics where a case has one, the sensor's noise as a prior), and ``authors`` (the plain direction with the steps,
-batches, points, bandwidth and starting noise of the authors' public code). The Gaussian process of FSVGD has its full
-weight in both, and prior moments come from a bank of draws.
+Two ways of fitting: ``ours`` (what data, simulator and a gap of learned covariance say together, and particles led
+there by Stein's direction; FSVGD and GreyBox alike, without simulator), and ``authors`` (the plain direction with the
+steps, batches, points, bandwidth and starting noise of the authors' public code; prior moments from a bank of draws,
+and the Gaussian process of FSVGD with its full weight).
 """
 
 from __future__ import annotations
@@ -21,15 +21,21 @@ from torch import Tensor
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
 from carlab.experiment.regression_cases import CASES, Case, Data
+from learning.domain_models import DomainModel, draw_parameters
 from learning.ensemble import deep_ensemble
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood, root_mean_square_error
-from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit
+from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, SimulatorPrior, fit
+from learning.function_posterior import infer
 from learning.function_prior import RbfCovariance
 from learning.ridge import Ridge
-from learning.system_identification import grey_box, identify
+from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_points
+from learning.system_identification import GreyBox, Identified, grey_box, identify
 
 Way = Literal["ours", "authors"]
 Progress = Callable[[str, int, int], None]
+EXPECTED_FUNCTION = 1.0
+"""Size of a function of which nothing is known, in units of the outputs."""
+LEAST_GAP = 0.03
 POOL = 1024
 DRAWS = 2048
 LEAST_RIDGE = 3
@@ -75,7 +81,7 @@ class _Task:
     steps: int | None
 
     def settings(self) -> FsvgdSettings:
-        """How particles are fitted."""
+        """How particles are fitted in the authors' way, and the networks of an ensemble."""
         case, rows = self.case, len(self.data.inputs)
         if self.way == "ours":
             noise = tuple(s / o for s, o in zip(case.expected_noise_std, case.output_std, strict=True))
@@ -102,32 +108,52 @@ class _Task:
         """Of FSVGD and of a grey box: one normalised unit everywhere."""
         return RbfCovariance((1.0,) * len(self.case.output_std), (self.case.function_lengthscale,))
 
+    def inferred(self, simulator: DomainModel | None, outputs: Tensor, expected_gap: float | None) -> Particles:
+        """Our way: particles led to what data, simulator and gap say together."""
+        case = self.case
+        generator = torch.Generator().manual_seed(30_000 + self.seed)
+        normaliser = case.normaliser
+        gap = None if expected_gap is None else expected_gap * normaliser.output_std
+        posterior = infer(
+            simulator, self.data.inputs, outputs, normaliser, torch.tensor(case.expected_noise_std), gap_std=gap,
+            with_gap=expected_gap is not None, seed=self.seed,
+        )  # fmt: skip
+        points = measurement_points(simulator or case.prior, self.data.inputs, normaliser, generator)
+        return Particles(fit_particles(posterior, points, ParticleSettings(steps=self.steps or 3000, seed=self.seed)))
+
     def sim_fsvgd(self, *, gap: bool) -> Model:
         """Particles under draws of the simulator."""
-        case, normaliser, pool = self.case, self.case.normaliser, self.pool()
-        generator = torch.Generator().manual_seed(30_000 + self.seed)
-        process = case.process if gap and case.process is not None and self.way == "ours" else case.prior
+        case, normaliser = self.case, self.case.normaliser
+        if self.way == "ours":
+            process = case.process if gap and case.process is not None else case.prior
+            return self.inferred(process, self.data.outputs, case.expected_gap if gap else None)
+        pool, generator = self.pool(), torch.Generator().manual_seed(30_000 + self.seed)
         everything = torch.cat([self.data.inputs, pool])
         with torch.no_grad():
-            draws = normaliser.outputs(process(everything, process.sample(DRAWS, generator)))
-        prior = SimulatorPrior(draws, everything, case.gap() if gap else None)
+            bank = normaliser.outputs(case.prior(everything, draw_parameters(case.prior, DRAWS, generator)))
+        prior = SimulatorPrior(bank, everything, case.gap() if gap else None)
         return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings())
 
     def fsvgd(self) -> Model:
         """Particles under a Gaussian process, properly weighted."""
+        if self.way == "ours":
+            return self.inferred(None, self.data.outputs, EXPECTED_FUNCTION)
         normaliser, pool = self.case.normaliser, self.pool()
         prior = GaussianProcessPrior(normaliser.inputs(torch.cat([self.data.inputs, pool])), self.function_prior())
         return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings())
 
-    def sysid(self) -> Model:
+    def sysid(self) -> Identified:
         """The simulator with its parameters at maximum likelihood."""
         noise = torch.tensor(self.case.expected_noise_std)
         return identify(self.case.prior, self.data.inputs, self.data.outputs, noise, self.seed)
 
     def grey_box(self) -> Model:
         """The same and particles for what it leaves."""
-        noise = torch.tensor(self.case.expected_noise_std)
-        simulator = identify(self.case.prior, self.data.inputs, self.data.outputs, noise, self.seed)
+        simulator = self.sysid()
+        if self.way == "ours":
+            with torch.no_grad():
+                left = self.data.outputs - simulator.mean(self.data.inputs)
+            return GreyBox(simulator, self.inferred(None, left, self.case.expected_gap or LEAST_GAP))
         return grey_box(
             simulator, self.data.inputs, self.data.outputs, self.pool(), self.function_prior(), self.case.normaliser,
             self.settings(),
@@ -140,6 +166,17 @@ class _Task:
     def ridge(self) -> Model:
         """Linear regression."""
         return _Linear(Ridge.fit(self.data.inputs.double().numpy(), self.data.outputs.double().numpy()))
+
+
+@dataclass(frozen=True, slots=True)
+class Particles:
+    """Particles whose mixture is widened to the density that it stands for."""
+
+    posterior: Posterior
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Prediction at inputs (N, D)."""
+        return self.posterior.predict(inputs).smoothed()
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +231,8 @@ def run_study(
     if unknown := [m for m in methods if m not in METHODS]:
         raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(METHODS)}.")
     chosen, counts = CASES[case], tuple(rows) or CASES[case].counts
+    if way == "ours" and chosen.ours is not None:
+        chosen = chosen.ours
     names = tuple(methods) or tuple(METHODS)
     plan = [p for p in itertools.product(counts, range(seeds), names) if not (p[2] == "ridge" and p[0] < LEAST_RIDGE)]
     clock = MonotonicClock()

@@ -11,6 +11,7 @@ from carlab.cli import run
 from carlab.core.errors import ConfigError, DataError
 from carlab.experiment.regression_cases import CASES
 from carlab.experiment.regression_study import run_study, summarised
+from learning.domain_models import draw_parameters
 from learning.ridge import Ridge
 
 
@@ -27,7 +28,7 @@ def test_true_parameters_leave_the_noise_that_was_added():
     """The simulator that made a case's rows, with its parameters found again, is at the noise of the case."""
     case = CASES["pendulum"]
     data = case.data(50, 1)
-    system = case.truth.sample(1, torch.Generator().manual_seed(10_001))
+    system = draw_parameters(case.truth, 1, torch.Generator().manual_seed(10_001))
     left = (case.truth(data.test_inputs, system)[0] - data.test_outputs).std(dim=0)
     assert torch.allclose(left, torch.tensor(case.noise_std), rtol=0.1)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from learning.domain_models import KinematicCar, Pendulum, Sinusoids
+from learning.domain_models import KinematicCar, Pendulum, Sinusoids, draw_parameters
 
 
 def generator(seed=0):
@@ -19,7 +19,7 @@ def generator(seed=0):
 )
 def test_shapes_and_draws_of_their_own(model, inputs, outputs):
     x = model.inputs(5, generator())
-    parameters = model.sample(4, generator(1))
+    parameters = draw_parameters(model, 4, generator(1))
     out = model(x, parameters)
     assert x.shape == (5, inputs)
     assert out.shape == (4, 5, outputs)
@@ -30,7 +30,7 @@ def test_shapes_and_draws_of_their_own(model, inputs, outputs):
 
 def test_a_pendulum_follows_its_equation_in_small_steps():
     model = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6), dissipative=True, rate_gap=(0.8, 0.3, 0.3), substeps=2000)
-    x, parameters = model.inputs(3, generator()).double(), model.sample(2, generator(1)).double()
+    x, parameters = model.inputs(3, generator()).double(), draw_parameters(model, 2, generator(1)).double()
     ours = model(x, parameters)
     for k in range(2):
         m, length, g, nu, drag, linear, odd, even = parameters[k].tolist()
@@ -56,7 +56,7 @@ def test_the_pendulum_of_the_studies_explains_their_arrays(shared):
     left = []
     for drags in ((0.4, 0.6), (0.0, 0.0)):
         model = Pendulum(frictions=drags, drags=drags)
-        error = model(x, model.sample(20_000, generator())) - (y - x[:, :3])
+        error = model(x, draw_parameters(model, 20_000, generator())) - (y - x[:, :3])
         left.append(float(error.square().mean(dim=(1, 2)).sqrt().min()))
     assert left[0] < 0.03
     assert left[1] > 3.0 * left[0]
@@ -65,7 +65,7 @@ def test_the_pendulum_of_the_studies_explains_their_arrays(shared):
 def test_a_rolling_car_drives_the_circle_of_its_wheels():
     """At rest of all transients, r = v tan(d) / L, and the centre of mass goes round on the rear axle's arm."""
     model = KinematicCar()
-    parameters = model.sample(6, generator()).double()
+    parameters = draw_parameters(model, 6, generator()).double()
     _, front, rear, _, drive, damping, lock = (parameters[:, k] for k in range(7))
     parameters[:, 3] = 0.0
     steering, throttle = 0.6, 0.4
@@ -86,7 +86,7 @@ def test_a_rolling_car_drives_the_circle_of_its_wheels():
 def test_turning_the_world_turns_the_car_with_it():
     model, turn = KinematicCar(), 0.9
     x = model.inputs(7, generator()).double()
-    parameters = model.sample(3, generator(1)).double()
+    parameters = draw_parameters(model, 3, generator(1)).double()
     c, s = math.cos(turn), math.sin(turn)
 
     def turned(rows):

@@ -8,6 +8,7 @@ import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
+from learning.domain_models import draw_parameters
 from learning.simulator_model import CarModel
 from learning.system_identification import identify
 from learning.transitions import transitions_of
@@ -57,7 +58,7 @@ def test_draws_are_within_their_ranges_and_inputs_are_drives():
     ranges = {"motor.drive_gain": (6.0, 10.0), "tyre.front.mu": (0.5, 1.0)}
     model = CarModel(SimulatorConfig(mocap=QUIET), HISTORY, ranges)
     generator = torch.Generator().manual_seed(0)
-    drawn = model.sample(500, generator)
+    drawn = draw_parameters(model, 500, generator)
     for k, (low, high) in enumerate(ranges.values()):
         assert low <= float(drawn[:, k].min()) < low + 0.1 * (high - low)
         assert high >= float(drawn[:, k].max()) > high - 0.1 * (high - low)

@@ -6,7 +6,7 @@ import torch
 from scipy.optimize import least_squares
 
 from carlab.core.errors import DataError
-from learning.domain_models import Pendulum, Sinusoids
+from learning.domain_models import Pendulum, Sinusoids, draw_parameters
 from learning.evaluation import negative_log_likelihood
 from learning.fsvgd import FsvgdSettings
 from learning.function_prior import RbfCovariance
@@ -21,7 +21,7 @@ def generator(seed=0):
 def pendulum(count, noise, seed=0, **friction):
     model = Pendulum(**friction)
     inputs = model.inputs(count, generator(seed))
-    truth = model.sample(1, generator(seed + 1))
+    truth = draw_parameters(model, 1, generator(seed + 1))
     outputs = model(inputs, truth)[0]
     return inputs, outputs + noise * torch.randn(outputs.shape, generator=generator(seed + 2)), truth[0]
 

@@ -1,0 +1,95 @@
+"""A learned car: particles that predict one step in the body frame, and the exact kinematics that carry them on.
+
+The world's pose enters through kinematics alone, so a step is ``pose + R(yaw) change`` and the networks see velocities
+and the last commands. A particle is drawn for each car and step (Rothfuss et al., arXiv 2403.16644, section 5.3), and
+noise of the likelihood is added, so that a policy meets both kinds of doubt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from carlab.core.angles import wrap
+from carlab.core.observation import STATE_FEATURES, decode_history, decode_state, encode, push_action
+from learning.evaluation import Mixture
+from learning.fsvgd import Posterior
+
+STATE_SIZE = 6
+
+
+class OneStep(Protocol):
+    """What a learned world is made of."""
+
+    history: int
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class CarDynamics:
+    """A fitted model of one step of a car.
+
+    Attributes:
+        posterior: particles and noise.
+        history: H, commands before the last one that a row of inputs holds.
+        scale: of all standard deviations of the noise, by what held-out rows say.
+    """
+
+    posterior: Posterior
+    history: int
+    scale: float = 1.0
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Changes at inputs (N, 3 + 2 (H + 1)) with their calibrated doubt."""
+        found = self.posterior.predict(inputs)
+        return Mixture(found.means, found.stds * self.scale)
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        """One draw (N, 6) of the mixture for each row.
+
+        Rows are dealt to particles at random and evenly, so that each runs on its share alone.
+        """
+        posterior = self.posterior
+        count, particles = len(inputs), len(posterior.parameters)
+        share = -(-count // particles)
+        with torch.no_grad():
+            order = torch.randperm(share * particles, generator=generator).to(inputs.device)
+            rows = order % count
+            dealt = posterior.normaliser.inputs(inputs[rows]).view(particles, share, -1)
+            values = posterior.network(posterior.parameters, dealt).flatten(0, 1)
+            noise = (
+                torch.randn(dealt.shape[:2] + values.shape[1:], generator=generator).to(values) * posterior.noise_stds
+            )
+            values = values + self.scale * noise.flatten(0, 1)
+            found = torch.empty(count, values.shape[1], dtype=values.dtype, device=values.device)
+            found[rows] = posterior.normaliser.raw_outputs(values)
+        return found
+
+
+def inputs_of(features: Tensor, action: Tensor) -> Tensor:
+    """Rows of inputs (N, 3 + 2 (H + 1)) of features (N, 7 + 2 H) and the action (N, 2) that is sent now."""
+    return torch.cat([features[:, STATE_FEATURES - 3 :], action], dim=1)
+
+
+def moved(features: Tensor, action: Tensor, change: Tensor) -> Tensor:
+    """Features (N, 7 + 2 H) after a step that sent ``action`` (N, 2) and changed the body by ``change`` (N, 6)."""
+    sin, cos = features[:, 2], features[:, 3]
+    ahead, left = change[:, 0], change[:, 1]
+    state = decode_state(features)
+    after = torch.stack([
+        state[:, 0] + cos * ahead - sin * left,
+        state[:, 1] + sin * ahead + cos * left,
+        wrap(state[:, 2] + change[:, 2]),
+        *(state[:, 3:] + change[:, 3:]).T,
+    ], dim=1)  # fmt: skip
+    found: Tensor = encode(after, push_action(decode_history(features), action))
+    return found
+
+
+__all__ = ["STATE_SIZE", "CarDynamics", "OneStep", "inputs_of", "moved"]

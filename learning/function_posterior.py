@@ -1,0 +1,182 @@
+"""What data and simulator together say about a function: the posterior's moments at any inputs.
+
+A function is a simulator with unknown parameters and a Gaussian process for what it leaves out, seen through noise
+(Rothfuss et al., arXiv 2403.16644, section 4). Given the parameters all is Gaussian and closed (Rasmussen and Williams
+2006, equations 2.23 and 2.24); over draws of the parameters the moments are averaged (law of total covariance). The
+score that Sim-FSVGD has at a measurement set with all of the data in it is that of these marginals, without the noise
+of minibatches, and with what the data says of the parameters taken from the simulator rather than from the moments of
+its prior.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from learning.domain_models import DomainModel, draw_parameters
+from learning.gap import EXPECTED_GAP, TINY, GapCovariance, learn_gap
+from learning.normaliser import Normaliser
+from learning.outliers import left_out, student_weights, typical_scale
+from learning.parameter_posterior import posterior_parameters
+
+DRAWS = 128
+PRIOR_DRAWS = 1024
+EVIDENCE_ROWS = 300
+"""Rows, drawn from all, by which covariance and parameters are found."""
+LARGEST = 2000
+"""Rows that are conditioned on; of more data so many are drawn."""
+JITTER = 1e-5
+"""Variance added to a marginal, in normalised outputs."""
+ROUNDS = 2
+ROWS_FOR_TAILS = 40
+"""Rows from which on outliers are told from noise."""
+_AT_ONCE = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class FunctionPosterior:
+    """A simulator, its gap, and data, as Gaussian marginals in normalised outputs.
+
+    Attributes:
+        normaliser: of inputs and outputs.
+        noise_std: of the measurements (O,).
+        freedom: degrees of freedom of their multivariate Student distribution; infinite for a Gaussian.
+        model: the simulator; zero where it is None.
+        parameters: draws of its parameters given the data (P, K).
+        gap: covariance of what it leaves out; nothing where it is None.
+        inputs: normalised inputs of the data (n, D).
+        factor: Cholesky factors of the data's covariance (O, n, n).
+        white: residuals of each draw, whitened by them (O, n, P).
+    """
+
+    normaliser: Normaliser
+    noise_std: Tensor
+    freedom: float
+    model: DomainModel | None
+    parameters: Tensor | None
+    gap: GapCovariance | None
+    inputs: Tensor
+    factor: Tensor
+    white: Tensor
+
+    def marginals(self, sets: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (B, O, N) and covariances (B, O, N, N) of the function, without noise, at raw inputs (B, N, D)."""
+        parts = [self._some(part) for part in torch.split(sets, max(_AT_ONCE // sets.shape[1], 1))]
+        return torch.cat([m for m, _ in parts]), torch.cat([c for _, c in parts])
+
+    def predict(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation (N, O) of measurements at raw inputs (N, D), in raw units."""
+        mean, covariance = self.marginals(inputs[:, None])
+        std = (covariance[:, :, 0, 0].clamp_min(0.0) + self.noise_std**2).sqrt()
+        return self.normaliser.raw_outputs(mean[:, :, 0]), std * self.normaliser.output_std
+
+    def _some(self, sets: Tensor) -> tuple[Tensor, Tensor]:
+        count, points = sets.shape[:2]
+        flat = sets.flatten(0, 1)
+        at = self.normaliser.inputs(flat).double()
+        outputs = len(self.noise_std)
+        if self.model is None or self.parameters is None:
+            drawn = torch.zeros((outputs, 1, len(flat)), dtype=torch.float64, device=flat.device)
+        else:
+            drawn = _simulated(self.model, flat, self.parameters, self.normaliser).permute(2, 0, 1)
+        covariance = torch.zeros((count, outputs, points, points), dtype=torch.float64, device=flat.device)
+        if self.gap is not None:
+            covariance = self.gap(at.view(count, points, -1)).transpose(0, 1)
+            if len(self.inputs):
+                half = torch.linalg.solve_triangular(self.factor, self.gap(self.inputs, at), upper=False)
+                drawn = drawn + self.white.transpose(1, 2) @ half
+                blocks = half.view(outputs, -1, count, points).permute(2, 0, 1, 3)  # (B, O, n, N)
+                covariance = covariance - blocks.transpose(2, 3) @ blocks
+        mean = drawn.mean(dim=1)
+        off = (drawn - mean[:, None]).view(outputs, -1, count, points).permute(2, 0, 1, 3)
+        covariance = covariance + off.transpose(2, 3) @ off / drawn.shape[1]
+        return mean.view(outputs, count, points).transpose(0, 1).float(), covariance.float()
+
+
+def infer(
+    model: DomainModel | None,
+    inputs: Tensor,
+    outputs: Tensor,
+    normaliser: Normaliser,
+    noise_std: Tensor,
+    *,
+    gap_std: Tensor | None = None,
+    with_gap: bool = True,
+    seed: int = 0,
+) -> FunctionPosterior:
+    """What data and simulator say.
+
+    Args:
+        model: the simulator; zero where it is None.
+        inputs: raw (n, D); may be empty.
+        outputs: raw (n, O).
+        normaliser: of inputs and outputs.
+        noise_std: expected noise, raw (O,).
+        gap_std: expected error of the simulator, raw (O,); ``EXPECTED_GAP`` of the outputs' units unless given.
+        with_gap: whether the simulator is allowed to be wrong.
+        seed: of draws.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    if len(inputs) > LARGEST:
+        some = torch.randperm(len(inputs), generator=generator)[:LARGEST].to(inputs.device)
+        inputs, outputs = inputs[some], outputs[some]
+    count, width = len(inputs), outputs.shape[1]
+    x, y = normaliser.inputs(inputs).double(), normaliser.outputs(outputs).double()
+    expected_noise = noise = (noise_std / normaliser.output_std).double()
+    expected = EXPECTED_GAP * torch.ones_like(noise) if gap_std is None else gap_std / normaliser.output_std
+    gap = GapCovariance.before_data(x.shape[1], expected) if with_gap else None
+    rows = torch.randperm(count, generator=generator)[:EVIDENCE_ROWS].to(inputs.device)
+    trust = torch.ones(count, dtype=torch.float64, device=inputs.device)
+    freedom, scale = math.inf, torch.ones_like(noise)
+    parameters: Tensor | None = None
+    if model is not None:
+        parameters = draw_parameters(model, PRIOR_DRAWS if count else DRAWS, generator).to(inputs)
+
+    def left_by(where: Tensor) -> tuple[Tensor, Tensor | None]:
+        """What the mean of the draws leaves of some rows (m, O), and the draws' covariance there (O, m, m)."""
+        if model is None or parameters is None:
+            return y[where], None
+        there = _simulated(model, inputs[where], parameters, normaliser)
+        off = (there - there.mean(dim=0)).permute(2, 0, 1)
+        return y[where] - there.mean(dim=0), off.transpose(1, 2) @ off / len(there)
+
+    # The covariance is learned around the prior, then again around what the data leaves of it.
+    for _ in range(ROUNDS if count else 0):
+        left, known = left_by(rows)
+        if with_gap:
+            gap, noise = learn_gap(x[rows], left, known, expected_noise, expected, trust[rows])
+        if model is not None:
+            factor = torch.linalg.cholesky(_covariance(gap, x[rows], noise, trust[rows]))
+            parameters = posterior_parameters(
+                model, inputs[rows], outputs[rows], factor, normaliser, DRAWS, generator
+            )  # fmt: skip
+        if count >= ROWS_FOR_TAILS:
+            left, known = left_by(torch.arange(count, device=inputs.device))
+            covariance = _covariance(gap, x, noise, trust)
+            surprise = left_out(left, covariance if known is None else covariance + known, noise, trust)
+            freedom, trust = student_weights(surprise.sum(dim=1), len(noise))
+            scale = typical_scale(surprise, freedom)
+    factor = torch.linalg.cholesky(_covariance(gap, x, noise, trust))
+    every = y[None]
+    if model is not None and parameters is not None:
+        every = y - _simulated(model, inputs, parameters, normaliser) if count else y.expand(len(parameters), 0, width)
+    white = torch.linalg.solve_triangular(factor, every.permute(2, 1, 0), upper=False)
+    return FunctionPosterior(normaliser, (scale * noise).float(), freedom, model, parameters, gap, x, factor, white)
+
+
+def _simulated(model: DomainModel, inputs: Tensor, parameters: Tensor, normaliser: Normaliser) -> Tensor:
+    """Normalised outputs (P, N, O)."""
+    with torch.no_grad():
+        return normaliser.outputs(model(inputs, parameters)).double()
+
+
+def _covariance(gap: GapCovariance | None, inputs: Tensor, noise: Tensor, trust: Tensor) -> Tensor:
+    """Covariances (O, n, n) of gap and noise; the noise of a row is the larger the less it is trusted."""
+    of_noise = torch.diag_embed((noise**2)[:, None] / trust + TINY)
+    return of_noise if gap is None else gap(inputs) + of_noise
+
+
+__all__ = ["JITTER", "FunctionPosterior", "infer"]

@@ -1,0 +1,165 @@
+"""A learned car as a vectorised environment of stable-baselines3, with the task of the real one.
+
+Starts are drawn in part from the task and in part from states that were recorded, with the commands before them. An
+episode ends after the task's ticks, where the task ends, or where the car leaves the arena.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from carlab.core.observation import ACTION_SIZE, encode, feature_size
+from carlab.core.task import Task
+from learning.car_dynamics import OneStep, inputs_of, moved
+
+FEATURE_UNITS = (2.0, 2.0, 1.0, 1.0, 2.0, 1.0, 4.0)
+"""Metres, units of sine and cosine, m/s, m/s and rad/s that a policy sees as one."""
+REWARD_SCALE = 10.0
+FARTHEST = 10.0
+"""Units beyond which what a policy sees is cut off."""
+
+
+def policy_view(features: Any) -> NDArray[np.float32]:
+    """What a policy sees of features (..., 7 + 2 H): the same numbers in units of size one, cut off far outside."""
+    found = np.array(features, dtype=np.float32)
+    found[..., : len(FEATURE_UNITS)] /= np.array(FEATURE_UNITS, dtype=np.float32)
+    return np.clip(found, -FARTHEST, FARTHEST)
+
+
+class ModelEnv(VecEnv):
+    """Many copies of a learned car at once.
+
+    Args:
+        model: one step of the car.
+        task: reward, end and starts; its history is the model's.
+        cars: how many copies.
+        recorded: features (R, 7 + 2 H) of recorded states; may be empty.
+        from_recorded: share of starts among them, where there are any.
+        seed: of starts, particles and noise.
+        device: where the model's tensors are.
+    """
+
+    def __init__(
+        self,
+        model: OneStep,
+        task: Task,
+        cars: int,
+        *,
+        recorded: NDArray[np.float64] | None = None,
+        from_recorded: float = 0.5,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        width = feature_size(model.history)
+        high = np.full(width, FARTHEST, dtype=np.float32)
+        super().__init__(
+            cars, gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+        )
+        self._model, self._task, self._device = model, task, torch.device(device)
+        self._recorded = np.zeros((0, width)) if recorded is None else recorded
+        self._from_recorded = from_recorded if len(self._recorded) else 0.0
+        self._rng = np.random.default_rng(seed)
+        self._generator = torch.Generator().manual_seed(seed)
+        self._features = torch.zeros((cars, width), device=self._device)
+        self._ticks = np.zeros(cars, dtype=np.int64)
+        self._actions = torch.zeros((cars, ACTION_SIZE), device=self._device)
+        corners = np.array(task.arena_m).reshape(-1, 2)
+        far: NDArray[np.float64] = np.full(2, np.inf)
+        self._low: NDArray[np.float64] = corners.min(axis=0) if len(corners) else -far
+        self._high: NDArray[np.float64] = corners.max(axis=0) if len(corners) else far
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start all cars; their episodes end at different ticks, so that no batch is all starts."""
+        everyone = np.arange(self.num_envs)
+        self._start(everyone)
+        self._ticks = self._rng.integers(self._task.max_ticks, size=self.num_envs)
+        return self._seen()
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Take the commands (cars, 2)."""
+        self._actions = torch.as_tensor(actions, dtype=torch.float32).clamp(-1.0, 1.0).to(self._device)
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """One step of every car; those that end start anew."""
+        before, action = self._features, self._actions
+        with torch.no_grad():
+            change = self._model.sample(inputs_of(before, action), self._generator)
+            after = moved(before, action, change)
+            reward = self._task.reward(before, action, after) * REWARD_SCALE
+            terminated = self._task.terminated(after).cpu().numpy()
+        self._features = after
+        self._ticks += 1
+        seen = self._seen()
+        outside = self._outside(after)
+        truncated = ((self._ticks >= self._task.max_ticks) | outside) & ~terminated
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = np.flatnonzero(done)
+        for k in ended:
+            infos[k] = {"terminal_observation": seen[k].copy(), "TimeLimit.truncated": bool(truncated[k])}
+        if len(ended):
+            self._start(ended)
+            seen = self._seen()
+        return seen, reward.cpu().numpy().astype(np.float32), done, infos
+
+    @property
+    def features(self) -> Tensor:
+        """Present features (cars, 7 + 2 H)."""
+        return self._features
+
+    def _outside(self, features: Tensor) -> NDArray[np.bool_]:
+        place = features[:, :2].cpu().numpy()
+        found: NDArray[np.bool_] = np.any((place < self._low) | (place > self._high), axis=1)
+        return found
+
+    def _start(self, cars: NDArray[np.int64]) -> None:
+        fresh = np.array([self._task.sample_start(self._rng).to_array() for _ in cars])
+        rows = encode(fresh, np.zeros((len(cars), self._model.history, ACTION_SIZE)))
+        again = self._rng.random(len(cars)) < self._from_recorded
+        if again.any():
+            rows[again] = self._recorded[self._rng.integers(len(self._recorded), size=int(again.sum()))]
+        features = self._features.clone()
+        features[torch.from_numpy(cars).to(self._device)] = torch.from_numpy(rows).float().to(self._device)
+        self._features = features
+        self._ticks[cars] = 0
+
+    def _seen(self) -> NDArray[np.float32]:
+        return policy_view(self._features.cpu().numpy())
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed starts, particles and noise."""
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+            self._generator.manual_seed(seed)
+        return [seed] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the environment, once for each car asked for."""
+        return [getattr(self, attr_name, None)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of all cars."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the environment once, its answer repeated for each car asked for."""
+        answer = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [answer] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> list[bool]:
+        """Never."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+__all__ = ["FEATURE_UNITS", "ModelEnv", "policy_view"]

@@ -1,0 +1,85 @@
+"""Outliers among rows: noise with heavy tails as a multivariate Student distribution.
+
+A collision, a slipped marker or a stale pose spoils all outputs of a row at once. With Student noise each row has a
+weight, high for ordinary and low for surprising rows, which follow from what the other rows predict (Lange, Little and
+Taylor 1989, "Robust statistical modeling using the t distribution", section 3).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy.stats import chi2
+from scipy.stats import t as student
+from torch import Tensor
+
+FREEDOMS = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0, math.inf)
+SCALES = (0.3, 2.0)
+"""Within which a doubt is corrected."""
+
+
+def left_out(left: Tensor, covariance: Tensor, noise: Tensor, trust: Tensor) -> Tensor:
+    """Squared surprise (n, O) of each row by all others, in units of an ordinary row's doubt.
+
+    Leave-one-out residuals in closed form (Rasmussen and Williams 2006, equations 5.10 to 5.12).
+
+    Args:
+        left: residuals (n, O).
+        covariance: of the rows, noise as trusted included (O, n, n).
+        noise: standard deviation of an ordinary row (O,).
+        trust: what each row's noise variance is divided by (n,).
+    """
+    precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance))
+    own = precision.diagonal(dim1=1, dim2=2)
+    error = (precision @ left.T[:, :, None])[:, :, 0] / own
+    ordinary = 1.0 / own + (noise**2)[:, None] * (1.0 - 1.0 / trust)
+    found: Tensor = (error**2 / ordinary.clamp_min(1e-12)).T
+    return found
+
+
+def student_weights(surprise: Tensor, outputs: int) -> tuple[float, Tensor]:
+    """The degrees of freedom that make surprises most likely, and the weight of each row.
+
+    Args:
+        surprise: squared, summed over outputs (n,).
+        outputs: how many were summed.
+    """
+    best, freedom = -math.inf, math.inf
+    for candidate in FREEDOMS:
+        likelihood = float(_log_student(surprise, outputs, candidate).sum())
+        if likelihood > best + 1.0:
+            best, freedom = likelihood, candidate
+    if math.isinf(freedom):
+        return freedom, torch.ones_like(surprise)
+    return freedom, ((freedom + outputs) / (freedom + surprise)).clamp_max(1.0)
+
+
+def typical_scale(surprise: Tensor, freedom: float) -> Tensor:
+    """Of each output, by what a doubt is to be multiplied for half of the rows to lie within it (O,).
+
+    Args:
+        surprise: squared (n, O).
+        freedom: of the Student distribution that the doubt stands for.
+    """
+    half = float(student.ppf(0.75, min(freedom, 1e6))) ** 2
+    return (surprise.median(dim=0).values / half).sqrt().clamp(*SCALES)
+
+
+def tail_scales(freedom: float, count: int) -> Tensor:
+    """Scales (count,) of Gaussians whose even mixture is nearly a Student distribution."""
+    if math.isinf(freedom):
+        return torch.ones(count)
+    shares = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+    return torch.sqrt(freedom / torch.from_numpy(chi2.ppf(shares.numpy(), freedom))).float()
+
+
+def _log_student(surprise: Tensor, outputs: int, freedom: float) -> Tensor:
+    if math.isinf(freedom):
+        return -0.5 * (surprise + outputs * math.log(2.0 * math.pi))
+    constant = math.lgamma(0.5 * (freedom + outputs)) - math.lgamma(0.5 * freedom)
+    constant -= 0.5 * outputs * math.log(freedom * math.pi)
+    return constant - 0.5 * (freedom + outputs) * torch.log1p(surprise / freedom)
+
+
+__all__ = ["left_out", "student_weights", "tail_scales", "typical_scale"]

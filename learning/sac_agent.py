@@ -1,0 +1,168 @@
+"""SAC in a learned world: trained for so many steps, kept from episode to episode, and as a policy on the car."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+
+from carlab.core.errors import DataError
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import Action
+from learning.model_env import ModelEnv, policy_view
+from learning.sac import FastSac
+
+AGENT_FILE = "agent.zip"
+MOMENTS_FILE = "moments.pt"
+NEVER = 2**62
+
+
+@dataclass(frozen=True, slots=True)
+class SacSettings:
+    """How a policy is trained.
+
+    Attributes:
+        hidden: widths of the layers of policy and critics.
+        cars: copies of the learned car at once.
+        ticks_between: ticks of all copies between updates.
+        updates: gradient steps after each of those.
+        batch: transitions of a gradient step.
+        replay: transitions kept.
+        warm_up: transitions before the first update, by a random policy where there is none yet.
+        discount, learning_rate, target_rate: of SAC.
+        temperature: at the start.
+        target_entropy: of a policy's action [nat].
+        steps_ahead: rewards that are summed before a critic is asked.
+    """
+
+    hidden: tuple[int, ...] = (64, 64)
+    cars: int = 128
+    ticks_between: int = 4
+    updates: int = 64
+    batch: int = 256
+    replay: int = 100_000
+    warm_up: int = 4096
+    discount: float = 0.99
+    learning_rate: float = 1e-3
+    target_rate: float = 0.005
+    temperature: float = 0.1
+    target_entropy: float = -2.0
+    steps_ahead: int = 1
+
+
+class SacAgent:
+    """A policy that learns in a ``ModelEnv``. It starts untrained; ``load`` takes up an earlier one."""
+
+    def __init__(self, settings: SacSettings, seed: int, device: torch.device | str = "cpu") -> None:
+        self._settings, self._seed, self._device = settings, seed, device
+        self._sac: FastSac | None = None
+
+    def train(self, env: ModelEnv, updates: int, progress: Callable[[int, dict[str, float]], None]) -> None:
+        """Make so many gradient steps in this world; what was learned before stays, the replay does not.
+
+        Args:
+            env: the world.
+            updates: gradient steps.
+            progress: told the gradient steps done, and figures of them.
+
+        Raises:
+            DataError: the policy diverged; the one before is kept.
+        """
+        s = self._settings
+        again = self._sac
+        made = FastSac(
+            "MlpPolicy", env, learning_rate=s.learning_rate, buffer_size=s.replay, batch_size=s.batch,
+            learning_starts=0 if again is not None else s.warm_up, tau=s.target_rate, gamma=s.discount,
+            train_freq=(s.ticks_between, "step"), gradient_steps=0, ent_coef=f"auto_{s.temperature}",
+            target_entropy=s.target_entropy, n_steps=s.steps_ahead, policy_kwargs={"net_arch": list(s.hidden)},
+            seed=self._seed, device=self._device,
+        )  # fmt: skip
+        if again is not None:
+            made.policy.load_state_dict(again.policy.state_dict())
+            made.load_optimiser_state(again.optimiser_state())
+            assert made.log_ent_coef is not None
+            assert again.log_ent_coef is not None
+            made.log_ent_coef.data.copy_(again.log_ent_coef.data)
+        made.set_logger(Logger(None, []))
+        made.learn(s.warm_up, log_interval=NEVER)
+        made.gradient_steps = s.updates
+        until = _UntilUpdates(updates, progress)
+        made.learn(NEVER, callback=until, log_interval=NEVER, reset_num_timesteps=False)
+        if not all(bool(torch.isfinite(p).all()) for p in made.policy.parameters()):
+            raise DataError("The policy diverged; train it with a smaller learning rate.")
+        self._sac = made
+
+    def policy(self) -> SacPolicy:
+        """What drives: the mean action, without noise."""
+        assert self._sac is not None
+        return SacPolicy(self._sac)
+
+    def act(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mean actions (N, 2) for views (N, F)."""
+        assert self._sac is not None
+        found: NDArray[np.float32] = self._sac.predict(seen, deterministic=True)[0]
+        return found
+
+    def save(self, folder: Path) -> None:
+        """Write the agent and its optimisers into a folder."""
+        assert self._sac is not None
+        self._sac.save(folder / AGENT_FILE, exclude=["env", "replay_buffer"])
+        torch.save(self._sac.optimiser_state(), folder / MOMENTS_FILE)
+
+    @classmethod
+    def load(cls, folder: Path, settings: SacSettings, seed: int, device: torch.device | str = "cpu") -> SacAgent:
+        """Take up an agent. Raises DataError where its files are of another shape or broken."""
+        found = cls(settings, seed, device)
+        try:
+            found._sac = FastSac.load(folder / AGENT_FILE, device=device)
+            found._sac.load_optimiser_state(torch.load(folder / MOMENTS_FILE, weights_only=True))
+        except (OSError, ValueError, KeyError, RuntimeError, EOFError, AssertionError) as error:
+            raise DataError(
+                f"The policy in {folder} cannot be read ({error}); remove the folder, and it is trained anew."
+            ) from error
+        return found
+
+
+@dataclass
+class SacPolicy:
+    """The trained policy on a car."""
+
+    sac: FastSac
+    name: str = "sac"
+
+    def reset(self) -> None:
+        """A policy of this kind has no memory; the commands it needs are in what it sees."""
+
+    def act(self, view: PolicyInput) -> Action | None:
+        """The mean action."""
+        action: Any = self.sac.predict(policy_view(view.features)[None], deterministic=True)[0][0]
+        return Action.from_array(action.astype(np.float64))
+
+
+class _UntilUpdates(BaseCallback):
+    """Ends training after so many gradient steps."""
+
+    def __init__(self, updates: int, progress: Callable[[int, dict[str, float]], None]) -> None:
+        super().__init__()
+        self._updates, self._progress = updates, progress
+
+    def _on_rollout_start(self) -> None:
+        self._progress(self._done(), {k: float(v) for k, v in self.logger.name_to_value.items()})
+
+    def _on_step(self) -> bool:
+        return self._done() < self._updates
+
+    def _done(self) -> int:
+        model = self.model
+        assert isinstance(model, FastSac)
+        return int(model._n_updates)
+
+
+__all__ = ["SacAgent", "SacPolicy", "SacSettings"]

@@ -1,0 +1,168 @@
+"""Sim-FSVGD as carlab fits it: function-space SVGD to what simulator, gap and all of the data say together.
+
+The score of a measurement set that holds all data is that of the posterior's marginals, which ``function_posterior``
+has in closed form. Particles follow Stein's direction on many small sets at once (``stein.moment_direction``), pulled
+back to their parameters (Rothfuss et al., arXiv 2403.16644, algorithm 1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from learning.adam import Adam
+from learning.domain_models import DomainModel
+from learning.fsvgd import Posterior
+from learning.function_posterior import JITTER, FunctionPosterior
+from learning.normaliser import Normaliser
+from learning.outliers import tail_scales
+from learning.particles import Network, Pullback
+from learning.stein import moment_direction
+
+TOLD_EVERY = 200
+LAST_RATE = 0.01
+FEW_ROWS = 20
+"""Rows below which the domain alone tells where particles are held to the posterior."""
+LEAST_NOISE_SHARE = 0.5
+"""Of the measurements' variance, what is left as noise at least where particles spread more than they should."""
+NEARBY = 0.5
+"""How far from the data its neighbourhood reaches at most, in units of the inputs."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleSettings:
+    """How particles are led to a posterior.
+
+    Attributes:
+        particles: how many.
+        hidden: widths of each particle's hidden layers.
+        steps: of Adam.
+        sets: measurement sets of a step.
+        points: of a set; fewer than particles, for their covariance is to be matched.
+        learning_rate: at the start; it falls to a hundredth along a half cosine.
+        seed: of everything that is drawn.
+    """
+
+    particles: int = 20
+    hidden: tuple[int, ...] = (64, 64, 64)
+    steps: int = 3000
+    sets: int = 16
+    points: int = 4
+    learning_rate: float = 5e-3
+    seed: int = 0
+
+
+def fit_particles(
+    target: FunctionPosterior,
+    points: Tensor,
+    settings: ParticleSettings,
+    progress: Callable[[int], None] = lambda step: None,
+    start: Tensor | None = None,
+) -> Posterior:
+    """Lead particles to a posterior over functions.
+
+    Args:
+        target: the posterior.
+        points: raw inputs of the domain (M, D), from which measurement sets are made.
+        settings: how.
+        progress: told the number of steps done, from time to time.
+        start: parameters of earlier particles (L, P) to start from.
+
+    Returns:
+        The particles. Their noise is that of the measurements and what they miss of the target's mean where it is sure.
+
+    Raises:
+        DataError: the particles diverged.
+    """
+    device, normaliser = points.device, target.normaliser
+    generator = torch.Generator().manual_seed(settings.seed)
+    outputs = len(target.noise_std)
+    network = Network(points.shape[1], outputs, settings.hidden)
+    if start is None:
+        start = network.initial(settings.particles, generator, device)
+    numbers = start.to(points).clone()
+    layers, adam = network.split(numbers), Adam(numbers)
+    count = len(points) // settings.points
+    chosen = torch.randperm(len(points), generator=generator)[: count * settings.points].to(device)
+    sets = points[chosen].view(count, settings.points, -1)
+    mean, covariance = target.marginals(sets)
+    factor, weight = _factors(covariance, target.noise_std)
+    inputs = normaliser.inputs(sets)
+    order = torch.randint(count, (settings.steps, settings.sets), generator=generator).to(device)
+    with torch.no_grad():
+        for step, own in enumerate(order):
+            *seen, values = network.through(layers, inputs[own].flatten(0, 1))
+            shaped = values.view(len(numbers), settings.sets, settings.points, outputs)
+            # One set and output a row: (L, sets * outputs, points).
+            rows = shaped.transpose(2, 3).flatten(1, 2)
+            way = moment_direction(rows, mean[own].flatten(0, 1), factor[own].flatten(0, 1))
+            way = (way * weight[own].flatten(0, 1)).view(len(numbers), settings.sets, outputs, settings.points)
+            gradient = -Pullback(layers, seen, network.slope)(way.transpose(2, 3).flatten(1, 2))
+            share = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+            adam.step(gradient, settings.learning_rate * (LAST_RATE + (1.0 - LAST_RATE) * share))
+            if (step + 1) % TOLD_EVERY == 0:
+                progress(step + 1)
+        if not bool(torch.isfinite(numbers).all()):
+            raise DataError("The fit diverged; fit again with a smaller learning rate.")
+        found = network.through(layers, inputs.flatten(0, 1))[-1].view(-1, count, settings.points, outputs)
+        off = found.transpose(2, 3) - mean
+        # The mean square of a particle's error is that of their mean and their spread; the target's own is allowed.
+        own = covariance.diagonal(dim1=2, dim2=3)
+        beyond = (weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + own)).sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
+        noise = (target.noise_std**2 + beyond).clamp_min(LEAST_NOISE_SHARE * target.noise_std**2).sqrt()
+    tails = tail_scales(target.freedom, len(numbers)).to(numbers)
+    return Posterior(network, numbers, noise, normaliser, tails)
+
+
+def measurement_points(
+    model: DomainModel | None,
+    inputs: Tensor,
+    normaliser: Normaliser,
+    generator: torch.Generator,
+    count: int = 8192,
+    others: Tensor | None = None,
+) -> Tensor:
+    """Inputs (count, D) at which particles are held to a posterior.
+
+    Half are rows of data moved a little, as far as there is data; the rest is the simulator's domain, or ``others``
+    (M, D) where there is no simulator.
+
+    Args:
+        model: the simulator.
+        inputs: raw inputs of the data (n, D).
+        normaliser: its units.
+        generator: of the draws.
+        count: how many.
+        others: raw inputs of the domain.
+    """
+    near = count // 2 if len(inputs) >= FEW_ROWS else 0
+    found = []
+    if near:
+        rows = inputs[torch.randint(len(inputs), (near,), generator=generator).to(inputs.device)]
+        away = NEARBY * torch.rand((near, 1), generator=generator) * torch.randn(rows.shape, generator=generator)
+        found.append(rows + away.to(rows) * normaliser.input_std)
+    if model is not None:
+        found.append(model.inputs(count - near, generator).to(inputs))
+    elif others is not None:
+        found.append(others[torch.randint(len(others), (count - near,), generator=generator).to(others.device)])
+    return torch.cat(found)
+
+
+def _factors(covariance: Tensor, noise_std: Tensor) -> tuple[Tensor, Tensor]:
+    """Cholesky factors (B, O, N, N) of measurement sets, and weights (B, O, N) of errors there.
+
+    An error counts by what it adds to the surprise at a measurement: in units of the noise and the function's doubt.
+    """
+    eye = torch.eye(covariance.shape[-1], dtype=torch.float64, device=covariance.device)
+    factor = torch.linalg.cholesky(covariance.double() + JITTER * eye).to(covariance.dtype)
+    variance = covariance.diagonal(dim1=2, dim2=3).clamp_min(0.0) + noise_std[:, None] ** 2
+    weight = 1.0 / variance
+    return factor, weight / weight.mean()
+
+
+__all__ = ["ParticleSettings", "fit_particles", "measurement_points"]

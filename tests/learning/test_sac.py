@@ -1,0 +1,124 @@
+"""The written-out gradient step of SAC against the one of stable-baselines3, which takes the same by autograd."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import SAC
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+
+from carlab.core.errors import ConfigError
+from learning.sac import FastSac
+
+WIDTH, BATCH = 5, 32
+
+
+class Room(gym.Env[np.ndarray, np.ndarray]):
+    """Only its spaces are used."""
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(-5.0, 5.0, (WIDTH,), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return np.zeros(WIDTH, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return np.full(WIDTH, action.sum(), np.float32), float(action[0]), False, False, {}
+
+
+def batches(count: int) -> list[ReplayBufferSamples]:
+    generator = torch.Generator().manual_seed(3)
+    found = []
+    for _ in range(count):
+        seen, after = (torch.randn((BATCH, WIDTH), generator=generator) for _ in range(2))
+        action = torch.rand((BATCH, 2), generator=generator) * 2.0 - 1.0
+        done = (torch.rand((BATCH, 1), generator=generator) < 0.2).float()
+        reward = torch.randn((BATCH, 1), generator=generator)
+        found.append(ReplayBufferSamples(seen, action, after, done, reward))
+    return found
+
+
+def agent(kind: type[SAC], **others: object) -> SAC:
+    return kind(
+        "MlpPolicy", Room(), policy_kwargs={"net_arch": [16, 24]}, ent_coef="auto_0.3", learning_rate=1e-3, tau=0.05,
+        gamma=0.9, seed=5, device="cpu", **others,
+    )  # fmt: skip
+
+
+def deal(learner: SAC, material: list[ReplayBufferSamples]) -> None:
+    """Its replay gives these batches one after the other, or as many at once as are asked for."""
+    rows = iter(material)
+
+    def sample(batch_size: int, env: object = None) -> ReplayBufferSamples:
+        parts = [next(rows) for _ in range(batch_size // BATCH)]
+        return ReplayBufferSamples(*(torch.cat([p[k] for p in parts]) for k in range(5)))
+
+    learner.replay_buffer.sample = sample
+
+
+def trained(kind: type[SAC], material: list[ReplayBufferSamples]) -> SAC:
+    found = agent(kind)
+    with torch.no_grad():  # Some standard deviations beyond the bound, where the gradient stops.
+        found.actor.log_std.bias.copy_(torch.tensor([1.9, -0.5]))
+    deal(found, material)
+    found.set_logger(_quiet())
+    torch.manual_seed(11)
+    found.train(len(material), BATCH)
+    return found
+
+
+def _quiet() -> object:
+    from stable_baselines3.common.logger import Logger
+
+    return Logger(None, [])
+
+
+@pytest.mark.parametrize("steps", [1, 40])
+def test_steps_are_those_of_stable_baselines(steps: int) -> None:
+    stock, fast = (trained(kind, batches(steps)) for kind in (SAC, FastSac))
+    fresh = agent(SAC).policy.state_dict()
+    for name, wanted in stock.policy.state_dict().items():
+        found = fast.policy.state_dict()[name]
+        torch.testing.assert_close(found, wanted, rtol=2e-3, atol=2e-5 * steps, msg=lambda m, n=name: f"{n}: {m}")
+        if "log_std.bias" not in name:
+            assert not torch.equal(wanted, fresh[name]), name
+    assert float(fast.log_ent_coef.detach()) == pytest.approx(float(stock.log_ent_coef.detach()), abs=1e-5)
+    for name in ("train/ent_coef", "train/actor_loss", "train/critic_loss") if steps == 1 else ():
+        assert fast.logger.name_to_value[name] == pytest.approx(stock.logger.name_to_value[name], rel=1e-3), name
+
+
+def test_a_saved_agent_acts_alike_and_goes_on_alike(tmp_path: Path) -> None:
+    material = batches(20)
+    first = trained(FastSac, material)
+    first.save(tmp_path / "agent.zip")
+    again = FastSac.load(tmp_path / "agent.zip", env=Room(), device="cpu")
+    again.load_optimiser_state(first.optimiser_state())
+    seen = np.random.default_rng(0).normal(size=(7, WIDTH)).astype(np.float32)
+    theirs, ours = (a.predict(seen, deterministic=True)[0] for a in (first, again))
+    np.testing.assert_array_equal(theirs, ours)
+    for a in (first, again):
+        deal(a, batches(5))
+        a.set_logger(_quiet())
+        torch.manual_seed(1)
+        a.train(5, BATCH)
+    np.testing.assert_allclose(
+        first.predict(seen, deterministic=True)[0], again.predict(seen, deterministic=True)[0], atol=1e-6
+    )
+
+
+def test_it_learns_by_the_interface_of_stable_baselines() -> None:
+    """The reward is the first action, so that is what it must learn."""
+    made = agent(FastSac, learning_starts=50, batch_size=BATCH)
+    made.learn(600)
+    assert made.predict(np.zeros(WIDTH, np.float32), deterministic=True)[0][0] > 0.8
+
+
+def test_other_networks_are_refused() -> None:
+    with pytest.raises(ConfigError, match="use stable_baselines3"):
+        FastSac("MlpPolicy", Room(), policy_kwargs={"activation_fn": torch.nn.Tanh}, device="cpu")
