@@ -24,7 +24,10 @@ STATE_SIZE = 6
 class OneStep(Protocol):
     """What a learned world is made of."""
 
-    history: int
+    @property
+    def history(self) -> int:
+        """H, commands before the last one that a row of inputs holds."""
+        ...
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""

@@ -156,7 +156,7 @@ def infer(
         if count >= ROWS_FOR_TAILS:
             left, known = left_by(torch.arange(count, device=inputs.device))
             covariance = _covariance(gap, x, noise, trust)
-            surprise = left_out(left, covariance if known is None else covariance + known, noise, trust)
+            surprise, _ = left_out(left, covariance if known is None else covariance + known, noise, trust)
             freedom, trust = student_weights(surprise.sum(dim=1), len(noise))
             scale = typical_scale(surprise, freedom)
     factor = torch.linalg.cholesky(_covariance(gap, x, noise, trust))

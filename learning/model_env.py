@@ -6,7 +6,7 @@ episode ends after the task's ticks, where the task ends, or where the car leave
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -109,6 +109,32 @@ class ModelEnv(VecEnv):
             self._start(ended)
             seen = self._seen()
         return seen, reward.cpu().numpy().astype(np.float32), done, infos
+
+    def rolled_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
+        """Drive every car once from a start of the task by a policy, to the end.
+
+        Args:
+            act: actions (cars, 2) for views (cars, F).
+
+        Returns:
+            Returns (cars,), unscaled and counted until a car ends, and the features at its end (cars, 7 + 2 H).
+        """
+        share, self._from_recorded = self._from_recorded, 0.0
+        self._start(np.arange(self.num_envs))
+        total = torch.zeros(self.num_envs)
+        ended = torch.zeros(self.num_envs, dtype=torch.bool)
+        last = self._features.clone()
+        with torch.no_grad():
+            for _ in range(self._task.max_ticks):
+                before = self._features
+                action = torch.as_tensor(act(self._seen())).clamp(-1.0, 1.0).to(self._device)
+                after = moved(before, action, self._model.sample(inputs_of(before, action), self._generator))
+                total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
+                last = torch.where(ended.to(self._device)[:, None], last, after)
+                ended |= torch.from_numpy(self._outside(after)) | self._task.terminated(after).cpu()
+                self._features = after
+        self._from_recorded = share
+        return total, last
 
     @property
     def features(self) -> Tensor:

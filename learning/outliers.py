@@ -19,8 +19,8 @@ SCALES = (0.3, 2.0)
 """Within which a doubt is corrected."""
 
 
-def left_out(left: Tensor, covariance: Tensor, noise: Tensor, trust: Tensor) -> Tensor:
-    """Squared surprise (n, O) of each row by all others, in units of an ordinary row's doubt.
+def left_out(left: Tensor, covariance: Tensor, noise: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared surprise (n, O) of each row by all others, in units of an ordinary row's doubt; and its variance.
 
     Leave-one-out residuals in closed form (Rasmussen and Williams 2006, equations 5.10 to 5.12).
 
@@ -34,8 +34,8 @@ def left_out(left: Tensor, covariance: Tensor, noise: Tensor, trust: Tensor) -> 
     own = precision.diagonal(dim1=1, dim2=2)
     error = (precision @ left.T[:, :, None])[:, :, 0] / own
     ordinary = 1.0 / own + (noise**2)[:, None] * (1.0 - 1.0 / trust)
-    found: Tensor = (error**2 / ordinary.clamp_min(1e-12)).T
-    return found
+    doubt = ordinary.clamp_min(1e-12).T
+    return error.T**2 / doubt, doubt
 
 
 def student_weights(surprise: Tensor, outputs: int) -> tuple[float, Tensor]:
@@ -47,7 +47,7 @@ def student_weights(surprise: Tensor, outputs: int) -> tuple[float, Tensor]:
     """
     best, freedom = -math.inf, math.inf
     for candidate in FREEDOMS:
-        likelihood = float(_log_student(surprise, outputs, candidate).sum())
+        likelihood = float(log_student(surprise, outputs, candidate).sum())
         if likelihood > best + 1.0:
             best, freedom = likelihood, candidate
     if math.isinf(freedom):
@@ -74,7 +74,8 @@ def tail_scales(freedom: float, count: int) -> Tensor:
     return torch.sqrt(freedom / torch.from_numpy(chi2.ppf(shares.numpy(), freedom))).float()
 
 
-def _log_student(surprise: Tensor, outputs: int, freedom: float) -> Tensor:
+def log_student(surprise: Tensor, outputs: int, freedom: float) -> Tensor:
+    """Log density of squared surprises, each summed over ``outputs``, of unit scale."""
     if math.isinf(freedom):
         return -0.5 * (surprise + outputs * math.log(2.0 * math.pi))
     constant = math.lgamma(0.5 * (freedom + outputs)) - math.lgamma(0.5 * freedom)
@@ -82,4 +83,4 @@ def _log_student(surprise: Tensor, outputs: int, freedom: float) -> Tensor:
     return constant - 0.5 * (freedom + outputs) * torch.log1p(surprise / freedom)
 
 
-__all__ = ["left_out", "student_weights", "tail_scales", "typical_scale"]
+__all__ = ["left_out", "log_student", "student_weights", "tail_scales", "typical_scale"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from learning.sac import FastSac
 AGENT_FILE = "agent.zip"
 MOMENTS_FILE = "moments.pt"
 NEVER = 2**62
+_NO_REPLAY: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1, "n_steps": 1}
+"""An agent that is read drives, or gives its networks to one that learns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +48,16 @@ class SacSettings:
     hidden: tuple[int, ...] = (64, 64)
     cars: int = 128
     ticks_between: int = 4
-    updates: int = 64
+    updates: int = 32
     batch: int = 256
     replay: int = 100_000
     warm_up: int = 4096
     discount: float = 0.99
     learning_rate: float = 1e-3
-    target_rate: float = 0.005
-    temperature: float = 0.1
+    target_rate: float = 0.01
+    temperature: float = 1.0
     target_entropy: float = -2.0
-    steps_ahead: int = 1
+    steps_ahead: int = 5
 
 
 class SacAgent:
@@ -64,13 +67,26 @@ class SacAgent:
         self._settings, self._seed, self._device = settings, seed, device
         self._sac: FastSac | None = None
 
-    def train(self, env: ModelEnv, updates: int, progress: Callable[[int, dict[str, float]], None]) -> None:
+    def train(
+        self,
+        env: ModelEnv,
+        updates: int,
+        progress: Callable[[int], None] = lambda done: None,
+        judge: Callable[[SacAgent], float] | None = None,
+        judged: int = 5,
+    ) -> dict[str, float]:
         """Make so many gradient steps in this world; what was learned before stays, the replay does not.
 
         Args:
             env: the world.
             updates: gradient steps.
-            progress: told the gradient steps done, and figures of them.
+            progress: told the gradient steps done.
+            judge: says how good the policy is; of those at ``judged`` even distances, the last one among them, the best
+                is kept.
+            judged: how often it is asked.
+
+        Returns:
+            Figures of the last gradient step.
 
         Raises:
             DataError: the policy diverged; the one before is kept.
@@ -93,11 +109,22 @@ class SacAgent:
         made.set_logger(Logger(None, []))
         made.learn(s.warm_up, log_interval=NEVER)
         made.gradient_steps = s.updates
-        until = _UntilUpdates(updates, progress)
-        made.learn(NEVER, callback=until, log_interval=NEVER, reset_num_timesteps=False)
-        if not all(bool(torch.isfinite(p).all()) for p in made.policy.parameters()):
-            raise DataError("The policy diverged; train it with a smaller learning rate.")
+        best, kept = -np.inf, None
         self._sac = made
+        try:
+            for part in range(judged if judge is not None else 1):
+                goal = updates * (part + 1) // (judged if judge is not None else 1)
+                made.learn(NEVER, callback=_UntilUpdates(goal, progress), log_interval=NEVER, reset_num_timesteps=False)
+                if not all(bool(torch.isfinite(p).all()) for p in made.policy.parameters()):
+                    raise DataError("The policy diverged; train it with a smaller learning rate.")
+                if judge is not None and (value := judge(self)) > best:
+                    best, kept = value, copy.deepcopy(made.policy.state_dict())
+        except BaseException:
+            self._sac = again
+            raise
+        if kept is not None:
+            made.policy.load_state_dict(kept)
+        return {name: float(value) for name, value in made.logger.name_to_value.items()}
 
     def policy(self) -> SacPolicy:
         """What drives: the mean action, without noise."""
@@ -121,7 +148,7 @@ class SacAgent:
         """Take up an agent. Raises DataError where its files are of another shape or broken."""
         found = cls(settings, seed, device)
         try:
-            found._sac = FastSac.load(folder / AGENT_FILE, device=device)
+            found._sac = FastSac.load(folder / AGENT_FILE, device=device, custom_objects=_NO_REPLAY)
             found._sac.load_optimiser_state(torch.load(folder / MOMENTS_FILE, weights_only=True))
         except (OSError, ValueError, KeyError, RuntimeError, EOFError, AssertionError) as error:
             raise DataError(
@@ -149,12 +176,12 @@ class SacPolicy:
 class _UntilUpdates(BaseCallback):
     """Ends training after so many gradient steps."""
 
-    def __init__(self, updates: int, progress: Callable[[int, dict[str, float]], None]) -> None:
+    def __init__(self, updates: int, progress: Callable[[int], None]) -> None:
         super().__init__()
         self._updates, self._progress = updates, progress
 
     def _on_rollout_start(self) -> None:
-        self._progress(self._done(), {k: float(v) for k, v in self.logger.name_to_value.items()})
+        self._progress(self._done())
 
     def _on_step(self) -> bool:
         return self._done() < self._updates

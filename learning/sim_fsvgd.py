@@ -113,7 +113,9 @@ def fit_particles(
         off = found.transpose(2, 3) - mean
         # The mean square of a particle's error is that of their mean and their spread; the target's own is allowed.
         own = covariance.diagonal(dim1=2, dim2=3)
-        beyond = (weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + own)).sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
+        beyond = (weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + own)).sum(dim=(0, 2)) / weight.sum(
+            dim=(0, 2)
+        )
         noise = (target.noise_std**2 + beyond).clamp_min(LEAST_NOISE_SHARE * target.noise_std**2).sqrt()
     tails = tail_scales(target.freedom, len(numbers)).to(numbers)
     return Posterior(network, numbers, noise, normaliser, tails)

@@ -62,6 +62,7 @@ def _verbs() -> dict[str, Callable[..., Any]]:
     from carlab.cli.emulate import Emulate
     from carlab.cli.export import Export
     from carlab.cli.import_ import Import
+    from carlab.cli.learn import Learn
     from carlab.cli.listen import Listen
     from carlab.cli.prove import Prove
     from carlab.cli.replay import Replay
@@ -76,6 +77,7 @@ def _verbs() -> dict[str, Callable[..., Any]]:
         "check": Check,
         "emulate": Emulate,
         "listen": Listen,
+        "learn": Learn,
         "diagnose": Diagnose,
         "prove": Prove,
         "bench": Bench,

@@ -24,22 +24,40 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def new_run(out: Path, name: str, choice: CarChoice) -> Iterator[RunDirectory]:
-    """A run's folder, with the program's log in it. It goes again where no episode was recorded."""
+def new_run(out: Path, name: str, choice: CarChoice, keep: str = "episodes") -> Iterator[RunDirectory]:
+    """A run's folder, with the program's log in it. It goes again where nothing came into its folder ``keep``."""
     from carlab.recording.run_directory import RunDirectory
 
     run = RunDirectory.create(out, name, config_toml=choice.config_toml)
+    try:
+        with _logged(run, choice):
+            yield run
+    finally:
+        if not any((run.path / keep).iterdir()):
+            shutil.rmtree(run.path, ignore_errors=True)
+
+
+@contextmanager
+def existing_run(path: Path, choice: CarChoice) -> Iterator[RunDirectory]:
+    """A run's folder that is taken up again, with the program's log going on in it."""
+    from carlab.recording.run_directory import RunDirectory
+
+    run = RunDirectory.open_existing(path)
+    with _logged(run, choice):
+        yield run
+
+
+@contextmanager
+def _logged(run: RunDirectory, choice: CarChoice) -> Iterator[None]:
     choice.log_to(run.path)
     banner(choice.car.reality, choice.car.name)
     handler = run.log_handler()
     logging.getLogger().addHandler(handler)
     try:
-        yield run
+        yield
     finally:
         logging.getLogger().removeHandler(handler)
         handler.close()
-        if not any(run.episodes.iterdir()):
-            shutil.rmtree(run.path, ignore_errors=True)
 
 
 def write_result(run: RunDirectory, results: list[EpisodeResult]) -> None:

@@ -1,0 +1,223 @@
+"""``carlab learn``."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from rich.progress import Progress, TaskID
+from tyro.conf import OmitArgPrefixes
+
+from carlab.cli.console import console, fail, progress, table
+from carlab.cli.drive import EXIT_SAFETY_STOP
+from carlab.cli.options import CarOptions, above_zero
+from carlab.cli.runs import ask_to_place, existing_run, new_run, write_result
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.cars import CarChoice
+    from carlab.core.documents import Tick
+    from carlab.core.outcome import EndReason
+    from carlab.experiment.campaign import Campaign, CampaignHooks
+    from carlab.experiment.campaign_figures import EpisodeFigures
+    from carlab.experiment.interrupts import Interrupts
+    from carlab.experiment.session import EpisodeResult
+    from carlab.experiment.training import TrainingPlan
+    from carlab.recording.run_directory import RunDirectory
+
+STEPS_PERIOD_S = 600.0
+
+
+@dataclass
+class Learn:
+    """Learn the car, learn to park in the learned car, drive, and again with what was recorded.
+
+    Between episodes another process learns while the car sits in neutral. A run that was ended anywhere goes on with
+    --resume to the number of episodes it was started with.
+    """
+
+    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
+
+    episodes: int = 20
+    """How many, those of a run that is taken up again included."""
+
+    ticks: int | None = None
+    """Ticks an episode; the task's number (100) unless given."""
+
+    prior: str = "kinematic"
+    """The simulator that is the prior: kinematic (the car's file, wheels that do not slip), nominal (the car's file as
+    it is), or FILE.toml (a diagnosed model.toml, say). Without ranges in the file they are 30 % about its numbers."""
+
+    method: Literal["sim-fsvgd", "fsvgd"] = "sim-fsvgd"
+    """sim-fsvgd, or fsvgd without a simulator."""
+
+    history: int = 3
+    """Past commands that model and policy see."""
+
+    model_steps: int = 2500
+    """Steps of the model's optimiser before each episode."""
+
+    updates: int = 15000
+    """Gradient steps of SAC before each episode; twice as many before the first."""
+
+    seed: int = 0
+    """Of everything that is drawn."""
+
+    device: str = "cpu"
+    """Where the model and the policy learn: cpu or cuda."""
+
+    place: bool = True
+    """Start each episode at the task's start pose; off: from where the car stands."""
+
+    resume: Path | None = None
+    """A run's folder that is taken up again; --car must be as it was, the other options are those of the run."""
+
+    out: Path = Path("runs")
+    """Folder that receives the run's folder."""
+
+    name: str = "learn"
+    """Last part of the run folder's name."""
+
+    rerun: bool = True
+    """Record .rrd files beside the MCAP files."""
+
+    verbose: bool = False
+    """Show the whole log."""
+
+    def run(self) -> int:
+        """Learn and say how it went."""
+        from carlab.experiment.campaign import Campaign, taken_up
+        from carlab.experiment.interrupts import Interrupts
+
+        above_zero(episodes=self.episodes, updates=self.updates, ticks=self.ticks, **{"model-steps": self.model_steps})
+        if self.history < 0 or self.seed < 0:
+            raise ConfigError("--history and --seed: 0 or more.")
+        choice = self.which_car.choose(seed=self.seed)
+        figures: list[EpisodeFigures] = []
+        with contextlib.ExitStack() as stack:
+            if self.resume is None:
+                plan, episodes = self._plan(choice), self.episodes
+                run = stack.enter_context(new_run(self.out, self.name, choice, keep="models"))
+            else:
+                run = stack.enter_context(existing_run(self.resume, choice))
+                plan, episodes = taken_up(run)
+            stack.enter_context(choice.car)
+            bar = stack.enter_context(progress(speed_estimate_period_s=STEPS_PERIOD_S))
+            interrupts = stack.enter_context(Interrupts())
+            campaign = Campaign(
+                choice, plan, episodes, run, self._hooks(bar, run, figures, interrupts), self.ticks, self.place,
+                self.rerun,
+            )  # fmt: skip
+            if self.resume is None:
+                campaign.write_plan()
+            results = list(self._watched(campaign, figures))
+        return self._report(campaign, results, figures)
+
+    def _plan(self, choice: CarChoice) -> TrainingPlan:
+        import tomli_w
+
+        from carlab.cars import load_car_file
+        from carlab.experiment.campaign import prior_simulator
+        from carlab.experiment.training import TrainingPlan
+
+        if self.prior in ("kinematic", "nominal"):
+            kind: Literal["kinematic", "nominal"] = "kinematic" if self.prior == "kinematic" else "nominal"
+            simulator = prior_simulator(choice.simulator, kind)
+        else:
+            simulator = prior_simulator(load_car_file(Path(self.prior)).simulator, "nominal")
+        if self.device != "cpu":
+            import torch
+
+            if not torch.cuda.is_available():
+                raise ConfigError(f"--device {self.device}: there is no such device here; leave it out.")
+        text = tomli_w.dumps(simulator.to_tables())
+        tomllib.loads(text)
+        return TrainingPlan(
+            text, self.history, self.method, self.model_steps, self.updates, self.seed, self.device
+        )  # fmt: skip
+
+    def _hooks(
+        self, bar: Progress, run: RunDirectory, figures: list[EpisodeFigures], interrupts: Interrupts
+    ) -> CampaignHooks:
+        from carlab.experiment.campaign import CampaignHooks
+        from carlab.experiment.session import SessionHooks
+
+        rows: dict[str, TaskID] = {}
+
+        def at(what: str, done: int, total: int) -> None:
+            if what not in rows:
+                for task in rows.values():
+                    bar.remove_task(task)
+                rows.clear()
+                rows[what] = bar.add_task(what, total=total, note="")
+            bar.update(rows[what], completed=done, total=total)
+
+        def on_episode(number: int, ticks: int) -> None:
+            at(f"episode {number}", 0, ticks)
+
+        def on_tick(tick: Tick) -> None:
+            (task,) = rows.values()
+            bar.update(task, completed=tick.step + 1)
+
+        def on_abandon(reason: EndReason, detail: str) -> None:
+            fail(f"{reason.value} {detail} The recording is in {run.path}.")
+            os._exit(EXIT_SAFETY_STOP)
+
+        def on_figures(row: EpisodeFigures) -> None:
+            figures.append(row)
+            parked = "parked" if row.parked else f"{row.distance_m:.2f} m from the goal"
+            bar.console.print(
+                f"episode {row.episode}: return {row.total_reward:.1f} (foretold {row.foretold:.1f}), {parked}; "
+                f"learned from {row.rows} rows in {row.model_seconds:.0f} + {row.policy_seconds:.0f} s",
+                soft_wrap=True,
+            )
+
+        session = SessionHooks(
+            place_by_hand=ask_to_place(bar, "use --no-place or a terminal"), on_episode=on_episode, on_tick=on_tick,
+            on_abandon=on_abandon,
+        )  # fmt: skip
+        return CampaignHooks(session, at, on_figures, interrupts.requested.is_set)
+
+    def _watched(self, campaign: Campaign, figures: list[EpisodeFigures]) -> list[EpisodeResult]:
+        from carlab.experiment.campaign_report import write_report
+
+        results = []
+        for result in campaign.go_on():
+            results.append(result)
+            write_report(campaign.run, campaign.plan, figures[-1])
+        return results
+
+    def _report(self, campaign: Campaign, results: list[EpisodeResult], figures: list[EpisodeFigures]) -> int:
+        from carlab.cli import EXIT_INTERRUPTED
+        from carlab.experiment.campaign import GOES_ON
+
+        done = len(campaign.run.recordings())
+        if results:
+            write_result(campaign.run, results)
+            table(
+                "",
+                ["episode", "return", "foretold", "distance\n[m]", "yaw error\n[rad]", "speed\n[m/s]", "parked", "end"],
+                [
+                    [str(r.episode), f"{r.total_reward:.1f}", f"{r.foretold:.1f}", f"{r.distance_m:.2f}",
+                     f"{r.yaw_error_rad:.2f}", f"{r.speed_mps:.2f}", "yes" if r.parked else "no",
+                     r.end.lower().replace("_", " ")]
+                    for r in figures
+                ],
+            )  # fmt: skip
+            console.print(f"Learned and recorded in {campaign.run.path} (learn.png, learn.rrd).", soft_wrap=True)
+        if done < campaign.episodes:
+            console.print(
+                f"{done} of {campaign.episodes} episodes; go on with: carlab learn --resume {campaign.run.path}",
+                soft_wrap=True,
+            )
+            last = results[-1].reason if results else None
+            return (
+                EXIT_SAFETY_STOP
+                if last is not None and last.is_safety_stop and last not in GOES_ON
+                else EXIT_INTERRUPTED
+            )
+        return 0

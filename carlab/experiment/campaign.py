@@ -1,0 +1,167 @@
+"""The outer loop: learn the car, learn to drive in the learned car, drive, and again with what was recorded.
+
+Algorithm 2 of Rothfuss et al., arXiv 2403.16644. A run may be ended anywhere: what the next step is follows from the
+files in its folder alone.
+
+| finished recordings | models/000k, k = recordings + 1 | next |
+| --- | --- | --- |
+| fewer than wanted | absent | learn |
+| fewer than wanted | there | drive |
+| as many as wanted | | done |
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from carlab.cars import CarChoice
+from carlab.core.errors import DataError
+from carlab.core.outcome import EndReason
+from carlab.experiment.campaign_figures import EpisodeFigures, figures_of
+from carlab.experiment.session import EpisodeResult, Session, SessionHooks
+from carlab.experiment.training import (
+    FIGURES_FILE,
+    Tell,
+    TrainingPlan,
+    model_folder,
+    plan_as_json,
+    train_beside,
+)
+from carlab.recording.run_directory import RunDirectory
+from learning.sac_agent import SacAgent, SacSettings
+from sim_backends.car_parameters import SimulatorConfig
+
+CAMPAIGN_FILE = "campaign.json"
+GOES_ON = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOFENCE, EndReason.OVERSPEED})
+"""Ends of an episode after which the next may follow: a policy that has not learned yet leaves the arena."""
+SPREAD = 0.3
+"""How far from its value a number of the car file may lie, where the file gives no range."""
+UNCERTAIN = (
+    *("vehicle.yaw_inertia", "tyre.front.B", "tyre.front.mu", "tyre.rear.B", "tyre.rear.mu"),
+    *("motor.drive_gain", "motor.damping", "steering.max_angle"),
+)
+KINEMATIC_UNCERTAIN = ("motor.drive_gain", "motor.damping", "steering.max_angle")
+
+
+def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"]) -> SimulatorConfig:
+    """The simulator that is the prior: the car's own, or one whose wheels do not slip; with ranges.
+
+    Args:
+        car: as its file describes it.
+        kind: which.
+    """
+    if kind == "kinematic":
+        car = replace(car, kind="kinematic", effects={}, priors={})
+    if car.priors:
+        return car
+    values = car.values()
+    names = KINEMATIC_UNCERTAIN if car.kind == "kinematic" else UNCERTAIN
+    ranges = {n: tuple(sorted((values[n] * (1.0 - SPREAD), values[n] * (1.0 + SPREAD)))) for n in names if values[n]}
+    return replace(car, priors={n: (low, high) for n, (low, high) in ranges.items()})
+
+
+@dataclass(slots=True)
+class CampaignHooks:
+    """What a campaign tells its surroundings."""
+
+    session: SessionHooks = field(default_factory=SessionHooks)
+    on_training: Tell = lambda what, done, total: None
+    on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
+    stop: Callable[[], bool] = lambda: False
+
+
+@dataclass(slots=True)
+class Campaign:
+    """A run of ``carlab learn`` on an open car."""
+
+    choice: CarChoice
+    plan: TrainingPlan
+    episodes: int
+    run: RunDirectory
+    hooks: CampaignHooks = field(default_factory=CampaignHooks)
+    max_ticks: int | None = None
+    place: bool = True
+    record_rerun: bool = True
+
+    def write_plan(self) -> None:
+        """Write what is wanted, for taking the run up again."""
+        self.run.write_json(CAMPAIGN_FILE, {"episodes": self.episodes, "plan": plan_as_json(self.plan)})
+
+    def go_on(self) -> Iterator[EpisodeResult]:
+        """Learn and drive until there are enough episodes; gives each as it ends.
+
+        Ends early when asked to, or after an episode that ended for a reason that a person must look at.
+
+        Raises:
+            DataError: what training says.
+        """
+        while (done := len(self.run.recordings())) < self.episodes:
+            folder = model_folder(self.run.models, done + 1)
+            if not folder.is_dir():
+                told = train_beside(
+                    self.plan, self.run.models, self.run.recordings(), self.hooks.on_training, self.hooks.stop
+                )
+                if told is None:
+                    return
+            if self.hooks.stop():
+                return
+            result = self._drive(done + 1)
+            if result is None:
+                return
+            if result.reason.is_safety_stop and result.reason in GOES_ON:
+                self.choice.car.reset_fault()
+            self.hooks.on_figures(figures_of(result, self._training(done + 1), self.plan))
+            yield result
+            if result.reason not in GOES_ON:
+                return
+
+    def _drive(self, number: int) -> EpisodeResult | None:
+        agent = SacAgent.load(model_folder(self.run.models, number), SacSettings(), self.plan.seed)
+        task = self.plan.task
+        envelope = self.choice.envelope
+        if not envelope.arena_m:
+            envelope = replace(envelope, arena_m=task.arena_m)
+        session = Session(
+            self.choice.car,
+            agent.policy(),
+            task,
+            envelope,
+            self.run,
+            self.choice.control_period_s,
+            seed=self.plan.seed + number,
+            max_ticks=self.max_ticks,
+            config_toml=self.choice.config_toml,
+            metadata={"model": str(number), "method": self.plan.method},
+            hooks=self.hooks.session,
+            place=self.place,
+            record_rerun=self.record_rerun,
+        )
+        results = session.drive(1)
+        return results[0] if results else None
+
+    def _training(self, number: int) -> dict[str, Any]:
+        path = model_folder(self.run.models, number) / FIGURES_FILE
+        try:
+            found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path} cannot be read ({error}); remove its folder, and it is learned anew.") from error
+        return found
+
+
+def taken_up(run: RunDirectory) -> tuple[TrainingPlan, int]:
+    """The plan of a run and how many episodes it wanted. Raises DataError where it is no campaign."""
+    path = run.path / CAMPAIGN_FILE
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        plan = TrainingPlan(**content["plan"])
+        SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+        return plan, int(content["episodes"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{run.path} is no run of carlab learn that can be taken up again ({error}).") from error
+
+
+__all__ = ["CAMPAIGN_FILE", "Campaign", "CampaignHooks", "prior_simulator", "taken_up"]

@@ -1,0 +1,118 @@
+"""What an episode of learning came to: return and final pose beside what the model had foretold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.observation import encode
+from carlab.core.quantities import FloatArray
+from carlab.experiment.session import EpisodeResult
+from carlab.experiment.training import TrainingPlan
+from learning.car_dynamics import CarDynamics, inputs_of, moved
+
+AHEAD_S = 1.0
+SAMPLES = 64
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeFigures:
+    """One row of the learning curve.
+
+    Attributes:
+        episode: from 1.
+        total_reward: on the car.
+        foretold: mean return of the same policy in the learned car.
+        parked: on the car.
+        distance_m, yaw_error_rad, speed_mps: at the end.
+        rows: from which the model was learned.
+        last_episode_nll: of the episode before under the model that had not seen it [nat]; NaN for the first.
+        last_episode_calibration_error: of the same.
+        model_seconds, policy_seconds: that learning took.
+        updates: gradient steps of SAC.
+        end: why the episode ended.
+    """
+
+    episode: int
+    total_reward: float
+    foretold: float
+    parked: bool
+    distance_m: float
+    yaw_error_rad: float
+    speed_mps: float
+    rows: int
+    last_episode_nll: float
+    last_episode_calibration_error: float
+    model_seconds: float
+    policy_seconds: float
+    updates: int
+    end: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """For a file."""
+        return asdict(self)
+
+
+def figures_of(result: EpisodeResult, training: Mapping[str, Any], plan: TrainingPlan) -> EpisodeFigures:
+    """Figures of an episode and of what was learned before it."""
+    summary = result.summary
+    return EpisodeFigures(
+        episode=int(training["episode"]),
+        total_reward=result.total_reward,
+        foretold=float(training["return_in_model"]),
+        parked=bool(summary["parked"]),
+        distance_m=summary["distance_m"],
+        yaw_error_rad=summary["yaw_error_rad"],
+        speed_mps=summary["speed_mps"],
+        rows=int(training["rows"]),
+        last_episode_nll=float(training.get("last_episode_nll", float("nan"))),
+        last_episode_calibration_error=float(training.get("last_episode_calibration_error", float("nan"))),
+        model_seconds=float(training["model_seconds"]),
+        policy_seconds=float(training["policy_seconds"]),
+        updates=int(training["updates"]),
+        end=result.reason.name,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Foretold:
+    """Where the model says the car goes from recorded states, by the recorded commands.
+
+    Attributes:
+        ticks: of the recording, the first of each stretch being where it starts (S, T).
+        mean, std: of x, y [m] and yaw [rad] at those ticks (S, T, 3).
+    """
+
+    ticks: np.ndarray
+    mean: FloatArray
+    std: FloatArray
+
+
+def foretell(dynamics: CarDynamics, episode: EpisodeData, seed: int = 0) -> Foretold:
+    """Stretches of a second, one after the other, by draws of particles and noise."""
+    history = dynamics.history
+    length = max(round(AHEAD_S / episode.period_s), 1)
+    starts = np.arange(history, episode.ticks - length + 1, length)
+    generator = torch.Generator().manual_seed(seed)
+    past = np.stack([episode.sent[starts - back] for back in range(history, 0, -1)], axis=1)
+    first = encode(episode.states[starts], past.reshape(len(starts), history, 2))
+    features = torch.from_numpy(first).float().repeat_interleave(SAMPLES, dim=0)
+    poses = []
+    for k in range(length + 1):
+        x, y, sin, cos = features[:, :4].T
+        poses.append(torch.stack([x, y, torch.atan2(sin, cos)], dim=1).view(len(starts), SAMPLES, 3))
+        if k < length:
+            command = torch.from_numpy(episode.sent[starts + k]).float().repeat_interleave(SAMPLES, dim=0)
+            change = dynamics.sample(inputs_of(features, command), generator)
+            features = moved(features, command, change)
+    every = torch.stack(poses, dim=1).double().numpy()  # (S, T, samples, 3)
+    every[..., 2] = np.unwrap(every[..., 2], axis=1)
+    return Foretold(starts[:, None] + np.arange(length + 1), every.mean(axis=2), every.std(axis=2))
+
+
+__all__ = ["EpisodeFigures", "Foretold", "figures_of", "foretell"]

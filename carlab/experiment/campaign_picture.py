@@ -1,0 +1,83 @@
+"""A run of learning as a picture: the learning curve, and the last episode beside what the model foretold of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.task import ParkingTask
+from carlab.experiment.campaign_figures import EpisodeFigures, Foretold
+
+CAR_M = (0.3, 0.16)
+
+
+def draw(
+    rows: Sequence[EpisodeFigures], episode: EpisodeData, foretold: Foretold, task: ParkingTask, path: Path
+) -> None:
+    """Write a PNG.
+
+    Args:
+        rows: one an episode.
+        episode: the last one.
+        foretold: of it, by the model it was driven with.
+        task: goal and arena.
+        path: to write to.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (curve, surprise, plan) = pyplot.subplots(1, 3, figsize=(15, 4.6), layout="constrained")
+    numbers = [r.episode for r in rows]
+    curve.plot(numbers, [r.total_reward for r in rows], marker="o", label="on the car")
+    curve.plot(numbers, [r.foretold for r in rows], marker=".", linestyle="--", label="in the learned car")
+    parked = [r for r in rows if r.parked]
+    curve.plot([r.episode for r in parked], [r.total_reward for r in parked], "*", markersize=14, label="parked")
+    curve.set(xlabel="episode", ylabel="return")
+    curve.legend(fontsize=8)
+    surprise.plot(numbers, [r.last_episode_nll for r in rows], marker="o", color="tab:purple")
+    surprise.set(xlabel="episode", ylabel="surprise at the episode before [nat a step]")
+    other = surprise.twinx()
+    other.plot(numbers, [r.distance_m for r in rows], marker=".", linestyle=":", color="tab:gray")
+    other.set_ylabel("distance from the goal at the end [m]", color="tab:gray")
+    for axis in (curve, surprise):
+        axis.grid(alpha=0.3)
+        axis.xaxis.get_major_locator().set_params(integer=True)
+    _plan(plan, episode, foretold, task)
+    plan.set_title(f"episode {numbers[-1]}: driven, and foretold a second ahead", fontsize=9)
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)
+
+
+def _plan(axis: Any, episode: EpisodeData, foretold: Foretold, task: ParkingTask) -> None:
+    from matplotlib.patches import Ellipse, Polygon
+
+    axis.plot(*episode.states[:, :2].T, color="black", linewidth=1.5, label="driven")
+    for k, (mean, std) in enumerate(zip(foretold.mean, foretold.std, strict=True)):
+        axis.plot(mean[:, 0], mean[:, 1], color="tab:orange", linewidth=1.2, label="foretold" if k == 0 else None)
+        width, height = 4.0 * std[-1, :2]
+        axis.add_patch(Ellipse((mean[-1, 0], mean[-1, 1]), width, height, alpha=0.25, color="tab:orange", linewidth=0))
+    for pose, colour in ((task.goal_pose, "tab:green"), (tuple(episode.states[-1, :3]), "tab:blue")):
+        axis.add_patch(Polygon(_outline(pose), fill=False, edgecolor=colour, linewidth=2))
+    axis.plot([], [], color="tab:green", label="goal")
+    axis.plot([], [], color="tab:blue", label="end")
+    corners = np.array([*task.arena_m, task.arena_m[0]])
+    axis.plot(*corners.T, color="tab:red", linewidth=0.8, alpha=0.5)
+    axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axis.legend(fontsize=8)
+
+
+def _outline(pose: Sequence[float]) -> np.ndarray:
+    half = 0.5 * np.array(CAR_M)
+    corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * half
+    sin, cos = np.sin(pose[2]), np.cos(pose[2])
+    outline: np.ndarray = corners @ np.array([[cos, sin], [-sin, cos]]) + np.array(pose[:2])
+    return outline
+
+
+__all__ = ["draw"]

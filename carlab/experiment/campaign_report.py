@@ -1,0 +1,53 @@
+"""What a run of learning leaves for people: a table of figures, a picture, and a recording for rerun."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+
+import numpy as np
+
+from carlab.core.errors import DataError
+from carlab.experiment.campaign_figures import EpisodeFigures, foretell
+from carlab.experiment.campaign_picture import draw
+from carlab.experiment.training import DYNAMICS_FILE, TrainingPlan, model_folder
+from carlab.recording.learning_curve import write_learning_curve
+from carlab.recording.mcap_source import read_episode
+from carlab.recording.run_directory import RunDirectory
+from learning.car_fit import load_car
+
+CURVE_FILE = "learn.json"
+
+
+def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
+    """The rows so far. Raises DataError where the file is broken."""
+    path = run.path / CURVE_FILE
+    if not path.is_file():
+        return []
+    try:
+        return [EpisodeFigures(**row) for row in json.loads(path.read_text(encoding="utf-8"))["episodes"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} cannot be read ({error}); remove it, and it is begun anew.") from error
+
+
+def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> None:
+    """Add an episode to learn.json, learn.png and learn.rrd of a run."""
+    rows = [r for r in learning_curve(run) if r.episode != row.episode] + [row]
+    run.write_json(CURVE_FILE, {"schema": "carlab.learn/1", "episodes": [r.to_dict() for r in rows]})
+    recordings = run.recordings()
+    driven, told = [], []
+    shown = [r for r in rows if r.episode <= len(recordings)]
+    for r in shown:
+        episode = read_episode(recordings[r.episode - 1])
+        foretold = foretell(load_car(model_folder(run.models, r.episode) / DYNAMICS_FILE), episode)
+        driven.append(episode.states[:, :2])
+        told.append((foretold.mean[..., :2], foretold.std[..., :2]))
+        if r is shown[-1]:
+            draw(rows, episode, foretold, plan.task, run.path / "learn.png")
+    numbers = [f.name for f in fields(EpisodeFigures) if f.name != "end"]
+    write_learning_curve(
+        run.path / "learn.rrd", [{n: float(np.float64(getattr(r, n))) for n in numbers} for r in shown], driven, told
+    )
+
+
+__all__ = ["CURVE_FILE", "learning_curve", "write_report"]

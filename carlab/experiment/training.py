@@ -1,0 +1,269 @@
+"""Between two episodes: learn the car from all that was recorded, and a policy in the learned car, in another process.
+
+The process that drives only waits, its car in neutral. What was learned appears in the run's folder at once and whole
+(``models/0003``), or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import os
+import shutil
+import tomllib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from carlab.core.clock import MonotonicClock
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import CarlabError, DataError
+from carlab.core.observation import encode
+from carlab.core.quantities import FloatArray
+from carlab.core.task import ParkingTask
+from learning.car_fit import CarFitSettings, Method
+from sim_backends.car_parameters import SimulatorConfig
+
+log = logging.getLogger(__name__)
+
+DYNAMICS_FILE = "dynamics.pt"
+FIGURES_FILE = "training.json"
+POLL_S = 0.1
+JUDGED_CARS = 64
+Tell = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingPlan:
+    """What is learned before an episode, the same for every episode of a run.
+
+    Attributes:
+        prior_toml: car file of the simulator that is the prior, ranges and effects included.
+        history: past commands that model and policy see.
+        method: with the simulator as prior, or without.
+        model_steps: steps of the particles' optimiser.
+        updates: gradient steps of SAC; twice as many before the first episode.
+        seed: of everything.
+        device: of the model's and the policy's tensors.
+        threads: of torch.
+    """
+
+    prior_toml: str
+    history: int = 3
+    method: Method = "sim-fsvgd"
+    model_steps: int = 2500
+    updates: int = 15_000
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 2
+
+    @property
+    def task(self) -> ParkingTask:
+        """The task, with the history of the model."""
+        return replace(ParkingTask(), history_length=self.history)
+
+
+def model_folder(models: Path, episode: int) -> Path:
+    """Where what was learned before an episode lies."""
+    return models / f"{episode:04d}"
+
+
+def train(plan: TrainingPlan, models: Path, recordings: list[Path], tell: Tell) -> dict[str, Any]:
+    """Learn before the episode that follows the recordings.
+
+    Args:
+        plan: what.
+        models: folder that gets the result.
+        recordings: MCAP files of all episodes so far, in order.
+        tell: told what is done, how many steps of it, and of how many.
+
+    Returns:
+        Figures, also written beside the result.
+
+    Raises:
+        DataError: the recordings hold no row, or something diverged. Nothing is left behind.
+    """
+    import torch
+
+    from carlab.recording.mcap_source import read_episode
+    from learning.car_fit import fit_car, load_car, save_car
+    from learning.evaluation import calibration_error, negative_log_likelihood
+    from learning.model_env import ModelEnv
+    from learning.sac_agent import SacAgent, SacSettings
+    from learning.simulator_model import CarModel
+    from learning.transitions import transitions_of
+
+    torch.set_num_threads(plan.threads)
+    clock = MonotonicClock()
+    number = len(recordings) + 1
+    tell("reading the recordings", 0, 1)
+    episodes = [read_episode(path) for path in recordings]
+    simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+    model = CarModel(simulator, plan.history, simulator.priors)
+    usable = [e for e in episodes if e.ticks > plan.history]
+    rows = transitions_of(usable, plan.history) if usable else None
+    figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
+    earlier = model_folder(models, number - 1)
+    before = load_car(earlier / DYNAMICS_FILE) if earlier.is_dir() else None
+    if before is not None and episodes and episodes[-1].ticks > plan.history:
+        fresh = transitions_of(episodes[-1:], plan.history)
+        inputs, outputs = (torch.from_numpy(v).float() for v in (fresh.inputs, fresh.targets))
+        predicted = before.predict(inputs).smoothed()
+        figures |= {
+            "last_episode_nll": negative_log_likelihood(predicted, outputs),
+            "last_episode_calibration_error": calibration_error(predicted, outputs),
+        }
+
+    began_s = clock.now_s()
+    seed = plan.seed + 1000 * number
+    settings = CarFitSettings(plan.method, plan.model_steps, seed=seed)
+    tell("learning the car", 0, plan.model_steps)
+    dynamics = fit_car(
+        rows, model, settings, before=before, device=plan.device,
+        progress=lambda done: tell("learning the car", done, plan.model_steps),
+    )  # fmt: skip
+    figures["model_seconds"] = clock.now_s() - began_s
+
+    began_s = clock.now_s()
+    updates = plan.updates if before is not None else 2 * plan.updates
+    sac = SacSettings()
+    agent = SacAgent(sac, plan.seed, plan.device)
+    if before is not None:
+        agent = SacAgent.load(earlier, sac, plan.seed, plan.device)
+    recorded = recorded_features(usable, plan.history) if usable else None
+    world = ModelEnv(dynamics, plan.task, sac.cars, recorded=recorded, seed=seed, device=plan.device)
+    judging = ModelEnv(dynamics, plan.task, JUDGED_CARS, seed=seed + 1, device=plan.device)
+
+    def judge(candidate: SacAgent) -> float:
+        return float(judging.rolled_out(candidate.act)[0].mean())
+
+    tell("learning to drive", 0, updates)
+    figures |= agent.train(world, updates, lambda done: tell("learning to drive", done, updates), judge)
+    total, last = judging.rolled_out(agent.act)
+    figures |= {
+        "policy_seconds": clock.now_s() - began_s,
+        "updates": updates,
+        "return_in_model": float(total.mean()),
+        "parked_in_model": float(plan.task.parked(last).float().mean()),
+    }
+
+    def write(folder: Path) -> None:
+        save_car(dynamics, folder / DYNAMICS_FILE)
+        agent.save(folder)
+
+    _publish(model_folder(models, number), figures, write)
+    return figures
+
+
+def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
+    """Features (R, 7 + 2 H) of recorded states with the commands before them."""
+    import numpy as np
+
+    found = []
+    for episode in episodes:
+        rows = np.arange(history, episode.ticks)
+        past = np.stack([episode.sent[rows - back] for back in range(history, 0, -1)], axis=1) if history else None
+        commands = np.zeros((len(rows), 0, 2)) if past is None else past
+        found.append(encode(episode.states[rows], commands))
+    features: FloatArray = np.concatenate(found)
+    return features[np.isfinite(features).all(axis=1)]
+
+
+def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None]) -> None:
+    unfinished = folder.with_name(f"{folder.name}.partial")
+    try:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        write(unfinished)
+        (unfinished / FIGURES_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        os.replace(unfinished, folder)
+    except OSError as error:
+        raise DataError(f"{folder}: {error.strerror or error}; check the disk, then take the run up again.") from error
+
+
+def train_beside(
+    plan: TrainingPlan, models: Path, recordings: list[Path], tell: Tell, stop: Callable[[], bool] = lambda: False
+) -> dict[str, Any] | None:
+    """``train`` in a process of its own, while this one waits.
+
+    Args:
+        plan: as for ``train``.
+        models: as for ``train``.
+        recordings: as for ``train``.
+        tell: as for ``train``.
+        stop: asked again and again; once true the process is ended and nothing is left behind.
+
+    Returns:
+        The figures; None where it was stopped.
+
+    Raises:
+        DataError: what ``train`` says, or that its process died.
+    """
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    child = context.Process(target=_child, args=(theirs, plan, models, recordings), daemon=True, name="training")
+    child.start()
+    theirs.close()
+    try:
+        while True:
+            if stop():
+                return None
+            if ours.poll(POLL_S):
+                try:
+                    kind, content = ours.recv()
+                except EOFError:
+                    child.join()
+                    raise DataError(
+                        f"The training process died (exit code {child.exitcode}; -9 is often too little memory); "
+                        "what was recorded is kept, take the run up again."
+                    ) from None
+                if kind == "done":
+                    figures: dict[str, Any] = content
+                    return figures
+                if kind == "failed":
+                    raise DataError(str(content))
+                tell(*content)
+    finally:
+        if child.is_alive():
+            child.terminate()
+        child.join()
+        ours.close()
+        for left in models.glob("*.partial"):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _child(pipe: Connection, plan: TrainingPlan, models: Path, recordings: list[Path]) -> None:
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the process that drives; it ends this one.
+    try:
+        pipe.send(("done", train(plan, models, recordings, lambda *what: pipe.send(("at", what)))))
+    except CarlabError as error:
+        pipe.send(("failed", str(error)))
+    except BrokenPipeError:
+        pass
+    except Exception as error:
+        log.exception("Training failed")
+        pipe.send(("failed", f"Training failed: {type(error).__name__}: {error}; what was recorded is kept."))
+    finally:
+        pipe.close()
+
+
+def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
+    """The plan for a file."""
+    return asdict(plan)
+
+
+__all__ = [
+    "DYNAMICS_FILE",
+    "FIGURES_FILE",
+    "TrainingPlan",
+    "model_folder",
+    "plan_as_json",
+    "recorded_features",
+    "train",
+    "train_beside",
+]

@@ -1,0 +1,50 @@
+"""The learning curve and what a model foretold, for the rerun viewer."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from carlab.core.quantities import FloatArray
+from carlab.recording.sink import partial_path
+
+APPLICATION = "carlab"
+
+
+def write_learning_curve(
+    path: Path,
+    rows: Sequence[Mapping[str, float]],
+    driven: Sequence[FloatArray],
+    foretold: Sequence[tuple[FloatArray, FloatArray]],
+) -> None:
+    """Write a recording whose timeline is the episode: every figure as a curve, paths in the plan view.
+
+    Args:
+        path: of the .rrd file; replaced whole.
+        rows: figures by name, one mapping an episode, ``episode`` among them.
+        driven: x, y [m] of each episode (T, 2).
+        foretold: mean and standard deviation of x, y [m] of stretches of each episode (S, T, 2).
+    """
+    unfinished = partial_path(path)
+    unfinished.unlink(missing_ok=True)
+    stream = rr.RecordingStream(APPLICATION, recording_id=path.parent.name)
+    try:
+        stream.save(unfinished)
+        for row, line, (mean, std) in zip(rows, driven, foretold, strict=True):
+            stream.set_time("episode", sequence=int(row["episode"]))
+            for name, value in row.items():
+                if name != "episode" and np.isfinite(value):
+                    stream.log(f"learning/{name}", rr.Scalars(float(value)))
+            stream.log("plan/driven", rr.LineStrips2D([line], colors=[(0, 0, 0)]))
+            stream.log("plan/foretold", rr.LineStrips2D(list(mean), colors=[(230, 130, 0)]))
+            stream.log("plan/foretold/doubt", rr.Boxes2D(centers=mean[:, -1], half_sizes=2.0 * std[:, -1]))
+    finally:
+        stream.disconnect()
+    os.replace(unfinished, path)
+
+
+__all__ = ["write_learning_curve"]

@@ -1,0 +1,144 @@
+"""From recorded rows and a simulator to a learned car, and to a file and back."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from learning.car_dynamics import CarDynamics
+from learning.domain_models import draw_parameters
+from learning.fsvgd import Posterior
+from learning.function_posterior import infer
+from learning.normaliser import Normaliser
+from learning.particles import Network
+from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_points
+from learning.simulator_model import CarModel
+from learning.transitions import OUTPUTS, Transitions
+
+Method = Literal["sim-fsvgd", "fsvgd"]
+FILE_VERSION = 1
+NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
+"""Expected noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
+EXPECTED_GAP = 0.3
+EXPECTED_FUNCTION = 1.0
+"""Size of what a simulator leaves out, and of a step of which nothing is known, in units of the outputs."""
+ROWS = 1200
+"""Rows that are conditioned on at most; of more so many are drawn."""
+_UNITS_FROM = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class CarFitSettings:
+    """How a car is learned.
+
+    Attributes:
+        method: with the simulator as prior, or without.
+        steps: of the particles' optimiser.
+        particles: how many.
+        seed: of everything that is drawn.
+    """
+
+    method: Method = "sim-fsvgd"
+    steps: int = 2500
+    particles: int = 20
+    seed: int = 0
+
+
+def car_units(model: CarModel, generator: torch.Generator) -> Normaliser:
+    """Units of inputs and outputs by random drives of the simulator; they do not change with the data."""
+    inputs = model.inputs(_UNITS_FROM, generator)
+    with torch.no_grad():
+        outputs = model(inputs, draw_parameters(model, 16, generator)).flatten(0, 1)
+    width = inputs.std(dim=0).clamp_min(0.1)
+    return Normaliser(inputs.mean(dim=0), width, torch.zeros(len(OUTPUTS)), outputs.std(dim=0).clamp_min(1e-3))
+
+
+def fit_car(
+    rows: Transitions | None,
+    model: CarModel,
+    settings: CarFitSettings,
+    *,
+    before: CarDynamics | None = None,
+    progress: Callable[[int], None] = lambda step: None,
+    device: torch.device | str = "cpu",
+) -> CarDynamics:
+    """Learn a car.
+
+    Args:
+        rows: what was recorded; without any the simulator alone is learned.
+        model: the simulator, which is the prior or (``fsvgd``) only tells units and domain.
+        settings: how.
+        before: an earlier fit of the same car, whose units and particles are taken up.
+        progress: told the steps of the optimiser that are done.
+        device: where tensors live.
+
+    Raises:
+        DataError: the history of the rows is not the model's, or the fit diverged.
+    """
+    if rows is not None and rows.history != model.history:
+        raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; make them alike.")
+    generator = torch.Generator().manual_seed(settings.seed)
+    units = car_units(model, generator) if before is None else before.posterior.normaliser
+    width = 3 + 2 * (model.history + 1)
+    inputs, outputs = torch.zeros((0, width)), torch.zeros((0, len(OUTPUTS)))
+    if rows is not None and len(rows):
+        inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
+    if len(inputs) > ROWS:
+        some = torch.randperm(len(inputs), generator=generator)[:ROWS]
+        inputs, outputs = inputs[some], outputs[some]
+    own = settings.method == "sim-fsvgd"
+    gap = (EXPECTED_GAP if own else EXPECTED_FUNCTION) * units.output_std
+    target = infer(
+        model if own else None, inputs, outputs, units, torch.tensor(NOISE_STD), gap_std=gap, seed=settings.seed
+    )
+    points = measurement_points(model, inputs, units, generator)
+    particles = ParticleSettings(particles=settings.particles, steps=settings.steps, seed=settings.seed)
+    start = None if before is None else before.posterior.parameters
+    return CarDynamics(fit_particles(target, points, particles, progress, start), model.history)
+
+
+def save_car(dynamics: CarDynamics, path: Path) -> None:
+    """Write a learned car into a file."""
+    posterior = dynamics.posterior
+    units = posterior.normaliser
+    content: dict[str, Any] = {
+        "version": FILE_VERSION,
+        "history": dynamics.history,
+        "scale": dynamics.scale,
+        "network": [posterior.network.inputs, posterior.network.outputs, *posterior.network.hidden],
+        "parameters": posterior.parameters.cpu(),
+        "noise_std": posterior.noise_std.cpu(),
+        "tails": None if posterior.tails is None else posterior.tails.cpu(),
+        "units": [t.cpu() for t in (units.input_mean, units.input_std, units.output_mean, units.output_std)],
+    }
+    torch.save(content, path)
+
+
+def load_car(path: Path) -> CarDynamics:
+    """Read a learned car. Raises DataError where the file is broken, or of another version or shape."""
+    remedy = "remove its folder, and it is learned anew"
+    try:
+        content: dict[str, Any] = torch.load(path, weights_only=True)
+        if content["version"] != FILE_VERSION:
+            raise DataError(f"{path} is of version {content['version']}, this program reads {FILE_VERSION}; {remedy}.")
+        inputs, outputs, *hidden = content["network"]
+        network = Network(inputs, outputs, tuple(hidden))
+        parameters: Tensor = content["parameters"]
+        if parameters.shape[1] != network.parameters:
+            raise DataError(f"{path} holds {parameters.shape[1]} numbers for {network.parameters}; {remedy}.")
+        posterior = Posterior(
+            network, parameters, content["noise_std"], Normaliser(*content["units"]), content["tails"]
+        )  # fmt: skip
+        return CarDynamics(posterior, content["history"], content["scale"])
+    except (OSError, RuntimeError, EOFError, KeyError, TypeError, ValueError, pickle.UnpicklingError) as error:
+        raise DataError(f"The learned car in {path} cannot be read ({error}); {remedy}.") from error
+
+
+__all__ = ["CarFitSettings", "Method", "car_units", "fit_car", "load_car", "save_car"]
