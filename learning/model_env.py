@@ -1,7 +1,8 @@
 """A learned car as a vectorised environment of stable-baselines3, with the task of the real one.
 
 Starts are drawn in part from the task and in part from states that were recorded, with the commands before them. An
-episode ends after the task's ticks, where the task ends, or where the car leaves the arena.
+episode ends after the task's ticks, where the task ends, or where the safety gate would stop a real car, which is worth
+nothing from then on.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from carlab.core.observation import ACTION_SIZE, encode, feature_size
+from carlab.core.geofence import stopping_distance_m
+from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
+from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import Task
 from learning.car_dynamics import OneStep, inputs_of, moved
 
@@ -43,6 +46,8 @@ class ModelEnv(VecEnv):
         cars: how many copies.
         recorded: features (R, 7 + 2 H) of recorded states; may be empty.
         from_recorded: share of starts among them, where there are any.
+        envelope: limits of the safety gate, which slews commands and stops a car that could not stop inside the arena.
+        period_s: control period, for the slew limits [s].
         seed: of starts, particles and noise.
         device: where the model's tensors are.
     """
@@ -55,6 +60,8 @@ class ModelEnv(VecEnv):
         *,
         recorded: NDArray[np.float64] | None = None,
         from_recorded: float = 0.5,
+        envelope: SafetyEnvelope | None = None,
+        period_s: float = 1.0 / 30.0,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -64,6 +71,11 @@ class ModelEnv(VecEnv):
             cars, gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
         )
         self._model, self._task, self._device = model, task, torch.device(device)
+        self._envelope = SafetyEnvelope() if envelope is None else envelope
+        rates = (self._envelope.steering_rate_per_s, self._envelope.throttle_rate_per_s)
+        self._slew = torch.tensor(rates, device=self._device) * period_s
+        limits = (self._envelope.max_steering, self._envelope.max_throttle)
+        self._limits = torch.tensor(limits, device=self._device)
         self._recorded = np.zeros((0, width)) if recorded is None else recorded
         self._from_recorded = from_recorded if len(self._recorded) else 0.0
         self._rng = np.random.default_rng(seed)
@@ -71,7 +83,7 @@ class ModelEnv(VecEnv):
         self._features = torch.zeros((cars, width), device=self._device)
         self._ticks = np.zeros(cars, dtype=np.int64)
         self._actions = torch.zeros((cars, ACTION_SIZE), device=self._device)
-        corners = np.array(task.arena_m).reshape(-1, 2)
+        corners = np.array(self._envelope.arena_m or task.arena_m).reshape(-1, 2)
         far: NDArray[np.float64] = np.full(2, np.inf)
         self._low: NDArray[np.float64] = corners.min(axis=0) if len(corners) else -far
         self._high: NDArray[np.float64] = corners.max(axis=0) if len(corners) else far
@@ -85,21 +97,21 @@ class ModelEnv(VecEnv):
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Take the commands (cars, 2)."""
-        self._actions = torch.as_tensor(actions, dtype=torch.float32).clamp(-1.0, 1.0).to(self._device)
+        self._actions = torch.as_tensor(actions, dtype=torch.float32).to(self._device)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """One step of every car; those that end start anew."""
-        before, action = self._features, self._actions
+        before = self._features
         with torch.no_grad():
+            action = self._gate(before, self._actions)
             change = self._model.sample(inputs_of(before, action), self._generator)
             after = moved(before, action, change)
             reward = self._task.reward(before, action, after) * REWARD_SCALE
-            terminated = self._task.terminated(after).cpu().numpy()
+            terminated = self._task.terminated(after).cpu().numpy() | self._stopped(after)
         self._features = after
         self._ticks += 1
         seen = self._seen()
-        outside = self._outside(after)
-        truncated = ((self._ticks >= self._task.max_ticks) | outside) & ~terminated
+        truncated = (self._ticks >= self._task.max_ticks) & ~terminated
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(done)
@@ -127,11 +139,11 @@ class ModelEnv(VecEnv):
         with torch.no_grad():
             for _ in range(self._task.max_ticks):
                 before = self._features
-                action = torch.as_tensor(act(self._seen())).clamp(-1.0, 1.0).to(self._device)
+                action = self._gate(before, torch.as_tensor(act(self._seen())).to(self._device))
                 after = moved(before, action, self._model.sample(inputs_of(before, action), self._generator))
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
                 last = torch.where(ended.to(self._device)[:, None], last, after)
-                ended |= torch.from_numpy(self._outside(after)) | self._task.terminated(after).cpu()
+                ended |= torch.from_numpy(self._stopped(after)) | self._task.terminated(after).cpu()
                 self._features = after
         self._from_recorded = share
         return total, last
@@ -141,9 +153,25 @@ class ModelEnv(VecEnv):
         """Present features (cars, 7 + 2 H)."""
         return self._features
 
-    def _outside(self, features: Tensor) -> NDArray[np.bool_]:
-        place = features[:, :2].cpu().numpy()
+    def _gate(self, features: Tensor, asked: Tensor) -> Tensor:
+        """Commands (cars, 2) as the safety gate would send them after those before (``carlab.core.safety.slew``)."""
+        asked = torch.minimum(torch.maximum(asked, -self._limits), self._limits)
+        if not self._model.history:
+            return asked
+        previous = features[:, -ACTION_SIZE:]
+        previous = torch.where(asked * previous < 0.0, 0.0, previous)
+        held = torch.minimum(torch.maximum(asked, previous - self._slew), previous + self._slew)
+        return torch.where(asked.abs() <= previous.abs(), asked, held)
+
+    def _stopped(self, features: Tensor) -> NDArray[np.bool_]:
+        """Whether the gate stops a car: too fast, or not able to stop inside the arena's bounding box."""
+        state = decode_state(features).cpu().numpy()
+        speed = np.hypot(state[:, 3], state[:, 4])
+        course = state[:, 2] + np.arctan2(state[:, 4], state[:, 3])
+        needed = stopping_distance_m(speed, self._envelope.reaction_s, self._envelope.deceleration_mps2)
+        place = state[:, :2] + needed[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
         found: NDArray[np.bool_] = np.any((place < self._low) | (place > self._high), axis=1)
+        found |= speed > self._envelope.max_speed_mps
         return found
 
     def _start(self, cars: NDArray[np.int64]) -> None:

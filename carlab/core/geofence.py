@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -55,8 +56,8 @@ def free_distance_m(corners_m: Polygon, x_m: float, y_m: float, heading_rad: flo
     return nearest
 
 
-def stopping_distance_m(speed_mps: float, reaction_s: float, deceleration_mps2: float) -> float:
-    """Distance to standstill: travel during the reaction time plus v^2 / (2 a)."""
+def stopping_distance_m(speed_mps: Any, reaction_s: float, deceleration_mps2: float) -> Any:
+    """Distance to standstill: travel during the reaction time plus v^2 / (2 a); of a speed or an array of them."""
     return speed_mps * reaction_s + speed_mps**2 / (2.0 * deceleration_mps2)
 
 
@@ -68,7 +69,7 @@ def can_stop_inside(corners_m: Polygon, state: CarState, reaction_s: float, dece
     course_rad = state.yaw_rad + math.atan2(state.vy_mps, state.vx_mps)
     needed = stopping_distance_m(speed, reaction_s, deceleration_mps2)
     # From inside, every way meets an edge somewhere: infinity means a course that is none, or an edge just touched.
-    return needed < free_distance_m(corners_m, state.x_m, state.y_m, course_rad) < math.inf
+    return bool(needed < free_distance_m(corners_m, state.x_m, state.y_m, course_rad) < math.inf)
 
 
 def rectangle(x_low_m: float, x_high_m: float, y_low_m: float, y_high_m: float) -> tuple[tuple[float, float], ...]:

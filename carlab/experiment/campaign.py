@@ -21,6 +21,7 @@ from typing import Any, Literal
 from carlab.cars import CarChoice
 from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
+from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign_figures import EpisodeFigures, figures_of
 from carlab.experiment.session import EpisodeResult, Session, SessionHooks
 from carlab.experiment.training import (
@@ -103,7 +104,12 @@ class Campaign:
             folder = model_folder(self.run.models, done + 1)
             if not folder.is_dir():
                 told = train_beside(
-                    self.plan, self.run.models, self.run.recordings(), self.hooks.on_training, self.hooks.stop
+                    self.plan,
+                    self.run.models,
+                    self.run.recordings(),
+                    self._envelope,
+                    self.hooks.on_training,
+                    self.hooks.stop,
                 )
                 if told is None:
                     return
@@ -119,17 +125,19 @@ class Campaign:
             if result.reason not in GOES_ON:
                 return
 
+    @property
+    def _envelope(self) -> SafetyEnvelope:
+        """The car's limits, in the arena of the task where the car has none of its own."""
+        own = self.choice.envelope
+        return own if own.arena_m else replace(own, arena_m=self.plan.task.arena_m)
+
     def _drive(self, number: int) -> EpisodeResult | None:
         agent = SacAgent.load(model_folder(self.run.models, number), SacSettings(), self.plan.seed)
-        task = self.plan.task
-        envelope = self.choice.envelope
-        if not envelope.arena_m:
-            envelope = replace(envelope, arena_m=task.arena_m)
         session = Session(
             self.choice.car,
             agent.policy(),
-            task,
-            envelope,
+            self.plan.task,
+            self._envelope,
             self.run,
             self.choice.control_period_s,
             seed=self.plan.seed + number,

@@ -54,8 +54,14 @@ class EpisodeFigures:
     end: str
 
     def to_dict(self) -> dict[str, Any]:
-        """For a file."""
-        return asdict(self)
+        """For a file; what is no number is null."""
+        return {k: None if isinstance(v, float) and v != v else v for k, v in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> EpisodeFigures:
+        """What ``to_dict`` gave. Raises TypeError for other names."""
+        found: dict[str, Any] = {k: float("nan") if v is None else v for k, v in row.items()}
+        return cls(**found)
 
 
 def figures_of(result: EpisodeResult, training: Mapping[str, Any], plan: TrainingPlan) -> EpisodeFigures:
@@ -94,10 +100,13 @@ class Foretold:
 
 
 def foretell(dynamics: CarDynamics, episode: EpisodeData, seed: int = 0) -> Foretold:
-    """Stretches of a second, one after the other, by draws of particles and noise."""
+    """Stretches of a second, one after the other, by draws of particles and noise; none of a shorter episode."""
     history = dynamics.history
     length = max(round(AHEAD_S / episode.period_s), 1)
     starts = np.arange(history, episode.ticks - length + 1, length)
+    if not len(starts):
+        none = np.zeros((0, length + 1, 3))
+        return Foretold(np.zeros((0, length + 1), dtype=np.int64), none, none)
     generator = torch.Generator().manual_seed(seed)
     past = np.stack([episode.sent[starts - back] for back in range(history, 0, -1)], axis=1)
     first = encode(episode.states[starts], past.reshape(len(starts), history, 2))

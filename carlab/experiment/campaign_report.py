@@ -25,7 +25,7 @@ def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
     if not path.is_file():
         return []
     try:
-        return [EpisodeFigures(**row) for row in json.loads(path.read_text(encoding="utf-8"))["episodes"]]
+        return [EpisodeFigures.from_dict(row) for row in json.loads(path.read_text(encoding="utf-8"))["episodes"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} cannot be read ({error}); remove it, and it is begun anew.") from error
 

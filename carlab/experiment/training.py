@@ -23,6 +23,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.observation import encode
 from carlab.core.quantities import FloatArray
+from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from learning.car_fit import CarFitSettings, Method
 from sim_backends.car_parameters import SimulatorConfig
@@ -58,7 +59,7 @@ class TrainingPlan:
     updates: int = 15_000
     seed: int = 0
     device: str = "cpu"
-    threads: int = 2
+    threads: int = 1
 
     @property
     def task(self) -> ParkingTask:
@@ -71,13 +72,16 @@ def model_folder(models: Path, episode: int) -> Path:
     return models / f"{episode:04d}"
 
 
-def train(plan: TrainingPlan, models: Path, recordings: list[Path], tell: Tell) -> dict[str, Any]:
+def train(
+    plan: TrainingPlan, models: Path, recordings: list[Path], envelope: SafetyEnvelope, tell: Tell
+) -> dict[str, Any]:
     """Learn before the episode that follows the recordings.
 
     Args:
         plan: what.
         models: folder that gets the result.
         recordings: MCAP files of all episodes so far, in order.
+        envelope: limits of the car's safety gate.
         tell: told what is done, how many steps of it, and of how many.
 
     Returns:
@@ -134,8 +138,9 @@ def train(plan: TrainingPlan, models: Path, recordings: list[Path], tell: Tell) 
     if before is not None:
         agent = SacAgent.load(earlier, sac, plan.seed, plan.device)
     recorded = recorded_features(usable, plan.history) if usable else None
-    world = ModelEnv(dynamics, plan.task, sac.cars, recorded=recorded, seed=seed, device=plan.device)
-    judging = ModelEnv(dynamics, plan.task, JUDGED_CARS, seed=seed + 1, device=plan.device)
+    gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s, "device": plan.device}
+    world = ModelEnv(dynamics, plan.task, sac.cars, recorded=recorded, seed=seed, **gate)
+    judging = ModelEnv(dynamics, plan.task, JUDGED_CARS, seed=seed + 1, **gate)
 
     def judge(candidate: SacAgent) -> float:
         return float(judging.rolled_out(candidate.act)[0].mean())
@@ -185,7 +190,12 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
 
 
 def train_beside(
-    plan: TrainingPlan, models: Path, recordings: list[Path], tell: Tell, stop: Callable[[], bool] = lambda: False
+    plan: TrainingPlan,
+    models: Path,
+    recordings: list[Path],
+    envelope: SafetyEnvelope,
+    tell: Tell,
+    stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any] | None:
     """``train`` in a process of its own, while this one waits.
 
@@ -193,6 +203,7 @@ def train_beside(
         plan: as for ``train``.
         models: as for ``train``.
         recordings: as for ``train``.
+        envelope: as for ``train``.
         tell: as for ``train``.
         stop: asked again and again; once true the process is ended and nothing is left behind.
 
@@ -204,7 +215,9 @@ def train_beside(
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    child = context.Process(target=_child, args=(theirs, plan, models, recordings), daemon=True, name="training")
+    child = context.Process(
+        target=_child, args=(theirs, plan, models, recordings, envelope), daemon=True, name="training"
+    )
     child.start()
     theirs.close()
     try:
@@ -235,12 +248,14 @@ def train_beside(
             shutil.rmtree(left, ignore_errors=True)
 
 
-def _child(pipe: Connection, plan: TrainingPlan, models: Path, recordings: list[Path]) -> None:
+def _child(
+    pipe: Connection, plan: TrainingPlan, models: Path, recordings: list[Path], envelope: SafetyEnvelope
+) -> None:
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the process that drives; it ends this one.
     try:
-        pipe.send(("done", train(plan, models, recordings, lambda *what: pipe.send(("at", what)))))
+        pipe.send(("done", train(plan, models, recordings, envelope, lambda *what: pipe.send(("at", what)))))
     except CarlabError as error:
         pipe.send(("failed", str(error)))
     except BrokenPipeError:
