@@ -6,12 +6,16 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
 from carlab.cli.console import console, progress, table
 from carlab.cli.options import above_zero
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.experiment.regression_recordings import RecordedCase
 
 
 @dataclass
@@ -19,7 +23,7 @@ class Bench:
     """Measure how fast the parts are, or how well models learn from few rows."""
 
     what: Positional[Literal["speed", "regression"]] = "speed"
-    """speed: simulator, gradients, NatNet decoding, lateness of the command sender, as ratios taken in one run.
+    """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios taken in one run.
     regression: Sim-FSVGD and its baselines on the cases of the paper."""
 
     out: Path | None = None
@@ -28,9 +32,10 @@ class Bench:
     seconds: float = 10.0
     """Length of each condition of the sender's measurement [s]."""
 
-    case: Literal["1d", "pendulum", "car", "racecar"] = "1d"
+    case: Literal["1d", "pendulum", "car", "racecar", "realcar"] = "1d"
     """What is learned. 1d: sinusoids, two points. pendulum: friction and drag hidden from the prior. car: one step of a
-    car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of theirs (with --data)."""
+    car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of theirs (with --data). realcar: recordings
+    in the folder --data, the last one held out."""
 
     rows: tuple[int, ...] = ()
     """Numbers of rows to learn from; those of the paper's figure unless given."""
@@ -46,6 +51,12 @@ class Bench:
 
     data: Path | None = None
     """Folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it."""
+
+    car: Path = Path("eth_rc_car")
+    """realcar: the car file whose simulator is the prior."""
+
+    history: int | None = None
+    """realcar: past commands; found from the recordings unless given (the paper has 3)."""
 
     steps: int | None = None
     """Steps of the optimiser; those of the way unless given."""
@@ -75,11 +86,12 @@ class Bench:
         from carlab.experiment.regression_study import Score, as_json, run_study, summarised
 
         above_zero(seeds=self.seeds, steps=self.steps, **{"rows": min(self.rows)} if self.rows else {})
+        case = self._recorded() if self.case == "realcar" else self.case
         scores: list[Score] = []
         with Interrupts() as interrupts, progress(speed_estimate_period_s=MINUTES_S) as bar:
             task = bar.add_task(self.case, total=None, note="")
             study = run_study(
-                self.case, rows=self.rows, seeds=self.seeds, methods=self.methods, way=self.way, data=self.data,
+                case, rows=self.rows, seeds=self.seeds, methods=self.methods, way=self.way, data=self.data,
                 steps=self.steps,
                 progress=lambda what, done, total: bar.update(task, completed=done, total=total, note=what),
             )  # fmt: skip
@@ -104,6 +116,17 @@ class Bench:
             draw(found, picture)
             console.print(f"{self.out}, {picture}")
         return 0
+
+    def _recorded(self) -> RecordedCase:
+        from carlab.cli.recordings import load_episodes
+        from carlab.experiment.regression_recordings import recorded_case
+
+        if self.data is None or not self.data.is_dir():
+            raise ConfigError("--case realcar needs --data FOLDER, with two recordings (MCAP or CSV) at least.")
+        files = sorted(p for p in self.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
+        case = recorded_case([load_episodes(path) for path in files], self.car, self.history)
+        console.print(f"{case.told} Held out: {files[-1].name}.", soft_wrap=True)
+        return case
 
 
 MINUTES_S = 600.0

@@ -200,7 +200,7 @@ METHODS: dict[str, Callable[[_Task], Model]] = {
 
 
 def run_study(
-    case: str,
+    case: str | Case,
     *,
     rows: Sequence[int] = (),
     seeds: int = 3,
@@ -213,7 +213,7 @@ def run_study(
     """Fit every method to every number of rows with every seed, and score it as soon as it is fitted.
 
     Args:
-        case: of ``CASES``.
+        case: of ``CASES``, or one that was made.
         rows: numbers of rows; those of the case unless given.
         seeds: how many; data and fit have the same one.
         methods: of ``METHODS``; all unless given.
@@ -226,11 +226,12 @@ def run_study(
         ConfigError: an unknown case or method.
         DataError: arrays are missing.
     """
-    if case not in CASES:
+    if isinstance(case, str) and case not in CASES:
         raise ConfigError(f"There is no case '{case}'; choose {', '.join(CASES)}.")
     if unknown := [m for m in methods if m not in METHODS]:
         raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(METHODS)}.")
-    chosen, counts = CASES[case], tuple(rows) or CASES[case].counts
+    chosen = CASES[case] if isinstance(case, str) else case
+    counts = tuple(rows) or chosen.counts
     if way == "ours" and chosen.ours is not None:
         chosen = chosen.ours
     names = tuple(methods) or tuple(METHODS)
@@ -244,7 +245,7 @@ def run_study(
         seconds = clock.now_s() - began_s
         prediction = model.predict(found.test_inputs)
         yield Score(
-            case, name, count, seed,
+            chosen.name, name, count, seed,
             negative_log_likelihood(prediction, found.test_outputs),
             root_mean_square_error(prediction, found.test_outputs),
             calibration_error(prediction, found.test_outputs),

@@ -9,7 +9,7 @@ from typing import Any
 
 
 def measure_speed(*, seconds: float = 5.0, note: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
-    """Measure the simulator, gradients, NatNet decoding and the command sender.
+    """Measure the simulator, gradients, learning, NatNet decoding and the command sender.
 
     Everything but the sender runs on one core with one thread. The sender is measured on all cores and, pinned with
     everything else, on one.
@@ -22,6 +22,7 @@ def measure_speed(*, seconds: float = 5.0, note: Callable[[str], None] = lambda 
         Figures by part and name; the names say the unit.
     """
     from drivers.speed import sender_lateness
+    from learning.speed import prediction_speed, sac_speed, training_speed
     from mocap.speed import natnet_decode_speed
     from sim_backends.speed import gradient_speed, simulation_speed
 
@@ -34,6 +35,12 @@ def measure_speed(*, seconds: float = 5.0, note: Callable[[str], None] = lambda 
         figures["simulation"] = simulation_speed()
         note("gradient of a rollout against central differences, one core")
         figures["gradient"] = gradient_speed()
+        note("training of particles, one core")
+        figures["training"] = training_speed()
+        note("predictions of particles against a matrix product, one core")
+        figures["prediction"] = prediction_speed()
+        note("gradient steps of SAC against stable-baselines3, one core")
+        figures["sac"] = sac_speed()
         note("NatNet decoding, one core")
         figures["natnet"] = natnet_decode_speed()
         note("lateness of the command sender, everything on one core")

@@ -1,0 +1,101 @@
+"""The real car as a case of the regression study: recordings to learn from, and one that is held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from carlab.cars import load_car_file
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.experiment.regression_cases import Case, Data
+from learning.car_fit import NOISE_STD
+from learning.history import find_history
+from learning.simulator_model import CarModel
+from learning.transitions import Transitions, transitions_of
+
+FASTEST_TURN_RADPS = 10.0
+"""Rows that turn faster are spikes of a differentiated angle."""
+NAME = "realcar"
+COUNTS = (50, 200, 800)
+DELAY_S = (0.0, 0.2)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedCase(Case):
+    """Rows of recordings.
+
+    Attributes:
+        rows: to draw from.
+        held_out: of the last recording.
+        told: how the history was chosen, in words.
+    """
+
+    rows: Transitions | None = None
+    held_out: Transitions | None = None
+    told: str = ""
+
+    def recorded(self, folder: Path, count: int, seed: int) -> Data:
+        """Rows drawn from all but the last recording, and the last one whole. Raises DataError for too few."""
+        assert self.rows is not None
+        assert self.held_out is not None
+        if count > len(self.rows):
+            raise DataError(f"The recordings have {len(self.rows)} rows, not {count}; ask for fewer with --rows.")
+        chosen = self.rows.take(np.random.default_rng(seed).choice(len(self.rows), count, replace=False))
+        parts = (chosen.inputs, chosen.targets, self.held_out.inputs, self.held_out.targets)
+        return Data(*(torch.from_numpy(part).float() for part in parts))
+
+
+def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, history: int | None) -> RecordedCase:
+    """A case of recordings.
+
+    Args:
+        recordings: episodes of each; the last recording is held out.
+        car: file or name of the car whose simulator is the prior, with its ranges.
+        history: past commands; found from the recordings that are not held out unless given.
+
+    Raises:
+        DataError: fewer than two recordings, or too short to tell the history.
+    """
+    if len(recordings) < 2:
+        raise DataError("The real car's study needs two recordings at least; the last one is held out.")
+    fitted = [episode for recording in recordings[:-1] for episode in recording]
+    told = f"{history} past commands, as asked for."
+    if history is None:
+        choice = find_history(fitted)
+        if choice is None:
+            raise DataError("The recordings are too short to tell how many past commands count; give --history.")
+        history, told = choice.history, choice.words()
+    rows, held_out = (_ordinary(transitions_of(episodes, history)) for episodes in (fitted, recordings[-1]))
+    simulator = load_car_file(car).simulator
+    ranges = {"timing.command_delay": DELAY_S, **simulator.priors}
+    output_std = tuple(float(v) for v in rows.targets.std(axis=0))
+    return RecordedCase(
+        name=NAME,
+        prior=CarModel(simulator, history, ranges),
+        process=None,
+        truth=None,
+        counts=COUNTS,
+        noise_std=tuple(0.5 * n for n in NOISE_STD),
+        likelihood_std=tuple(0.5 * s for s in output_std),
+        learn_noise=True,
+        input_std=tuple(float(v) for v in rows.inputs.std(axis=0)),
+        output_std=output_std,
+        gap_std=tuple(0.3 * s for s in output_std),
+        gap_lengthscale=3.0,
+        function_lengthscale=3.0,
+        rows=rows,
+        held_out=held_out,
+        told=told,
+    )
+
+
+def _ordinary(rows: Transitions) -> Transitions:
+    return rows.take(np.abs(rows.inputs[:, 2]) < FASTEST_TURN_RADPS)
+
+
+__all__ = ["FASTEST_TURN_RADPS", "NAME", "RecordedCase", "recorded_case"]

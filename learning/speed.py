@@ -1,0 +1,131 @@
+"""How fast learning is: training and prediction of particles, gradient steps of SAC, each beside a yardstick."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
+
+from carlab.core.clock import MonotonicClock
+from learning.function_posterior import infer
+from learning.normaliser import Normaliser
+from learning.particles import Network
+from learning.sac import FastSac
+from learning.sim_fsvgd import ParticleSettings, fit_particles
+
+AUTHORS_STEPS_PER_S = 10.0
+"""Training steps per second of the authors' code on two cores (7 to 10)."""
+STEPS = 1500
+SIZES = {
+    "online RL: 10 particles, 48 points, 15 inputs": (10, 12, 15),
+    "regression: 20 particles, 40 points": (20, 10, 9),
+}
+SAC_SIZES = {"64 x 64, batch 64": ([64, 64], 64), "64 x 64, batch 256": ([64, 64], 256)}
+
+
+def training_speed() -> dict[str, Any]:
+    """Steps of the particles' optimiser per second at the sizes of the paper, and of a whole fit of 100 rows."""
+    found: dict[str, Any] = {}
+    for name, (particles, sets, width) in SIZES.items():
+        generator = torch.Generator().manual_seed(0)
+        inputs = torch.randn((100, width), generator=generator)
+        outputs = torch.tanh(inputs[:, :7]) + 0.02 * torch.randn((100, 7), generator=generator)
+        units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(7), torch.ones(7))
+        clock = MonotonicClock()
+        began_s = clock.now_s()
+        target = infer(None, inputs, outputs, units, torch.full((7,), 0.02))
+        inferred_s = clock.now_s()
+        points = torch.randn((4096, width), generator=generator)
+        steps = [0.0, 0.0]
+
+        def told(done: int, at: list[float] = steps, clock: MonotonicClock = clock) -> None:
+            at[0] = at[0] or clock.now_s()
+            at[1] = clock.now_s()
+
+        fit_particles(target, points, ParticleSettings(particles=particles, sets=sets, steps=STEPS), told)
+        between = STEPS // 200 * 200 - 200
+        rate = between / (steps[1] - steps[0])
+        found[name] = {
+            "steps_per_s": rate,
+            "over_authors": rate / AUTHORS_STEPS_PER_S,
+            "inference_s": inferred_s - began_s,
+            "40000_steps_s": 40_000 / rate,
+        }
+    return found
+
+
+def prediction_speed() -> dict[str, Any]:
+    """A batch of 256 one-step predictions of 20 particles against one matrix product of as many operations."""
+    network = Network(15, 6)
+    generator = torch.Generator().manual_seed(0)
+    numbers = network.initial(20, generator)
+    layers = network.split(numbers)
+    inputs = torch.randn((256, 15), generator=generator)
+    operations = 20 * 256 * sum(a * b for a, b in network.layers)
+    side = 256
+    left, right = torch.randn((operations // side**2, side)), torch.randn((side, side))
+    with torch.no_grad():
+        ours_s = _seconds(lambda: network.through(layers, inputs))
+        product_s = _seconds(lambda: left @ right)
+    return {
+        "batch_ms": 1e3 * ours_s,
+        "matrix_product_ms": 1e3 * product_s,
+        "share_of_its_speed": product_s / ours_s,
+    }
+
+
+def sac_speed() -> dict[str, Any]:
+    """Gradient steps of SAC per second, ours and those of stable-baselines3, at the same sizes."""
+    found: dict[str, Any] = {}
+    for name, (hidden, batch) in SAC_SIZES.items():
+        rates = {}
+        for label, kind in (("stable_baselines3", SAC), ("ours", FastSac)):
+            agent = kind(
+                "MlpPolicy", _Room(), policy_kwargs={"net_arch": hidden}, learning_starts=1000, seed=0, device="cpu"
+            )  # fmt: skip
+            agent.set_logger(Logger(None, []))
+            agent.learn(1000)
+            agent.train(50, batch)
+            rates[label] = 1.0 / (_seconds(lambda a=agent, b=batch: a.train(100, b), times=3) / 100.0)
+        found[name] = {f"{k}_steps_per_s": v for k, v in rates.items()} | {
+            "ratio": rates["ours"] / rates["stable_baselines3"]
+        }
+    return found
+
+
+class _Room(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """Spaces of the parking task and numbers without meaning."""
+
+    observation_space = gym.spaces.Box(-5.0, 5.0, (13,), np.float32)
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        super().reset(seed=seed)
+        return np.zeros(13, np.float32), {}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        seen = self.np_random.normal(size=13).astype(np.float32)
+        return seen, float(action[0]), False, False, {}
+
+
+def _seconds(work: Any, times: int = 50) -> float:
+    """Median time of a call, the first ones left out."""
+    clock = MonotonicClock()
+    for _ in range(max(times // 10, 1)):
+        work()
+    taken = []
+    for _ in range(times):
+        began_s = clock.now_s()
+        work()
+        taken.append(clock.now_s() - began_s)
+    return float(np.median(taken))
+
+
+__all__ = ["prediction_speed", "sac_speed", "training_speed"]
