@@ -61,8 +61,8 @@ class Learn:
     model_steps: int = 2500
     """Steps of the model's optimiser before each episode."""
 
-    updates: int = 15000
-    """Gradient steps of SAC before each episode; twice as many before the first."""
+    updates: int = 30000
+    """Gradient steps of SAC before each episode; half as many again before the first."""
 
     seed: int = 0
     """Of everything that is drawn."""

@@ -46,7 +46,7 @@ class TrainingPlan:
         history: past commands that model and policy see.
         method: with the simulator as prior, or without.
         model_steps: steps of the particles' optimiser.
-        updates: gradient steps of SAC; twice as many before the first episode.
+        updates: gradient steps of SAC; half as many again before the first episode.
         seed: of everything.
         device: of the model's and the policy's tensors.
         threads: of torch.
@@ -56,7 +56,7 @@ class TrainingPlan:
     history: int = 3
     method: Method = "sim-fsvgd"
     model_steps: int = 2500
-    updates: int = 15_000
+    updates: int = 30_000
     seed: int = 0
     device: str = "cpu"
     threads: int = 1
@@ -132,7 +132,7 @@ def train(
     figures["model_seconds"] = clock.now_s() - began_s
 
     began_s = clock.now_s()
-    updates = plan.updates if before is not None else 2 * plan.updates
+    updates = plan.updates if before is not None else plan.updates * 3 // 2
     sac = SacSettings()
     agent = SacAgent(sac, plan.seed, plan.device)
     if before is not None:
