@@ -1,4 +1,4 @@
-# make demo: three parking episodes over the whole emulated hardware path.   make test: linters, types, layers, tests.
+# make demo: learn to park in three episodes over the whole emulated hardware path.   make test: linters, types, layers, tests.
 # Each sets up .venv by itself on a fresh machine that has Python >= 3.11 and make.
 PYTHON ?= python3
 VENV := .venv
@@ -16,7 +16,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(VENV)/.installed
-	$(BIN)/carlab drive --car emulated --episodes 3 --ticks 150 --name demo
+	$(BIN)/carlab learn --car emulated --episodes 3 --name demo
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .

@@ -48,7 +48,7 @@ class Adam:
     def load(self, state: dict[str, Tensor | int]) -> None:
         """Take up the moments that ``state`` gave. Raises ValueError for those of other numbers."""
         mean, square = torch.as_tensor(state["mean"]), torch.as_tensor(state["square"])
-        if mean.shape != self.mean.shape:
+        if mean.shape != self.mean.shape or square.shape != mean.shape:
             raise ValueError(f"moments of shape {tuple(mean.shape)} for numbers of shape {tuple(self.mean.shape)}")
         self.mean.copy_(mean)
         self.square.copy_(square)

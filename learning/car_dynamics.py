@@ -62,17 +62,13 @@ class CarDynamics:
         count, particles = len(inputs), len(posterior.parameters)
         share = -(-count // particles)
         with torch.no_grad():
-            order = torch.randperm(share * particles, generator=generator).to(inputs.device)
-            rows = order % count
-            dealt = posterior.normaliser.inputs(inputs[rows]).view(particles, share, -1)
-            values = posterior.network(posterior.parameters, dealt).flatten(0, 1)
-            noise = (
-                torch.randn(dealt.shape[:2] + values.shape[1:], generator=generator).to(values) * posterior.noise_stds
-            )
-            values = values + self.scale * noise.flatten(0, 1)
-            found = torch.empty(count, values.shape[1], dtype=values.dtype, device=values.device)
-            found[rows] = posterior.normaliser.raw_outputs(values)
-        return found
+            place = torch.randperm(share * particles, generator=generator)[:count].to(inputs.device)
+            dealt = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
+            dealt[place] = posterior.normaliser.inputs(inputs)
+            values = posterior.network(posterior.parameters, dealt.view(particles, share, inputs.shape[1]))
+            drawn = torch.randn(values.shape, generator=generator).to(values)
+            values = values + self.scale * drawn * posterior.noise_stds
+            return posterior.normaliser.raw_outputs(values.flatten(0, 1)[place])
 
 
 def inputs_of(features: Tensor, action: Tensor) -> Tensor:

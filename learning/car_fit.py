@@ -126,19 +126,30 @@ def load_car(path: Path) -> CarDynamics:
     remedy = "remove its folder, and it is learned anew"
     try:
         content: dict[str, Any] = torch.load(path, weights_only=True)
-        if content["version"] != FILE_VERSION:
-            raise DataError(f"{path} is of version {content['version']}, this program reads {FILE_VERSION}; {remedy}.")
+        version = content["version"]
         inputs, outputs, *hidden = content["network"]
         network = Network(inputs, outputs, tuple(hidden))
         parameters: Tensor = content["parameters"]
-        if parameters.shape[1] != network.parameters:
-            raise DataError(f"{path} holds {parameters.shape[1]} numbers for {network.parameters}; {remedy}.")
+        found = parameters.shape[1]
         posterior = Posterior(
             network, parameters, content["noise_std"], Normaliser(*content["units"]), content["tails"]
         )  # fmt: skip
-        return CarDynamics(posterior, content["history"], content["scale"])
-    except (OSError, RuntimeError, EOFError, KeyError, TypeError, ValueError, pickle.UnpicklingError) as error:
-        raise DataError(f"The learned car in {path} cannot be read ({error}); {remedy}.") from error
+        car = CarDynamics(posterior, content["history"], content["scale"])
+    except _BROKEN as error:
+        raise DataError(f"The learned car in {path} cannot be read ({_first(error)}); {remedy}.") from error
+    if version != FILE_VERSION:
+        raise DataError(f"{path} is of version {version}, this program reads {FILE_VERSION}; {remedy}.")
+    if found != network.parameters:
+        raise DataError(f"{path} holds {found} numbers a particle for {network.parameters}; {remedy}.")
+    return car
+
+
+_BROKEN = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, pickle.UnpicklingError)
+
+
+def _first(error: BaseException) -> str:
+    """The first line of an error, or what kind it is."""
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
 __all__ = ["CarFitSettings", "Method", "car_units", "fit_car", "load_car", "save_car"]

@@ -16,10 +16,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from carlab.core.errors import DataError
 from learning.domain_models import DomainModel, draw_parameters
 from learning.gap import EXPECTED_GAP, TINY, GapCovariance, learn_gap
 from learning.normaliser import Normaliser
-from learning.outliers import left_out, student_weights, typical_scale
+from learning.outliers import first_trust, left_out, student_weights, typical_scale
 from learning.parameter_posterior import posterior_parameters
 
 DRAWS = 128
@@ -63,14 +64,17 @@ class FunctionPosterior:
     white: Tensor
 
     def marginals(self, sets: Tensor) -> tuple[Tensor, Tensor]:
-        """Means (B, O, N) and covariances (B, O, N, N) of the function, without noise, at raw inputs (B, N, D)."""
+        """Means (B, O, N) and covariances (B, O, N, N), double, without noise, at raw inputs (B, N, D)."""
         parts = [self._some(part) for part in torch.split(sets, max(_AT_ONCE // sets.shape[1], 1))]
         return torch.cat([m for m, _ in parts]), torch.cat([c for _, c in parts])
 
     def predict(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation (N, O) of measurements at raw inputs (N, D), in raw units."""
+        """Mean and standard deviation (N, O) at raw inputs (N, D), in raw units, of ordinary measurements.
+
+        Those of Student noise have the deviation of its scale; outliers are wider.
+        """
         mean, covariance = self.marginals(inputs[:, None])
-        std = (covariance[:, :, 0, 0].clamp_min(0.0) + self.noise_std**2).sqrt()
+        std = (covariance[:, :, 0, 0].clamp_min(0.0) + self.noise_std**2).sqrt().float()
         return self.normaliser.raw_outputs(mean[:, :, 0]), std * self.normaliser.output_std
 
     def _some(self, sets: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,7 +97,7 @@ class FunctionPosterior:
         mean = drawn.mean(dim=1)
         off = (drawn - mean[:, None]).view(outputs, -1, count, points).permute(2, 0, 1, 3)
         covariance = covariance + off.transpose(2, 3) @ off / drawn.shape[1]
-        return mean.view(outputs, count, points).transpose(0, 1).float(), covariance.float()
+        return mean.view(outputs, count, points).transpose(0, 1).float(), covariance
 
 
 def infer(
@@ -118,7 +122,12 @@ def infer(
         gap_std: expected error of the simulator, raw (O,); ``EXPECTED_GAP`` of the outputs' units unless given.
         with_gap: whether the simulator is allowed to be wrong.
         seed: of draws.
+
+    Raises:
+        DataError: numbers are missing or infinite.
     """
+    if not (torch.isfinite(inputs).all() and torch.isfinite(outputs).all()):
+        raise DataError("The data holds numbers that are missing or infinite; leave those rows out and fit again.")
     generator = torch.Generator().manual_seed(seed)
     if len(inputs) > LARGEST:
         some = torch.randperm(len(inputs), generator=generator)[:LARGEST].to(inputs.device)
@@ -143,6 +152,15 @@ def infer(
         off = (there - there.mean(dim=0)).permute(2, 0, 1)
         return y[where] - there.mean(dim=0), off.transpose(1, 2) @ off / len(there)
 
+    if count >= ROWS_FOR_TAILS:
+        left, known = left_by(torch.arange(count, device=inputs.device))
+        doubt = torch.zeros_like(noise) if known is None else known
+
+        def before_data(trust: Tensor, gap: GapCovariance | None = gap, doubt: Tensor = doubt) -> Tensor:
+            own = _covariance(gap, x, expected_noise, trust)
+            return own if doubt.ndim == 1 else own + doubt
+
+        trust = first_trust(left, before_data, expected_noise)
     # The covariance is learned around the prior, then again around what the data leaves of it.
     for _ in range(ROUNDS if count else 0):
         left, known = left_by(rows)

@@ -78,6 +78,7 @@ class ModelEnv(VecEnv):
         self._limits = torch.tensor(limits, device=self._device)
         self._recorded = np.zeros((0, width)) if recorded is None else recorded
         self._from_recorded = from_recorded if len(self._recorded) else 0.0
+        self._own_seed = seed
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator().manual_seed(seed)
         self._features = torch.zeros((cars, width), device=self._device)
@@ -190,6 +191,10 @@ class ModelEnv(VecEnv):
 
     def close(self) -> None:
         """Nothing is held open."""
+
+    def seed_anew(self) -> None:
+        """Seed with the number that it was made with; an agent of stable-baselines3 seeds its world with its own."""
+        self.seed(self._own_seed)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed starts, particles and noise."""

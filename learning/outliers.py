@@ -8,6 +8,7 @@ Taylor 1989, "Robust statistical modeling using the t distribution", section 3).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from scipy.stats import chi2
@@ -15,8 +16,30 @@ from scipy.stats import t as student
 from torch import Tensor
 
 FREEDOMS = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0, math.inf)
+FIRST_ROUNDS = 5
+_MEDIAN_SQUARE = 0.455
+"""Median of a squared standard normal number."""
 SCALES = (0.3, 2.0)
 """Within which a doubt is corrected."""
+
+
+def first_trust(left: Tensor, covariance: Callable[[Tensor], Tensor], noise: Tensor) -> Tensor:
+    """Weights (n,) of rows before anything is fitted: low for those that an ordinary gap does not explain.
+
+    A gap that may choose its lengthscales would follow gross outliers, and they would surprise it no more.
+
+    Args:
+        left: what a simulator leaves (n, O).
+        covariance: of the rows (O, n, n) for their weights, before there is data.
+        noise: expected standard deviation (O,).
+    """
+    trust = torch.ones(len(left), dtype=left.dtype, device=left.device)
+    for _ in range(FIRST_ROUNDS):
+        surprise, _ = left_out(left, covariance(trust), noise, trust)
+        # The ordinary row sets the scale, whatever the expected gap and noise were.
+        ordinary = (surprise.median(dim=0).values / _MEDIAN_SQUARE).clamp_min(1.0)
+        _, trust = student_weights((surprise / ordinary).sum(dim=1), left.shape[1])
+    return trust
 
 
 def left_out(left: Tensor, covariance: Tensor, noise: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,4 +106,4 @@ def log_student(surprise: Tensor, outputs: int, freedom: float) -> Tensor:
     return constant - 0.5 * (freedom + outputs) * torch.log1p(surprise / freedom)
 
 
-__all__ = ["left_out", "log_student", "student_weights", "tail_scales", "typical_scale"]
+__all__ = ["first_trust", "left_out", "log_student", "student_weights", "tail_scales", "typical_scale"]

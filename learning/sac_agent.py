@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,8 @@ from learning.sac import FastSac
 AGENT_FILE = "agent.zip"
 MOMENTS_FILE = "moments.pt"
 NEVER = 2**62
+DIVERGED = "The policy diverged; train it with a smaller learning rate."
+_BROKEN = (OSError, ValueError, LookupError, RuntimeError, EOFError, AssertionError, pickle.UnpicklingError)
 _NO_REPLAY: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1, "n_steps": 1}
 """An agent that is read drives, or gives its networks to one that learns."""
 
@@ -93,6 +96,10 @@ class SacAgent:
         """
         s = self._settings
         again = self._sac
+        if again is not None and (
+            again.policy.net_arch != list(s.hidden) or again.observation_space != env.observation_space
+        ):
+            raise DataError("The earlier policy has another shape; remove its folder, and it is trained anew.")
         made = FastSac(
             "MlpPolicy", env, learning_rate=s.learning_rate, buffer_size=s.replay, batch_size=s.batch,
             learning_starts=0 if again is not None else s.warm_up, tau=s.target_rate, gamma=s.discount,
@@ -107,20 +114,23 @@ class SacAgent:
             assert again.log_ent_coef is not None
             made.log_ent_coef.data.copy_(again.log_ent_coef.data)
         made.set_logger(Logger(None, []))
-        made.learn(s.warm_up, log_interval=NEVER)
-        made.gradient_steps = s.updates
+        env.seed_anew()
         best, kept = -np.inf, None
         self._sac = made
         try:
+            made.learn(s.warm_up, log_interval=NEVER)
+            made.gradient_steps = s.updates
             for part in range(judged if judge is not None else 1):
                 goal = updates * (part + 1) // (judged if judge is not None else 1)
                 made.learn(NEVER, callback=_UntilUpdates(goal, progress), log_interval=NEVER, reset_num_timesteps=False)
                 if not all(bool(torch.isfinite(p).all()) for p in made.policy.parameters()):
-                    raise DataError("The policy diverged; train it with a smaller learning rate.")
+                    raise DataError(DIVERGED)
                 if judge is not None and (value := judge(self)) > best:
                     best, kept = value, copy.deepcopy(made.policy.state_dict())
-        except BaseException:
+        except BaseException as error:
             self._sac = again
+            if isinstance(error, ValueError) and "nan" in str(error):  # torch's distributions refuse what is no number.
+                raise DataError(DIVERGED) from error
             raise
         if kept is not None:
             made.policy.load_state_dict(kept)
@@ -150,7 +160,15 @@ class SacAgent:
         try:
             found._sac = FastSac.load(folder / AGENT_FILE, device=device, custom_objects=_NO_REPLAY)
             found._sac.load_optimiser_state(torch.load(folder / MOMENTS_FILE, weights_only=True))
-        except (OSError, ValueError, KeyError, RuntimeError, EOFError, AssertionError) as error:
+        except (
+            OSError,
+            ValueError,
+            LookupError,
+            RuntimeError,
+            EOFError,
+            AssertionError,
+            pickle.UnpicklingError,
+        ) as error:
             raise DataError(
                 f"The policy in {folder} cannot be read ({error}); remove the folder, and it is trained anew."
             ) from error

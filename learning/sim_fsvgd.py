@@ -77,8 +77,10 @@ def fit_particles(
         The particles. Their noise is that of the measurements and what they miss of the target's mean where it is sure.
 
     Raises:
-        DataError: the particles diverged.
+        DataError: the particles diverged, or there are too few points.
     """
+    if len(points) < settings.points:
+        raise DataError(f"{len(points)} points of the domain make no measurement set of {settings.points}; give more.")
     device, normaliser = points.device, target.normaliser
     generator = torch.Generator().manual_seed(settings.seed)
     outputs = len(target.noise_std)
@@ -112,7 +114,7 @@ def fit_particles(
         found = network.through(layers, inputs.flatten(0, 1))[-1].view(-1, count, settings.points, outputs)
         off = found.transpose(2, 3) - mean
         # The mean square of a particle's error is that of their mean and their spread; the target's own is allowed.
-        own = covariance.diagonal(dim1=2, dim2=3)
+        own = covariance.diagonal(dim1=2, dim2=3).to(off)
         beyond = (weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + own)).sum(dim=(0, 2)) / weight.sum(
             dim=(0, 2)
         )
@@ -141,8 +143,14 @@ def measurement_points(
         generator: of the draws.
         count: how many.
         others: raw inputs of the domain.
+
+    Raises:
+        DataError: there is neither data nor a domain.
     """
-    near = count // 2 if len(inputs) >= FEW_ROWS else 0
+    if model is None and others is None and not len(inputs):
+        raise DataError("There is neither data nor a domain to learn in; name a car file as the prior.")
+    alone = model is None and others is None
+    near = count if alone else count // 2 if len(inputs) >= FEW_ROWS else 0
     found = []
     if near:
         rows = inputs[torch.randint(len(inputs), (near,), generator=generator).to(inputs.device)]
@@ -161,10 +169,10 @@ def _factors(covariance: Tensor, noise_std: Tensor) -> tuple[Tensor, Tensor]:
     An error counts by what it adds to the surprise at a measurement: in units of the noise and the function's doubt.
     """
     eye = torch.eye(covariance.shape[-1], dtype=torch.float64, device=covariance.device)
-    factor = torch.linalg.cholesky(covariance.double() + JITTER * eye).to(covariance.dtype)
+    factor = torch.linalg.cholesky(covariance + JITTER * eye)
     variance = covariance.diagonal(dim1=2, dim2=3).clamp_min(0.0) + noise_std[:, None] ** 2
     weight = 1.0 / variance
-    return factor, weight / weight.mean()
+    return factor.to(noise_std), (weight / weight.mean()).to(noise_std)
 
 
 __all__ = ["ParticleSettings", "fit_particles", "measurement_points"]

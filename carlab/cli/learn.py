@@ -100,20 +100,19 @@ class Learn:
         figures: list[EpisodeFigures] = []
         with contextlib.ExitStack() as stack:
             if self.resume is None:
-                plan, episodes = self._plan(choice), self.episodes
+                plan = self._plan(choice)
                 run = stack.enter_context(new_run(self.out, self.name, choice, keep="models"))
             else:
                 run = stack.enter_context(existing_run(self.resume, choice))
-                plan, episodes = taken_up(run)
             stack.enter_context(choice.car)
             bar = stack.enter_context(progress(speed_estimate_period_s=STEPS_PERIOD_S))
             interrupts = stack.enter_context(Interrupts())
-            campaign = Campaign(
-                choice, plan, episodes, run, self._hooks(bar, run, figures, interrupts), self.ticks, self.place,
-                self.rerun,
-            )  # fmt: skip
+            hooks = self._hooks(bar, run, figures, interrupts)
             if self.resume is None:
+                campaign = Campaign(choice, plan, self.episodes, run, hooks, self.ticks, self.place, self.rerun)
                 campaign.write_plan()
+            else:
+                campaign = taken_up(run, choice, hooks)
             results = list(self._watched(campaign, figures))
         return self._report(campaign, results, figures)
 
@@ -195,7 +194,14 @@ class Learn:
         from carlab.cli import EXIT_INTERRUPTED
         from carlab.experiment.campaign import GOES_ON
 
+        if not campaign.run.path.is_dir():
+            console.print("Nothing was learned; start again.")
+            return EXIT_INTERRUPTED
         done = len(campaign.run.recordings())
+        if not results and done >= campaign.episodes:
+            console.print(
+                f"All {done} episodes are driven; {campaign.run.path} has nothing left to do.", soft_wrap=True
+            )
         if results:
             write_result(campaign.run, results)
             table(

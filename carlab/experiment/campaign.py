@@ -90,7 +90,8 @@ class Campaign:
 
     def write_plan(self) -> None:
         """Write what is wanted, for taking the run up again."""
-        self.run.write_json(CAMPAIGN_FILE, {"episodes": self.episodes, "plan": plan_as_json(self.plan)})
+        wanted = {"episodes": self.episodes, "ticks": self.max_ticks, "place": self.place, "rerun": self.record_rerun}
+        self.run.write_json(CAMPAIGN_FILE, {**wanted, "plan": plan_as_json(self.plan)})
 
     def go_on(self) -> Iterator[EpisodeResult]:
         """Learn and drive until there are enough episodes; gives each as it ends.
@@ -160,14 +161,18 @@ class Campaign:
         return found
 
 
-def taken_up(run: RunDirectory) -> tuple[TrainingPlan, int]:
-    """The plan of a run and how many episodes it wanted. Raises DataError where it is no campaign."""
+def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks) -> Campaign:
+    """A run that goes on as it was started. Raises DataError where it is no campaign."""
     path = run.path / CAMPAIGN_FILE
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         plan = TrainingPlan(**content["plan"])
         SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
-        return plan, int(content["episodes"])
+        ticks = content["ticks"]
+        return Campaign(
+            choice, plan, int(content["episodes"]), run, hooks, None if ticks is None else int(ticks),
+            bool(content["place"]), bool(content["rerun"]),
+        )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{run.path} is no run of carlab learn that can be taken up again ({error}).") from error
 

@@ -108,8 +108,8 @@ def foretell(dynamics: CarDynamics, episode: EpisodeData, seed: int = 0) -> Fore
         none = np.zeros((0, length + 1, 3))
         return Foretold(np.zeros((0, length + 1), dtype=np.int64), none, none)
     generator = torch.Generator().manual_seed(seed)
-    past = np.stack([episode.sent[starts - back] for back in range(history, 0, -1)], axis=1)
-    first = encode(episode.states[starts], past.reshape(len(starts), history, 2))
+    past = episode.sent[starts[:, None] - np.arange(history, 0, -1)]
+    first = encode(episode.states[starts], past)
     features = torch.from_numpy(first).float().repeat_interleave(SAMPLES, dim=0)
     poses = []
     for k in range(length + 1):

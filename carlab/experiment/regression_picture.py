@@ -7,6 +7,7 @@ from pathlib import Path
 
 from carlab.experiment.regression_study import Row
 
+FAR_OFF_NAT = 30.0
 _FIGURES = (
     ("nll", "negative log-likelihood [nat]"),
     ("rmse", "root mean square error"),
@@ -37,9 +38,12 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 low, high = ([r.nll + sign * r.nll_standard_error for r in own] for sign in (-1, 1))
                 axis.fill_between(counts, low, high, alpha=0.2, color=line.get_color())
         axis.set(xscale="log", xlabel="rows", ylabel=label)
-        if name == "nll":
+        counts = sorted({row.rows for row in rows})
+        axis.set_xticks(counts, [str(c) for c in counts])
+        axis.minorticks_off()
+        if name == "nll" and max(row.nll for row in rows) > FAR_OFF_NAT:
             axis.set_yscale("symlog", linthresh=20.0)
-        elif name == "rmse":
+        elif name == "rmse" and max(row.rmse for row in rows) > 3.0 * min(row.rmse for row in rows):
             axis.set_yscale("log")
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from carlab.core.clock import MonotonicClock
+from carlab.core.documents import Transition
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.observation import encode
@@ -104,7 +105,7 @@ def train(
     clock = MonotonicClock()
     number = len(recordings) + 1
     tell("reading the recordings", 0, 1)
-    episodes = [read_episode(path) for path in recordings]
+    episodes = [read_episode(path) for path in recordings if _has_ticks(path)]
     simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
     model = CarModel(simulator, plan.history, simulator.priors)
     usable = [e for e in episodes if e.ticks > plan.history]
@@ -163,6 +164,13 @@ def train(
     return figures
 
 
+def _has_ticks(recording: Path) -> bool:
+    """Whether anything was driven: the gate may end an episode before its first tick."""
+    from carlab.recording.mcap_source import read_documents
+
+    return any(isinstance(document, Transition) for document in read_documents(recording))
+
+
 def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
     """Features (R, 7 + 2 H) of recorded states with the commands before them."""
     import numpy as np
@@ -170,9 +178,7 @@ def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
     found = []
     for episode in episodes:
         rows = np.arange(history, episode.ticks)
-        past = np.stack([episode.sent[rows - back] for back in range(history, 0, -1)], axis=1) if history else None
-        commands = np.zeros((len(rows), 0, 2)) if past is None else past
-        found.append(encode(episode.states[rows], commands))
+        found.append(encode(episode.states[rows], episode.sent[rows[:, None] - np.arange(history, 0, -1)]))
     features: FloatArray = np.concatenate(found)
     return features[np.isfinite(features).all(axis=1)]
 

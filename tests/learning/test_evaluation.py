@@ -6,6 +6,7 @@ import torch
 from scipy.stats import norm
 
 from learning.evaluation import (
+    LEVELS,
     Mixture,
     calibration_error,
     calibration_scale,
@@ -55,3 +56,43 @@ def test_calibration_scale_undoes_a_wrong_noise():
     sure = Mixture(torch.zeros(1, 4000, 2), torch.tensor(0.1).expand(1, 1, 2))
     assert calibration_scale(sure, targets) == pytest.approx(3.0, rel=0.03)
     assert calibration_scale(sure, targets[:0]) == 1.0
+
+
+@pytest.mark.parametrize("bandwidth", [0.0, 0.4, 0.9, 1.0])
+def test_a_smoothed_mixture_keeps_mean_and_spread(bandwidth):
+    sharp = Mixture(random(4, 5, 3), random(4, 1, 3, seed=1).exp())
+    found = sharp.smoothed(bandwidth)
+    means, stds = found.means.numpy(), found.stds.expand_as(found.means).numpy()
+    theirs, widths = sharp.means.numpy(), sharp.stds.expand_as(sharp.means).numpy()
+    assert np.allclose(means.mean(axis=0), theirs.mean(axis=0), atol=1e-12)
+    assert np.allclose(means.var(axis=0) + (stds**2).mean(axis=0), theirs.var(axis=0) + (widths**2).mean(axis=0))
+    assert np.allclose(means.std(axis=0), np.sqrt(1.0 - bandwidth**2) * theirs.std(axis=0), atol=1e-12)
+
+
+def test_wholly_smoothed_it_is_a_gaussian_and_not_at_all_it_is_itself():
+    sharp = Mixture(random(4, 5, 3), random(1, 1, 3, seed=1).exp())
+    targets = random(5, 3, seed=2)
+    mean, variance = sharp.means.numpy().mean(axis=0), sharp.means.numpy().var(axis=0) + sharp.stds.numpy()[0] ** 2
+    theirs = norm(mean, np.sqrt(variance)).logpdf(targets.numpy()).sum(axis=1)
+    assert np.allclose(sharp.smoothed(1.0).log_density(targets), theirs, atol=1e-12)
+    assert np.allclose(sharp.smoothed(0.0).log_density(targets), sharp.log_density(targets), atol=1e-12)
+
+
+def test_calibration_is_by_the_mixtures_own_quantiles():
+    """Two narrow peaks of unlike weight of their widths: quantiles of draws, which no Gaussian comes near."""
+    rng = np.random.default_rng(5)
+    means, stds = np.array([[-3.0, 0.0], [2.0, 1.0], [2.5, 8.0]]), np.array([[0.3, 0.2], [1.0, 0.5], [0.2, 2.0]])
+    targets = np.array([-1.0, 2.0]) + np.array([2.5, 3.0]) * rng.normal(size=(3000, 2))
+    which = rng.integers(3, size=1_000_000)
+    draws = means[which] + stds[which] * rng.normal(size=(len(which), 2))
+    off = []
+    for level in LEVELS:
+        low, high = np.quantile(draws, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+        off.append(np.abs(((targets >= low) & (targets <= high)).mean(axis=0) - level))
+    prediction = Mixture(torch.tensor(means)[:, None].expand(3, 3000, 2), torch.tensor(stds)[:, None])
+    assert calibration_error(prediction, torch.tensor(targets)) == pytest.approx(np.mean(off), abs=0.002)
+    own = torch.tensor(draws[:50_000])
+    spread = Mixture(torch.tensor(means)[:, None].expand(3, 50_000, 2), torch.tensor(stds)[:, None])
+    assert calibration_error(spread, own) < 0.005
+    gaussian = Mixture(spread.mean[None], spread.std[None])
+    assert calibration_error(gaussian, own) > 0.02

@@ -1,0 +1,186 @@
+"""``carlab learn`` as it is called: what it refuses, what it prints, and taking a run up again."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from carlab.cli import run
+from carlab.cli.learn import Learn
+from carlab.recording.mcap_source import read_episode
+from carlab.recording.run_directory import RunDirectory
+
+Carlab = Callable[..., tuple[int, str]]
+
+TICKS = 20
+TINY = ("--ticks", TICKS, "--model-steps", 40, "--updates", 32, "--history", 1, "--no-rerun")
+
+
+def said_by(*argv: object) -> tuple[int, str]:
+    """Exit code of a command line that is right, and what it printed, on one line."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        code = run([str(a) for a in argv])
+    return code, " ".join(out.getvalue().split())
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Any:
+    """A second thread of torch costs more than it gives where others compute as well."""
+    plan = Learn._plan
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Learn, "_plan", lambda self, choice: replace(plan(self, choice), threads=1))
+        yield
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Path]:
+    """A whole run of two episodes: exit code, what it printed, its folder."""
+    out = tmp_path_factory.mktemp("runs")
+    code, text = said_by("learn", "--car", "sim", "--episodes", 2, "--out", out, *TINY)
+    (folder,) = out.iterdir()
+    return code, text, folder
+
+
+@pytest.fixture(scope="module")
+def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Path]:
+    """The same where three were wanted: taken up again."""
+    folder = tmp_path_factory.mktemp("longer") / learned[2].name
+    shutil.copytree(learned[2], folder)
+    wanted = json.loads((folder / "campaign.json").read_text())
+    (folder / "campaign.json").write_text(json.dumps(wanted | {"episodes": 3}))
+    return *said_by("learn", "--resume", folder), folder
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--episodes 0", "--episodes 0: a number above zero."),
+        ("--history -1", "--history and --seed: 0 or more."),
+        ("--seed -1", "--history and --seed: 0 or more."),
+        ("--ticks 0", "--ticks 0: a number above zero."),
+        ("--updates -5", "--updates -5: a number above zero."),
+        ("--model-steps 0", "--model-steps 0: a number above zero."),
+        ("--device cuda", "--device cuda: there is no such device here; leave it out."),
+        ("--prior missing.toml", "There is no car file 'missing.toml'"),
+        ("--car nosuch", "There is no car 'nosuch'"),
+        ("--method guessing", "'sim-fsvgd', 'fsvgd'"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_in_a_sentence_and_leaves_nothing(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str, words: str
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.chdir(tmp_path)
+    code, text = carlab("learn", *options.split())
+    assert code == 2
+    assert words in text
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_only_a_run_of_learning_is_taken_up_again(carlab: Carlab, tmp_path: Path) -> None:
+    (tmp_path / "some").mkdir()
+    code, text = carlab("learn", "--resume", tmp_path / "some")
+    assert code == 1
+    assert "is not a run's folder" in text
+    assert list((tmp_path / "some").iterdir()) == []
+    driven = RunDirectory.create(tmp_path, "driven")
+    code, text = carlab("learn", "--resume", driven.path)
+    assert code == 1
+    assert "is no run of carlab learn that can be taken up again" in text
+
+
+def test_an_impossible_prior_file_is_named(carlab: Carlab, tmp_path: Path) -> None:
+    path = tmp_path / "model.toml"
+    path.write_text("[vehicle]\nmas = 1.6\n", encoding="utf-8")
+    code, text = carlab("learn", "--prior", path, "--out", tmp_path / "runs")
+    assert code == 2
+    assert "did you mean 'mass'?" in text
+    assert not (tmp_path / "runs").exists()
+
+
+def test_a_run_learns_drives_and_prints_how_it_went(learned: tuple[int, str, Path]) -> None:
+    code, text, folder = learned
+    assert code == 0
+    assert "SIMULATED" in text
+    rows = text.split("───")[-1]
+    curve = json.loads((folder / "learn.json").read_text())["episodes"]
+    for row in curve:
+        driven = read_episode(folder / "episodes" / f"{row['episode']:04d}.mcap")
+        assert driven.ticks == TICKS
+        line = f"{row['episode']} {driven.rewards.sum():.1f} {row['foretold']:.1f} {row['distance_m']:.2f}"
+        assert line in rows
+        assert f"episode {row['episode']}: return {driven.rewards.sum():.1f}" in text
+    assert f"learned from {TICKS - 1} rows" in text
+    assert f"Learned and recorded in {folder} (learn.png, learn.rrd)." in text
+    assert [e["ticks"] for e in json.loads((folder / "result.json").read_text())["episodes"]] == [TICKS, TICKS]
+    assert not list(folder.glob("episodes/*.rrd"))
+    assert sorted(p.name for p in folder.glob("models/*")) == ["0001", "0002"]
+
+
+def test_a_run_that_is_done_stays_as_it_is(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
+    folder = learned[2]
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "log.jsonl"}
+    code, _ = carlab("learn", "--resume", folder)
+    assert code == 0
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "log.jsonl"} == before
+
+
+def test_a_run_that_is_done_says_so(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
+    _, text = carlab("learn", "--resume", learned[2])
+    assert text.rpartition("╯")[2].strip()
+
+
+def test_a_run_that_wants_more_is_taken_up(longer: tuple[int, str, Path]) -> None:
+    code, text, folder = longer
+    assert code == 0
+    assert "episode 3: return" in text
+    assert [r["episode"] for r in json.loads((folder / "learn.json").read_text())["episodes"]] == [1, 2, 3]
+    assert sorted(p.name for p in folder.glob("episodes/*.mcap")) == ["0001.mcap", "0002.mcap", "0003.mcap"]
+
+
+def test_options_of_the_run_hold_when_it_is_taken_up(longer: tuple[int, str, Path]) -> None:
+    folder = longer[2]
+    assert read_episode(folder / "episodes" / "0003.mcap").ticks == TICKS
+    assert not list(folder.glob("episodes/*.rrd"))
+
+
+def interrupted(plan: Any, models: Path, recordings: list[Path], *others: Any) -> dict[str, Any] | None:
+    """A training during which somebody presses ^C."""
+    signal.raise_signal(signal.SIGINT)
+    assert others[-1](), "it is asked to stop"
+    return None
+
+
+def test_an_interrupted_run_tells_how_it_goes_on(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carlab.experiment.campaign.train_beside", interrupted)
+    folder = tmp_path / "run"
+    shutil.copytree(learned[2], folder)
+    wanted = json.loads((folder / "campaign.json").read_text())
+    (folder / "campaign.json").write_text(json.dumps(wanted | {"episodes": 5}))
+    code, text = carlab("learn", "--resume", folder)
+    assert code == 130
+    assert f"2 of 5 episodes; go on with: carlab learn --resume {folder}" in text
+
+
+def test_a_run_that_learned_nothing_is_not_to_be_taken_up(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Interrupted before anything was there, its folder goes; a command that names it would lead nowhere."""
+    monkeypatch.setattr("carlab.experiment.campaign.train_beside", interrupted)
+    code, text = carlab("learn", "--out", tmp_path / "runs", *TINY)
+    assert code == 130
+    left = list((tmp_path / "runs").iterdir())
+    assert [f"--resume {folder}" in text for folder in left] == [True] * len(left)
+    assert ("--resume" in text) == bool(left)

@@ -1,0 +1,370 @@
+"""Learning and driving in turns: whatever ends it, it goes on; and what a recording teaches is what was driven."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import tomllib
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+import torch
+
+from carlab.cars import CarChoice, choose_car
+from carlab.core.documents import Tick
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.observation import encode
+from carlab.core.outcome import EndReason
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import Action, CarState
+from carlab.core.safety import SafetyEnvelope
+from carlab.core.task import ParkingTask
+from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator, taken_up
+from carlab.experiment.campaign_figures import EpisodeFigures, foretell
+from carlab.experiment.campaign_report import learning_curve, write_report
+from carlab.experiment.session import EpisodeResult, Session
+from carlab.experiment.training import TrainingPlan, recorded_features, train, train_beside
+from carlab.recording.mcap_source import read_documents, read_episode
+from carlab.recording.run_directory import RunDirectory
+from drivers.emulators.command_log import read_log
+from learning.car_dynamics import CarDynamics
+from learning.car_fit import load_car
+from learning.evaluation import negative_log_likelihood
+from learning.fsvgd import Posterior
+from learning.normaliser import Normaliser
+from learning.particles import Network
+from learning.sac_agent import SacPolicy
+from learning.transitions import transitions_of
+from sim_backends.car_parameters import SimulatorConfig, preset_names
+
+HISTORY = 2
+TICKS = 25
+ENVELOPE = SafetyEnvelope(arena_m=ParkingTask().arena_m)
+
+
+def tiny_plan(choice: CarChoice, **changes: Any) -> TrainingPlan:
+    text = tomli_w.dumps(prior_simulator(choice.simulator, "kinematic").to_tables())
+    return replace(TrainingPlan(text, HISTORY, model_steps=60, updates=32, threads=1), **changes)
+
+
+def listened_to(choice: CarChoice) -> list[Action]:
+    """What the car says that it sent, from now on."""
+    heard: list[Action] = []
+    command = choice.car.command
+
+    def listening(action: Action) -> Action:
+        heard.append(command(action))
+        return heard[-1]
+
+    choice.car.command = listening  # type: ignore[method-assign]
+    return heard
+
+
+@dataclass
+class Story:
+    """A run that was stopped before it drove, whose second training was killed, and that was taken up each time."""
+
+    run: RunDirectory
+    plan: TrainingPlan
+    heard: list[Action] = field(default_factory=list)
+    results: list[EpisodeResult] = field(default_factory=list)
+    figures: list[EpisodeFigures] = field(default_factory=list)
+    after_the_stop: list[str] = field(default_factory=list)
+    after_the_kill: list[str] = field(default_factory=list)
+    said: str = ""
+    first_model: bytes = b""
+
+
+def names(run: RunDirectory) -> list[str]:
+    return sorted(str(p.relative_to(run.path)) for f in (run.models, run.episodes) for p in f.iterdir())
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
+    choice = choose_car("sim", seed=0)
+    run = RunDirectory.create(tmp_path_factory.mktemp("runs"), "learn")
+    found = Story(run, tiny_plan(choice), listened_to(choice))
+
+    def go_on(hooks: CampaignHooks) -> None:
+        hooks.on_figures = found.figures.append
+        campaign = Campaign(choice, found.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
+        campaign.write_plan()
+        for result in campaign.go_on():
+            found.results.append(result)
+            write_report(run, found.plan, found.figures[-1])
+
+    def kill(what: str, done: int, total: int) -> None:
+        if found.results and what == "learning to drive":
+            (child,) = multiprocessing.active_children()
+            (run.models / "0002.partial").mkdir(exist_ok=True)
+            (run.models / "0002.partial" / "dynamics.pt").write_bytes(b"rubbish")
+            os.kill(child.pid or 0, signal.SIGKILL)
+
+    with choice.car:
+        go_on(CampaignHooks(stop=(run.models / "0001").is_dir))
+        found.after_the_stop = names(run)
+        found.first_model = (run.models / "0001" / "agent.zip").read_bytes()
+        with pytest.raises(DataError) as error:
+            go_on(CampaignHooks(on_training=kill))
+        found.said = str(error.value)
+        found.after_the_kill = names(run)
+        (run.models / "0002.partial").mkdir()  # as where the whole program was killed with it
+        (run.models / "0002.partial" / "agent.zip").write_bytes(b"rubbish")
+        go_on(CampaignHooks())
+    return found
+
+
+def test_a_run_goes_on_where_it_was_ended(story: Story) -> None:
+    assert story.after_the_stop == ["models/0001"]
+    assert story.after_the_kill == ["episodes/0001.mcap", "models/0001"]
+    assert "exit code -9" in story.said
+    assert "take the run up again" in story.said
+    assert "\n" not in story.said
+    assert names(story.run) == ["episodes/0001.mcap", "episodes/0002.mcap", "models/0001", "models/0002"]
+    assert [r.reason for r in story.results] == [EndReason.COMPLETED] * 2
+    assert [p.name for p in sorted((story.run.models / "0002").iterdir())] == [
+        "agent.zip", "dynamics.pt", "moments.pt", "training.json",
+    ]  # fmt: skip
+    assert (story.run.models / "0001" / "agent.zip").read_bytes() == story.first_model, "it was not learned again"
+
+
+def test_a_run_that_has_all_its_episodes_does_nothing(story: Story) -> None:
+    before = names(story.run)
+    choice = choose_car("sim")
+    assert list(Campaign(choice, story.plan, 2, story.run).go_on()) == [], "the car is not even open"
+    assert names(story.run) == before
+
+
+def test_the_plan_is_taken_up_again(story: Story, tmp_path: Path) -> None:
+    found = taken_up(story.run, choose_car("sim"), CampaignHooks())
+    assert (found.plan, found.episodes) == (story.plan, 2)
+    other = RunDirectory.create(tmp_path, "other")
+    for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}'):
+        if content is not None:
+            (other.path / "campaign.json").write_text(content)
+        with pytest.raises(DataError, match="no run of carlab learn"):
+            taken_up(other, choose_car("sim"), CampaignHooks())
+
+
+def test_the_curve_has_the_figures_of_the_recordings(story: Story) -> None:
+    rows = json.loads((story.run.path / "learn.json").read_text())["episodes"]
+    assert [r["episode"] for r in rows] == [1, 2]
+    for row in rows:
+        driven = read_episode(story.run.episode_path(row["episode"]))
+        trained = json.loads((story.run.models / f"{row['episode']:04d}" / "training.json").read_text())
+        assert driven.ticks == TICKS
+        assert driven.metadata["model"] == str(row["episode"])
+        assert row["total_reward"] == pytest.approx(driven.rewards.sum())
+        x, y, yaw, vx, vy, _ = driven.states[-1]
+        assert row["distance_m"] == pytest.approx(np.hypot(x, y))
+        assert row["yaw_error_rad"] == pytest.approx(abs(np.angle(np.exp(1j * yaw))))
+        assert row["speed_mps"] == pytest.approx(np.hypot(vx, vy))
+        assert row["parked"] is False
+        assert row["end"] == driven.metadata["end_reason"] == "COMPLETED"
+        assert row["foretold"] == trained["return_in_model"]
+    assert [r["rows"] for r in rows] == [0, TICKS - HISTORY]
+    assert rows[0]["updates"] > rows[1]["updates"] == 32, "before the first there is most to learn"
+    assert [str(r) for r in learning_curve(story.run)] == [str(f) for f in story.figures]
+    assert (story.run.path / "learn.png").read_bytes().startswith(b"\x89PNG")
+    assert (story.run.path / "learn.rrd").stat().st_size > 1000
+
+
+def test_surprise_is_that_of_the_model_that_had_not_seen_the_episode(story: Story) -> None:
+    rows = transitions_of([read_episode(story.run.episode_path(1))], HISTORY)
+    inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
+    nll = [
+        negative_log_likelihood(load_car(story.run.models / n / "dynamics.pt").predict(inputs).smoothed(), outputs)
+        for n in ("0001", "0002")
+    ]
+    assert nll[0] > nll[1] + 0.1, "the second has learned from it"
+    assert story.figures[1].last_episode_nll == pytest.approx(nll[0], abs=1e-3)
+    assert np.isnan(story.figures[0].last_episode_nll)
+
+
+def test_a_recorded_row_ends_in_the_command_of_its_tick(story: Story) -> None:
+    episodes = [read_episode(path) for path in story.run.recordings()]
+    heard = np.array([a.to_array() for a in story.heard])
+    np.testing.assert_array_equal(np.concatenate([e.sent for e in episodes]), heard)
+    assert len(np.unique(heard, axis=0)) > TICKS
+    rows = transitions_of(episodes, HISTORY)
+    assert len(rows) == 2 * (TICKS - HISTORY)
+    for row, number, tick in zip(rows.inputs, rows.episode, rows.tick, strict=True):
+        np.testing.assert_array_equal(row[-2:], heard[number * TICKS + tick])
+
+
+def test_the_policy_saw_the_commands_before_and_starts_are_drawn_from_what_it_saw(story: Story) -> None:
+    path = story.run.episode_path(2)
+    ticks = [d for d in read_documents(path) if isinstance(d, Tick)]
+    assert len(ticks) == TICKS
+    assert ticks[0].features[-2 * HISTORY :].tolist() == [0.0] * 2 * HISTORY
+    for before, now in pairwise(ticks):
+        np.testing.assert_array_equal(now.features[-2:], before.sent.to_array())
+        np.testing.assert_array_equal(now.features[-4:-2], before.features[-2:])
+    driven = read_episode(path)
+    wanted = np.array([t.features for t in ticks[HISTORY:]])
+    np.testing.assert_allclose(recorded_features([driven], HISTORY), wanted, atol=1e-12)
+    states = driven.states.copy()
+    states[5, 4] = np.nan
+    left = recorded_features([driven, replace(driven, states=states)], HISTORY)
+    assert len(left) == 2 * len(wanted) - 1
+    np.testing.assert_allclose(recorded_features([driven], 0), encode(driven.states[:-1], np.zeros((TICKS, 0, 2))))
+
+
+@pytest.mark.realtime
+def test_over_the_wire_a_row_ends_in_what_the_firmware_heard(
+    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def act(self: SacPolicy, view: PolicyInput) -> Action:
+        rng = np.random.default_rng(view.step)
+        return Action(float(rng.uniform(-0.3, 0.3)), float(rng.uniform(0.05, 0.3)))
+
+    monkeypatch.setattr(SacPolicy, "act", act)
+    run = RunDirectory.create(tmp_path, "wire")
+    shutil.copytree(story.run.models / "0001", run.models / "0001")
+    choice = choose_car("emulated", seed=0)
+    choice.log_to(run.path)
+    heard = listened_to(choice)
+    with choice.car:
+        (result,) = Campaign(choice, story.plan, 1, run, max_ticks=TICKS, record_rerun=False).go_on()
+    driven = read_episode(result.path)
+    rows = transitions_of([driven], HISTORY)
+    assert len(rows) > TICKS // 2
+    wanted = np.array([a.to_array() for a in heard])
+    np.testing.assert_array_equal(rows.inputs[:, -2:], wanted[rows.tick])
+    currents = [e for e in read_log(run.path / "firmware.jsonl") if e.name == "current"]
+    times_s, values = np.array([e.t_s for e in currents]), np.array([e.value for e in currents])
+    # The last thing that the firmware heard before the next tick; a busy machine may be late for some.
+    last = values[np.searchsorted(times_s, driven.times_s[rows.tick + 1]) - 1]
+    per_throttle = last / rows.inputs[:, -1]
+    assert np.mean(np.abs(per_throttle / np.median(per_throttle) - 1.0) < 0.01) > 0.7
+
+
+def drive(folder: Path, ticks: int, start: CarState | None = None) -> RunDirectory:
+    """A run with one recording of so many ticks, of a car that somebody may have put somewhere."""
+
+    class Forward:
+        name = "forward"
+
+        def reset(self) -> None: ...
+
+        def act(self, view: PolicyInput) -> Action:
+            return Action(0.0, 0.3)
+
+    choice = choose_car("sim", seed=0)
+    run = RunDirectory.create(folder, "short")
+    with choice.car as car:
+        car.place(CarState() if start is None else start)
+        task = ParkingTask(history_length=HISTORY)
+        Session(
+            car, Forward(), task, ENVELOPE, run, choice.control_period_s, max_ticks=ticks, place=False,
+            record_rerun=False,
+        ).drive(1)  # fmt: skip
+    return run
+
+
+def test_from_an_episode_that_is_too_short_nothing_is_learned_but_the_prior(tmp_path: Path) -> None:
+    run = drive(tmp_path, HISTORY)
+    told: list[str] = []
+    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
+    figures = train(plan, run.models, run.recordings(), ENVELOPE, lambda what, done, total: told.append(what))
+    assert figures["rows"] == 0
+    assert "last_episode_nll" not in figures
+    assert json.loads((run.models / "0002" / "training.json").read_text()) == figures
+    assert list(dict.fromkeys(told)) == ["reading the recordings", "learning the car", "learning to drive"]
+
+
+def test_an_episode_that_ended_before_its_first_tick_is_no_obstacle(tmp_path: Path) -> None:
+    """Somebody put the car down outside the arena: the gate ends the episode at once, and the next may follow."""
+    run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
+    assert len(run.recordings()) == 1
+    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
+    assert train(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)["rows"] == 0
+
+
+@pytest.mark.parametrize(
+    ("recording", "changes", "said"),
+    [(b"rubbish", {}, "not an MCAP file"), (None, {"device": "abacus"}, "Training failed: RuntimeError")],
+)
+def test_what_goes_wrong_in_the_other_process_is_said_in_a_sentence(
+    tmp_path: Path, recording: bytes | None, changes: dict[str, Any], said: str
+) -> None:
+    run = RunDirectory.create(tmp_path, "wrong")
+    if recording is not None:
+        run.episode_path(1).write_bytes(recording)
+    plan = tiny_plan(choose_car("sim"), model_steps=1, **changes)
+    with pytest.raises(DataError, match=said) as error:
+        train_beside(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)
+    assert "\n" not in str(error.value)
+    assert names(run) == ([] if recording is None else ["episodes/0001.mcap"])
+    assert multiprocessing.active_children() == []
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_a_prior_has_ranges_about_the_numbers_of_the_car(name: str) -> None:
+    car = choose_car(name).simulator
+    for kind in ("kinematic", "nominal"):
+        found = prior_simulator(car, kind)
+        assert found.kind == ("kinematic" if kind == "kinematic" else car.kind)
+        assert found.parameters == car.parameters
+        assert found.priors
+        for key, (low, high) in found.priors.items():
+            value = car.values()[key]
+            assert low < value < high
+            if kind == "kinematic" or not car.priors:
+                assert sorted([low / value, high / value]) == pytest.approx([0.7, 1.3])
+        assert SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(found.to_tables()))) == found
+
+
+def test_a_prior_whose_wheels_do_not_slip_has_neither_effects_nor_ranges_of_tyres() -> None:
+    ranges = {"tyre.front.mu": (0.2, 1.1), "motor.drive_gain": (1.0, 50.0)}
+    car = replace(SimulatorConfig(), effects={"steering_lag": {}}, priors=ranges)
+    assert prior_simulator(car, "nominal") == car, "ranges of the file are those to be had"
+    found = prior_simulator(car, "kinematic")
+    assert found.effects == {}
+    assert not [name for name in found.priors if name.startswith("tyre")]
+    assert found.priors["motor.drive_gain"][1] == pytest.approx(1.3 * car.values()["motor.drive_gain"])
+
+
+def recording_of(ticks: int) -> EpisodeData:
+    """A recording at 30 Hz whose states and commands have nothing to do with each other."""
+    rng = np.random.default_rng(0)
+    sent = rng.uniform(-1.0, 1.0, (ticks, 2))
+    return EpisodeData(np.arange(ticks + 1) / 30.0, rng.normal(size=(ticks + 1, 6)), sent, sent, sent[:, 0])
+
+
+NO_HISTORY = pytest.mark.xfail(strict=True, reason="there is nothing to stack")
+
+
+@pytest.mark.parametrize("history", [pytest.param(0, marks=NO_HISTORY), 1, 3])
+def test_foretold_is_where_the_model_goes_by_the_recorded_commands(history: int) -> None:
+    """It goes ahead by the oldest throttle that it sees and turns by 0.05 rad, from each stretch's recorded start."""
+    width = 3 + 2 * (history + 1)
+    network = Network(width, 6, (1,), slope=1.0)
+    parameters = torch.zeros(4, network.parameters)
+    (first, _), (last, bias) = network.split(parameters)
+    first[:, 4, 0] = last[:, 0, 0] = 1.0
+    bias[:, 0, 2] = 0.05
+    units = Normaliser(*(f(n) for n in (width, 6) for f in (torch.zeros, torch.ones)))
+    car = CarDynamics(Posterior(network, parameters, torch.full((6,), 1e-7), units), history)
+    driven = recording_of(100)
+    found = foretell(car, driven)
+    assert found.ticks[:, 0].tolist() == [history, history + 30, history + 60]
+    assert found.mean.shape == found.std.shape == (3, 31, 3)
+    for (start, *_), path in zip(found.ticks, found.mean, strict=True):
+        x, y, yaw = driven.states[start, :3]
+        headings = yaw + 0.05 * np.arange(31)
+        ahead = driven.sent[start - history : start - history + 30, 1]
+        np.testing.assert_allclose(path[1:, 0], x + np.cumsum(ahead * np.cos(headings[:-1])), atol=1e-4)
+        np.testing.assert_allclose(path[1:, 1], y + np.cumsum(ahead * np.sin(headings[:-1])), atol=1e-4)
+        np.testing.assert_allclose(np.exp(1j * path[:, 2]), np.exp(1j * headings), atol=1e-4)
+    assert found.std.max() < 1e-4
+    assert foretell(car, recording_of(20)).mean.shape == (0, 31, 3)

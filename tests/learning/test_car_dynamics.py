@@ -1,0 +1,235 @@
+"""A learned car: exact kinematics against a recorded drive, draws against a mixture in closed form, and its file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from carlab.cars import choose_car
+from carlab.core.documents import Document, Transition
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import Action, CarState
+from carlab.core.task import ParkingTask
+from carlab.experiment.episode import EpisodeHooks, run_episode
+from learning.car_dynamics import CarDynamics, inputs_of, moved
+from learning.car_fit import CarFitSettings, fit_car, load_car, save_car
+from learning.fsvgd import Posterior
+from learning.normaliser import Normaliser
+from learning.particles import Network
+from learning.simulator_model import CarModel
+from learning.transitions import transitions_of
+from sim_backends.car_parameters import SimulatorConfig
+
+HISTORY = 3
+INPUTS = 3 + 2 * (HISTORY + 1)
+
+
+class Circling:
+    """Random commands that turn the car through more than a full circle."""
+
+    name = "circling"
+
+    def reset(self) -> None: ...
+
+    def act(self, view: PolicyInput) -> Action:
+        rng = np.random.default_rng(view.step)
+        return Action(float(rng.uniform(0.4, 1.0)), float(rng.uniform(0.3, 0.7)))
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[EpisodeData, list[Transition]]:
+    """A drive of the simulated car, and each of its transitions as the control loop saw it."""
+    choice = choose_car("sim", seed=0)
+    seen: list[Document] = []
+    with choice.car as car:
+        car.place(CarState(yaw_rad=3.0))
+        driven = run_episode(
+            car, Circling(), replace(ParkingTask(), history_length=HISTORY), choice.envelope,
+            period_s=choice.control_period_s, max_ticks=90, hooks=EpisodeHooks(emit=seen.append),
+        )  # fmt: skip
+    return driven, [d for d in seen if isinstance(d, Transition)]
+
+
+def test_a_drive_is_carried_on_exactly(drive: tuple[EpisodeData, list[Transition]]) -> None:
+    driven, transitions = drive
+    rows = transitions_of([driven], HISTORY)
+    own = [transitions[k] for k in rows.tick]
+    assert len(own) > 60
+    assert np.ptp(driven.states[:, 2]) > 6.0, "yaw jumps from pi to -pi on the way"
+    features = torch.from_numpy(np.array([t.features for t in own]))
+    action = torch.from_numpy(np.array([t.action.to_array() for t in own]))
+    after = moved(features, action, torch.from_numpy(rows.targets)).numpy()
+    np.testing.assert_allclose(after, [t.next_features for t in own], atol=1e-12)
+    wanted = driven.states[rows.tick + 1]
+    np.testing.assert_allclose(after[:, [0, 1, 4, 5, 6]], wanted[:, [0, 1, 3, 4, 5]], atol=1e-12)
+    yaw = np.arctan2(after[:, 2], after[:, 3])
+    np.testing.assert_allclose(np.exp(1j * yaw), np.exp(1j * wanted[:, 2]), atol=1e-12)
+
+
+def test_a_model_is_asked_what_a_recording_teaches_it(drive: tuple[EpisodeData, list[Transition]]) -> None:
+    driven, transitions = drive
+    rows = transitions_of([driven], HISTORY)
+    features = torch.from_numpy(np.array([transitions[k].features for k in rows.tick]))
+    sent = torch.from_numpy(driven.sent[rows.tick])
+    inputs = inputs_of(features, sent).numpy()
+    np.testing.assert_array_equal(inputs, rows.inputs)
+    np.testing.assert_array_equal(inputs[:, -2:], [transitions[k].action.to_array() for k in rows.tick])
+
+
+def test_without_a_history_a_step_forgets_the_command() -> None:
+    features = torch.tensor([[1.0, 2.0, 1.0, 0.0, 0.5, 0.0, 0.0]])  # heading along y
+    after = moved(features, torch.tensor([[0.3, 0.4]]), torch.tensor([[0.2, 0.1, math.pi / 2, 0.1, 0.0, -0.2]]))
+    assert after[0].tolist() == pytest.approx([0.9, 2.2, 0.0, -1.0, 0.6, 0.0, -0.2], abs=1e-6)
+
+
+def known_car(values: Tensor, tails: Tensor | None = None, noise: float = 0.5, scale: float = 1.0) -> CarDynamics:
+    """Particles that each say one value (L, 6), whatever the input."""
+    network = Network(INPUTS, 6, (4,))
+    parameters = torch.zeros(len(values), network.parameters)
+    parameters[:, -6:] = values
+    units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.full((6,), 0.3), torch.arange(1.0, 7.0))
+    return CarDynamics(Posterior(network, parameters, torch.full((6,), noise), units, tails), HISTORY, scale)
+
+
+@pytest.mark.parametrize("tails", [None, torch.tensor([0.5, 1.0, 1.5, 3.0])])
+def test_draws_are_those_of_the_mixture(tails: Tensor | None) -> None:
+    """Equal shares of four Gaussians: mean and variance by the law of total variance, kurtosis by their moments."""
+    values = torch.randn(4, 6, generator=torch.Generator().manual_seed(2))
+    car = known_car(values, tails, scale=1.7)
+    count = 40_000
+    drawn = car.sample(torch.zeros(count, INPUTS), torch.Generator().manual_seed(0)).double()
+    unit = torch.arange(1.0, 7.0).double()
+    means = 0.3 + values.double() * unit
+    stds = 1.7 * 0.5 * unit * (torch.ones(4) if tails is None else tails).double()[:, None]
+    mean = means.mean(dim=0)
+    away = means - mean
+    variance = (away**2 + stds**2).mean(dim=0)
+    fourth = (away**4 + 6 * away**2 * stds**2 + 3 * stds**4).mean(dim=0)
+    assert torch.all((drawn.mean(dim=0) - mean).abs() < 4 * (variance / count).sqrt())
+    found = ((drawn - mean) ** 2).mean(dim=0)
+    assert torch.all((found - variance).abs() < 4 * ((fourth - variance**2) / count).sqrt())
+    predicted = car.predict(torch.zeros(1, INPUTS))
+    torch.testing.assert_close(predicted.mean[0].double(), mean, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(predicted.std[0].double(), variance.sqrt(), rtol=1e-5, atol=1e-5)
+
+
+def test_every_particle_gets_its_share_and_every_row_a_particle_of_its_own() -> None:
+    car = known_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
+    drawn = car.sample(torch.zeros(200, INPUTS), torch.Generator().manual_seed(0))
+    said = (drawn[:, 0] - 0.3).round().int()
+    assert torch.bincount(said).tolist() == [40] * 5
+    assert len(said.unique_consecutive()) > 100, "they are not dealt in order"
+
+
+@pytest.mark.parametrize("count", [1, 3, 7, 64])
+def test_every_row_meets_every_particle_equally_often_however_many_rows_there_are(count: int) -> None:
+    car = known_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
+    generator, inputs = torch.Generator().manual_seed(0), torch.zeros(count, INPUTS)
+    said = torch.stack([(car.sample(inputs, generator)[:, 0] - 0.3).round() for _ in range(1500)])
+    for row in {0, count - 1}:
+        often = torch.bincount(said[:, row].int(), minlength=5)
+        assert torch.all((often - 300).abs() < 5 * math.sqrt(1500 * 0.2 * 0.8)), (row, often)
+
+
+def test_a_row_is_answered_for_its_own_inputs() -> None:
+    """A network that says vx back: the draw of a row must be near that of the row, whichever particle it met."""
+    network = Network(INPUTS, 6, (2,), slope=1.0)
+    parameters = torch.zeros(3, network.parameters)
+    (first, _), (last, _) = network.split(parameters)
+    first[:, 0, 0] = last[:, 0, :] = 1.0
+    units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.zeros(6), torch.ones(6))
+    car = CarDynamics(Posterior(network, parameters, torch.full((6,), 1e-4), units), HISTORY)
+    inputs = torch.zeros(100, INPUTS)
+    inputs[:, 0] = torch.arange(100.0)
+    drawn = car.sample(inputs, torch.Generator().manual_seed(0))
+    assert torch.allclose(drawn, inputs[:, :1].expand(100, 6), atol=1e-3)
+
+
+def some_car(tails: Tensor | None = None) -> CarDynamics:
+    generator = torch.Generator().manual_seed(5)
+    network = Network(INPUTS, 6, (8, 4))
+    units = Normaliser(*(torch.rand(n, generator=generator) + 0.5 for n in (INPUTS, INPUTS, 6, 6)))
+    noise = torch.rand(6, generator=generator)
+    return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, tails), HISTORY, 1.3)
+
+
+@pytest.mark.parametrize("tails", [None, torch.tensor([0.5, 1.0, 2.0])])
+def test_a_car_from_its_file_predicts_alike(tmp_path: Path, tails: Tensor | None) -> None:
+    car = some_car(tails)
+    save_car(car, tmp_path / "car.pt")
+    again = load_car(tmp_path / "car.pt")
+    assert again.history == HISTORY
+    inputs = torch.randn(50, INPUTS, generator=torch.Generator().manual_seed(1))
+    ours, theirs = car.predict(inputs), again.predict(inputs)
+    assert torch.equal(ours.means, theirs.means)
+    assert torch.equal(ours.stds, theirs.stds)
+    first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, again))
+    assert torch.equal(first, second)
+
+
+def damaged(path: Path, kind: str) -> None:
+    save_car(some_car(), path)
+    whole = path.read_bytes()
+    content: dict[str, Any] = torch.load(path, weights_only=True)
+    if kind == "of another version":
+        torch.save(content | {"version": 99}, path)
+    elif kind == "a particle short of a number":
+        torch.save(content | {"parameters": content["parameters"][:, :-1]}, path)
+    elif kind == "one particle alone":
+        torch.save(content | {"parameters": content["parameters"][0]}, path)
+    elif kind == "of another network":
+        torch.save(content | {"network": [INPUTS + 2, 6, 8, 4]}, path)
+    elif kind == "without a part":
+        del content["units"]
+        torch.save(content, path)
+    elif kind == "a list":
+        torch.save([1, 2], path)
+    elif kind == "not there":
+        path.unlink()
+    else:
+        path.write_bytes({"cut short": whole[: len(whole) // 2], "empty": b"", "text": b"rubbish\n"}[kind])
+
+
+KINDS = (
+    *("of another version", "a particle short of a number", "of another network", "without a part", "a list"),
+    *("not there", "cut short", "empty", "one particle alone", "text"),
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_file_that_is_no_learned_car_is_refused_with_what_to_do(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "car.pt"
+    damaged(path, kind)
+    with pytest.raises(DataError, match=r"remove its folder, and it is learned anew\.$") as said:
+        load_car(path)
+    assert str(said.value).count("learned anew") == 1
+    assert "car.pt" in str(said.value)
+
+
+def test_without_rows_the_learned_car_is_its_simulator() -> None:
+    """Mean and spread of its particles against cars drawn from the ranges."""
+    model = CarModel(SimulatorConfig(kind="kinematic"), 1, {"motor.drive_gain": (5.0, 12.0)})
+    told: list[int] = []
+    car = fit_car(None, model, CarFitSettings(steps=600, particles=12), progress=told.append)
+    inputs = model.inputs(300, torch.Generator().manual_seed(9))
+    gains = torch.linspace(5.0, 12.0, 101)[:, None]
+    truth = model(inputs, gains)
+    found = car.predict(inputs)
+    away = (found.mean - truth.mean(dim=0)).square().mean(dim=0).sqrt()
+    assert torch.all(away < 0.25 * truth.flatten(0, 1).std(dim=0))
+    assert told == [200, 400, 600]
+
+
+def test_rows_with_another_history_are_refused(drive: tuple[EpisodeData, list[Transition]]) -> None:
+    model = CarModel(SimulatorConfig(), 2, {"motor.drive_gain": (5.0, 12.0)})
+    with pytest.raises(DataError, match="3 past commands, the model 2"):
+        fit_car(transitions_of([drive[0]], HISTORY), model, CarFitSettings(steps=1))

@@ -1,0 +1,282 @@
+"""The posterior over functions against Gaussian processes in numpy, which it is for a linear simulator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from learning import function_posterior
+from learning.domain_models import uniform
+from learning.function_posterior import DRAWS, infer
+from learning.gap import EXPECTED_GAP, MIDDLE_LENGTH, TINY
+from learning.normaliser import Normaliser
+
+UNITS = Normaliser(
+    torch.tensor([0.5, -1.0]), torch.tensor([2.0, 0.5]), torch.tensor([1.0, -2.0]), torch.tensor([2.0, 0.5])
+)
+NOISE = torch.tensor([0.2, 0.1])
+EMPTY = torch.zeros(0, 2)
+
+
+def features(x):
+    """Of two outputs, in numpy (O, N, 3)."""
+    a, b = np.asarray(x, dtype=float).T
+    return np.stack([np.stack([a, b, np.ones_like(a)], axis=1), np.stack([0 * a, 0.3 * a, np.sin(b)], axis=1)])
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Two outputs, linear in three standard normal parameters: a Gaussian process."""
+
+    size: int = 3
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        return uniform(((-3.0, 4.0), (-2.0, 0.0)), count, generator)
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        return normal
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        return torch.einsum("onk,pk->pno", torch.tensor(features(inputs)).to(parameters), parameters)
+
+
+def rows(count, seed=0, noise=NOISE):
+    """Inputs and outputs, which the linear simulator cannot wholly explain."""
+    rng = np.random.default_rng(seed)
+    x = np.stack([rng.uniform(-3, 4, count), rng.uniform(-2, 0, count)], axis=1)
+    return tensors(x, truth(x) + noise.numpy() * rng.normal(size=(count, 2)))
+
+
+def truth(x):
+    x = np.asarray(x, dtype=float)
+    wave = np.stack([0.5 * np.sin(2 * x[:, 0]), 0.2 * np.cos(3 * x[:, 1])], axis=1)
+    return (features(x) @ np.array([0.8, -1.1, 0.4])).T + wave
+
+
+def tensors(*arrays):
+    return [torch.tensor(a, dtype=torch.float32) for a in arrays]
+
+
+def kernel(gap, first, second):
+    """The gap's covariance at raw inputs, of raw outputs (O, N, M)."""
+    a, b = ((np.asarray(v, dtype=float) - UNITS.input_mean.numpy()) / UNITS.input_std.numpy() for v in (first, second))
+    found = []
+    for k, unit in enumerate(UNITS.output_std.double().numpy()):
+        s, length, w, c = (v[k].double().numpy() for v in (gap.scales, gap.lengths, gap.slopes, gap.offsets))
+        distance = (((a[:, None] - b[None]) / length) ** 2).sum(axis=2)
+        found.append(unit**2 * (s**2 * np.exp(-0.5 * distance) + (w * a) @ (w * b).T + c**2))
+    return np.stack(found)
+
+
+def apart(x, y, at, gap, noise):
+    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of the gap alone, output by output."""
+    means, covariances = [], []
+    between, within, own = kernel(gap, x, at), kernel(gap, x, x), kernel(gap, at, at)
+    for k, (middle, unit) in enumerate(zip(UNITS.output_mean.numpy(), UNITS.output_std.double().numpy(), strict=True)):
+        seen = within[k] + (noise[k] ** 2 + TINY * unit**2) * np.eye(len(x))
+        gain = np.linalg.solve(seen, between[k]).T
+        means.append(middle + gain @ (np.asarray(y, dtype=float)[:, k] - middle))
+        covariances.append(own[k] - gain @ between[k])
+    covariance = np.stack(covariances)
+    return np.stack(means, axis=1), np.sqrt(covariance.diagonal(axis1=1, axis2=2).T + noise**2), covariance
+
+
+def raw_noise(posterior):
+    return (posterior.noise_std * UNITS.output_std).double().numpy()
+
+
+def together(x, y, at, gap, noise):
+    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of simulator and gap, in numpy.
+
+    Outputs share the simulator's parameters, so that all rows of all outputs are conditioned on at once.
+    """
+    n, m, units = len(x), len(at), UNITS.output_std.double().numpy()
+
+    def joint(first, second):
+        """Covariances (2 N, 2 M), output by output."""
+        a, b = (np.concatenate(features(v)) for v in (first, second))
+        of_gap = np.zeros((len(a), len(b)))
+        if gap is not None:
+            for k, block in enumerate(kernel(gap, first, second)):
+                of_gap[k * len(first) : (k + 1) * len(first), k * len(second) : (k + 1) * len(second)] = block
+        return a @ b.T + of_gap
+
+    seen = joint(x, x) + np.diag(np.repeat(noise**2 + TINY * units**2, n))
+    gain = np.linalg.solve(seen, joint(x, at)).T
+    mean = (gain @ np.asarray(y, dtype=float).T.ravel()).reshape(2, m)
+    covariance = joint(at, at) - gain @ joint(x, at)
+    blocks = np.stack([covariance[k * m : (k + 1) * m, k * m : (k + 1) * m] for k in range(2)])
+    return mean.T, np.sqrt(blocks.diagonal(axis1=1, axis2=2).T + noise**2), blocks
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Without a simulator."""
+    return infer(None, TestWithoutSimulator.x, TestWithoutSimulator.y, UNITS, NOISE)
+
+
+class TestWithoutSimulator:
+    """The exact Gaussian process with the covariance that was found."""
+
+    x, y = rows(30)
+
+    def test_predictions_are_the_gaussian_processs(self, found):
+        at, _ = rows(1500, seed=1)
+        mean, std = found.predict(at)
+        theirs, exact, _ = apart(self.x, self.y, at, found.gap, raw_noise(found))
+        assert np.allclose(mean, theirs, atol=2e-5)
+        assert np.allclose(std, exact, rtol=1e-5)
+
+    def test_marginals_are_the_gaussian_processs(self, found):
+        at, _ = rows(35, seed=2)
+        means, covariances = found.marginals(at.view(7, 5, 2))
+        units = UNITS.output_std.numpy()
+        for k in range(7):
+            mean, _, exact = apart(self.x, self.y, at[5 * k : 5 * k + 5], found.gap, raw_noise(found))
+            assert np.allclose(means[k].numpy().T * units + UNITS.output_mean.numpy(), mean, atol=2e-5)
+            assert np.allclose(covariances[k], exact / units[:, None, None] ** 2, atol=2e-5)
+
+    def test_its_prediction_is_near_the_truth_where_there_are_rows(self, found):
+        """A function of size 2 and 0.6, seen through noise of 0.2 and 0.1."""
+        at, _ = rows(200, seed=3)
+        error = found.predict(at)[0].numpy() - truth(at)
+        assert (np.sqrt((error**2).mean(axis=0)) < [0.4, 0.15]).all()
+
+
+def over_seeds(x, y, at, count, **settings):
+    """Errors of mean (count, M, 2) in exact standard deviations of the function, and ratios of the variances."""
+    off, ratios = [], []
+    for seed in range(count):
+        found = infer(Linear(), x, y, UNITS, NOISE, seed=seed, **settings)
+        mean, std = found.predict(at)
+        theirs, exact, _ = together(x, y, at, found.gap, raw_noise(found))
+        own, wanted = (v**2 - raw_noise(found) ** 2 for v in (std.double().numpy(), exact))
+        off.append((mean.numpy() - theirs) / np.sqrt(wanted))
+        ratios.append(own / wanted)
+    return np.stack(off), np.stack(ratios)
+
+
+class TestWithSimulator:
+    at, _ = rows(40, seed=1)
+
+    @pytest.mark.parametrize("settings", [{}, {"gap_std": torch.tensor([0.1, 0.03])}, {"with_gap": False}])
+    def test_it_is_the_gaussian_process_of_simulator_and_gap(self, settings):
+        """Within the error of 128 draws of the parameters, and closer on the average of six seeds."""
+        off, ratios = over_seeds(*rows(12), self.at, 6, **settings)
+        assert np.abs(off).max() < 4.0 / math.sqrt(DRAWS)
+        assert np.abs(ratios - 1.0).max() < 4.5 * math.sqrt(2.0 / DRAWS)
+        assert np.abs(off.mean(axis=0)).max() < 2.0 / math.sqrt(DRAWS)
+        assert np.abs(ratios.mean(axis=0) - 1.0).max() < 2.0 * math.sqrt(2.0 / DRAWS)
+
+    def test_marginals_are_those_of_the_same_process(self):
+        x, y = rows(12)
+        found = infer(Linear(), x, y, UNITS, NOISE)
+        means, covariances = found.marginals(self.at[:20].view(4, 5, 2))
+        units = UNITS.output_std.numpy()
+        for k in range(4):
+            mean, _, exact = together(x, y, self.at[5 * k : 5 * k + 5], found.gap, raw_noise(found))
+            exact = exact / units[:, None, None] ** 2
+            std = np.sqrt(exact.diagonal(axis1=1, axis2=2))
+            assert (np.abs(means[k].numpy().T * units + UNITS.output_mean.numpy() - mean) / units < 0.35 * std.T).all()
+            scaled = (covariances[k].numpy() - exact) / (std[:, :, None] * std[:, None, :])
+            assert np.abs(scaled).max() < 0.5
+
+    def test_without_a_gap_the_noise_is_the_expected_one(self):
+        found = infer(Linear(), *rows(12), UNITS, NOISE, with_gap=False)
+        assert found.gap is None
+        assert np.allclose(raw_noise(found), NOISE)
+        assert math.isinf(found.freedom)
+
+    def test_of_a_right_simulator_the_gap_is_smaller(self):
+        """Rows of the simulator itself, and rows with waves that it cannot make."""
+        x, wrong = rows(100)
+        (right,) = tensors((features(x) @ np.array([0.8, -1.1, 0.4])).T)
+        right += NOISE * torch.randn(right.shape, generator=torch.Generator().manual_seed(1))
+        small, large = (infer(Linear(), x, y, UNITS, NOISE).gap.scales for y in (right, wrong))
+        assert (small < 0.7 * large).all()
+        assert (small < EXPECTED_GAP).all()
+
+
+class TestWithoutRows:
+    at, _ = rows(10, seed=1)
+
+    @pytest.mark.parametrize("expected", [None, torch.tensor([0.3, 0.7])])
+    def test_it_is_the_simulators_draws_and_the_expected_gap(self, expected):
+        found = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, gap_std=expected)
+        means, covariances = found.marginals(self.at.view(2, 5, 2))
+        assert found.parameters.shape == (DRAWS, 3)
+        drawn = np.einsum("onk,pk->pon", features(self.at), found.parameters.double().numpy())
+        drawn = (drawn - UNITS.output_mean.numpy()[:, None]) / UNITS.output_std.numpy()[:, None]
+        size = [EXPECTED_GAP] * 2 if expected is None else (expected / UNITS.output_std).tolist()
+        x = (self.at.double().numpy() - UNITS.input_mean.numpy()) / UNITS.input_std.numpy()
+        distance = ((x[:, None] - x[None]) ** 2).sum(axis=2)
+        for k in range(2):
+            of_gap = size[k] ** 2 * (np.exp(-0.5 * distance / MIDDLE_LENGTH**2) + x @ x.T + 1.0)
+            exact = np.cov(drawn[:, k].T, bias=True) + of_gap
+            assert np.allclose(means[:, k].flatten(), drawn[:, k].mean(axis=0), atol=1e-5)
+            for b in range(2):
+                some = slice(5 * b, 5 * b + 5)
+                assert np.allclose(covariances[b, k], exact[some, some], atol=1e-4)
+
+    def test_draws_of_the_parameters_are_the_priors(self):
+        mean, std = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, with_gap=False).predict(self.at)
+        exact = np.sqrt((features(self.at) ** 2).sum(axis=2).T + NOISE.numpy() ** 2)
+        assert np.abs(mean.numpy() / exact).max() < 4.0 / math.sqrt(DRAWS)
+        assert np.allclose(std, exact, rtol=4.0 / math.sqrt(2.0 * DRAWS))
+
+
+class TestOutliers:
+    """Four rows of a hundred are off by some thirty, or three hundred, times the noise."""
+
+    noise = torch.tensor([0.1, 0.05])
+    x, y = rows(100, noise=noise)
+    at, _ = rows(200, seed=5)
+
+    def spoilt(self, size):
+        off = torch.tensor([[1.0, 0.3], [-1.0, 0.25], [1.2, -0.25], [0.9, -0.3]])
+        return self.y.index_add(0, torch.tensor([3, 30, 60, 90]), size * off)
+
+    def error(self, mean):
+        return np.sqrt(((np.asarray(mean) - truth(self.at)) ** 2).mean(axis=0))
+
+    @pytest.mark.parametrize("model", [None, Linear()])
+    @pytest.mark.parametrize("size", [3.0, 30.0])
+    def test_they_hardly_move_the_prediction(self, model, size):
+        """An ordinary Gaussian process with the same covariance follows them."""
+        y = self.spoilt(size)
+        found, clean = (infer(model, self.x, v, UNITS, self.noise) for v in (y, self.y))
+        ours = self.error(found.predict(self.at)[0])
+        assert (ours < self.error(clean.predict(self.at)[0]) + 0.2 * self.noise.numpy()).all()
+        assert found.freedom < 10.0
+        assert np.allclose(raw_noise(found), self.noise, rtol=0.5)
+        ordinary = together if model else apart
+        theirs = ordinary(self.x, y, self.at, found.gap, raw_noise(found))[0]
+        assert (self.error(theirs) > 3.0 * ours).all()
+
+    def test_what_is_learned_of_few_rows_is_gaussian(self):
+        assert math.isinf(infer(None, self.x[:39], self.spoilt(3.0)[:39], UNITS, self.noise).freedom)
+
+
+def test_the_same_seed_gives_the_same_numbers():
+    at, _ = rows(5, seed=1)
+    first, second, other = (infer(Linear(), *rows(8), UNITS, NOISE, seed=s).predict(at) for s in (2, 2, 3))
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1], second[1])
+    assert not torch.equal(first[0], other[0])
+
+
+def test_of_too_many_rows_some_are_taken(monkeypatch):
+    monkeypatch.setattr(function_posterior, "LARGEST", 25)
+    x, y = rows(60)
+    found = infer(None, x, y, UNITS, NOISE)
+    places = UNITS.inputs(x).double()
+    taken = [int((places == row).all(dim=1).nonzero().item()) for row in found.inputs]
+    assert len(set(taken)) == 25
+    at, _ = rows(10, seed=1)
+    theirs, _, _ = apart(x[taken], y[taken], at, found.gap, raw_noise(found))
+    assert np.allclose(found.predict(at)[0], theirs, atol=2e-5)

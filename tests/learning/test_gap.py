@@ -1,0 +1,174 @@
+"""The gap's covariance against its formula, and what is learned of it against scipy and known processes."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+from scipy.stats import multivariate_normal
+
+from learning.gap import (
+    MIDDLE_LENGTH,
+    TINY,
+    WIDTH_LENGTH,
+    WIDTH_NOISE,
+    WIDTH_SCALE,
+    WIDTH_SLOPE,
+    GapCovariance,
+    learn_gap,
+    log_evidence,
+)
+
+
+def positive(*shape, seed=0):
+    return torch.tensor(np.random.default_rng(seed).uniform(0.3, 2.0, shape))
+
+
+def normal(*shape, seed=0):
+    return torch.tensor(np.random.default_rng(seed).normal(size=shape))
+
+
+GAP = GapCovariance(positive(2), positive(2, 3, seed=1), positive(2, 3, seed=2), positive(2, seed=3))
+
+
+def kernel(gap, output, first, second):
+    """The formula entry by entry (N, M)."""
+    s, length, w, c = (v[output].numpy() for v in (gap.scales, gap.lengths, gap.slopes, gap.offsets))
+
+    def entry(a, b):
+        return s**2 * np.exp(-np.sum(((a - b) / length) ** 2) / 2) + np.dot(w * a, w * b) + c**2
+
+    return np.array([[entry(a, b) for b in np.asarray(second)] for a in np.asarray(first)])
+
+
+def smooth(x, scale, lengths):
+    """Squared-exponential covariance in numpy (N, N)."""
+    off = (x[:, None] - x[None]) / lengths
+    return scale**2 * np.exp(-0.5 * (off**2).sum(axis=2))
+
+
+class TestCovariance:
+    def test_it_is_its_formula(self):
+        first, second = normal(5, 3, seed=4), normal(4, 3, seed=5)
+        for output in range(2):
+            assert np.allclose(GAP(first, second)[output], kernel(GAP, output, first, second), atol=1e-12)
+            assert np.allclose(GAP(first)[output], kernel(GAP, output, first, first), atol=1e-12)
+
+    def test_inputs_may_come_in_batches(self):
+        first, second = normal(6, 5, 3, seed=4), normal(6, 4, 3, seed=5)
+        found, alone = GAP(first, second), GAP(first)
+        assert found.shape == (2, 6, 5, 4)
+        for output in range(2):
+            for b in range(6):
+                assert np.allclose(found[output, b], kernel(GAP, output, first[b], second[b]), atol=1e-12)
+                assert np.allclose(alone[output, b], kernel(GAP, output, first[b], first[b]), atol=1e-12)
+
+    def test_before_data_all_parts_are_of_the_expected_size(self):
+        found = GapCovariance.before_data(3, torch.tensor([0.5, 2.0]))
+        a, b = normal(3, seed=6), normal(3, seed=7)
+        shape = np.exp(-0.5 * float(((a - b) ** 2).sum()) / MIDDLE_LENGTH**2) + float(a @ b) + 1.0
+        assert np.allclose(found(a[None], b[None])[:, 0, 0], [0.25 * shape, 4.0 * shape], atol=1e-12)
+
+
+def test_the_evidence_is_scipys():
+    residual, roots = normal(6, 2), normal(2, 6, 6, seed=1)
+    covariance = roots @ roots.transpose(1, 2) + 0.1 * torch.eye(6)
+    theirs = sum(multivariate_normal(np.zeros(6), covariance[k]).logpdf(residual[:, k]) for k in range(2))
+    assert float(log_evidence(residual, torch.linalg.cholesky(covariance))) == pytest.approx(theirs, rel=1e-10)
+
+
+def test_what_is_learned_is_nearly_the_most_probable():
+    """Against scipy's minimum of the same surprise, with one output and one input."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-2, 2, (30, 1))
+    y = np.sin(2 * x[:, 0]) + 0.2 * rng.normal(size=30)
+    known = 0.1 * x @ x.T
+    trust = np.where(np.arange(30) < 25, 1.0, 0.3)
+    middles = np.log([0.5, MIDDLE_LENGTH, 0.5, 0.5, 0.3])
+    widths = np.array([WIDTH_SCALE, WIDTH_LENGTH, WIDTH_SLOPE, WIDTH_SLOPE, WIDTH_NOISE])
+
+    def surprise(logs):
+        s, length, w, c, noise = np.exp(logs)
+        covariance = smooth(x, s, length) + w**2 * x @ x.T + c**2 + known + np.diag(noise**2 / trust + TINY)
+        return -multivariate_normal(np.zeros(30), covariance).logpdf(y) + 0.5 * np.sum(((logs - middles) / widths) ** 2)
+
+    gap, noise = learn_gap(
+        torch.tensor(x), torch.tensor(y)[:, None], torch.tensor(known)[None], torch.tensor([0.3]), torch.tensor([0.5]),
+        torch.tensor(trust),
+    )  # fmt: skip
+    found = np.log([float(v.squeeze()) for v in (gap.scales, gap.lengths, gap.slopes, gap.offsets, noise)])
+    best = minimize(surprise, middles, method="L-BFGS-B")
+    assert surprise(middles) > best.fun + 10.0
+    assert surprise(found) < best.fun + 0.05
+    assert np.allclose(found, best.x, atol=0.15)
+
+
+@pytest.fixture(scope="module")
+def process():
+    """150 rows and 60 more of two outputs; the first does not depend on the second input, the second not on the first.
+
+    Of lengths 0.8 and 1.2, noises 0.1 and 0.25, and expected to have noises 0.2 and 0.2.
+    """
+    rng = np.random.default_rng(1)
+    x = rng.uniform(-2, 2, (210, 2))
+    shapes = [smooth(x, 1.0, np.array([0.8, np.inf])), smooth(x, 0.7, np.array([np.inf, 1.2]))]
+    drawn = [np.linalg.cholesky(k + 1e-9 * np.eye(210)) @ rng.normal(size=210) for k in shapes]
+    y = np.stack(drawn, axis=1) + np.array([0.1, 0.25]) * rng.normal(size=(210, 2))
+    expected = torch.tensor([0.3, 0.3])
+    gap, noise = learn_gap(
+        torch.tensor(x[:150]), torch.tensor(y[:150]), None, torch.tensor([0.2, 0.2]), expected, torch.ones(150)
+    )
+    return x, y, gap, noise
+
+
+class TestOfAKnownProcess:
+    def test_the_noise_is_found(self, process):
+        assert np.allclose(process[3], [0.1, 0.25], rtol=0.3)
+
+    def test_an_input_that_does_not_count_has_the_longer_length(self, process):
+        lengths = process[2].lengths
+        assert lengths[0, 1] > 3.0 * lengths[0, 0]
+        assert lengths[1, 0] > 2.0 * lengths[1, 1]
+        assert float(lengths[0, 0]) == pytest.approx(0.8, rel=0.5)
+        assert float(lengths[1, 1]) == pytest.approx(1.2, rel=0.5)
+
+    def test_other_rows_are_less_surprising_than_before(self, process):
+        x, y, gap, noise = process
+
+        def of_others(covariance, stds):
+            """Log density of the last 60 rows given the first 150."""
+            total = 0.0
+            for k in range(2):
+                full = kernel(covariance, k, x, x) + float(stds[k]) ** 2 * np.eye(210)
+                total += multivariate_normal(np.zeros(210), full).logpdf(y[:, k])
+                total -= multivariate_normal(np.zeros(150), full[:150, :150]).logpdf(y[:150, k])
+            return total
+
+        before = of_others(GapCovariance.before_data(2, torch.tensor([0.3, 0.3])), [0.2, 0.2])
+        assert of_others(gap, noise) > before + 15.0
+
+
+def test_what_the_simulator_doubts_is_no_gap():
+    """A residual that is all a line of unknown slope: a gap only where the simulator claims to know it."""
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-2, 2, (40, 1))
+    y = torch.tensor(1.5 * x + 0.05 * rng.normal(size=(40, 1)))
+    x = torch.tensor(x)
+    settings = (torch.tensor([0.05]), torch.tensor([0.1]), torch.ones(40))
+    sure, _ = learn_gap(x, y, None, *settings)
+    doubtful, noise = learn_gap(x, y, 4.0 * (x @ x.T)[None], *settings)
+    at = torch.tensor([[2.0]], dtype=torch.float64)
+    assert float(sure(at)) > 1.0
+    assert float(doubtful(at)) < 0.1
+    assert float(noise) == pytest.approx(0.05, rel=0.3)
+
+
+def test_rows_that_are_not_trusted_leave_the_noise_alone():
+    """One row in five is twenty times as noisy, and known to be: its variance is divided by 1/400."""
+    rng = np.random.default_rng(3)
+    x = torch.tensor(rng.uniform(-2, 2, (100, 1)))
+    trust = torch.ones(100, dtype=torch.float64)
+    trust[::5] = 1.0 / 400.0
+    y = 0.5 * x + 0.1 * torch.tensor(rng.normal(size=(100, 1))) / trust[:, None].sqrt()
+    expected = (torch.tensor([0.15]), torch.tensor([0.3]))
+    assert float(learn_gap(x, y, None, *expected, trust)[1]) == pytest.approx(0.1, rel=0.2)
+    assert float(learn_gap(x, y, None, *expected, torch.ones(100))[1]) > 0.4

@@ -1,0 +1,293 @@
+"""A learned car as an environment, against the same drives by hand, the scalar safety gate and the task's formulas."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from carlab.core.geofence import can_stop_inside, rectangle
+from carlab.core.quantities import Action, CarState
+from carlab.core.safety import SafetyEnvelope, limit
+from carlab.core.task import ParkingTask
+from learning.model_env import REWARD_SCALE, ModelEnv, policy_view
+from learning.sac import FastSac
+
+HISTORY = 2
+WIDTH = 7 + 2 * HISTORY
+PERIOD_S = 1 / 30
+TASK = replace(ParkingTask(), history_length=HISTORY, max_ticks=10**9)
+
+
+@dataclass
+class Rolling:
+    """A car without doubt: throttle pushes it and steering turns it, one command late."""
+
+    history: int = HISTORY
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        v, late = inputs[:, 0], inputs[:, 5:7]
+        zero = torch.zeros_like(v)
+        turn = 0.1 * v * late[:, 0]
+        return torch.stack([v * PERIOD_S, 0.1 * turn, turn, 0.2 * late[:, 1] - 0.05 * v, zero, zero], dim=1)
+
+
+def by_hand(state: np.ndarray, late: np.ndarray) -> np.ndarray:
+    """Where ``Rolling`` takes one car in the room."""
+    x, y, yaw, v, *sideways = state
+    turn = 0.1 * v * late[0]
+    ahead, left = v * PERIOD_S, 0.1 * turn
+    x, y = x + math.cos(yaw) * ahead - math.sin(yaw) * left, y + math.sin(yaw) * ahead + math.cos(yaw) * left
+    return np.array([x, y, yaw + turn, v + 0.2 * late[1] - 0.05 * v, *sideways])
+
+
+def parking_reward(state: np.ndarray, action: np.ndarray) -> float:
+    """The formula of the paper: tolerance of distance and yaw error less the cost of the action."""
+    yaw_error = (state[2] + math.pi) % (2 * math.pi) - math.pi
+    beyond = max(math.sqrt(state[0] ** 2 + state[1] ** 2 + yaw_error**2) - 0.1, 0.0) / 2.0
+    return 1.0 / (1.0 + 9.0 * beyond**2) - 0.005 * float(action @ action)
+
+
+class Still:
+    """A car that never moves."""
+
+    history = HISTORY
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        return torch.zeros(len(inputs), 6)
+
+
+def rows_of(states: np.ndarray, past: np.ndarray | None = None) -> np.ndarray:
+    """Features of states (N, 6), after commands (N, 2 H) or none."""
+    past = np.zeros((len(states), 2 * HISTORY)) if past is None else past
+    yaw = states[:, 2:3]
+    return np.hstack([states[:, :2], np.sin(yaw), np.cos(yaw), states[:, 3:], past])
+
+
+def state_of(features: np.ndarray) -> np.ndarray:
+    return np.array([*features[:2], math.atan2(features[2], features[3]), *features[4:7]])
+
+
+def test_steps_and_rewards_are_those_by_hand() -> None:
+    env = ModelEnv(Rolling(), TASK, 6, seed=1)
+    env.reset()
+    rng = np.random.default_rng(0)
+    before = env.features.numpy().astype(np.float64)
+    states = [state_of(row) for row in before]
+    past = before[:, 7:].reshape(6, HISTORY, 2)
+    for _ in range(4):
+        commands = rng.uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
+        seen, rewards, done, _ = env.step(commands)
+        assert not done.any()
+        states = [by_hand(s, p[-1]) for s, p in zip(states, past, strict=True)]
+        past = np.concatenate([past[:, 1:], commands[:, None]], axis=1)
+        wanted = rows_of(np.array(states), past.reshape(6, -1))
+        np.testing.assert_allclose(env.features.numpy(), wanted, atol=1e-5)
+        np.testing.assert_allclose(seen, wanted / [2, 2, 1, 1, 2, 1, 4, 1, 1, 1, 1], atol=1e-5)
+        by_formula = [parking_reward(s, a) for s, a in zip(states, commands, strict=True)]
+        np.testing.assert_allclose(rewards, REWARD_SCALE * np.array(by_formula), atol=1e-4)
+
+
+def test_commands_pass_the_gate_of_the_real_car() -> None:
+    """Limits and slew rates: what the features say was sent is what the scalar gate sends."""
+    envelope = SafetyEnvelope(max_steering=0.9, max_throttle=0.5, steering_rate_per_s=12.0, throttle_rate_per_s=4.0)
+    env = ModelEnv(Still(), TASK, 50, envelope=envelope, period_s=PERIOD_S, seed=0)
+    env.reset()
+    rng = np.random.default_rng(0)
+    sent = [Action(0.0, 0.0)] * 50
+    for _ in range(8):
+        asked = rng.uniform(-1.5, 1.5, (50, 2)).astype(np.float32)
+        env.step(asked)
+        sent = [
+            limit(Action.from_array(a), s, PERIOD_S, envelope) for a, s in zip(asked.astype(float), sent, strict=True)
+        ]
+        np.testing.assert_allclose(env.features[:, -2:].numpy(), [a.to_array() for a in sent], atol=1e-6)
+    assert max(abs(a.throttle) for a in sent) > 0.3
+
+
+def test_a_car_ends_where_the_gate_would_stop_it() -> None:
+    """For good, not cut off: there is nothing to be had from a car that was stopped."""
+    envelope = SafetyEnvelope(max_speed_mps=2.5, arena_m=rectangle(-1.0, 2.0, -1.5, 0.5))
+    rng = np.random.default_rng(0)
+    states = rng.uniform([-1.0, -1.5, -math.pi, -3.0, -1.0, -4.0], [2.0, 0.5, math.pi, 3.0, 1.0, 4.0], (600, 6))
+    states[::10] = [2.1, 0.0, 0.3, 0.0, 0.0, 0.0]  # it stands outside
+    env = ModelEnv(Still(), TASK, 400, recorded=rows_of(states), from_recorded=1.0, envelope=envelope)
+    env.reset()
+    now = [CarState.from_array(state_of(row)) for row in env.features.numpy().astype(np.float64)]
+    _, _, done, infos = env.step(np.zeros((400, 2), np.float32))
+    wanted = [
+        s.speed_mps > 2.5 or not can_stop_inside(envelope.arena_m, s, envelope.reaction_s, envelope.deceleration_mps2)
+        for s in now
+    ]
+    assert done.tolist() == wanted
+    assert 50 < sum(wanted) < 350
+    assert all(info["TimeLimit.truncated"] is False for info, ended in zip(infos, done, strict=True) if ended)
+    assert all(info == {} for info, ended in zip(infos, done, strict=True) if not ended)
+
+
+def test_the_arena_is_that_of_the_task_where_the_car_has_none() -> None:
+    outside, inside = np.array([[2.9, 0.0, 0, 0, 0, 0]]), np.array([[2.7, 0.0, 0, 0, 0, 0]])
+    for states, wanted in ((outside, True), (inside, False)):
+        env = ModelEnv(Still(), TASK, 1, recorded=rows_of(states), from_recorded=1.0)
+        env.reset()
+        assert bool(env.step(np.zeros((1, 2), np.float32))[2][0]) is wanted
+
+
+def test_an_episode_is_cut_off_after_the_ticks_of_the_task() -> None:
+    task = replace(TASK, max_ticks=7)
+    env = ModelEnv(Rolling(), task, 200, seed=0)
+    env.reset()
+    commands = np.full((200, 2), 0.3, np.float32)
+    ended = np.zeros(200, dtype=int)
+    for tick in range(14):
+        driven = [by_hand(state_of(f), f[9:11]) for f in env.features.numpy().astype(np.float64)]
+        past = np.hstack([env.features.numpy()[:, 9:11], commands])
+        seen, _, done, infos = env.step(commands)
+        ended += done
+        if tick == 0:
+            assert 10 < done.sum() < 60, "episodes end at different ticks from the first"
+        if tick == 6:
+            assert (ended == 1).all()
+        final = policy_view(rows_of(np.array(driven), past))
+        for k in np.flatnonzero(done):
+            assert infos[k]["TimeLimit.truncated"] is True
+            np.testing.assert_allclose(infos[k]["terminal_observation"], final[k], atol=1e-5)
+            assert np.all(seen[k][7:] == 0.0), "a new start has no command behind it"
+            assert abs(seen[k][0] * 2 - 1.42) < 0.1 + 1e-6
+    assert (ended == 2).all()
+
+
+def test_a_parked_car_ends_its_episode_where_the_task_says_so() -> None:
+    states = np.array([[0.05, 0.0, 0.1, 0.0, 0.0, 0.0]])
+    for stop in (True, False):
+        env = ModelEnv(Still(), replace(TASK, stop_when_parked=stop), 1, recorded=rows_of(states), from_recorded=1.0)
+        env.reset()
+        _, _, done, infos = env.step(np.zeros((1, 2), np.float32))
+        assert bool(done[0]) is stop
+        if stop:
+            assert infos[0]["TimeLimit.truncated"] is False
+            assert infos[0]["terminal_observation"][0] == pytest.approx(0.025)
+
+
+def test_the_last_tick_of_a_car_that_parks_is_no_cut() -> None:
+    task = replace(TASK, stop_when_parked=True, max_ticks=1)
+    env = ModelEnv(Still(), task, 1, recorded=rows_of(np.zeros((1, 6))), from_recorded=1.0)
+    env.reset()
+    assert env.step(np.zeros((1, 2), np.float32))[3][0]["TimeLimit.truncated"] is False
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_starts_are_recorded_ones_in_the_share_asked_for(share: float) -> None:
+    rng = np.random.default_rng(0)
+    recorded = rng.uniform(-0.5, 0.5, (10, WIDTH))
+    env = ModelEnv(Still(), TASK, 4000, recorded=recorded, from_recorded=share, seed=3)
+    env.reset()
+    rows = env.features.numpy()
+    near = np.abs(rows[:, None] - recorded[None]).max(axis=2)
+    again = near.min(axis=1) < 1e-6
+    assert again.mean() == pytest.approx(share, abs=4 * math.sqrt(share * (1 - share) / 4000))
+    if share:
+        often = np.bincount(near.argmin(axis=1)[again], minlength=10)
+        assert often.min() > 0.6 * often.mean()
+    fresh = rows[~again]
+    if share < 1:
+        assert np.all(fresh[:, 7:] == 0.0)
+        assert np.ptp(fresh[:, 0]) == pytest.approx(0.2, abs=0.01)
+        assert fresh[:, 1].mean() == pytest.approx(-1.04, abs=0.01)
+        yaw = np.angle(np.exp(1j * (np.arctan2(fresh[:, 2], fresh[:, 3]) - math.pi)))
+        assert np.abs(yaw).max() == pytest.approx(0.1 * math.pi, abs=0.01)
+
+
+def test_without_recordings_every_start_is_the_tasks() -> None:
+    env = ModelEnv(Still(), TASK, 100, recorded=np.zeros((0, WIDTH)), from_recorded=1.0)
+    env.reset()
+    assert np.all(np.abs(env.features[:, 0].numpy() - 1.42) <= 0.1 + 1e-6)
+
+
+def test_a_rollout_counts_each_car_until_its_end() -> None:
+    """Cars that hold different throttles from one start; some leave the arena on the way."""
+    task = replace(TASK, start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=60)
+    throttle = np.linspace(-0.5, 0.6, 12)
+    envelope = SafetyEnvelope(arena_m=task.arena_m)
+    recorded = rows_of(np.array([[0.1, 0.2, 0.3, 0.0, 0.0, 0.0]]))
+    env = ModelEnv(Rolling(), task, 12, recorded=recorded, from_recorded=1.0, envelope=envelope)
+    commands = np.stack([np.full(12, 0.3), throttle], axis=1).astype(np.float32)
+    views: list[np.ndarray] = []
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        views.append(seen.copy())
+        return commands
+
+    total, last = env.rolled_out(act)
+    assert len(views) == 60
+    assert views[0].shape == (12, WIDTH)
+    lengths = []
+    for k in range(12):
+        state, late, reward, ticks = np.array([1.42, -1.04, math.pi, 0, 0, 0]), np.zeros(2), 0.0, 0
+        for _ in range(60):
+            state, late, ticks = by_hand(state, late), commands[k].astype(float), ticks + 1
+            reward += parking_reward(state, late)
+            if not can_stop_inside(task.arena_m, CarState.from_array(state), 0.15, 3.0):
+                break
+        lengths.append(ticks)
+        assert float(total[k]) == pytest.approx(reward, abs=1e-3)
+        np.testing.assert_allclose(last[k].numpy()[:7], rows_of(state[None])[0, :7], atol=1e-3)
+    assert len(set(lengths)) > 3
+    assert max(lengths) == 60
+    env.reset()
+    np.testing.assert_allclose(env.features.numpy(), np.repeat(recorded, 12, axis=0), atol=1e-6)
+
+
+def test_a_rollout_ends_a_car_that_has_parked() -> None:
+    task = replace(
+        TASK, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9,
+        stop_when_parked=True,
+    )  # fmt: skip
+    total, _ = ModelEnv(Still(), task, 3).rolled_out(lambda seen: np.zeros((3, 2), np.float32))
+    assert total.tolist() == pytest.approx([1.0] * 3), "one tick within the bound"
+    total, _ = ModelEnv(Still(), replace(task, stop_when_parked=False), 3).rolled_out(lambda s: np.zeros((3, 2)))
+    assert total.tolist() == pytest.approx([9.0] * 3)
+
+
+def test_the_same_seed_gives_the_same_starts() -> None:
+    first, second, other = (ModelEnv(Rolling(), TASK, 30, seed=s) for s in (4, 4, 5))
+    assert np.array_equal(first.reset(), second.reset())
+    assert not np.array_equal(first.reset(), other.reset())
+    first.seed(8)
+    second.seed(8)
+    assert np.array_equal(first.reset(), second.reset())
+
+
+def test_soft_actor_critic_of_stable_baselines_can_be_trained_in_it() -> None:
+    """Its replay holds true ends: a car that stands is where it was, on the tick that ends its episode as well."""
+    rng = np.random.default_rng(0)
+    states = rng.uniform([-1, -1, -3, 0, 0, 0], [1, 1, 3, 0, 0, 0], (500, 6))
+    env = ModelEnv(Still(), replace(TASK, max_ticks=5), 8, recorded=rows_of(states), from_recorded=1.0)
+    agent = FastSac(
+        "MlpPolicy", env, policy_kwargs={"net_arch": [8]}, learning_starts=40, buffer_size=4000, batch_size=16,
+        train_freq=(2, "step"), gradient_steps=3, seed=0, device="cpu",
+    )  # fmt: skip
+    agent.learn(400)
+    assert agent.num_timesteps == 400
+    assert agent._n_updates == 3 * (400 - 48) // 16 + 3
+    replay = agent.replay_buffer
+    assert replay is not None
+    ends = replay.dones[:50].astype(bool)
+    assert ends.mean() == pytest.approx(0.2, abs=0.02)
+    assert np.array_equal(replay.timeouts[:50].astype(bool), ends)
+    np.testing.assert_allclose(replay.next_observations[:50, :, :7], replay.observations[:50, :, :7], atol=1e-6)
+
+
+def test_a_policy_sees_numbers_of_size_one_and_nothing_far_outside() -> None:
+    features = np.array([[1.0, -3.0, 0.6, -0.8, 2.0, 0.5, 8.0, 0.1, -1.0], [500.0, -500.0, 0, 1, 100.0, 0, 0, 0, 0]])
+    kept = features.copy()
+    seen = policy_view(features)
+    assert seen.dtype == np.float32
+    assert seen[0].tolist() == pytest.approx([0.5, -1.5, 0.6, -0.8, 1.0, 0.5, 2.0, 0.1, -1.0])
+    assert seen[1].tolist() == [10.0, -10.0, 0.0, 1.0, 10.0, 0.0, 0.0, 0.0, 0.0]
+    assert np.array_equal(features, kept), "the features themselves stay"
+    assert np.array_equal(policy_view(features[0]), seen[0])

@@ -1,0 +1,181 @@
+"""Draws of a simulator's parameters against conjugate posteriors and quadrature."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from learning.domain_models import uniform
+from learning.normaliser import Normaliser
+from learning.parameter_posterior import posterior_parameters
+
+PRIOR_MEAN, PRIOR_STD = torch.tensor([1.0, -0.5, 0.2]), torch.tensor([0.5, 2.0, 1.0])
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def features(x):
+    """Of two outputs, in numpy (O, N, 3)."""
+    x = np.asarray(x)[:, 0]
+    return np.stack([np.stack([x, np.ones_like(x), x**2], axis=1), np.stack([np.sin(x), x, 0 * x], axis=1)])
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Two outputs, linear in three parameters that are normal and independent."""
+
+    size: int = 3
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        return uniform(((-2.0, 2.0),), count, generator)
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        return PRIOR_MEAN.to(normal) + PRIOR_STD.to(normal) * normal
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        return torch.einsum("onk,pk->pno", torch.tensor(features(inputs)).to(parameters), parameters)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A function of one standard normal parameter, the same at all inputs."""
+
+    shape: Callable[[Tensor], Tensor]
+    size: int = 1
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        return torch.zeros(count, 1)
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        return normal
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        return self.shape(parameters)[:, :, None].expand(-1, len(inputs), 1)
+
+
+UNITS = Normaliser(torch.zeros(1), torch.ones(1), torch.tensor([0.5, -1.0]), torch.tensor([2.0, 0.5]))
+PLAIN = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
+
+
+def conjugate(x, y, covariance):
+    """Mean and covariance of the linear model's parameters; ``covariance`` (O, n, n) in normalised outputs."""
+    prior = np.diag(1.0 / PRIOR_STD.double().numpy() ** 2)
+    precision, weighted = prior, prior @ PRIOR_MEAN.double().numpy()
+    for k, std in enumerate(UNITS.output_std.double().numpy()):
+        at = features(x.double())[k]
+        solved = np.linalg.solve(std**2 * covariance[k], np.column_stack([at, y[:, k].double().numpy()]))
+        precision, weighted = precision + at.T @ solved[:, :3], weighted + at.T @ solved[:, 3]
+    found = np.linalg.inv(precision)
+    return found @ weighted, found
+
+
+def material(rows, noise, seed=0):
+    """Rows of the linear model with a smooth error and noise, and their covariance in normalised outputs."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-2, 2, (rows, 1))
+    smooth = noise**2 * np.exp(-0.5 * (x - x.T) ** 2)
+    covariance = np.stack([smooth, 4.0 * smooth]) + noise**2 * np.eye(rows)
+    off = [np.linalg.cholesky(c) @ rng.normal(size=rows) for c in covariance]
+    truth = features(x) @ np.array([1.3, 1.0, -0.4])
+    y = truth.T + np.stack(off, axis=1) * UNITS.output_std.numpy()
+    return torch.tensor(x).float(), torch.tensor(y).float(), covariance
+
+
+@pytest.mark.parametrize(("rows", "noise"), [(1, 0.5), (6, 0.3), (60, 0.1), (100, 0.003)])
+def test_a_linear_simulator_has_its_conjugate_posterior(rows, noise):
+    """From a single row, which leaves the prior in two directions, to parameters known to a thousandth of it."""
+    x, y, covariance = material(rows, noise)
+    factor = torch.linalg.cholesky(torch.tensor(covariance))
+    draws = posterior_parameters(Linear(), x, y, factor, UNITS, 2000, generator()).double().numpy()
+    mean, exact = conjugate(x, y, covariance)
+    root = np.linalg.cholesky(exact)
+    # In units in which the posterior is standard normal: 2000 draws know their mean to 0.02.
+    white = np.linalg.solve(root, (draws - mean).T)
+    assert np.allclose(white.mean(axis=1), 0.0, atol=0.1)
+    assert np.allclose(np.cov(white), np.eye(3), atol=0.15)
+
+
+def test_draws_are_mostly_different_from_each_other():
+    x, y, covariance = material(60, 0.1)
+    draws = posterior_parameters(
+        Linear(), x, y, torch.linalg.cholesky(torch.tensor(covariance)), UNITS, 128, generator()
+    )
+    assert draws.shape == (128, 3)
+    assert len(torch.unique(draws, dim=0)) > 115
+
+
+def test_without_data_it_is_the_prior():
+    none = torch.zeros((2, 0, 0), dtype=torch.float64)
+    draws = posterior_parameters(Linear(), torch.zeros(0, 1), torch.zeros(0, 2), none, UNITS, 4000, generator())
+    assert draws.dtype == torch.float32
+    assert torch.allclose(draws.mean(dim=0), PRIOR_MEAN, atol=0.1)
+    assert torch.allclose(torch.cov(draws.T), torch.diag(PRIOR_STD**2), atol=0.15)
+
+
+def of_one(shape, seen, noise, count=2000):
+    """Draws (count,) of a curve's parameter given values ``seen``."""
+    y = torch.tensor(seen)[:, None]
+    factor = noise * torch.eye(len(y), dtype=torch.float64)[None]
+    found = posterior_parameters(Curve(shape), torch.zeros(len(y), 1), y, factor, PLAIN, count, generator(1))
+    return found[:, 0].double().numpy()
+
+
+def by_quadrature(log_likelihood):
+    """Places and weights of a posterior with a standard normal prior."""
+    at = np.linspace(-6.0, 6.0, 24_001)
+    with np.errstate(invalid="ignore"):
+        logs = np.nan_to_num(log_likelihood(at), nan=-np.inf) - 0.5 * at**2
+    weight = np.exp(logs - logs.max())
+    return at, weight / weight.sum()
+
+
+def test_both_of_two_answers_are_found():
+    """A narrow one that fits, and a wide one that fits worse: which is the likelier shifts while data gains weight."""
+
+    def shape(t):
+        return torch.where(t < 0.3, (t - 0.3) ** 2, ((t - 0.3) ** 2).clamp_max(1.3))
+
+    seen = [1.4, 1.45, 1.45, 1.5]
+    draws = of_one(shape, seen, 0.15)
+    at, weight = by_quadrature(lambda t: -0.5 * sum((s - shape(torch.tensor(t)).numpy()) ** 2 for s in seen) / 0.15**2)
+    below = at < 0.3
+    assert 0.3 < weight[below].sum() < 0.7
+    assert (draws < 0.3).mean() == pytest.approx(weight[below].sum(), abs=0.06)
+    for side, part in ((below, draws[draws < 0.3]), (~below, draws[draws >= 0.3])):
+        mean = (weight * at)[side].sum() / weight[side].sum()
+        std = np.sqrt((weight * (at - mean) ** 2)[side].sum() / weight[side].sum())
+        assert part.mean() == pytest.approx(mean, abs=0.2 * std)
+        assert part.std() == pytest.approx(std, rel=0.15)
+
+
+@pytest.mark.parametrize("broken", [float("nan"), float("inf")])
+def test_where_the_simulator_breaks_down_there_are_no_draws(broken):
+    """It does so for three quarters of the prior."""
+
+    def shape(t):
+        return torch.where(t > 0.7, t, torch.full_like(t, broken))
+
+    draws = of_one(shape, [0.5], 0.5)
+    at, weight = by_quadrature(lambda t: np.where(t > 0.7, -0.5 * ((0.5 - t) / 0.5) ** 2, np.nan))
+    mean = (weight * at).sum()
+    std = np.sqrt((weight * (at - mean) ** 2).sum())
+    assert draws.min() > 0.7
+    assert draws.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert draws.std() == pytest.approx(std, rel=0.1)
+
+
+def test_the_same_seed_gives_the_same_draws():
+    x, y, covariance = material(6, 0.3)
+    factor = torch.linalg.cholesky(torch.tensor(covariance))
+    first, second, other = (
+        posterior_parameters(Linear(), x, y, factor, UNITS, 64, generator(seed)) for seed in (3, 3, 4)
+    )
+    assert torch.equal(first, second)
+    assert not torch.equal(first, other)

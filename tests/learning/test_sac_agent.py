@@ -1,0 +1,226 @@
+"""A policy that is trained in a world whose best commands are evident; kept, judged, saved and driven with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from carlab.core.policy import Policy, PolicyInput
+from carlab.core.quantities import CarState, Observation
+from carlab.core.task import ParkingTask
+from learning.model_env import ModelEnv, policy_view
+from learning.sac_agent import AGENT_FILE, MOMENTS_FILE, SacAgent, SacPolicy, SacSettings
+
+HISTORY = 1
+SETTINGS = SacSettings(hidden=(32,), cars=32, warm_up=512, batch=128, discount=0.5, learning_rate=3e-3, temperature=0.3)
+SMALL = SacSettings(hidden=(8,), cars=16, warm_up=64, batch=32)
+X_M = np.array([-1.2, -0.6, 0.6, 1.2])
+
+
+@dataclass
+class Still:
+    """A car that changes by this number in everything, so unless it is told one it stands."""
+
+    history: int = HISTORY
+    change: float = 0.0
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        return torch.full((len(inputs), 6), self.change)
+
+
+@dataclass(frozen=True)
+class Sides(ParkingTask):
+    """Steer right always; push to the side that the car stands on."""
+
+    start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start_spread: tuple[float, float, float] = (1.4, 0.3, 0.1)
+    history_length: int = HISTORY
+    max_ticks: int = 10
+
+    def reward(self, features: Any, action: Any, next_features: Any) -> Any:
+        return torch.sign(features[:, 0]) * action[:, 1] - action[:, 0]
+
+
+def world(cars: int = 32, seed: int = 0, change: float = 0.0) -> ModelEnv:
+    return ModelEnv(Still(change=change), Sides(), cars, seed=seed)
+
+
+def features(x_m: np.ndarray) -> np.ndarray:
+    found = np.zeros((len(x_m), 7 + 2 * HISTORY))
+    found[:, 0], found[:, 3] = x_m, 1.0
+    return found
+
+
+def answers(agent: SacAgent) -> np.ndarray:
+    return agent.act(policy_view(features(X_M)))
+
+
+@pytest.fixture(scope="module")
+def trained() -> SacAgent:
+    agent = SacAgent(SETTINGS, seed=0)
+    agent.train(world(), 640)
+    return agent
+
+
+def test_it_learns_what_is_evident(trained: SacAgent) -> None:
+    steering, throttle = answers(trained).T
+    assert np.all(steering < -0.8)
+    assert np.all(throttle * np.sign(X_M) > 0.3)
+    total, _ = world(64, seed=3).rolled_out(trained.act)
+    assert float(total.mean()) > 15.0, "20 are to be had in ten ticks"
+
+
+def test_worlds_of_other_seeds_are_other_worlds() -> None:
+    ends = []
+    for seed in (1, 2):
+        env = world(16, seed)
+        SacAgent(SMALL, 0).train(env, 32)
+        ends.append(env.features.numpy())
+    assert not np.array_equal(*ends)
+
+
+def test_training_makes_as_many_steps_as_it_was_told_and_tells_them() -> None:
+    told: list[int] = []
+    figures = SacAgent(SMALL, 0).train(world(16), 160, told.append)
+    assert figures["train/n_updates"] == 160
+    assert told[0] == 0
+    assert told[-1] == 160
+    assert told == sorted(told)
+    assert all(np.isfinite(v) for v in figures.values())
+
+
+def test_a_policy_that_was_read_acts_alike_and_learns_on_from_there(trained: SacAgent, tmp_path: Path) -> None:
+    trained.save(tmp_path)
+    again = SacAgent.load(tmp_path, SETTINGS, seed=1)
+    np.testing.assert_array_equal(answers(again), answers(trained))
+    again.train(world(seed=5), 32)
+    assert not np.array_equal(answers(again), answers(trained))
+    fresh = SacAgent(SETTINGS, seed=1)
+    fresh.train(world(seed=5), 32)
+    learned, new = (float(world(64, seed=3).rolled_out(a.act)[0].mean()) for a in (again, fresh))
+    assert learned > 15.0 > new + 3.0
+
+
+@pytest.mark.parametrize(("values", "kept"), [((5, 4, 3, 2), 0), ((1, 2, 3, 4), 3), ((0, 7, 2, 7), 1)])
+def test_the_best_judged_policy_is_kept(values: tuple[float, ...], kept: int) -> None:
+    judged: list[np.ndarray] = []
+
+    def judge(agent: SacAgent) -> float:
+        judged.append(answers(agent))
+        return values[len(judged) - 1]
+
+    agent = SacAgent(SMALL, 0)
+    agent.train(world(16), 256, judge=judge, judged=4)
+    assert len(judged) == 4
+    assert all(not np.array_equal(a, b) for a, b in pairwise(judged))
+    np.testing.assert_array_equal(answers(agent), judged[kept])
+
+
+def let_diverge(agent: SacAgent, how: str) -> None:
+    env = world(16, change=float("nan") if how == "a world that is no number" else 0.0)
+    if how == "a rate far too large":
+        agent._settings = replace(SMALL, learning_rate=1e20)
+    agent.train(env, 256)
+
+
+@pytest.mark.parametrize("how", ["a rate far too large", "a world that is no number"])
+def test_of_a_policy_that_diverges_nothing_is_kept(how: str) -> None:
+    agent = SacAgent(SMALL, 0)
+    agent.train(world(16), 64)
+    before = answers(agent)
+    with pytest.raises(ValueError, match=r"diverged|constraint Real"):
+        let_diverge(agent, how)
+    np.testing.assert_array_equal(answers(agent), before)
+
+
+@pytest.mark.parametrize("how", ["a rate far too large", "a world that is no number"])
+def test_that_a_policy_diverges_is_told_in_a_sentence(how: str) -> None:
+    with pytest.raises(DataError, match=r"diverged"):
+        let_diverge(SacAgent(SMALL, 0), how)
+
+
+def test_whatever_stops_the_training_the_earlier_policy_is_kept() -> None:
+    def stop(agent: SacAgent) -> float:
+        raise KeyboardInterrupt
+
+    agent = SacAgent(SMALL, 0)
+    agent.train(world(16), 64)
+    before = answers(agent)
+    with pytest.raises(KeyboardInterrupt):
+        agent.train(world(16), 64, judge=stop)
+    np.testing.assert_array_equal(answers(agent), before)
+
+
+def view(row: np.ndarray) -> PolicyInput:
+    seen = Observation(CarState(), 0.0, 0.0, 0)
+    return PolicyInput(row, seen, 0, 0.0)
+
+
+def test_on_the_car_it_drives_by_its_mean_action_within_the_limits(trained: SacAgent) -> None:
+    policy = trained.policy()
+    assert isinstance(policy, SacPolicy)
+    assert isinstance(policy, Policy)
+    policy.reset()
+    for row, wanted in zip(features(X_M), answers(trained), strict=True):
+        np.testing.assert_array_equal(policy.act(view(row)).to_array(), wanted.astype(np.float64))
+    wild = np.random.default_rng(0).normal(size=(40, 7 + 2 * HISTORY)) * 1e4
+    actions = np.array([policy.act(view(row)).to_array() for row in wild])
+    assert np.abs(actions).max() <= 1.0
+    assert np.ptp(actions) > 0.5
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("saved")
+    agent = SacAgent(SMALL, 0)
+    agent.train(world(16), 32)
+    agent.save(folder)
+    return folder
+
+
+def copied(saved: Path, to: Path) -> Path:
+    for name in (AGENT_FILE, MOMENTS_FILE):
+        (to / name).write_bytes((saved / name).read_bytes())
+    return to
+
+
+BROKEN = [(n, k) for n in (AGENT_FILE, MOMENTS_FILE) for k in ("not there", "empty", "cut short", "other text")]
+
+
+@pytest.mark.parametrize(("name", "kind"), [*BROKEN, (AGENT_FILE, "text"), (MOMENTS_FILE, "text")])
+def test_broken_files_are_refused_with_what_to_do(saved: Path, tmp_path: Path, name: str, kind: str) -> None:
+    path = copied(saved, tmp_path) / name
+    whole = path.read_bytes()
+    if kind == "not there":
+        path.unlink()
+    else:
+        broken = {"empty": b"", "cut short": whole[: len(whole) // 2], "text": b"rubbish\n", "other text": b"hello"}
+        path.write_bytes(broken[kind])
+    with pytest.raises(DataError, match=r"remove the folder, and it is trained anew\.$"):
+        SacAgent.load(tmp_path, SMALL, 0)
+
+
+def test_moments_of_another_network_are_refused(saved: Path, tmp_path: Path) -> None:
+    other = SacAgent(replace(SMALL, hidden=(12,)), 0)
+    other.train(world(16), 32)
+    other.save(tmp_path)
+    (tmp_path / AGENT_FILE).write_bytes((saved / AGENT_FILE).read_bytes())
+    with pytest.raises(DataError, match="trained anew"):
+        SacAgent.load(tmp_path, SMALL, 0)
+
+
+@pytest.mark.parametrize("kind", ["other layers", "another history"])
+def test_an_agent_of_another_shape_is_refused(saved: Path, kind: str) -> None:
+    """Where it is read, or at the latest where it is to go on learning."""
+    settings, history = (replace(SMALL, hidden=(12,)), HISTORY) if kind == "other layers" else (SMALL, HISTORY + 2)
+    env = ModelEnv(Still(history), Sides(history_length=history), 16)
+    with pytest.raises(DataError, match="trained anew"):
+        SacAgent.load(saved, settings, 0).train(env, 32)
