@@ -170,9 +170,11 @@ class ModelEnv(VecEnv):
         speed = np.hypot(state[:, 3], state[:, 4])
         course = state[:, 2] + np.arctan2(state[:, 4], state[:, 3])
         needed = stopping_distance_m(speed, self._envelope.reaction_s, self._envelope.deceleration_mps2)
-        place = state[:, :2] + needed[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
-        found: NDArray[np.bool_] = np.any((place < self._low) | (place > self._high), axis=1)
-        found |= speed > self._envelope.max_speed_mps
+        along = needed[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
+        inside = np.ones(len(state), dtype=bool)
+        for place in (state[:, :2], state[:, :2] + along):
+            inside &= np.all((place >= self._low) & (place <= self._high), axis=1)
+        found: NDArray[np.bool_] = ~(inside & (speed <= self._envelope.max_speed_mps))
         return found
 
     def _start(self, cars: NDArray[np.int64]) -> None:

@@ -136,7 +136,7 @@ class Learn:
         text = tomli_w.dumps(simulator.to_tables())
         tomllib.loads(text)
         return TrainingPlan(
-            text, self.history, self.method, self.model_steps, self.updates, self.seed, self.device
+            text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed, self.device
         )  # fmt: skip
 
     def _hooks(

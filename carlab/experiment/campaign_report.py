@@ -10,7 +10,7 @@ import numpy as np
 from carlab.core.errors import DataError
 from carlab.experiment.campaign_figures import EpisodeFigures, foretell
 from carlab.experiment.campaign_picture import draw
-from carlab.experiment.training import DYNAMICS_FILE, TrainingPlan, model_folder
+from carlab.experiment.training import DYNAMICS_FILE, TrainingPlan, has_ticks, model_folder
 from carlab.recording.learning_curve import write_learning_curve
 from carlab.recording.mcap_source import read_episode
 from carlab.recording.run_directory import RunDirectory
@@ -36,7 +36,7 @@ def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> 
     run.write_json(CURVE_FILE, {"schema": "carlab.learn/1", "episodes": [r.to_dict() for r in rows]})
     recordings = run.recordings()
     driven, told = [], []
-    shown = [r for r in rows if r.episode <= len(recordings)]
+    shown = [r for r in rows if r.episode <= len(recordings) and has_ticks(recordings[r.episode - 1])]
     for r in shown:
         episode = read_episode(recordings[r.episode - 1])
         foretold = foretell(load_car(model_folder(run.models, r.episode) / DYNAMICS_FILE), episode)

@@ -48,6 +48,7 @@ class TrainingPlan:
         method: with the simulator as prior, or without.
         model_steps: steps of the particles' optimiser.
         updates: gradient steps of SAC; half as many again before the first episode.
+        ticks: of an episode; the task's unless given.
         seed: of everything.
         device: of the model's and the policy's tensors.
         threads: of torch.
@@ -58,14 +59,16 @@ class TrainingPlan:
     method: Method = "sim-fsvgd"
     model_steps: int = 2500
     updates: int = 30_000
+    ticks: int | None = None
     seed: int = 0
     device: str = "cpu"
     threads: int = 1
 
     @property
     def task(self) -> ParkingTask:
-        """The task, with the history of the model."""
-        return replace(ParkingTask(), history_length=self.history)
+        """The task, with the history of the model and the ticks of this run."""
+        task = ParkingTask(history_length=self.history)
+        return task if self.ticks is None else replace(task, max_ticks=self.ticks)
 
 
 def model_folder(models: Path, episode: int) -> Path:
@@ -105,7 +108,7 @@ def train(
     clock = MonotonicClock()
     number = len(recordings) + 1
     tell("reading the recordings", 0, 1)
-    episodes = [read_episode(path) for path in recordings if _has_ticks(path)]
+    episodes = [read_episode(path) for path in recordings if has_ticks(path)]
     simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
     model = CarModel(simulator, plan.history, simulator.priors)
     usable = [e for e in episodes if e.ticks > plan.history]
@@ -164,7 +167,7 @@ def train(
     return figures
 
 
-def _has_ticks(recording: Path) -> bool:
+def has_ticks(recording: Path) -> bool:
     """Whether anything was driven: the gate may end an episode before its first tick."""
     from carlab.recording.mcap_source import read_documents
 
@@ -282,6 +285,7 @@ __all__ = [
     "DYNAMICS_FILE",
     "FIGURES_FILE",
     "TrainingPlan",
+    "has_ticks",
     "model_folder",
     "plan_as_json",
     "recorded_features",

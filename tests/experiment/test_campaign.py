@@ -146,7 +146,8 @@ def test_a_run_that_has_all_its_episodes_does_nothing(story: Story) -> None:
 
 def test_the_plan_is_taken_up_again(story: Story, tmp_path: Path) -> None:
     found = taken_up(story.run, choose_car("sim"), CampaignHooks())
-    assert (found.plan, found.episodes) == (story.plan, 2)
+    assert (found.plan, found.episodes, found.max_ticks) == (story.plan, 2, TICKS)
+    assert (found.place, found.record_rerun) == (True, False)
     other = RunDirectory.create(tmp_path, "other")
     for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}'):
         if content is not None:
@@ -288,6 +289,14 @@ def test_an_episode_that_ended_before_its_first_tick_is_no_obstacle(tmp_path: Pa
     assert len(run.recordings()) == 1
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     assert train(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)["rows"] == 0
+
+
+def test_the_report_is_written_beside_an_episode_without_a_tick(story: Story, tmp_path: Path) -> None:
+    run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
+    shutil.copytree(story.run.models / "0001", run.models / "0001")
+    row = replace(story.figures[0], end="GEOFENCE", total_reward=0.0)
+    write_report(run, story.plan, row)
+    assert [str(r) for r in learning_curve(run)] == [str(row)]
 
 
 @pytest.mark.parametrize(

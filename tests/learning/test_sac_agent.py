@@ -124,27 +124,18 @@ def test_the_best_judged_policy_is_kept(values: tuple[float, ...], kept: int) ->
     np.testing.assert_array_equal(answers(agent), judged[kept])
 
 
-def let_diverge(agent: SacAgent, how: str) -> None:
-    env = world(16, change=float("nan") if how == "a world that is no number" else 0.0)
-    if how == "a rate far too large":
-        agent._settings = replace(SMALL, learning_rate=1e20)
-    agent.train(env, 256)
-
-
 @pytest.mark.parametrize("how", ["a rate far too large", "a world that is no number"])
-def test_of_a_policy_that_diverges_nothing_is_kept(how: str) -> None:
+def test_a_policy_that_diverges_is_told_and_the_earlier_one_kept(how: str) -> None:
     agent = SacAgent(SMALL, 0)
     agent.train(world(16), 64)
     before = answers(agent)
-    with pytest.raises(ValueError, match=r"diverged|constraint Real"):
-        let_diverge(agent, how)
+    env = world(16, change=float("nan") if how == "a world that is no number" else 0.0)
+    if how == "a rate far too large":
+        agent._settings = replace(SMALL, learning_rate=1e20)
+    with pytest.raises(DataError, match="diverged") as error:
+        agent.train(env, 256)
+    assert "\n" not in str(error.value)
     np.testing.assert_array_equal(answers(agent), before)
-
-
-@pytest.mark.parametrize("how", ["a rate far too large", "a world that is no number"])
-def test_that_a_policy_diverges_is_told_in_a_sentence(how: str) -> None:
-    with pytest.raises(DataError, match=r"diverged"):
-        let_diverge(SacAgent(SMALL, 0), how)
 
 
 def test_whatever_stops_the_training_the_earlier_policy_is_kept() -> None:
@@ -192,10 +183,8 @@ def copied(saved: Path, to: Path) -> Path:
     return to
 
 
-BROKEN = [(n, k) for n in (AGENT_FILE, MOMENTS_FILE) for k in ("not there", "empty", "cut short", "other text")]
-
-
-@pytest.mark.parametrize(("name", "kind"), [*BROKEN, (AGENT_FILE, "text"), (MOMENTS_FILE, "text")])
+@pytest.mark.parametrize("name", [AGENT_FILE, MOMENTS_FILE])
+@pytest.mark.parametrize("kind", ["not there", "empty", "cut short", "text", "other text"])
 def test_broken_files_are_refused_with_what_to_do(saved: Path, tmp_path: Path, name: str, kind: str) -> None:
     path = copied(saved, tmp_path) / name
     whole = path.read_bytes()
