@@ -6,7 +6,7 @@ public code. Data is drawn here, or read from arrays that their code made.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -206,6 +206,31 @@ KINEMATIC_RANGES = {
     "steering.max_angle": (0.3, 0.7),
 }
 
+_WORLD = Case(
+    name="racecar",
+    prior=KinematicCar(place_m=4.0, speed_mps=6.0, rate_radps=8.0),
+    process=None,
+    truth=None,
+    counts=(20, 50, 100, 200, 400),
+    noise_std=_CAR_NOISE,
+    likelihood_std=tuple(20.0 * s for s in _CAR_NOISE),
+    learn_noise=True,
+    input_std=(3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0, 1.0, 1.0),
+    output_std=(0.127, 0.123, 0.060, 0.056, 2.86, 2.86, 5.65),
+    gap_std=(0.004, 0.004, 0.015, 0.015, 0.15, 0.15, 0.75),
+    gap_lengthscale=10.0,
+    function_lengthscale=0.4,
+)
+_BODY = replace(
+    _WORLD,
+    prior=BodyFrame(KinematicCar()),
+    input_std=(3.0, 3.0, 1.0, 1.0, 1.5, 1.5, 2.0, 0.6, 0.6),
+    output_std=(0.1, 0.06, 0.1, 0.03, 1.0, 1.0, 3.0),
+    function_lengthscale=2.0,
+    in_body_frame=True,
+)
+_RACECAR = replace(_WORLD, ours=_BODY)
+
 CASES = {
     case.name: case
     for case in (
@@ -256,37 +281,7 @@ CASES = {
             gap_lengthscale=3.0,
             function_lengthscale=3.0,
         ),
-        Case(
-            name="racecar",
-            prior=KinematicCar(place_m=4.0, speed_mps=6.0, rate_radps=8.0),
-            process=None,
-            truth=None,
-            counts=(20, 50, 100, 200, 400),
-            noise_std=_CAR_NOISE,
-            likelihood_std=tuple(20.0 * s for s in _CAR_NOISE),
-            learn_noise=True,
-            input_std=(3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0, 1.0, 1.0),
-            output_std=(0.127, 0.123, 0.060, 0.056, 2.86, 2.86, 5.65),
-            gap_std=(0.004, 0.004, 0.015, 0.015, 0.15, 0.15, 0.75),
-            gap_lengthscale=10.0,
-            function_lengthscale=0.4,
-            ours=Case(
-                name="racecar",
-                prior=BodyFrame(KinematicCar()),
-                process=None,
-                truth=None,
-                counts=(20, 50, 100, 200, 400),
-                noise_std=_CAR_NOISE,
-                likelihood_std=tuple(20.0 * s for s in _CAR_NOISE),
-                learn_noise=True,
-                input_std=(3.0, 3.0, 1.0, 1.0, 1.5, 1.5, 2.0, 0.6, 0.6),
-                output_std=(0.1, 0.06, 0.1, 0.03, 1.0, 1.0, 3.0),
-                gap_std=(0.004, 0.004, 0.015, 0.015, 0.15, 0.15, 0.75),
-                gap_lengthscale=10.0,
-                function_lengthscale=2.0,
-                in_body_frame=True,
-            ),
-        ),
+        _RACECAR,
     )
 }
 
