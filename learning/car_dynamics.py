@@ -18,8 +18,6 @@ from carlab.core.observation import STATE_FEATURES, decode_history, decode_state
 from learning.evaluation import Mixture
 from learning.fsvgd import Posterior
 
-STATE_SIZE = 6
-
 
 class OneStep(Protocol):
     """What a learned world is made of."""
@@ -41,17 +39,14 @@ class CarDynamics:
     Attributes:
         posterior: particles and noise.
         history: H, commands before the last one that a row of inputs holds.
-        scale: of all standard deviations of the noise, by what held-out rows say.
     """
 
     posterior: Posterior
     history: int
-    scale: float = 1.0
 
     def predict(self, inputs: Tensor) -> Mixture:
-        """Changes at inputs (N, 3 + 2 (H + 1)) with their calibrated doubt."""
-        found = self.posterior.predict(inputs)
-        return Mixture(found.means, found.stds * self.scale)
+        """Changes at inputs (N, 3 + 2 (H + 1)) with their doubt."""
+        return self.posterior.predict(inputs)
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """One draw (N, 6) of the mixture for each row.
@@ -67,7 +62,7 @@ class CarDynamics:
             dealt[place] = posterior.normaliser.inputs(inputs)
             values = posterior.network(posterior.parameters, dealt.view(particles, share, inputs.shape[1]))
             drawn = torch.randn(values.shape, generator=generator).to(values)
-            values = values + self.scale * drawn * posterior.noise_stds
+            values = values + drawn * posterior.noise_stds
             return posterior.normaliser.raw_outputs(values.flatten(0, 1)[place])
 
 
@@ -91,4 +86,4 @@ def moved(features: Tensor, action: Tensor, change: Tensor) -> Tensor:
     return found
 
 
-__all__ = ["STATE_SIZE", "CarDynamics", "OneStep", "inputs_of", "moved"]
+__all__ = ["CarDynamics", "OneStep", "inputs_of", "moved"]

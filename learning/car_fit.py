@@ -67,7 +67,6 @@ def fit_car(
     *,
     before: CarDynamics | None = None,
     progress: Callable[[int], None] = lambda step: None,
-    device: torch.device | str = "cpu",
 ) -> CarDynamics:
     """Learn a car.
 
@@ -77,7 +76,6 @@ def fit_car(
         settings: how.
         before: an earlier fit of the same car, whose units and particles are taken up.
         progress: told the steps of the optimiser that are done.
-        device: where tensors live.
 
     Raises:
         DataError: the history of the rows is not the model's, or the fit diverged.
@@ -111,7 +109,6 @@ def save_car(dynamics: CarDynamics, path: Path) -> None:
     content: dict[str, Any] = {
         "version": FILE_VERSION,
         "history": dynamics.history,
-        "scale": dynamics.scale,
         "network": [posterior.network.inputs, posterior.network.outputs, *posterior.network.hidden],
         "parameters": posterior.parameters.cpu(),
         "noise_std": posterior.noise_std.cpu(),
@@ -134,7 +131,7 @@ def load_car(path: Path) -> CarDynamics:
         posterior = Posterior(
             network, parameters, content["noise_std"], Normaliser(*content["units"]), content["tails"]
         )  # fmt: skip
-        car = CarDynamics(posterior, content["history"], content["scale"])
+        car = CarDynamics(posterior, content["history"])
     except _BROKEN as error:
         raise DataError(f"The learned car in {path} cannot be read ({_first(error)}); {remedy}.") from error
     if version != FILE_VERSION:

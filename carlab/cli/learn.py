@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -67,9 +66,6 @@ class Learn:
     seed: int = 0
     """Of everything that is drawn."""
 
-    device: str = "cpu"
-    """Where the model and the policy learn: cpu or cuda."""
-
     place: bool = True
     """Start each episode at the task's start pose; off: from where the car stands."""
 
@@ -128,15 +124,9 @@ class Learn:
             simulator = prior_simulator(choice.simulator, kind)
         else:
             simulator = prior_simulator(load_car_file(Path(self.prior)).simulator, "nominal")
-        if self.device != "cpu":
-            import torch
-
-            if not torch.cuda.is_available():
-                raise ConfigError(f"--device {self.device}: there is no such device here; leave it out.")
         text = tomli_w.dumps(simulator.to_tables())
-        tomllib.loads(text)
         return TrainingPlan(
-            text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed, self.device
+            text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed
         )  # fmt: skip
 
     def _hooks(

@@ -21,6 +21,7 @@ from typing import Any, Literal
 from carlab.cars import CarChoice
 from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
+from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign_figures import EpisodeFigures, figures_of
 from carlab.experiment.session import EpisodeResult, Session, SessionHooks
@@ -61,8 +62,7 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
         return car
     values = car.values()
     names = KINEMATIC_UNCERTAIN if car.kind == "kinematic" else UNCERTAIN
-    ranges = {n: tuple(sorted((values[n] * (1.0 - SPREAD), values[n] * (1.0 + SPREAD)))) for n in names if values[n]}
-    return replace(car, priors={n: (low, high) for n, (low, high) in ranges.items()})
+    return replace(car, priors={n: (values[n] * (1.0 - SPREAD), values[n] * (1.0 + SPREAD)) for n in names})
 
 
 @dataclass(slots=True)
@@ -119,12 +119,18 @@ class Campaign:
             result = self._drive(done + 1)
             if result is None:
                 return
-            if result.reason.is_safety_stop and result.reason in GOES_ON:
+            goes_on = self._may_go_on(result.reason)
+            if goes_on and result.reason.is_safety_stop:
                 self.choice.car.reset_fault()
-            self.hooks.on_figures(figures_of(result, self._training(done + 1), self.plan))
+            self.hooks.on_figures(figures_of(result, self._training(done + 1)))
             yield result
-            if result.reason not in GOES_ON:
+            if not goes_on:
                 return
+
+    def _may_go_on(self, reason: EndReason) -> bool:
+        """A real car goes on after a safety stop only where a person puts it at its start, and says so."""
+        asked = self.place or self.choice.car.reality is not Reality.REAL
+        return reason in GOES_ON and (asked or not reason.is_safety_stop)
 
     @property
     def _envelope(self) -> SafetyEnvelope:

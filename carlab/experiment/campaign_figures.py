@@ -13,7 +13,6 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import encode
 from carlab.core.quantities import FloatArray
 from carlab.experiment.session import EpisodeResult
-from carlab.experiment.training import TrainingPlan
 from learning.car_dynamics import CarDynamics, inputs_of, moved
 
 AHEAD_S = 1.0
@@ -64,7 +63,7 @@ class EpisodeFigures:
         return cls(**found)
 
 
-def figures_of(result: EpisodeResult, training: Mapping[str, Any], plan: TrainingPlan) -> EpisodeFigures:
+def figures_of(result: EpisodeResult, training: Mapping[str, Any]) -> EpisodeFigures:
     """Figures of an episode and of what was learned before it."""
     summary = result.summary
     return EpisodeFigures(

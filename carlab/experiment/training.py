@@ -50,7 +50,6 @@ class TrainingPlan:
         updates: gradient steps of SAC; half as many again before the first episode.
         ticks: of an episode; the task's unless given.
         seed: of everything.
-        device: of the model's and the policy's tensors.
         threads: of torch.
     """
 
@@ -61,7 +60,6 @@ class TrainingPlan:
     updates: int = 30_000
     ticks: int | None = None
     seed: int = 0
-    device: str = "cpu"
     threads: int = 1
 
     @property
@@ -130,7 +128,7 @@ def train(
     settings = CarFitSettings(plan.method, plan.model_steps, seed=seed)
     tell("learning the car", 0, plan.model_steps)
     dynamics = fit_car(
-        rows, model, settings, before=before, device=plan.device,
+        rows, model, settings, before=before,
         progress=lambda done: tell("learning the car", done, plan.model_steps),
     )  # fmt: skip
     figures["model_seconds"] = clock.now_s() - began_s
@@ -138,11 +136,11 @@ def train(
     began_s = clock.now_s()
     updates = plan.updates if before is not None else plan.updates * 3 // 2
     sac = SacSettings()
-    agent = SacAgent(sac, plan.seed, plan.device)
+    agent = SacAgent(sac, plan.seed)
     if before is not None:
-        agent = SacAgent.load(earlier, sac, plan.seed, plan.device)
+        agent = SacAgent.load(earlier, sac, plan.seed)
     recorded = recorded_features(usable, plan.history) if usable else None
-    gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s, "device": plan.device}
+    gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s}
     world = ModelEnv(dynamics, plan.task, sac.cars, recorded=recorded, seed=seed, **gate)
     judging = ModelEnv(dynamics, plan.task, JUDGED_CARS, seed=seed + 1, **gate)
 

@@ -70,7 +70,6 @@ def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFact
         ("--ticks 0", "--ticks 0: a number above zero."),
         ("--updates -5", "--updates -5: a number above zero."),
         ("--model-steps 0", "--model-steps 0: a number above zero."),
-        ("--device cuda", "--device cuda: there is no such device here; leave it out."),
         ("--prior missing.toml", "There is no car file 'missing.toml'"),
         ("--car nosuch", "There is no car 'nosuch'"),
         ("--method guessing", "'sim-fsvgd', 'fsvgd'"),

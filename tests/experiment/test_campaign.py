@@ -25,7 +25,7 @@ from carlab.core.errors import DataError
 from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
-from carlab.core.quantities import Action, CarState
+from carlab.core.quantities import Action, CarState, Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator, taken_up
@@ -272,6 +272,21 @@ def drive(folder: Path, ticks: int, start: CarState | None = None) -> RunDirecto
     return run
 
 
+@pytest.mark.parametrize(("reality", "driven"), [(Reality.SIMULATED, 2), (Reality.REAL, 1)])
+def test_a_real_car_that_nobody_puts_at_its_start_drives_no_more_after_a_safety_stop(
+    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reality: Reality, driven: int
+) -> None:
+    choice = choose_car("sim", seed=0)
+    monkeypatch.setattr(choice.car, "reality", reality)
+    run = RunDirectory.create(tmp_path, "outside")
+    for model in ("0001", "0002"):
+        shutil.copytree(story.run.models / model, run.models / model)
+    with choice.car as car:
+        car.place(CarState(5.0, 5.0))
+        results = list(Campaign(choice, story.plan, 2, run, place=False, record_rerun=False).go_on())
+    assert [r.reason.name for r in results] == ["GEOFENCE"] * driven
+
+
 def test_from_an_episode_that_is_too_short_nothing_is_learned_but_the_prior(tmp_path: Path) -> None:
     run = drive(tmp_path, HISTORY)
     told: list[str] = []
@@ -301,7 +316,7 @@ def test_the_report_is_written_beside_an_episode_without_a_tick(story: Story, tm
 
 @pytest.mark.parametrize(
     ("recording", "changes", "said"),
-    [(b"rubbish", {}, "not an MCAP file"), (None, {"device": "abacus"}, "Training failed: RuntimeError")],
+    [(b"rubbish", {}, "not an MCAP file"), (None, {"threads": 0}, "Training failed: RuntimeError")],
 )
 def test_what_goes_wrong_in_the_other_process_is_said_in_a_sentence(
     tmp_path: Path, recording: bytes | None, changes: dict[str, Any], said: str

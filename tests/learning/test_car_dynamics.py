@@ -91,25 +91,25 @@ def test_without_a_history_a_step_forgets_the_command() -> None:
     assert after[0].tolist() == pytest.approx([0.9, 2.2, 0.0, -1.0, 0.6, 0.0, -0.2], abs=1e-6)
 
 
-def known_car(values: Tensor, tails: Tensor | None = None, noise: float = 0.5, scale: float = 1.0) -> CarDynamics:
+def known_car(values: Tensor, tails: Tensor | None = None, noise: float = 0.5) -> CarDynamics:
     """Particles that each say one value (L, 6), whatever the input."""
     network = Network(INPUTS, 6, (4,))
     parameters = torch.zeros(len(values), network.parameters)
     parameters[:, -6:] = values
     units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.full((6,), 0.3), torch.arange(1.0, 7.0))
-    return CarDynamics(Posterior(network, parameters, torch.full((6,), noise), units, tails), HISTORY, scale)
+    return CarDynamics(Posterior(network, parameters, torch.full((6,), noise), units, tails), HISTORY)
 
 
 @pytest.mark.parametrize("tails", [None, torch.tensor([0.5, 1.0, 1.5, 3.0])])
 def test_draws_are_those_of_the_mixture(tails: Tensor | None) -> None:
     """Equal shares of four Gaussians: mean and variance by the law of total variance, kurtosis by their moments."""
     values = torch.randn(4, 6, generator=torch.Generator().manual_seed(2))
-    car = known_car(values, tails, scale=1.7)
+    car = known_car(values, tails, noise=0.85)
     count = 40_000
     drawn = car.sample(torch.zeros(count, INPUTS), torch.Generator().manual_seed(0)).double()
     unit = torch.arange(1.0, 7.0).double()
     means = 0.3 + values.double() * unit
-    stds = 1.7 * 0.5 * unit * (torch.ones(4) if tails is None else tails).double()[:, None]
+    stds = 0.85 * unit * (torch.ones(4) if tails is None else tails).double()[:, None]
     mean = means.mean(dim=0)
     away = means - mean
     variance = (away**2 + stds**2).mean(dim=0)
@@ -159,7 +159,7 @@ def some_car(tails: Tensor | None = None) -> CarDynamics:
     network = Network(INPUTS, 6, (8, 4))
     units = Normaliser(*(torch.rand(n, generator=generator) + 0.5 for n in (INPUTS, INPUTS, 6, 6)))
     noise = torch.rand(6, generator=generator)
-    return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, tails), HISTORY, 1.3)
+    return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, tails), HISTORY)
 
 
 @pytest.mark.parametrize("tails", [None, torch.tensor([0.5, 1.0, 2.0])])
