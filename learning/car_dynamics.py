@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from carlab.core.angles import wrap
+from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import STATE_FEATURES, decode_history, decode_state, encode, push_action
-from learning.evaluation import Mixture
+from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.fsvgd import Posterior
+from learning.transitions import transitions_of
 
 
 class OneStep(Protocol):
@@ -27,13 +29,27 @@ class OneStep(Protocol):
         """H, commands before the last one that a row of inputs holds."""
         ...
 
-    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
+    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
+        """Features (N, 7 + 2 H) one step after those that ``action`` (N, 2) is sent at, drawn with their doubt."""
         ...
 
 
+class StepInBody:
+    """A step by the changes that ``sample`` draws in the body frame of its start, and exact kinematics."""
+
+    __slots__ = ()
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
+        raise NotImplementedError
+
+    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
+        """Features (N, 7 + 2 H) a step later."""
+        return moved(features, action, self.sample(inputs_of(features, action), generator))
+
+
 @dataclass(frozen=True, slots=True)
-class CarDynamics:
+class CarDynamics(StepInBody):
     """A fitted model of one step of a car.
 
     Attributes:
@@ -49,21 +65,32 @@ class CarDynamics:
         return self.posterior.predict(inputs)
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        """One draw (N, 6) of the mixture for each row.
+        """One draw (N, 6) of the mixture for each row."""
+        return drawn(self.posterior, inputs, generator)
 
-        Rows are dealt to particles at random and evenly, so that each runs on its share alone.
-        """
-        posterior = self.posterior
-        count, particles = len(inputs), len(posterior.parameters)
-        share = -(-count // particles)
-        with torch.no_grad():
-            place = torch.randperm(share * particles, generator=generator)[:count].to(inputs.device)
-            dealt = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
-            dealt[place] = posterior.normaliser.inputs(inputs)
-            values = posterior.network(posterior.parameters, dealt.view(particles, share, inputs.shape[1]))
-            drawn = torch.randn(values.shape, generator=generator).to(values)
-            values = values + drawn * posterior.noise_stds
-            return posterior.normaliser.raw_outputs(values.flatten(0, 1)[place])
+    def surprise(self, episode: EpisodeData) -> tuple[float, float]:
+        """Negative log-likelihood of an episode's steps [nat a step] and the calibration error there."""
+        rows = transitions_of([episode], self.history)
+        inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
+        predicted = self.predict(inputs).smoothed()
+        return negative_log_likelihood(predicted, outputs), calibration_error(predicted, outputs)
+
+
+def drawn(posterior: Posterior, inputs: Tensor, generator: torch.Generator) -> Tensor:
+    """One draw (N, O) of the mixture at raw inputs (N, D).
+
+    Rows are dealt to particles at random and evenly, so that each runs on its share alone.
+    """
+    count, particles = len(inputs), len(posterior.parameters)
+    share = -(-count // particles)
+    with torch.no_grad():
+        place = torch.randperm(share * particles, generator=generator)[:count].to(inputs.device)
+        dealt = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
+        dealt[place] = posterior.normaliser.inputs(inputs)
+        values = posterior.network(posterior.parameters, dealt.view(particles, share, inputs.shape[1]))
+        noise = torch.randn(values.shape, generator=generator).to(values)
+        values = values + noise * posterior.noise_stds
+        return posterior.normaliser.raw_outputs(values.flatten(0, 1)[place])
 
 
 def inputs_of(features: Tensor, action: Tensor) -> Tensor:
@@ -86,4 +113,4 @@ def moved(features: Tensor, action: Tensor, change: Tensor) -> Tensor:
     return found
 
 
-__all__ = ["CarDynamics", "OneStep", "inputs_of", "moved"]
+__all__ = ["CarDynamics", "OneStep", "StepInBody", "drawn", "inputs_of", "moved"]

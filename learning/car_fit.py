@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
+from learning.authors_fsvgd import WorldDynamics
 from learning.car_dynamics import CarDynamics
 from learning.domain_models import draw_parameters
 from learning.fsvgd import Posterior
@@ -22,14 +23,15 @@ from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_poin
 from learning.simulator_model import CarModel
 from learning.transitions import OUTPUTS, Transitions
 
-Method = Literal["sim-fsvgd", "fsvgd"]
-FILE_VERSION = 1
+Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
+LearnedCar = CarDynamics | WorldDynamics
+FILE_VERSION = 2
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
 """Expected noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
 EXPECTED_GAP = 0.3
 EXPECTED_FUNCTION = 1.0
 """Size of what a simulator leaves out, and of a step of which nothing is known, in units of the outputs."""
-ROWS = 1200
+ROWS = 800
 """Rows that are conditioned on at most; of more so many are drawn."""
 _UNITS_FROM = 2000
 
@@ -39,7 +41,7 @@ class CarFitSettings:
     """How a car is learned.
 
     Attributes:
-        method: with the simulator as prior, or without.
+        method: with the simulator as prior, or without (``fsvgd``).
         steps: of the particles' optimiser.
         particles: how many.
         seed: of everything that is drawn.
@@ -102,12 +104,13 @@ def fit_car(
     return CarDynamics(fit_particles(target, points, particles, progress, start), model.history)
 
 
-def save_car(dynamics: CarDynamics, path: Path) -> None:
+def save_car(dynamics: LearnedCar, path: Path) -> None:
     """Write a learned car into a file."""
     posterior = dynamics.posterior
     units = posterior.normaliser
     content: dict[str, Any] = {
         "version": FILE_VERSION,
+        "frame": "body" if isinstance(dynamics, CarDynamics) else "world",
         "history": dynamics.history,
         "network": [posterior.network.inputs, posterior.network.outputs, *posterior.network.hidden],
         "parameters": posterior.parameters.cpu(),
@@ -118,7 +121,7 @@ def save_car(dynamics: CarDynamics, path: Path) -> None:
     torch.save(content, path)
 
 
-def load_car(path: Path) -> CarDynamics:
+def load_car(path: Path) -> LearnedCar:
     """Read a learned car. Raises DataError where the file is broken, or of another version or shape."""
     remedy = "remove its folder, and it is learned anew"
     try:
@@ -131,7 +134,8 @@ def load_car(path: Path) -> CarDynamics:
         posterior = Posterior(
             network, parameters, content["noise_std"], Normaliser(*content["units"]), content["tails"]
         )  # fmt: skip
-        car = CarDynamics(posterior, content["history"])
+        frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
+        car: LearnedCar = frames[content.get("frame", "body")](posterior, content["history"])
     except _BROKEN as error:
         raise DataError(f"The learned car in {path} cannot be read ({_first(error)}); {remedy}.") from error
     if version != FILE_VERSION:
@@ -149,4 +153,4 @@ def _first(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
-__all__ = ["CarFitSettings", "Method", "car_units", "fit_car", "load_car", "save_car"]
+__all__ = ["CarFitSettings", "LearnedCar", "Method", "car_units", "fit_car", "load_car", "save_car"]

@@ -19,15 +19,13 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.evaluation import Mixture
+from learning.evaluation import Mixture, negative_log_likelihood
 from learning.function_prior import JITTER, Marginal, RbfCovariance, gaussian_process, simulator_marginal
 from learning.normaliser import Normaliser
 from learning.particles import Network
 from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
 CHECKED_EVERY = 500
-NOISE_FASTER = 5.0
-"""Learning rate of the noise over that of the networks."""
 LEAST_NOISE = 1e-4
 """Floor of the likelihood's standard deviation, in normalised units."""
 
@@ -93,7 +91,12 @@ class FsvgdSettings:
         learn_noise: whether it is fitted too.
         noise_rows: rows of data that ``noise_std`` counts for then (an inverse-gamma prior): a handful of rows that a
             network meets exactly says nothing of their noise.
+        noise_rate: learning rate of the noise over that of the networks.
         likelihood_exponent: power of the likelihood.
+        prior_exponent: power of the prior.
+        falling_rate: whether the learning rate falls; it stays without.
+        checked_every: steps between looks at rows that are held out, where there are any; the best networks are kept.
+        patience: looks without a better one after which the fit ends; 0: never.
         seed: of everything that is drawn.
     """
 
@@ -110,7 +113,12 @@ class FsvgdSettings:
     noise_std: float | tuple[float, ...] = 0.1
     learn_noise: bool = True
     noise_rows: float = 0.0
+    noise_rate: float = 5.0
     likelihood_exponent: float = 1.0
+    prior_exponent: float = 1.0
+    falling_rate: bool = True
+    checked_every: int = 2000
+    patience: int = 0
     seed: int = 0
 
 
@@ -159,8 +167,12 @@ class _State:
         self.expected_noise = self.log_noise.exp()
         groups = [{"params": [self.networks], "weight_decay": settings.weight_decay}]
         if settings.learn_noise:
-            groups.append({"params": [self.log_noise], "weight_decay": 0.0, "faster": NOISE_FASTER})
+            groups.append({"params": [self.log_noise], "weight_decay": 0.0, "faster": settings.noise_rate})
         self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
+
+    def posterior(self, network: Network, normaliser: Normaliser) -> Posterior:
+        noise = self.log_noise.exp().clamp_min(LEAST_NOISE)
+        return Posterior(network, self.networks.detach().clone(), noise, normaliser)
 
 
 def fit(
@@ -171,6 +183,7 @@ def fit(
     normaliser: Normaliser,
     settings: FsvgdSettings,
     progress: Callable[[int], None] = lambda step: None,
+    held_out: tuple[Tensor, Tensor] | None = None,
 ) -> Posterior:
     """Fit particles to data and prior.
 
@@ -182,6 +195,7 @@ def fit(
         normaliser: of inputs and outputs.
         settings: how.
         progress: told the number of steps done, from time to time.
+        held_out: raw inputs and outputs of rows that choose the step whose particles are kept.
 
     Raises:
         DataError: there is nothing to fit, or numbers are missing or infinite; says what to do.
@@ -205,8 +219,10 @@ def fit(
     )
     state.prepare(settings)
     points = settings.measurement_points if prior is not None or count == 0 else 0
+    kept = _Best(settings.patience)
     for step in range(settings.steps):
-        rate = settings.learning_rate * (0.01 + 0.495 * (1.0 + math.cos(math.pi * step / settings.steps)))
+        falling = 0.01 + 0.495 * (1.0 + math.cos(math.pi * step / settings.steps))
+        rate = settings.learning_rate * (falling if settings.falling_rate else 1.0)
         for group in state.optimiser.param_groups:
             group["lr"] = rate * group.get("faster", 1.0)
         rows = _rows(count, settings.batch, generator)
@@ -214,9 +230,34 @@ def fit(
         _step(network, state, everything, targets, rows.to(device), others.to(device), prior, settings)
         if (step + 1) % CHECKED_EVERY == 0:
             progress(step + 1)
-    if not torch.isfinite(state.networks).all():
+        if held_out is not None and (step + 1) % settings.checked_every == 0:
+            kept.look(state.posterior(network, normaliser), *held_out)
+            if kept.settled:
+                break
+    found = state.posterior(network, normaliser) if kept.posterior is None else kept.posterior
+    if not torch.isfinite(found.parameters).all():
         raise DataError("The fit diverged; fit again with a smaller learning rate.")
-    return Posterior(network, state.networks, state.log_noise.exp().clamp_min(LEAST_NOISE), normaliser)
+    return found
+
+
+@dataclass
+class _Best:
+    """The particles that rows which are held out like best."""
+
+    patience: int
+    posterior: Posterior | None = None
+    surprise: float = math.inf
+    since: int = 0
+
+    def look(self, posterior: Posterior, inputs: Tensor, outputs: Tensor) -> None:
+        surprise = negative_log_likelihood(posterior.predict(inputs), outputs)
+        self.since += 1
+        if surprise < self.surprise:
+            self.posterior, self.surprise, self.since = posterior, surprise, 0
+
+    @property
+    def settled(self) -> bool:
+        return 0 < self.patience <= self.since
 
 
 def _rows(count: int, batch: int, generator: torch.Generator) -> Tensor:
@@ -239,7 +280,7 @@ def _step(
     chosen = torch.cat([rows, others])
     values, pullback = network.values_and_pullback(state.networks, everything[chosen])
     marginal = None if prior is None else prior.marginal(chosen)
-    score = torch.zeros_like(values) if marginal is None else marginal.score(values)
+    score = torch.zeros_like(values) if marginal is None else settings.prior_exponent * marginal.score(values)
     known = torch.zeros(values.shape[2], values.shape[1], dtype=values.dtype, device=values.device)
     if len(rows):
         noise = state.log_noise.exp().clamp_min(LEAST_NOISE)

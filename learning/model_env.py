@@ -21,7 +21,7 @@ from carlab.core.geofence import stopping_distance_m
 from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import Task
-from learning.car_dynamics import OneStep, inputs_of, moved
+from learning.car_dynamics import OneStep
 
 FEATURE_UNITS = (2.0, 2.0, 1.0, 1.0, 2.0, 1.0, 4.0)
 """Metres, units of sine and cosine, m/s, m/s and rad/s that a policy sees as one."""
@@ -105,8 +105,7 @@ class ModelEnv(VecEnv):
         before = self._features
         with torch.no_grad():
             action = self._gate(before, self._actions)
-            change = self._model.sample(inputs_of(before, action), self._generator)
-            after = moved(before, action, change)
+            after = self._model.step(before, action, self._generator)
             reward = self._task.reward(before, action, after) * REWARD_SCALE
             terminated = self._task.terminated(after).cpu().numpy() | self._stopped(after)
         self._features = after
@@ -141,7 +140,7 @@ class ModelEnv(VecEnv):
             for _ in range(self._task.max_ticks):
                 before = self._features
                 action = self._gate(before, torch.as_tensor(act(self._seen())).to(self._device))
-                after = moved(before, action, self._model.sample(inputs_of(before, action), self._generator))
+                after = self._model.step(before, action, self._generator)
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
                 last = torch.where(ended.to(self._device)[:, None], last, after)
                 ended |= torch.from_numpy(self._stopped(after)) | self._task.terminated(after).cpu()

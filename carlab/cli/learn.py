@@ -51,17 +51,18 @@ class Learn:
     """The simulator that is the prior: kinematic (the car's file, wheels that do not slip), nominal (the car's file as
     it is), or FILE.toml (a diagnosed model.toml, say). Without ranges in the file they are 30 % about its numbers."""
 
-    method: Literal["sim-fsvgd", "fsvgd"] = "sim-fsvgd"
-    """sim-fsvgd, or fsvgd without a simulator."""
+    method: Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"] = "sim-fsvgd"
+    """sim-fsvgd; fsvgd without a simulator; or that as the authors of Sim-FSVGD set it, to be compared with."""
 
     history: int = 3
     """Past commands that model and policy see."""
 
-    model_steps: int = 2500
-    """Steps of the model's optimiser before each episode."""
+    model_steps: int | None = None
+    """Steps of the model's optimiser before each episode; those of the method unless given."""
 
     updates: int = 30000
-    """Gradient steps of SAC before each episode; half as many again before the first."""
+    """Gradient steps of SAC before an episode: half as many again before the first, and after the third the fewer the
+    smaller the share of new rows is (3 / episode)."""
 
     seed: int = 0
     """Of everything that is drawn."""

@@ -13,7 +13,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import encode
 from carlab.core.quantities import FloatArray
 from carlab.experiment.session import EpisodeResult
-from learning.car_dynamics import CarDynamics, inputs_of, moved
+from learning.car_dynamics import OneStep
 
 AHEAD_S = 1.0
 SAMPLES = 64
@@ -98,7 +98,7 @@ class Foretold:
     std: FloatArray
 
 
-def foretell(dynamics: CarDynamics, episode: EpisodeData, seed: int = 0) -> Foretold:
+def foretell(dynamics: OneStep, episode: EpisodeData, seed: int = 0) -> Foretold:
     """Stretches of a second, one after the other, by draws of particles and noise; none of a shorter episode."""
     history = dynamics.history
     length = max(round(AHEAD_S / episode.period_s), 1)
@@ -116,8 +116,7 @@ def foretell(dynamics: CarDynamics, episode: EpisodeData, seed: int = 0) -> Fore
         poses.append(torch.stack([x, y, torch.atan2(sin, cos)], dim=1).view(len(starts), SAMPLES, 3))
         if k < length:
             command = torch.from_numpy(episode.sent[starts + k]).float().repeat_interleave(SAMPLES, dim=0)
-            change = dynamics.sample(inputs_of(features, command), generator)
-            features = moved(features, command, change)
+            features = dynamics.step(features, command, generator)
     every = torch.stack(poses, dim=1).double().numpy()  # (S, T, samples, 3)
     every[..., 2] = np.unwrap(every[..., 2], axis=1)
     return Foretold(starts[:, None] + np.arange(length + 1), every.mean(axis=2), every.std(axis=2))

@@ -26,7 +26,9 @@ from carlab.core.observation import encode
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
-from learning.car_fit import CarFitSettings, Method
+from learning.car_fit import LearnedCar, Method
+from learning.simulator_model import CarModel
+from learning.transitions import Transitions, transitions_of
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -45,9 +47,9 @@ class TrainingPlan:
     Attributes:
         prior_toml: car file of the simulator that is the prior, ranges and effects included.
         history: past commands that model and policy see.
-        method: with the simulator as prior, or without.
-        model_steps: steps of the particles' optimiser.
-        updates: gradient steps of SAC; half as many again before the first episode.
+        method: with the simulator as prior, or without; as carlab fits, or as the authors of Sim-FSVGD set FSVGD.
+        model_steps: steps of the particles' optimiser; the method's own number unless given.
+        updates: gradient steps of SAC (``updates_before``).
         ticks: of an episode; the task's unless given.
         seed: of everything.
         threads: of torch.
@@ -56,7 +58,7 @@ class TrainingPlan:
     prior_toml: str
     history: int = 3
     method: Method = "sim-fsvgd"
-    model_steps: int = 2500
+    model_steps: int | None = None
     updates: int = 30_000
     ticks: int | None = None
     seed: int = 0
@@ -67,6 +69,16 @@ class TrainingPlan:
         """The task, with the history of the model and the ticks of this run."""
         task = ParkingTask(history_length=self.history)
         return task if self.ticks is None else replace(task, max_ticks=self.ticks)
+
+    def updates_before(self, episode: int) -> int:
+        """Gradient steps of SAC before an episode.
+
+        Half as many again before the first; after the third the fewer the smaller the share of new rows is in what is
+        learned from, for the policy is kept.
+        """
+        if episode == 1:
+            return self.updates * 3 // 2
+        return self.updates * 3 // max(episode, 3)
 
 
 def model_folder(models: Path, episode: int) -> Path:
@@ -95,12 +107,9 @@ def train(
     import torch
 
     from carlab.recording.mcap_source import read_episode
-    from learning.car_fit import fit_car, load_car, save_car
-    from learning.evaluation import calibration_error, negative_log_likelihood
+    from learning.car_fit import load_car, save_car
     from learning.model_env import ModelEnv
     from learning.sac_agent import SacAgent, SacSettings
-    from learning.simulator_model import CarModel
-    from learning.transitions import transitions_of
 
     torch.set_num_threads(plan.threads)
     clock = MonotonicClock()
@@ -115,26 +124,16 @@ def train(
     earlier = model_folder(models, number - 1)
     before = load_car(earlier / DYNAMICS_FILE) if earlier.is_dir() else None
     if before is not None and episodes and episodes[-1].ticks > plan.history:
-        fresh = transitions_of(episodes[-1:], plan.history)
-        inputs, outputs = (torch.from_numpy(v).float() for v in (fresh.inputs, fresh.targets))
-        predicted = before.predict(inputs).smoothed()
-        figures |= {
-            "last_episode_nll": negative_log_likelihood(predicted, outputs),
-            "last_episode_calibration_error": calibration_error(predicted, outputs),
-        }
+        nll, off = before.surprise(episodes[-1])
+        figures |= {"last_episode_nll": nll, "last_episode_calibration_error": off}
 
     began_s = clock.now_s()
     seed = plan.seed + 1000 * number
-    settings = CarFitSettings(plan.method, plan.model_steps, seed=seed)
-    tell("learning the car", 0, plan.model_steps)
-    dynamics = fit_car(
-        rows, model, settings, before=before,
-        progress=lambda done: tell("learning the car", done, plan.model_steps),
-    )  # fmt: skip
+    dynamics = _fitted(plan, model, usable, rows, before, seed, tell)
     figures["model_seconds"] = clock.now_s() - began_s
 
     began_s = clock.now_s()
-    updates = plan.updates if before is not None else plan.updates * 3 // 2
+    updates = plan.updates_before(number)
     sac = SacSettings()
     agent = SacAgent(sac, plan.seed)
     if before is not None:
@@ -163,6 +162,34 @@ def train(
 
     _publish(model_folder(models, number), figures, write)
     return figures
+
+
+def _fitted(
+    plan: TrainingPlan,
+    model: CarModel,
+    episodes: list[EpisodeData],
+    rows: Transitions | None,
+    before: LearnedCar | None,
+    seed: int,
+    tell: Tell,
+) -> LearnedCar:
+    """The car as the plan's method learns it."""
+    from learning.authors_fsvgd import STEPS, fit_authors_fsvgd
+    from learning.car_dynamics import CarDynamics
+    from learning.car_fit import CarFitSettings, fit_car
+
+    ours = plan.method != "fsvgd-authors"
+    steps = plan.model_steps or (CarFitSettings().steps if ours else STEPS)
+
+    def at(done: int) -> None:
+        tell("learning the car", done, steps)
+
+    at(0)
+    if not ours:
+        return fit_authors_fsvgd(episodes, plan.history, steps, seed, at)
+    settings = CarFitSettings(plan.method, steps, seed=seed)
+    earlier = before if isinstance(before, CarDynamics) else None
+    return fit_car(rows, model, settings, before=earlier, progress=at)
 
 
 def has_ticks(recording: Path) -> bool:

@@ -14,6 +14,7 @@ from carlab.core.geofence import can_stop_inside, rectangle
 from carlab.core.quantities import Action, CarState
 from carlab.core.safety import SafetyEnvelope, limit
 from carlab.core.task import ParkingTask
+from learning.car_dynamics import StepInBody
 from learning.model_env import REWARD_SCALE, ModelEnv, policy_view
 from learning.sac import FastSac
 
@@ -24,7 +25,7 @@ TASK = replace(ParkingTask(), history_length=HISTORY, max_ticks=10**9)
 
 
 @dataclass
-class Rolling:
+class Rolling(StepInBody):
     """A car without doubt: throttle pushes it and steering turns it, one command late."""
 
     history: int = HISTORY
@@ -52,7 +53,7 @@ def parking_reward(state: np.ndarray, action: np.ndarray) -> float:
     return 1.0 / (1.0 + 9.0 * beyond**2) - 0.005 * float(action @ action)
 
 
-class Still:
+class Still(StepInBody):
     """A car that never moves."""
 
     history = HISTORY

@@ -16,6 +16,7 @@ from carlab.core.errors import DataError
 from carlab.core.policy import Policy, PolicyInput
 from carlab.core.quantities import CarState, Observation
 from carlab.core.task import ParkingTask
+from learning.car_dynamics import StepInBody
 from learning.model_env import ModelEnv, policy_view
 from learning.sac_agent import AGENT_FILE, MOMENTS_FILE, SacAgent, SacPolicy, SacSettings
 
@@ -26,7 +27,7 @@ X_M = np.array([-1.2, -0.6, 0.6, 1.2])
 
 
 @dataclass
-class Still:
+class Still(StepInBody):
     """A car that changes by this number in everything, so unless it is told one it stands."""
 
     history: int = HISTORY
