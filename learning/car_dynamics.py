@@ -7,6 +7,7 @@ noise of the likelihood is added, so that a policy meets both kinds of doubt.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -34,14 +35,14 @@ class OneStep(Protocol):
         ...
 
 
-class StepInBody:
+class StepInBody(ABC):
     """A step by the changes that ``sample`` draws in the body frame of its start, and exact kinematics."""
 
     __slots__ = ()
 
+    @abstractmethod
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
-        raise NotImplementedError
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
         """Features (N, 7 + 2 H) a step later."""

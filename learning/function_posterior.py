@@ -48,7 +48,7 @@ class FunctionPosterior:
         model: the simulator; zero where it is None.
         parameters: draws of its parameters given the data (P, K).
         gap: covariance of what it leaves out; nothing where it is None.
-        inputs: normalised inputs of the data (n, D).
+        inputs: normalised inputs of the data, and what the simulator says there (n, D + O); (n, D) without one.
         factor: Cholesky factors of the data's covariance (O, n, n).
         white: residuals of each draw, whitened by them (O, n, P).
     """
@@ -86,6 +86,7 @@ class FunctionPosterior:
             drawn = torch.zeros((outputs, 1, len(flat)), dtype=torch.float64, device=flat.device)
         else:
             drawn = _simulated(self.model, flat, self.parameters, self.normaliser).permute(2, 0, 1)
+            at = torch.cat([at, drawn.mean(dim=1).T], dim=1)
         covariance = torch.zeros((count, outputs, points, points), dtype=torch.float64, device=flat.device)
         if self.gap is not None:
             covariance = self.gap(at.view(count, points, -1)).transpose(0, 1)
@@ -128,61 +129,88 @@ def infer(
     """
     if not (torch.isfinite(inputs).all() and torch.isfinite(outputs).all()):
         raise DataError("The data holds numbers that are missing or infinite; leave those rows out and fit again.")
-    generator = torch.Generator().manual_seed(seed)
     if len(inputs) > LARGEST:
+        generator = torch.Generator().manual_seed(seed)
         some = torch.randperm(len(inputs), generator=generator)[:LARGEST].to(inputs.device)
         inputs, outputs = inputs[some], outputs[some]
-    count, width = len(inputs), outputs.shape[1]
-    x, y = normaliser.inputs(inputs).double(), normaliser.outputs(outputs).double()
-    expected_noise = noise = (noise_std / normaliser.output_std).double()
-    expected = EXPECTED_GAP * torch.ones_like(noise) if gap_std is None else gap_std / normaliser.output_std
-    gap = GapCovariance.before_data(x.shape[1], expected) if with_gap else None
-    rows = torch.randperm(count, generator=generator)[:EVIDENCE_ROWS].to(inputs.device)
-    trust = torch.ones(count, dtype=torch.float64, device=inputs.device)
-    freedom, scale = math.inf, torch.ones_like(noise)
-    parameters: Tensor | None = None
-    if model is not None:
-        parameters = draw_parameters(model, PRIOR_DRAWS if count else DRAWS, generator).to(inputs)
+    expected = EXPECTED_GAP * torch.ones_like(noise_std) if gap_std is None else gap_std / normaliser.output_std
+    return _Case(
+        model, inputs, outputs, normaliser, (noise_std / normaliser.output_std).double(), expected.double(), with_gap,
+        seed,
+    ).explained()  # fmt: skip
 
-    def left_by(where: Tensor) -> tuple[Tensor, Tensor | None]:
-        """What the mean of the draws leaves of some rows (m, O), and the draws' covariance there (O, m, m)."""
-        if model is None or parameters is None:
-            return y[where], None
-        there = _simulated(model, inputs[where], parameters, normaliser)
-        off = (there - there.mean(dim=0)).permute(2, 0, 1)
-        return y[where] - there.mean(dim=0), off.transpose(1, 2) @ off / len(there)
 
-    if count >= ROWS_FOR_TAILS:
-        left, known = left_by(torch.arange(count, device=inputs.device))
-        doubt = torch.zeros_like(noise) if known is None else known
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """What is to be explained, in normalised units."""
 
-        def before_data(trust: Tensor, gap: GapCovariance | None = gap, doubt: Tensor = doubt) -> Tensor:
-            own = _covariance(gap, x, expected_noise, trust)
-            return own if doubt.ndim == 1 else own + doubt
+    model: DomainModel | None
+    inputs: Tensor
+    outputs: Tensor
+    normaliser: Normaliser
+    noise: Tensor
+    expected: Tensor
+    with_gap: bool
+    seed: int
 
-        trust = first_trust(left, before_data, expected_noise)
-    # The covariance is learned around the prior, then again around what the data leaves of it.
-    for _ in range(ROUNDS if count else 0):
-        left, known = left_by(rows)
-        if with_gap:
-            gap, noise = learn_gap(x[rows], left, known, expected_noise, expected, trust[rows])
+    def explained(self) -> FunctionPosterior:
+        """The posterior."""
+        model, normaliser, inputs = self.model, self.normaliser, self.inputs
+        generator = torch.Generator().manual_seed(self.seed)
+        x, y = normaliser.inputs(inputs).double(), normaliser.outputs(self.outputs).double()
+        count, width = x.shape
+        device = inputs.device
+        noise, scale, freedom = self.noise, torch.ones_like(self.noise), math.inf
+        gap = GapCovariance.before_data(width, self.expected) if self.with_gap else None
+        rows = torch.randperm(count, generator=generator)[:EVIDENCE_ROWS].to(device)
+        trust = torch.ones(count, dtype=torch.float64, device=device)
+        parameters: Tensor | None = None
         if model is not None:
-            factor = torch.linalg.cholesky(_covariance(gap, x[rows], noise, trust[rows]))
-            parameters = posterior_parameters(
-                model, inputs[rows], outputs[rows], factor, normaliser, DRAWS, generator
-            )  # fmt: skip
+            parameters = draw_parameters(model, PRIOR_DRAWS if count else DRAWS, generator).to(inputs)
+        left, known, seen = self._left(x, y, parameters)
         if count >= ROWS_FOR_TAILS:
-            left, known = left_by(torch.arange(count, device=inputs.device))
-            covariance = _covariance(gap, x, noise, trust)
-            surprise, _ = left_out(left, covariance if known is None else covariance + known, noise, trust)
-            freedom, trust = student_weights(surprise.sum(dim=1), len(noise))
-            scale = typical_scale(surprise, freedom)
-    factor = torch.linalg.cholesky(_covariance(gap, x, noise, trust))
-    every = y[None]
-    if model is not None and parameters is not None:
-        every = y - _simulated(model, inputs, parameters, normaliser) if count else y.expand(len(parameters), 0, width)
-    white = torch.linalg.solve_triangular(factor, every.permute(2, 1, 0), upper=False)
-    return FunctionPosterior(normaliser, (scale * noise).float(), freedom, model, parameters, gap, x, factor, white)
+            before, doubt = gap, known
+
+            def before_data(trust: Tensor) -> Tensor:
+                own = _covariance(before, seen, self.noise, trust)
+                return own if doubt is None else own + doubt
+
+            trust = first_trust(left, before_data, self.noise)
+        # The covariance is learned around the prior, then again around what the data leaves of it.
+        for _ in range(ROUNDS if count else 0):
+            known_there = None if known is None else known[:, rows][:, :, rows]
+            if self.with_gap:
+                gap, noise = learn_gap(
+                    x[rows], left[rows], known_there, self.noise, self.expected, trust[rows],
+                    None if model is None else seen[rows, width:],
+                )  # fmt: skip
+            if model is not None:
+                factor = torch.linalg.cholesky(_covariance(gap, seen[rows], noise, trust[rows]))
+                parameters = posterior_parameters(
+                    model, inputs[rows], self.outputs[rows], factor, normaliser, DRAWS, generator
+                )  # fmt: skip
+                left, known, seen = self._left(x, y, parameters)
+            if count >= ROWS_FOR_TAILS:
+                covariance = _covariance(gap, seen, noise, trust)
+                surprise, _ = left_out(left, covariance if known is None else covariance + known, noise, trust)
+                freedom, trust = student_weights(surprise.sum(dim=1), len(noise))
+                scale = typical_scale(surprise, freedom)
+        factor = torch.linalg.cholesky(_covariance(gap, seen, noise, trust))
+        every = y[None]
+        if model is not None and parameters is not None:
+            every = y - _simulated(model, inputs, parameters, normaliser) if count else y.expand(len(parameters), 0, -1)
+        white = torch.linalg.solve_triangular(factor, every.permute(2, 1, 0), upper=False)
+        noise_std = (scale * noise).float()
+        return FunctionPosterior(normaliser, noise_std, freedom, model, parameters, gap, seen, factor, white)
+
+    def _left(self, x: Tensor, y: Tensor, parameters: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor]:
+        """What the mean of the draws leaves (n, O), the draws' covariance (O, n, n), and inputs for the gap."""
+        if self.model is None or parameters is None:
+            return y, None, x
+        there = _simulated(self.model, self.inputs, parameters, self.normaliser)
+        mean = there.mean(dim=0)
+        off = (there - mean).permute(2, 0, 1)
+        return y - mean, off.transpose(1, 2) @ off / len(there), torch.cat([x, mean], dim=1)
 
 
 def _simulated(model: DomainModel, inputs: Tensor, parameters: Tensor, normaliser: Normaliser) -> Tensor:

@@ -21,53 +21,82 @@ TINY = 1e-6
 EXPECTED_GAP = 0.3
 """Size of a gap before there is data, in normalised outputs, unless something better is known."""
 MIDDLE_LENGTH = 3.0
-WIDTH_SCALE, WIDTH_LENGTH, WIDTH_SLOPE, WIDTH_NOISE = 1.0, 1.0, 1.0, 0.5
-"""Standard deviations of the logarithms of what is learned around its median."""
+WIDTH_SCALE, WIDTH_OWN, WIDTH_NOISE = 1.0, 0.3, 0.5
+"""Standard deviations of the logarithms of what is learned: sizes, an output's own lengths and slopes, noise."""
+WIDTH_SIZE, WIDTH_REACH = 1.0, 1.0
+"""The same of a factor on all sizes of an output, and of one on the lengthscales of all outputs along an input: a few
+rows cannot tell each output's alone."""
 
 
 @dataclass(frozen=True, slots=True)
 class GapCovariance:
-    """Covariance of each output's gap: ``s^2 exp(-|(a - b) / l|^2 / 2) + (w a) . (w b) + c^2``.
+    """Covariance of each output's gap: ``s^2 r(a, b; l) + (w a) . (w b) + c^2 + d^2 f(a) f(b) r(a, b; m)``.
+
+    ``r(a, b; l)`` is ``exp(-|(a - b) / l|^2 / 2)``. The last term is what the simulator itself says, f, times a share
+    that changes with the inputs (the factor of Kennedy and O'Hagan 2000, "Predicting the output from a complex computer
+    code when fast approximations are available", equation 1, as a process): a simulator may be right in one place and
+    worth nothing in another.
 
     Attributes:
         scales: s (O,).
         lengths: l (O, D).
         slopes: w (O, D).
         offsets: c (O,).
+        doubts: d (O,).
+        doubt_lengths: m (O, D).
     """
 
     scales: Tensor
     lengths: Tensor
     slopes: Tensor
     offsets: Tensor
+    doubts: Tensor
+    doubt_lengths: Tensor
 
     @classmethod
     def before_data(cls, inputs: int, expected: Tensor) -> GapCovariance:
         """The medians of what may be learned, for gaps of an expected size (O,)."""
         size = expected.double()
         wide = torch.ones((len(size), inputs), dtype=torch.float64)
-        return cls(size, MIDDLE_LENGTH * wide, size[:, None] * wide, size)
+        long = MIDDLE_LENGTH * wide
+        return cls(size, long, size[:, None] * wide, size, size, long)
 
     def __call__(self, first: Tensor, second: Tensor | None = None) -> Tensor:
-        """Covariances (O, ..., N, M) between inputs (..., N, D) and (..., M, D)."""
+        """Covariances (O, ..., N, M) between inputs (..., N, D) and (..., M, D).
+
+        Inputs of width D + O end in what the simulator says there; those of width D are without a simulator.
+        """
         second = first if second is None else second
         outputs, width = self.lengths.shape
+        a, b = first[..., :width], second[..., :width]
         each = (outputs, *[1] * (first.ndim - 1), width)
+        alone = (outputs, *[1] * first.ndim)
 
         def scaled(by: Tensor) -> Tensor:
             """Inner products of inputs that are multiplied by ``by`` (O, D)."""
-            return (first * by.view(each) ** 2) @ second.transpose(-1, -2)
+            return (a * by.view(each) ** 2) @ b.transpose(-1, -2)
 
-        near = 1.0 / self.lengths
-        squares = [((x[None] * near.view(each)) ** 2).sum(dim=-1) for x in (first, second)]
-        distance = squares[0][..., :, None] + squares[1][..., None, :] - 2.0 * scaled(near)
-        alone = (outputs, *[1] * first.ndim)
-        smooth = self.scales.view(alone) ** 2 * torch.exp(-0.5 * distance.clamp_min(0.0))
-        return smooth + scaled(self.slopes) + self.offsets.view(alone) ** 2
+        def near(lengths: Tensor) -> Tensor:
+            by = 1.0 / lengths
+            squares = [((x[None] * by.view(each)) ** 2).sum(dim=-1) for x in (a, b)]
+            distance = squares[0][..., :, None] + squares[1][..., None, :] - 2.0 * scaled(by)
+            return torch.exp(-0.5 * distance.clamp_min(0.0))
+
+        found = self.scales.view(alone) ** 2 * near(self.lengths) + scaled(self.slopes) + self.offsets.view(alone) ** 2
+        if first.shape[-1] == width:
+            return found
+        said = [self.doubts.view(alone[:-1]) * x[..., width:].movedim(-1, 0) for x in (first, second)]
+        return found + said[0][..., :, None] * said[1][..., None, :] * near(self.doubt_lengths)
 
 
 def learn_gap(
-    inputs: Tensor, residual: Tensor, known: Tensor | None, noise_std: Tensor, expected: Tensor, trust: Tensor
+    inputs: Tensor,
+    residual: Tensor,
+    known: Tensor | None,
+    noise_std: Tensor,
+    expected: Tensor,
+    trust: Tensor,
+    said: Tensor | None = None,
 ) -> tuple[GapCovariance, Tensor]:
     """Find the covariance of the gap and the noise by the evidence.
 
@@ -78,29 +107,30 @@ def learn_gap(
         noise_std: expected noise (O,).
         expected: size of the gap (O,).
         trust: what a row's noise variance is divided by (n,), 1 unless it is an outlier.
+        said: normalised outputs of the simulator (n, O), where there is one.
 
     Returns:
         The covariance and the noise (O,).
     """
     residual, inputs = residual.double(), inputs.double()
     start = GapCovariance.before_data(inputs.shape[1], expected)
-    middles = [
-        start.scales.log(),
-        start.lengths.log(),
-        start.slopes.log(),
-        start.offsets.log(),
-        noise_std.double().log(),
-    ]
-    widths = (WIDTH_SCALE, WIDTH_LENGTH, WIDTH_SLOPE, WIDTH_SLOPE, WIDTH_NOISE)
+    inputs = inputs if said is None else torch.cat([inputs, said.double()], dim=1)
+    of_gap = (start.scales, start.lengths, start.slopes, start.offsets, start.doubts, start.doubt_lengths)
+    reach = torch.zeros_like(start.lengths[0])
+    middles = [*(v.log() for v in of_gap), noise_std.double().log(), torch.zeros_like(start.scales), reach]
+    widths = (
+        *(WIDTH_SCALE, WIDTH_OWN, WIDTH_OWN, WIDTH_SCALE, WIDTH_SCALE, WIDTH_OWN),
+        *(WIDTH_NOISE, WIDTH_SIZE, WIDTH_REACH),
+    )
     logs = [m.clone().requires_grad_() for m in middles]
     optimiser = torch.optim.Adam(logs, lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS, eta_min=0.05 * RATE)
     for _ in range(STEPS):
-        gap = GapCovariance(*(v.exp() for v in logs[:4]))
-        covariance = gap(inputs) + torch.diag_embed(torch.exp(2.0 * logs[4])[:, None] / trust + TINY)
+        gap = _covariance_of(logs)
+        covariance = gap(inputs) + torch.diag_embed(torch.exp(2.0 * logs[6])[:, None] / trust + TINY)
         if known is not None:
             covariance = covariance + known
-        surprise = -log_evidence(residual, torch.linalg.cholesky(covariance))
+        surprise: Tensor = -log_evidence(residual, torch.linalg.cholesky(covariance))
         for value, middle, width in zip(logs, middles, widths, strict=True):
             surprise = surprise + 0.5 * (((value - middle) / width) ** 2).sum()
         for value, gradient in zip(logs, torch.autograd.grad(surprise, logs), strict=True):
@@ -108,7 +138,16 @@ def learn_gap(
         optimiser.step()
         schedule.step()
     with torch.no_grad():
-        return GapCovariance(*(v.exp() for v in logs[:4])), logs[4].exp()
+        return _covariance_of(logs), logs[6].exp()
+
+
+def _covariance_of(logs: list[Tensor]) -> GapCovariance:
+    """The covariance of logarithms: of its six parts, of the noise, of a factor on all sizes, of one on all lengths."""
+    scales, lengths, slopes, offsets, doubts, doubt_lengths, _, size, reach = logs
+    return GapCovariance(
+        (scales + size).exp(), (lengths + reach).exp(), (slopes + size[:, None]).exp(), (offsets + size).exp(),
+        (doubts + size).exp(), (doubt_lengths + reach).exp(),
+    )  # fmt: skip
 
 
 def log_evidence(residual: Tensor, factor: Tensor) -> Tensor:

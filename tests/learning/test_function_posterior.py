@@ -62,14 +62,25 @@ def tensors(*arrays):
     return [torch.tensor(a, dtype=torch.float32) for a in arrays]
 
 
-def kernel(gap, first, second):
-    """The gap's covariance at raw inputs, of raw outputs (O, N, M)."""
+def said(parameters, x):
+    """Normalised outputs of the simulator with the mean of some parameters (O, N)."""
+    raw = features(x) @ parameters.double().numpy().mean(axis=0)
+    return (raw - UNITS.output_mean.numpy()[:, None]) / UNITS.output_std.numpy()[:, None]
+
+
+def kernel(gap, first, second, parameters=None):
+    """The gap's covariance at raw inputs, of raw outputs (O, N, M); with draws of the parameters of a simulator."""
     a, b = ((np.asarray(v, dtype=float) - UNITS.input_mean.numpy()) / UNITS.input_std.numpy() for v in (first, second))
     found = []
     for k, unit in enumerate(UNITS.output_std.double().numpy()):
         s, length, w, c = (v[k].double().numpy() for v in (gap.scales, gap.lengths, gap.slopes, gap.offsets))
         distance = (((a[:, None] - b[None]) / length) ** 2).sum(axis=2)
-        found.append(unit**2 * (s**2 * np.exp(-0.5 * distance) + (w * a) @ (w * b).T + c**2))
+        own = s**2 * np.exp(-0.5 * distance) + (w * a) @ (w * b).T + c**2
+        if parameters is not None:
+            d, long = (v[k].double().numpy() for v in (gap.doubts, gap.doubt_lengths))
+            near = np.exp(-0.5 * (((a[:, None] - b[None]) / long) ** 2).sum(axis=2))
+            own = own + d**2 * said(parameters, first)[k][:, None] * said(parameters, second)[k] * near
+        found.append(unit**2 * own)
     return np.stack(found)
 
 
@@ -90,7 +101,7 @@ def raw_noise(posterior):
     return (posterior.noise_std * UNITS.output_std).double().numpy()
 
 
-def together(x, y, at, gap, noise):
+def together(x, y, at, gap, noise, parameters=None):
     """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of simulator and gap, in numpy.
 
     Outputs share the simulator's parameters, so that all rows of all outputs are conditioned on at once.
@@ -102,7 +113,7 @@ def together(x, y, at, gap, noise):
         a, b = (np.concatenate(features(v)) for v in (first, second))
         of_gap = np.zeros((len(a), len(b)))
         if gap is not None:
-            for k, block in enumerate(kernel(gap, first, second)):
+            for k, block in enumerate(kernel(gap, first, second, parameters)):
                 of_gap[k * len(first) : (k + 1) * len(first), k * len(second) : (k + 1) * len(second)] = block
         return a @ b.T + of_gap
 
@@ -154,7 +165,7 @@ def over_seeds(x, y, at, count, **settings):
     for seed in range(count):
         found = infer(Linear(), x, y, UNITS, NOISE, seed=seed, **settings)
         mean, std = found.predict(at)
-        theirs, exact, _ = together(x, y, at, found.gap, raw_noise(found))
+        theirs, exact, _ = together(x, y, at, found.gap, raw_noise(found), found.parameters)
         own, wanted = (v**2 - raw_noise(found) ** 2 for v in (std.double().numpy(), exact))
         off.append((mean.numpy() - theirs) / np.sqrt(wanted))
         ratios.append(own / wanted)
@@ -179,7 +190,7 @@ class TestWithSimulator:
         means, covariances = found.marginals(self.at[:20].view(4, 5, 2))
         units = UNITS.output_std.numpy()
         for k in range(4):
-            mean, _, exact = together(x, y, self.at[5 * k : 5 * k + 5], found.gap, raw_noise(found))
+            mean, _, exact = together(x, y, self.at[5 * k : 5 * k + 5], found.gap, raw_noise(found), found.parameters)
             exact = exact / units[:, None, None] ** 2
             std = np.sqrt(exact.diagonal(axis1=1, axis2=2))
             assert (np.abs(means[k].numpy().T * units + UNITS.output_mean.numpy() - mean) / units < 0.35 * std.T).all()
@@ -216,7 +227,8 @@ class TestWithoutRows:
         x = (self.at.double().numpy() - UNITS.input_mean.numpy()) / UNITS.input_std.numpy()
         distance = ((x[:, None] - x[None]) ** 2).sum(axis=2)
         for k in range(2):
-            of_gap = size[k] ** 2 * (np.exp(-0.5 * distance / MIDDLE_LENGTH**2) + x @ x.T + 1.0)
+            near, own = np.exp(-0.5 * distance / MIDDLE_LENGTH**2), drawn[:, k].mean(axis=0)
+            of_gap = size[k] ** 2 * (near + x @ x.T + 1.0 + own[:, None] * own * near)
             exact = np.cov(drawn[:, k].T, bias=True) + of_gap
             assert np.allclose(means[:, k].flatten(), drawn[:, k].mean(axis=0), atol=1e-5)
             for b in range(2):

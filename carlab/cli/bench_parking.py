@@ -1,0 +1,75 @@
+"""``carlab bench parking``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, get_args
+
+from carlab.cli.console import console, table
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.cli.bench import Bench
+    from carlab.experiment.parking_study import MethodFigures
+
+
+def run_parking(options: Bench) -> int:
+    """Drive what is missing of the study's runs, and print what all of them came to."""
+    from carlab.cli.learn import Learn
+    from carlab.cli.options import CarOptions
+    from carlab.experiment.campaign import CAMPAIGN_FILE
+    from carlab.experiment.parking_study import as_json, draw, read_curve, run_folder, run_name, summarised
+    from learning.car_fit import Method
+
+    methods = options.methods or get_args(Method)
+    if unknown := [m for m in methods if m not in get_args(Method)]:
+        raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(get_args(Method))}.")
+    folders = []
+    for seed in range(options.seeds):
+        for method in methods:
+            done = run_folder(options.runs, method, seed)
+            console.print(f"{method}, seed {seed}")
+            code = Learn(
+                CarOptions("sim"), episodes=options.episodes, updates=options.updates, method=method, seed=seed,
+                resume=done if done is not None and (done / CAMPAIGN_FILE).is_file() else None, out=options.runs,
+                name=run_name(method, seed), rerun=False,
+            ).run()  # fmt: skip
+            if code != 0:
+                return code
+            folder = run_folder(options.runs, method, seed)
+            assert folder is not None
+            folders.append(folder)
+    curves = [read_curve(folder) for folder in sorted(folders, key=lambda f: methods.index(read_curve(f).method))]
+    table(
+        f"Parking, simulated car, {options.seeds} seeds",
+        [
+            "method",
+            "first parked in episode",
+            "median",
+            "parked in the last five",
+            "seconds\nan episode",
+            "minutes\na run",
+        ],
+        [_row(row) for row in summarised(curves)],
+    )
+    if options.out is not None:
+        command = " ".join(["carlab", *sys.argv[1:]])
+        options.out.write_text(json.dumps(as_json(curves, command), indent=2) + "\n", encoding="utf-8")
+        picture = options.out.with_suffix(".png")
+        draw(curves, picture)
+        console.print(f"{options.out}, {picture}, {options.runs}")
+    return 0
+
+
+def _row(row: MethodFigures) -> list[str]:
+    first = ", ".join("never" if f is None else str(f) for f in row.first_parked)
+    median = "never" if row.median_first_parked == float("inf") else f"{row.median_first_parked:g}"
+    return [
+        row.method,
+        first,
+        median,
+        f"{row.parked_at_last:.0%}",
+        f"{row.seconds_an_episode:.0f}",
+        f"{row.minutes:.0f}",
+    ]

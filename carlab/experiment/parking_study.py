@@ -1,0 +1,188 @@
+"""Learning to park, method beside method: runs of ``carlab learn`` with several seeds as curves with bands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlab.core.errors import DataError
+from carlab.experiment.campaign import CAMPAIGN_FILE
+from carlab.experiment.campaign_figures import EpisodeFigures
+from carlab.experiment.campaign_report import CURVE_FILE
+
+LAST = 5
+"""Episodes at the end over which the share of parked ones is told."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One run.
+
+    Attributes:
+        method: of learning the car.
+        seed: of everything.
+        updates: gradient steps of SAC that were asked for before an episode.
+        episodes: its figures, in order.
+    """
+
+    method: str
+    seed: int
+    updates: int
+    episodes: tuple[EpisodeFigures, ...]
+
+    @property
+    def first_parked(self) -> int | None:
+        """The first episode that ended parked."""
+        return next((e.episode for e in self.episodes if e.parked), None)
+
+
+@dataclass(frozen=True, slots=True)
+class MethodFigures:
+    """The runs of one method.
+
+    Attributes:
+        method: which.
+        seeds: how many runs.
+        episodes: of the shortest.
+        first_parked: of each run the first episode that ended parked, None where none did.
+        median_first_parked: over runs, one that never parked counted as later than all; infinite where that is so.
+        parked_at_last: share of parked episodes among the last ``LAST``.
+        mean_return: of each episode over the runs (E,).
+        return_standard_error: of those means (E,); NaN for a single run.
+        seconds_an_episode: that learning took on average.
+        minutes: that learning of a whole run took on average.
+    """
+
+    method: str
+    seeds: int
+    episodes: int
+    first_parked: tuple[int | None, ...]
+    median_first_parked: float
+    parked_at_last: float
+    mean_return: tuple[float, ...]
+    return_standard_error: tuple[float, ...]
+    seconds_an_episode: float
+    minutes: float
+
+
+def run_folder(runs: Path, method: str, seed: int) -> Path | None:
+    """The folder of an earlier run. Raises DataError where there are several."""
+    found = sorted(p for p in runs.glob(f"*_{run_name(method, seed)}") if p.is_dir())
+    if len(found) > 1:
+        raise DataError(f"{runs} has {len(found)} runs named {run_name(method, seed)}; remove all but one.")
+    return found[0] if found else None
+
+
+def run_name(method: str, seed: int) -> str:
+    """Last part of the name of a run's folder."""
+    return f"{method}-seed{seed}"
+
+
+def read_curve(folder: Path) -> Curve:
+    """A run's figures. Raises DataError where the folder is no run of learning."""
+    try:
+        plan = json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]
+        rows = json.loads((folder / CURVE_FILE).read_text(encoding="utf-8"))["episodes"]
+        episodes = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
+        return Curve(plan["method"], int(plan["seed"]), int(plan["updates"]), tuple(episodes))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{folder} is no run of carlab learn with figures ({error}); remove it.") from error
+
+
+def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
+    """One row a method, in the order in which they come."""
+    found = []
+    for method in dict.fromkeys(c.method for c in curves):
+        own = [c for c in curves if c.method == method and c.episodes]
+        if not own:
+            continue
+        count = min(len(c.episodes) for c in own)
+        returns = np.array([[e.total_reward for e in c.episodes[:count]] for c in own])
+        spread = returns.std(axis=0, ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.full(count, np.nan)
+        first = tuple(c.first_parked for c in own)
+        parked = [[e.parked for e in c.episodes[-LAST:]] for c in own]
+        seconds = [[e.model_seconds + e.policy_seconds for e in c.episodes] for c in own]
+        found.append(
+            MethodFigures(
+                method, len(own), count, first,
+                float(np.median([np.inf if f is None else f for f in first])),
+                float(np.mean([np.mean(p) for p in parked])),
+                tuple(returns.mean(axis=0).tolist()), tuple(spread.tolist()),
+                float(np.mean([np.mean(s) for s in seconds])), float(np.mean([np.sum(s) for s in seconds])) / 60.0,
+            )
+        )  # fmt: skip
+    return found
+
+
+def as_json(curves: Sequence[Curve], command: str) -> dict[str, Any]:
+    """Everything that was measured, and what made it; what is no number or infinite is null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {k: plain(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    runs = [
+        {"method": c.method, "seed": c.seed, "updates": c.updates, "episodes": [e.to_dict() for e in c.episodes]}
+        for c in curves
+    ]
+    return {
+        "schema": "carlab.parking/1",
+        "command": command,
+        "methods": [plain(asdict(row)) for row in summarised(curves)],
+        "runs": runs,
+    }
+
+
+def draw(curves: Sequence[Curve], path: Path) -> None:
+    """Write a PNG: return and distance from the goal against the episode, and who parked when.
+
+    Args:
+        curves: of all runs.
+        path: to write to.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (reward, distance, parked) = pyplot.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
+    rows = summarised(curves)
+    ticks, labels = [], []
+    for row in rows:
+        own = [c for c in curves if c.method == row.method and c.episodes]
+        numbers = np.arange(1, row.episodes + 1)
+        mean, error = np.array(row.mean_return), np.array(row.return_standard_error)
+        (line,) = reward.plot(numbers, mean, marker="o", markersize=3, label=f"{row.method}, {row.seeds} seeds")
+        colour = line.get_color()
+        reward.fill_between(numbers, mean - error, mean + error, alpha=0.25, color=colour, linewidth=0)
+        metres = np.array([[e.distance_m for e in c.episodes[: row.episodes]] for c in own])
+        distance.plot(numbers, np.median(metres, axis=0), color=colour, marker="o", markersize=3)
+        distance.fill_between(numbers, metres.min(axis=0), metres.max(axis=0), alpha=0.15, color=colour, linewidth=0)
+        for curve in own:
+            height = -len(ticks)
+            ticks.append(height)
+            labels.append(f"{curve.method}, seed {curve.seed}")
+            for there in (True, False):
+                at = [e.episode for e in curve.episodes if e.parked is there]
+                parked.plot(at, [height] * len(at), "s" if there else "x", color=colour, markersize=5 if there else 4)
+    reward.set(xlabel="episode", ylabel="return on the car (mean, standard error)")
+    reward.legend(fontsize=8)
+    distance.set(xlabel="episode", ylabel="distance from the goal at the end [m]\n(median, all seeds)", ylim=(0.0, 3.0))
+    parked.set(xlabel="episode", title="squares: parked")
+    parked.set_yticks(ticks, labels, fontsize=7)
+    for axis in (reward, distance, parked):
+        axis.grid(alpha=0.3)
+        axis.xaxis.get_major_locator().set_params(integer=True)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+__all__ = ["LAST", "Curve", "MethodFigures", "as_json", "draw", "read_curve", "run_folder", "run_name", "summarised"]

@@ -1,0 +1,139 @@
+"""FSVGD as the authors set it: its world frame against complex numbers, and what choosing by held-out rows keeps."""
+
+from __future__ import annotations
+
+import cmath
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from learning.authors_fsvgd import (
+    WorldDynamics,
+    authors_settings,
+    fit_authors_fsvgd,
+    in_world,
+    world_rows,
+)
+from learning.evaluation import negative_log_likelihood
+from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, fit
+from learning.function_prior import RbfCovariance
+from learning.normaliser import Normaliser
+from learning.particles import Network
+
+HISTORY = 2
+
+
+def circling(ticks: int = 80, seed: int = 0) -> EpisodeData:
+    """A car whose velocity in the world turns at 1.5 rad/s and whose body looks 0.2 rad beside it."""
+    times = np.arange(ticks + 1) / 30.0
+    place = np.exp(1j * 1.5 * times) / 1.5j
+    yaw = 1.5 * times + 0.2
+    body = np.exp(1j * 1.5 * times) * np.exp(-1j * yaw)
+    states = np.stack([place.real, place.imag, yaw, body.real, body.imag, np.full(ticks + 1, 1.5)], axis=1)
+    sent = np.random.default_rng(seed).uniform(-1, 1, (ticks, 2))
+    return EpisodeData(times, states, sent, sent, np.zeros(ticks))
+
+
+def constant(change: list[float]) -> WorldDynamics:
+    """A world that always changes by so much."""
+    width = 7 + 2 * (HISTORY + 1)
+    network = Network(width, 7, (4,))
+    parameters = torch.zeros(3, network.parameters)
+    units = Normaliser(torch.zeros(width), torch.ones(width), torch.tensor(change), torch.ones(7))
+    return WorldDynamics(Posterior(network, parameters, torch.zeros(7), units), HISTORY)
+
+
+def test_rows_are_those_of_the_world() -> None:
+    episode = circling()
+    inputs, changes = world_rows([episode], HISTORY)
+    assert inputs.shape == (episode.ticks - HISTORY, 7 + 2 * (HISTORY + 1))
+    for row in (0, 31, 77):
+        tick = row + HISTORY
+        t = episode.times_s[tick]
+        velocity = cmath.exp(1.5j * t)
+        wanted = [velocity.imag / 1.5, -velocity.real / 1.5, np.sin(1.5 * t + 0.2), np.cos(1.5 * t + 0.2)]
+        wanted += [velocity.real, velocity.imag, 1.5, *episode.sent[tick - HISTORY : tick + 1].ravel()]
+        assert np.allclose(inputs[row], wanted, atol=1e-5)
+        later = cmath.exp(1.5j * episode.times_s[tick + 1])
+        assert np.allclose(changes[row, 4:6], [later.real - velocity.real, later.imag - velocity.imag], atol=1e-5)
+
+
+def test_a_step_is_carried_on_in_the_world() -> None:
+    """A car that looks along y with 1 m/s ahead and 0.5 m/s to the left; it is pushed and turned to look along -x."""
+    features = torch.tensor([[2.0, 1.0, 1.0, 0.0, 1.0, 0.5, 0.1, 0.1, 0.2, 0.3, 0.4]])
+    assert np.allclose(in_world(features)[0, 4:6], [-0.5, 1.0], atol=1e-6)
+    world = constant([0.1, -0.2, -1.0, -1.0, 0.3, 0.0, 0.05])
+    after = world.step(features, torch.tensor([[0.5, 0.6]]), torch.Generator().manual_seed(0))[0]
+    assert np.allclose(after[:4], [2.1, 0.8, 0.0, -1.0], atol=1e-6)
+    assert np.allclose(after[4:6], [0.2, -1.0], atol=1e-6), "velocity (-0.2, 1.0) seen by a body that looks along -x"
+    assert np.allclose(after[6:], [0.15, 0.3, 0.4, 0.5, 0.6], atol=1e-6)
+
+
+def test_a_fit_learns_and_before_any_episode_there_is_none() -> None:
+    episodes = [circling(seed=s) for s in range(3)]
+    unfitted = fit_authors_fsvgd([], HISTORY, seed=1)
+    fitted = fit_authors_fsvgd(episodes[:2], HISTORY, 400, seed=1)
+    assert torch.equal(
+        unfitted.posterior.parameters,
+        unfitted.posterior.network.initial(10, torch.Generator().manual_seed(1)),
+    )
+    before, after = unfitted.surprise(episodes[2])[0], fitted.surprise(episodes[2])[0]
+    assert after < before - 5.0
+
+
+def test_a_handful_of_rows_is_too_few() -> None:
+    with pytest.raises(DataError, match="too few to hold some out"):
+        fit_authors_fsvgd([circling(ticks=HISTORY + 3)], HISTORY, 10)
+
+
+def test_their_prior_weighs_next_to_nothing() -> None:
+    assert authors_settings(1000, 0).prior_exponent == pytest.approx(1 / 480)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> tuple[torch.Tensor, ...]:
+    generator = torch.Generator().manual_seed(0)
+    x = torch.randn(212, 1, generator=generator)
+    y = 0.5 * x + torch.randn(212, 1, generator=generator)
+    return x[:12], y[:12], x[12:], y[12:]
+
+
+class TestHeldOutRows:
+    """Twelve rows of noise are learned by heart; others tell when."""
+
+    SETTINGS = FsvgdSettings(
+        particles=4, steps=1500, hidden=(64, 64), learning_rate=3e-3, noise_std=0.3, learn_noise=False, natural=False,
+        falling_rate=False, checked_every=100, bandwidth=0.1,
+    )  # fmt: skip
+    UNITS = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
+
+    def test_the_best_of_the_looks_is_kept(self, noisy: tuple[torch.Tensor, ...]) -> None:
+        x, y, others, truth = noisy
+        last = fit(x, y, x, None, self.UNITS, self.SETTINGS)
+        kept = fit(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
+        surprise = [negative_log_likelihood(p.predict(others), truth) for p in (kept, last)]
+        assert surprise[0] < surprise[1] - 0.5
+
+    def test_patience_ends_the_fit_with_the_same_networks(self, noisy: tuple[torch.Tensor, ...]) -> None:
+        x, y, others, truth = noisy
+        told: list[int] = []
+        kept = fit(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
+        soon = fit(x, y, x, None, self.UNITS, replace(self.SETTINGS, patience=3), told.append, held_out=(others, truth))
+        assert max(told, default=0) < 1500
+        assert torch.equal(soon.parameters, kept.parameters)
+
+    def test_the_priors_exponent_scales_it(self, noisy: tuple[torch.Tensor, ...]) -> None:
+        """Without weight another prior changes nothing; with its weight it does."""
+        x, y, others, _ = noisy
+        found = {}
+        for exponent in (0.0, 1.0):
+            for length in (0.1, 3.0):
+                prior = GaussianProcessPrior(torch.cat([x, others]), RbfCovariance((1.0,), (length,)))
+                settings = replace(self.SETTINGS, steps=60, prior_exponent=exponent)
+                found[exponent, length] = fit(x, y, others, prior, self.UNITS, settings).parameters
+        assert torch.equal(found[0.0, 0.1], found[0.0, 3.0])
+        assert not torch.allclose(found[1.0, 0.1], found[1.0, 3.0], atol=1e-3)
