@@ -45,7 +45,7 @@ class GapCovariance:
     def before_data(cls, inputs: int, expected: Tensor) -> GapCovariance:
         """The medians of what may be learned, for gaps of an expected size (O,)."""
         size = expected.double()
-        wide = torch.ones((len(size), inputs), dtype=torch.float64)
+        wide = torch.ones((len(size), inputs), dtype=torch.float64, device=size.device)
         return cls(size, MIDDLE_LENGTH * wide, size[:, None] * wide, size)
 
     def __call__(self, first: Tensor, second: Tensor | None = None) -> Tensor:

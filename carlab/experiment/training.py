@@ -51,6 +51,7 @@ class TrainingPlan:
         ticks: of an episode; the task's unless given.
         seed: of everything.
         threads: of torch.
+        device: where model and policy are learned; what drives is on the CPU.
     """
 
     prior_toml: str
@@ -61,6 +62,7 @@ class TrainingPlan:
     ticks: int | None = None
     seed: int = 0
     threads: int = 1
+    device: str = "cpu"
 
     @property
     def task(self) -> ParkingTask:
@@ -113,10 +115,10 @@ def train(
     rows = transitions_of(usable, plan.history) if usable else None
     figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
     earlier = model_folder(models, number - 1)
-    before = load_car(earlier / DYNAMICS_FILE) if earlier.is_dir() else None
+    before = load_car(earlier / DYNAMICS_FILE, plan.device) if earlier.is_dir() else None
     if before is not None and episodes and episodes[-1].ticks > plan.history:
         fresh = transitions_of(episodes[-1:], plan.history)
-        inputs, outputs = (torch.from_numpy(v).float() for v in (fresh.inputs, fresh.targets))
+        inputs, outputs = (torch.from_numpy(v).float().to(plan.device) for v in (fresh.inputs, fresh.targets))
         predicted = before.predict(inputs).smoothed()
         figures |= {
             "last_episode_nll": negative_log_likelihood(predicted, outputs),
@@ -128,7 +130,7 @@ def train(
     settings = CarFitSettings(plan.method, plan.model_steps, seed=seed)
     tell("learning the car", 0, plan.model_steps)
     dynamics = fit_car(
-        rows, model, settings, before=before,
+        rows, model, settings, before=before, device=plan.device,
         progress=lambda done: tell("learning the car", done, plan.model_steps),
     )  # fmt: skip
     figures["model_seconds"] = clock.now_s() - began_s
@@ -136,11 +138,11 @@ def train(
     began_s = clock.now_s()
     updates = plan.updates if before is not None else plan.updates * 3 // 2
     sac = SacSettings()
-    agent = SacAgent(sac, plan.seed)
+    agent = SacAgent(sac, plan.seed, plan.device)
     if before is not None:
-        agent = SacAgent.load(earlier, sac, plan.seed)
+        agent = SacAgent.load(earlier, sac, plan.seed, plan.device)
     recorded = recorded_features(usable, plan.history) if usable else None
-    gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s}
+    gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s, "device": plan.device}
     world = ModelEnv(dynamics, plan.task, sac.cars, recorded=recorded, seed=seed, **gate)
     judging = ModelEnv(dynamics, plan.task, JUDGED_CARS, seed=seed + 1, **gate)
 
