@@ -3,16 +3,21 @@
 Inside ``stand_in()`` whatever is made on or moved to ``cuda`` is an ``Elsewhere``. It holds ordinary numbers, so that
 whole fits run with the values and the branches of the CPU, but it meets no tensor of the CPU in an operation (plain
 scalars excepted, as on CUDA), becomes no NumPy array, is drawn by no generator of the CPU and is not written to a file.
-Crossing copies: nothing is seen from both sides. The operations that cross are counted.
+An index must be there, too, though CUDA would move it. Crossing copies, so that nothing is seen from both sides. The
+operations that were used are kept, and torch's own list says which of them CUDA has.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
+import torchgen
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -82,8 +87,7 @@ class Elsewhere(Tensor):
 class _Operations(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
-        self.crossings = 0
-        self.done = 0
+        self.used: set[str] = set()
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
@@ -92,20 +96,16 @@ class _Operations(TorchDispatchMode):
         to = kwargs.get("device")
         if not ours and to != UNDER:
             return func(*args, **kwargs)
-        self.done += 1
+        self.used.add(func._schema.name.removeprefix("aten::") + f".{func._schema.overload_name}".rstrip("."))
         if func is _aten.copy_.default:
-            self.crossings += type(args[0]) is not type(args[1])
             _inner(args[0]).copy_(_inner(args[1]))
             return args[0]
         if to is not None:
             kwargs["device"] = CPU
         if func is _aten._to_copy.default:
-            crosses = to is not None and (to == UNDER) != ours
-            self.crossings += crosses
             found = func(*_inner(args), **kwargs)
             return Elsewhere(found) if (to == UNDER if to is not None else ours) else found
         if ours:
-            self.crossings += func is _aten._local_scalar_dense.default
             _refuse_mixtures(func, tensors)
         if any(isinstance(v, torch.Generator) for v in (*args, *kwargs.values())):
             raise RuntimeError("Expected a 'cuda' device type for generator but found 'cpu'")
@@ -167,6 +167,26 @@ def _is_cuda(device: Any) -> bool:
         return device is not None and torch.device(device).type == "cuda"
     except (RuntimeError, TypeError):
         return False
+
+
+@cache
+def _kernels() -> dict[str, str]:
+    """What torch's list of operations says of each."""
+    text = Path(torchgen.__file__).with_name("packaged").joinpath("ATen/native/native_functions.yaml").read_text()
+    return {block.split("(")[0]: block for block in text.split("\n- func: ")[1:]}
+
+
+def without_cuda(used: Iterable[str]) -> list[str]:
+    """Those of some operations for which CUDA has nothing."""
+    return sorted(name for name in used if not _has_cuda(name))
+
+
+def _has_cuda(name: str) -> bool:
+    block = _kernels()[name]
+    if delegate := re.search(r"structured_delegate: (\S+)", block):
+        return _has_cuda(delegate[1])
+    everywhere = "ufunc_inner_loop" in block or "\n  dispatch:" not in block
+    return everywhere or re.search(r"\n    [\w, ]*(\bCUDA\b|Composite)[\w, ]*:", block) is not None
 
 
 @contextmanager

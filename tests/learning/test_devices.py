@@ -6,10 +6,9 @@ The stand-in (``tests/stand_in_device.py``) has the CPU's numbers and CUDA's ref
 from __future__ import annotations
 
 import copy
-import importlib.util
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -39,19 +38,6 @@ from learning.system_identification import grey_box, identify
 from learning.transitions import Transitions
 from sim_backends.car_parameters import SimulatorConfig
 
-_spec = importlib.util.spec_from_file_location("stand_in_device", Path(__file__).parents[1] / "stand_in_device.py")
-assert _spec is not None
-assert _spec.loader is not None
-stand_in_device = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(stand_in_device)
-
-CUDA_TOO = [
-    "stand-in",
-    pytest.param(
-        "cuda",
-        marks=[pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")],
-    ),
-]
 ROWS, HISTORY = 48, 1
 TRUE = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6))
 PENDULUM_UNITS = Normaliser(
@@ -67,21 +53,9 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("learning.gap.STEPS", 10)
     monkeypatch.setattr("learning.system_identification.STEPS", 10)
     monkeypatch.setattr("learning.function_posterior.PRIOR_DRAWS", 64)
-    monkeypatch.setattr("learning.parameter_posterior.HOTTEST", 6)
-
-
-@pytest.fixture(params=CUDA_TOO)
-def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """``cuda``, real or not."""
-    if request.param == "cuda":
-        yield "cuda"
-        return
-    for name, module in list(sys.modules.items()):  # It falls back to the CPU in silence.
-        if name.startswith("stable_baselines3") and hasattr(module, "get_device"):
-            monkeypatch.setattr(module, "get_device", torch.device)
-    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
-    with stand_in_device.stand_in():
-        yield "cuda"
+    monkeypatch.setattr("learning.function_posterior.DRAWS", 16)
+    monkeypatch.setattr("learning.parameter_posterior.HOTTEST", 3)
+    monkeypatch.setattr("learning.parameter_posterior.MOVES", 2)
 
 
 def close(found: Any, wanted: Any, tolerance: float = 1e-4) -> None:
@@ -128,6 +102,12 @@ def test_what_does_not_work_on_a_device_is_refused(device: str, what: Callable[[
     """Of the stand-in, that it can fail."""
     with pytest.raises((RuntimeError, TypeError)):
         what(torch.ones(3, device=device))
+
+
+def test_what_cuda_has_is_known(stand_in_device: ModuleType) -> None:
+    """Of the list that the stand-in's operations are held to."""
+    known = ("mul.Tensor", "add.Tensor", "linalg_cholesky_ex", "cov", "mkldnn_linear")
+    assert stand_in_device.without_cuda(known) == ["mkldnn_linear"]
 
 
 def test_what_crosses_is_a_copy(device: str) -> None:
@@ -318,8 +298,7 @@ def test_a_policy_is_trained_kept_and_trained_on(device: str, tmp_path: Path) ->
         agents.append(agent)
     seen = np.random.default_rng(2).normal(size=(50, feature_size(HISTORY))).astype(np.float32)
     there, here = (agent.act(seen) for agent in agents)
-    if device == "cuda" and isinstance(torch.ones(1, device=device), stand_in_device.Elsewhere):
-        # A real one draws its exploration from a generator of its own.
+    if not torch.cuda.is_available():  # A real one draws its exploration from a generator of its own.
         np.testing.assert_allclose(there, here, atol=1e-3)
     agents[0].save(tmp_path)
     assert isinstance(torch.load(tmp_path / "moments.pt", weights_only=True)["actor"]["mean"], Tensor)
