@@ -139,9 +139,7 @@ def _refuse_mixtures(func: Any, tensors: list[Tensor]) -> None:
     for k, tensor in enumerate(tensors):
         written = k == 0 and func._schema.is_mutable
         if not isinstance(tensor, Elsewhere) and (tensor.ndim or written or func in _NO_SCALARS):
-            raise RuntimeError(
-                f"Expected all tensors to be on the same device, but found at least two devices, cpu and cuda:0! ({func})"
-            )
+            raise RuntimeError(f"Expected all tensors to be on the same device, but found cpu and cuda:0! ({func})")
 
 
 class _Names(TorchFunctionMode):

@@ -74,7 +74,8 @@ class Learn:
     """Start each episode at the task's start pose; off: from where the car stands."""
 
     resume: Path | None = None
-    """A run's folder that is taken up again; --car must be as it was, the other options but --device are those of the run."""
+    """A run's folder that is taken up again; --car must be as it was, the other options but --device are those of the
+    run."""
 
     out: Path = Path("runs")
     """Folder that receives the run's folder."""

@@ -1,4 +1,4 @@
-"""A run that learns on another device: what it learns is what it would have learned here, and it drives from the CPU."""
+"""A run that learns on another device: it learns what it would have learned here, and drives from the CPU."""
 
 from __future__ import annotations
 

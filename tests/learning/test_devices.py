@@ -325,12 +325,9 @@ def test_a_gradient_step_is_that_of_the_cpu(device: str) -> None:
     there.replay_buffer = copy.copy(here.replay_buffer)
     there.replay_buffer.device = there.device
     for agent in agents:
-        np.random.seed(0)
-        torch.manual_seed(0)
+        agent.set_random_seed(0)
         agent.train(40, 32)
-    for (name, found), wanted in zip(
-        there.policy.state_dict().items(), here.policy.state_dict().values(), strict=True
-    ):
+    for (name, found), wanted in zip(there.policy.state_dict().items(), here.policy.state_dict().values(), strict=True):
         assert found.device.type == "cuda", name
         torch.testing.assert_close(found.cpu(), wanted, rtol=1e-3, atol=1e-3)
     close(there.log_ent_coef, here.log_ent_coef)
