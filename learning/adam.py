@@ -42,8 +42,8 @@ class Adam:
         self.numbers.addcdiv_(self.mean, below, value=-rate * scale / (1.0 - FIRST**self.steps))
 
     def state(self) -> dict[str, Tensor | int]:
-        """A copy of the moments."""
-        return {"steps": self.steps, "mean": self.mean.clone(), "square": self.square.clone()}
+        """A copy of the moments, on the CPU."""
+        return {"steps": self.steps, "mean": self.mean.cpu().clone(), "square": self.square.cpu().clone()}
 
     def load(self, state: dict[str, Tensor | int]) -> None:
         """Take up the moments that ``state`` gave. Raises ValueError for those of other numbers."""

@@ -73,7 +73,7 @@ class WorldDynamics:
 
     def surprise(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps, seven outputs [nat a step], and the calibration error."""
-        inputs, changes = world_rows([episode], self.history)
+        inputs, changes = (v.to(self.posterior.parameters) for v in world_rows([episode], self.history))
         predicted = self.posterior.predict(inputs)
         return negative_log_likelihood(predicted, changes), calibration_error(predicted, changes)
 
@@ -104,6 +104,7 @@ def fit_authors_fsvgd(
     steps: int = STEPS,
     seed: int = 0,
     progress: Callable[[int], None] = lambda step: None,
+    device: torch.device | str = "cpu",
 ) -> WorldDynamics:
     """Fit anew to all episodes; networks as they are drawn where there are none, as theirs before the first episode.
 
@@ -118,12 +119,13 @@ def fit_authors_fsvgd(
     if not episodes:
         network = Network(width, STATE_FEATURES, settings.hidden)
         noise = torch.as_tensor(settings.noise_std)
-        return WorldDynamics(Posterior(network, network.initial(PARTICLES, generator), noise, units), history)
+        unfitted = Posterior(network, network.initial(PARTICLES, generator), noise, units)
+        return WorldDynamics(unfitted.to(device), history)
     inputs, changes = world_rows(episodes, history)
     aside = int(HELD_OUT * len(inputs))
     if aside == 0:
         raise DataError(f"{len(inputs)} rows are too few to hold some out; record a longer episode.")
-    order = torch.randperm(len(inputs), generator=generator)
+    order = torch.randperm(len(inputs), generator=generator).to(device)
     rows, held_out = order[aside:], order[:aside]
     domain = torch.tensor(
         [PLACES_M, PLACES_M, np.pi, 0.0, SPEEDS_MPS, SPEEDS_MPS, RATES_RADPS, *(1.0,) * (2 * history + 2)]
@@ -131,6 +133,8 @@ def fit_authors_fsvgd(
     pool = domain * (2.0 * torch.rand((POOL, width), generator=generator) - 1.0)
     yaw = pool[:, 2].clone()
     pool[:, 2], pool[:, 3] = yaw.sin(), yaw.cos()
+    units = units.to(device)
+    inputs, changes, pool = (v.to(device) for v in (inputs, changes, pool))
     everything = units.inputs(torch.cat([inputs[rows], pool]))
     prior = GaussianProcessPrior(everything, RbfCovariance((1.0,) * STATE_FEATURES, (LENGTHSCALE,)))
     found = fit(

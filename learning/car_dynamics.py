@@ -72,7 +72,7 @@ class CarDynamics(StepInBody):
     def surprise(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps [nat a step] and the calibration error there."""
         rows = transitions_of([episode], self.history)
-        inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
+        inputs, outputs = (torch.from_numpy(v).to(self.posterior.parameters) for v in (rows.inputs, rows.targets))
         predicted = self.predict(inputs).smoothed()
         return negative_log_likelihood(predicted, outputs), calibration_error(predicted, outputs)
 

@@ -68,6 +68,7 @@ def fit_car(
     settings: CarFitSettings,
     *,
     before: CarDynamics | None = None,
+    device: torch.device | str = "cpu",
     progress: Callable[[int], None] = lambda step: None,
 ) -> CarDynamics:
     """Learn a car.
@@ -76,7 +77,8 @@ def fit_car(
         rows: what was recorded; without any the simulator alone is learned.
         model: the simulator, which is the prior or (``fsvgd``) only tells units and domain.
         settings: how.
-        before: an earlier fit of the same car, whose units and particles are taken up.
+        before: an earlier fit of the same car, whose units and particles are taken up, from any device.
+        device: where it is learned; what is drawn is drawn on the CPU.
         progress: told the steps of the optimiser that are done.
 
     Raises:
@@ -85,7 +87,7 @@ def fit_car(
     if rows is not None and rows.history != model.history:
         raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; make them alike.")
     generator = torch.Generator().manual_seed(settings.seed)
-    units = car_units(model, generator) if before is None else before.posterior.normaliser
+    units = (car_units(model, generator) if before is None else before.posterior.normaliser).to(device)
     width = 3 + 2 * (model.history + 1)
     inputs, outputs = torch.zeros((0, width)), torch.zeros((0, len(OUTPUTS)))
     if rows is not None and len(rows):
@@ -93,11 +95,13 @@ def fit_car(
     if len(inputs) > ROWS:
         some = torch.randperm(len(inputs), generator=generator)[:ROWS]
         inputs, outputs = inputs[some], outputs[some]
+    inputs, outputs = inputs.to(device), outputs.to(device)
     own = settings.method == "sim-fsvgd"
     gap = (EXPECTED_GAP if own else EXPECTED_FUNCTION) * units.output_std
     target = infer(
-        model if own else None, inputs, outputs, units, torch.tensor(NOISE_STD), gap_std=gap, seed=settings.seed
-    )
+        model if own else None, inputs, outputs, units, torch.tensor(NOISE_STD).to(device), gap_std=gap,
+        seed=settings.seed,
+    )  # fmt: skip
     points = measurement_points(model, inputs, units, generator)
     particles = ParticleSettings(particles=settings.particles, steps=settings.steps, seed=settings.seed)
     start = None if before is None else before.posterior.parameters
@@ -105,27 +109,27 @@ def fit_car(
 
 
 def save_car(dynamics: LearnedCar, path: Path) -> None:
-    """Write a learned car into a file."""
-    posterior = dynamics.posterior
+    """Write a learned car into a file, from wherever it is."""
+    posterior = dynamics.posterior.to("cpu")
     units = posterior.normaliser
     content: dict[str, Any] = {
         "version": FILE_VERSION,
         "frame": "body" if isinstance(dynamics, CarDynamics) else "world",
         "history": dynamics.history,
         "network": [posterior.network.inputs, posterior.network.outputs, *posterior.network.hidden],
-        "parameters": posterior.parameters.cpu(),
-        "noise_std": posterior.noise_std.cpu(),
-        "tails": None if posterior.tails is None else posterior.tails.cpu(),
-        "units": [t.cpu() for t in (units.input_mean, units.input_std, units.output_mean, units.output_std)],
+        "parameters": posterior.parameters,
+        "noise_std": posterior.noise_std,
+        "tails": posterior.tails,
+        "units": [units.input_mean, units.input_std, units.output_mean, units.output_std],
     }
     torch.save(content, path)
 
 
-def load_car(path: Path) -> LearnedCar:
-    """Read a learned car. Raises DataError where the file is broken, or of another version or shape."""
+def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
+    """Read a learned car onto a device. Raises DataError where the file is broken, or of another version or shape."""
     remedy = "remove its folder, and it is learned anew"
     try:
-        content: dict[str, Any] = torch.load(path, weights_only=True)
+        content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
         version = content["version"]
         inputs, outputs, *hidden = content["network"]
         network = Network(inputs, outputs, tuple(hidden))
@@ -135,7 +139,7 @@ def load_car(path: Path) -> LearnedCar:
             network, parameters, content["noise_std"], Normaliser(*content["units"]), content["tails"]
         )  # fmt: skip
         frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
-        car: LearnedCar = frames[content.get("frame", "body")](posterior, content["history"])
+        car: LearnedCar = frames[content.get("frame", "body")](posterior.to(device), content["history"])
     except _BROKEN as error:
         raise DataError(f"The learned car in {path} cannot be read ({_first(error)}); {remedy}.") from error
     if version != FILE_VERSION:
@@ -145,7 +149,7 @@ def load_car(path: Path) -> LearnedCar:
     return car
 
 
-_BROKEN = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, pickle.UnpicklingError)
+_BROKEN = (OSError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, pickle.UnpicklingError)
 
 
 def _first(error: BaseException) -> str:

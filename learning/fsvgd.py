@@ -153,6 +153,12 @@ class Posterior:
             values = self.network(self.parameters, self.normaliser.inputs(inputs))
         return Mixture(self.normaliser.raw_outputs(values), self.noise_stds * self.normaliser.output_std)
 
+    def to(self, device: torch.device | str) -> Posterior:
+        """The same on a device."""
+        tails = None if self.tails is None else self.tails.to(device)
+        own = (self.parameters.to(device), self.noise_std.to(device), self.normaliser.to(device))
+        return Posterior(self.network, *own, tails)
+
 
 @dataclass
 class _State:

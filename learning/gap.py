@@ -57,7 +57,7 @@ class GapCovariance:
     def before_data(cls, inputs: int, expected: Tensor) -> GapCovariance:
         """The medians of what may be learned, for gaps of an expected size (O,)."""
         size = expected.double()
-        wide = torch.ones((len(size), inputs), dtype=torch.float64)
+        wide = torch.ones((len(size), inputs), dtype=torch.float64, device=size.device)
         long = MIDDLE_LENGTH * wide
         return cls(size, long, size[:, None] * wide, size, size, long)
 

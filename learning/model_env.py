@@ -107,10 +107,11 @@ class ModelEnv(VecEnv):
             action = self._gate(before, self._actions)
             after = self._model.step(before, action, self._generator)
             reward = self._task.reward(before, action, after) * REWARD_SCALE
-            terminated = self._task.terminated(after).cpu().numpy() | self._stopped(after)
+        here = after.cpu()
+        terminated = self._task.terminated(here).numpy() | self._stopped(here)
         self._features = after
         self._ticks += 1
-        seen = self._seen()
+        seen = policy_view(here.numpy())
         truncated = (self._ticks >= self._task.max_ticks) & ~terminated
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -118,8 +119,7 @@ class ModelEnv(VecEnv):
         for k in ended:
             infos[k] = {"terminal_observation": seen[k].copy(), "TimeLimit.truncated": bool(truncated[k])}
         if len(ended):
-            self._start(ended)
-            seen = self._seen()
+            seen[ended] = policy_view(self._start(ended))
         return seen, reward.cpu().numpy().astype(np.float32), done, infos
 
     def rolled_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
@@ -129,22 +129,24 @@ class ModelEnv(VecEnv):
             act: actions (cars, 2) for views (cars, F).
 
         Returns:
-            Returns (cars,), unscaled and counted until a car ends, and the features at its end (cars, 7 + 2 H).
+            Returns (cars,), unscaled and counted until a car ends, and the features at its end (cars, 7 + 2 H); both on
+            the CPU.
         """
         share, self._from_recorded = self._from_recorded, 0.0
         self._start(np.arange(self.num_envs))
         total = torch.zeros(self.num_envs)
         ended = torch.zeros(self.num_envs, dtype=torch.bool)
-        last = self._features.clone()
+        last, seen = self._features.cpu().clone(), self._seen()
         with torch.no_grad():
             for _ in range(self._task.max_ticks):
                 before = self._features
-                action = self._gate(before, torch.as_tensor(act(self._seen())).to(self._device))
+                action = self._gate(before, torch.as_tensor(act(seen)).to(self._device))
                 after = self._model.step(before, action, self._generator)
+                here = after.cpu()
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
-                last = torch.where(ended.to(self._device)[:, None], last, after)
-                ended |= torch.from_numpy(self._stopped(after)) | self._task.terminated(after).cpu()
-                self._features = after
+                last = torch.where(ended[:, None], last, here)
+                ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
+                self._features, seen = after, policy_view(here.numpy())
         self._from_recorded = share
         return total, last
 
@@ -164,8 +166,8 @@ class ModelEnv(VecEnv):
         return torch.where(asked.abs() <= previous.abs(), asked, held)
 
     def _stopped(self, features: Tensor) -> NDArray[np.bool_]:
-        """Whether the gate stops a car: too fast, or not able to stop inside the arena's bounding box."""
-        state = decode_state(features).cpu().numpy()
+        """Whether the gate stops a car: too fast, or not able to stop inside the arena's bounding box. On the CPU."""
+        state = decode_state(features).numpy()
         speed = np.hypot(state[:, 3], state[:, 4])
         course = state[:, 2] + np.arctan2(state[:, 4], state[:, 3])
         needed = stopping_distance_m(speed, self._envelope.reaction_s, self._envelope.deceleration_mps2)
@@ -176,16 +178,20 @@ class ModelEnv(VecEnv):
         found: NDArray[np.bool_] = ~(inside & (speed <= self._envelope.max_speed_mps))
         return found
 
-    def _start(self, cars: NDArray[np.int64]) -> None:
+    def _start(self, cars: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Start some of the cars anew; their features."""
         fresh = np.array([self._task.sample_start(self._rng).to_array() for _ in cars])
         rows = encode(fresh, np.zeros((len(cars), self._model.history, ACTION_SIZE)))
         again = self._rng.random(len(cars)) < self._from_recorded
         if again.any():
             rows[again] = self._recorded[self._rng.integers(len(self._recorded), size=int(again.sum()))]
+        fresh_rows = torch.from_numpy(rows).float()
         features = self._features.clone()
-        features[torch.from_numpy(cars).to(self._device)] = torch.from_numpy(rows).float().to(self._device)
+        features[torch.from_numpy(cars).to(self._device)] = fresh_rows.to(self._device)
         self._features = features
         self._ticks[cars] = 0
+        found: NDArray[np.float32] = fresh_rows.numpy()
+        return found
 
     def _seen(self) -> NDArray[np.float32]:
         return policy_view(self._features.cpu().numpy())

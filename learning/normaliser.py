@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -27,6 +28,11 @@ class Normaliser:
     def raw_outputs(self, normalised: Tensor) -> Tensor:
         """Outputs in their own units."""
         return normalised * self.output_std + self.output_mean
+
+    def to(self, device: torch.device | str) -> Normaliser:
+        """The same on a device."""
+        parts = (self.input_mean, self.input_std, self.output_mean, self.output_std)
+        return Normaliser(*(part.to(device) for part in parts))
 
 
 __all__ = ["Normaliser"]

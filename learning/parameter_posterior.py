@@ -38,12 +38,13 @@ def posterior_parameters(
         factor: Cholesky factor (O, n, n) of the covariance of gap and noise, in normalised outputs.
         normaliser: of the outputs.
         count: how many draws.
-        generator: of all randomness.
+        generator: of all randomness, on the CPU.
 
     Returns:
         Parameters (count, K).
     """
     wanted = normaliser.outputs(outputs).double()
+    device = wanted.device
 
     def log_likelihood(normal: Tensor) -> Tensor:
         found = normaliser.outputs(model(inputs, model.parameters(normal).to(inputs))).double()
@@ -52,7 +53,7 @@ def posterior_parameters(
         return torch.nan_to_num(-0.5 * (white * white).sum(dim=(0, 1)), nan=-torch.inf)
 
     with torch.no_grad():
-        normal = torch.randn((count, model.size), generator=generator).double()
+        normal = torch.randn((count, model.size), generator=generator).double().to(device)
         if not len(inputs):
             return model.parameters(normal).to(inputs)
         likelihood = log_likelihood(normal)
@@ -64,13 +65,14 @@ def posterior_parameters(
             spread = torch.cov(normal.T, aweights=weight).reshape(model.size, model.size)
             normal, likelihood = normal[chosen], likelihood[chosen]
             cold += step
-            root = torch.linalg.cholesky(spread + 1e-6 * torch.eye(model.size, dtype=torch.float64))
+            root = torch.linalg.cholesky(spread + 1e-6 * torch.eye(model.size, dtype=torch.float64, device=device))
             scale = 2.38 / model.size**0.5
             for _ in range(MOVES if cold < 1.0 else 3 * MOVES):
-                fresh = normal + scale * torch.randn(normal.shape, generator=generator).double() @ root.T
+                away = torch.randn(normal.shape, generator=generator).double().to(device)
+                fresh = normal + scale * away @ root.T
                 there = log_likelihood(fresh)
                 gain = cold * (there - likelihood) + 0.5 * ((normal**2).sum(dim=1) - (fresh**2).sum(dim=1))
-                taken = torch.log(torch.rand(count, generator=generator)) < gain
+                taken = torch.log(torch.rand(count, generator=generator)).to(device) < gain
                 normal = torch.where(taken[:, None], fresh, normal)
                 likelihood = torch.where(taken, there, likelihood)
                 # Towards a quarter of the steps taken (Roberts and Rosenthal 2001).
@@ -82,7 +84,7 @@ def posterior_parameters(
 
 def _colder(likelihood: Tensor, rest: float) -> float:
     """The largest step of the likelihood's exponent, at most ``rest``, that keeps enough of the draws effective."""
-    best = likelihood - likelihood.max()
+    best = (likelihood - likelihood.max()).cpu()  # Fifty small questions are answered where they are asked.
 
     def effective(step: float) -> float:
         weight = torch.softmax(step * best, dim=0)
@@ -100,8 +102,8 @@ def _colder(likelihood: Tensor, rest: float) -> float:
 def _resampled(weight: Tensor, generator: torch.Generator) -> Tensor:
     """Indices of draws in proportion to their weights, by systematic resampling."""
     count = len(weight)
-    points = (torch.arange(count, dtype=weight.dtype) + torch.rand(1, generator=generator).to(weight)) / count
-    return torch.searchsorted(weight.cumsum(dim=0), points).clamp_max(count - 1)
+    points = torch.arange(count, dtype=weight.dtype) + torch.rand(1, generator=generator).to(weight.dtype)
+    return torch.searchsorted(weight.cumsum(dim=0), (points / count).to(weight.device)).clamp_max(count - 1)
 
 
 __all__ = ["posterior_parameters"]

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from stable_baselines3 import SAC
@@ -83,7 +83,7 @@ class FastSac(SAC):
         self.logger.record("train/learning_rate", rate)
         with torch.no_grad():
             rows = self.replay_buffer.sample(gradient_steps * batch_size, env=self._vec_normalize_env)
-            noise = torch.randn((gradient_steps, 2 * batch_size, rows.actions.shape[1]), device=self.device)
+            noise = torch.randn((gradient_steps, 2 * batch_size, rows.actions.shape[1])).to(self.device)
             discounts = self.gamma if rows.discounts is None else rows.discounts
             kept = (1.0 - rows.dones) * discounts
             fields = (rows.observations, rows.actions, rows.next_observations, kept, rows.rewards)
@@ -97,8 +97,28 @@ class FastSac(SAC):
             self.logger.record(f"train/{name}", float(value))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """The numbers of all networks, on the CPU, as they are saved."""
+        found: dict[str, dict[str, Any]] = super().get_parameters()
+        found["policy"] = {name: value.cpu() for name, value in found["policy"].items()}
+        return found
+
+    def save(self, *where: Any, **others: Any) -> None:
+        """Write a file that is read on any machine."""
+        here = self.log_ent_coef
+        assert here is not None
+        try:
+            self.log_ent_coef = here.detach().cpu()
+            super().save(*where, **others)
+        finally:
+            self.log_ent_coef = here
+
+    def _excluded_save_params(self) -> list[str]:
+        """What is made again from the networks."""
+        return [*super()._excluded_save_params(), "_actor", "_critics", "_targets", "_temperature"]
+
     def optimiser_state(self) -> dict[str, dict[str, Tensor | int]]:
-        """Moments of the optimisers, for going on later from a saved policy."""
+        """Moments of the optimisers, on the CPU, for going on later from a saved policy."""
         return {name: adam.state() for name, adam in self._adams().items()}
 
     def load_optimiser_state(self, state: dict[str, dict[str, Tensor | int]]) -> None:

@@ -155,11 +155,14 @@ class SacAgent:
 
     @classmethod
     def load(cls, folder: Path, settings: SacSettings, seed: int, device: torch.device | str = "cpu") -> SacAgent:
-        """Take up an agent. Raises DataError where its files are of another shape or broken."""
+        """Take up an agent. Raises DataError where its files are of another shape or broken.
+
+        Until it is trained again, on ``device``, it acts on the CPU: what drives a car waits for no other device.
+        """
         found = cls(settings, seed, device)
         try:
-            found._sac = FastSac.load(folder / AGENT_FILE, device=device, custom_objects=_NO_REPLAY)
-            found._sac.load_optimiser_state(torch.load(folder / MOMENTS_FILE, weights_only=True))
+            found._sac = FastSac.load(folder / AGENT_FILE, device="cpu", custom_objects=_NO_REPLAY)
+            found._sac.load_optimiser_state(torch.load(folder / MOMENTS_FILE, weights_only=True, map_location="cpu"))
         except (
             OSError,
             ValueError,

@@ -12,6 +12,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 
 from carlab.core.clock import MonotonicClock
+from learning.devices import settle
 from learning.function_posterior import infer
 from learning.normaliser import Normaliser
 from learning.particles import Network
@@ -28,22 +29,24 @@ SIZES = {
 SAC_SIZES = {"64 x 64, batch 64": ([64, 64], 64), "64 x 64, batch 256": ([64, 64], 256)}
 
 
-def training_speed() -> dict[str, Any]:
+def training_speed(device: str = "cpu") -> dict[str, Any]:
     """Steps of the particles' optimiser per second at the sizes of the paper, and of a whole fit of 100 rows."""
     found: dict[str, Any] = {}
     for name, (particles, sets, width) in SIZES.items():
         generator = torch.Generator().manual_seed(0)
-        inputs = torch.randn((100, width), generator=generator)
-        outputs = torch.tanh(inputs[:, :7]) + 0.02 * torch.randn((100, 7), generator=generator)
-        units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(7), torch.ones(7))
+        inputs = torch.randn((100, width), generator=generator).to(device)
+        outputs = torch.tanh(inputs[:, :7]) + 0.02 * torch.randn((100, 7), generator=generator).to(device)
+        units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(7), torch.ones(7)).to(device)
         clock = MonotonicClock()
         began_s = clock.now_s()
-        target = infer(None, inputs, outputs, units, torch.full((7,), 0.02))
+        target = infer(None, inputs, outputs, units, torch.full((7,), 0.02).to(device))
+        settle(device)
         inferred_s = clock.now_s()
-        points = torch.randn((4096, width), generator=generator)
+        points = torch.randn((4096, width), generator=generator).to(device)
         steps = [0.0, 0.0]
 
         def told(done: int, at: list[float] = steps, clock: MonotonicClock = clock) -> None:
+            settle(device)
             at[0] = at[0] or clock.now_s()
             at[1] = clock.now_s()
 
@@ -59,19 +62,19 @@ def training_speed() -> dict[str, Any]:
     return found
 
 
-def prediction_speed() -> dict[str, Any]:
+def prediction_speed(device: str = "cpu") -> dict[str, Any]:
     """A batch of 256 one-step predictions of 20 particles against one matrix product of as many operations."""
     network = Network(15, 6)
     generator = torch.Generator().manual_seed(0)
-    numbers = network.initial(20, generator)
+    numbers = network.initial(20, generator, device)
     layers = network.split(numbers)
-    inputs = torch.randn((256, 15), generator=generator)
+    inputs = torch.randn((256, 15), generator=generator).to(device)
     operations = 20 * 256 * sum(a * b for a, b in network.layers)
     side = 256
-    left, right = torch.randn((operations // side**2, side)), torch.randn((side, side))
+    left, right = torch.randn((operations // side**2, side)).to(device), torch.randn((side, side)).to(device)
     with torch.no_grad():
-        ours_s = _seconds(lambda: network.through(layers, inputs))
-        product_s = _seconds(lambda: left @ right)
+        ours_s = _seconds(lambda: network.through(layers, inputs), device)
+        product_s = _seconds(lambda: left @ right, device)
     return {
         "batch_ms": 1e3 * ours_s,
         "matrix_product_ms": 1e3 * product_s,
@@ -79,19 +82,19 @@ def prediction_speed() -> dict[str, Any]:
     }
 
 
-def sac_speed() -> dict[str, Any]:
+def sac_speed(device: str = "cpu") -> dict[str, Any]:
     """Gradient steps of SAC per second, ours and those of stable-baselines3, at the same sizes."""
     found: dict[str, Any] = {}
     for name, (hidden, batch) in SAC_SIZES.items():
         rates = {}
         for label, kind in (("stable_baselines3", SAC), ("ours", FastSac)):
             agent = kind(
-                "MlpPolicy", _Room(), policy_kwargs={"net_arch": hidden}, learning_starts=1000, seed=0, device="cpu"
+                "MlpPolicy", _Room(), policy_kwargs={"net_arch": hidden}, learning_starts=1000, seed=0, device=device
             )  # fmt: skip
             agent.set_logger(Logger(None, []))
             agent.learn(1000)
             agent.train(50, batch)
-            rates[label] = 1.0 / (_seconds(lambda a=agent, b=batch: a.train(100, b), times=3) / 100.0)
+            rates[label] = 1.0 / (_seconds(lambda a=agent, b=batch: a.train(100, b), device, times=3) / 100.0)
         found[name] = {f"{k}_steps_per_s": v for k, v in rates.items()} | {
             "ratio": rates["ours"] / rates["stable_baselines3"]
         }
@@ -115,15 +118,17 @@ class _Room(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return seen, float(action[0]), False, False, {}
 
 
-def _seconds(work: Any, times: int = 50) -> float:
+def _seconds(work: Any, device: str, times: int = 50) -> float:
     """Median time of a call, the first ones left out."""
     clock = MonotonicClock()
     for _ in range(max(times // 10, 1)):
         work()
+    settle(device)
     taken = []
     for _ in range(times):
         began_s = clock.now_s()
         work()
+        settle(device)
         taken.append(clock.now_s() - began_s)
     return float(np.median(taken))
 

@@ -1,9 +1,12 @@
 """Shared fixtures: seeded randomness, the folder of reference material, and a check for threads left behind."""
 
+import importlib.util
 import os
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -37,6 +40,40 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the folder 'shared' with reference captures and recordings is not beside the repository")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def stand_in_device() -> ModuleType:
+    """The module beside this one; importing it imports torch."""
+    spec = importlib.util.spec_from_file_location("stand_in_device", Path(__file__).with_name("stand_in_device.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(params=["stand-in", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(
+    request: pytest.FixtureRequest, stand_in_device: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[str]:
+    """``cuda``: its stand-in always, and the real one where there is one."""
+    import stable_baselines3.common.utils as sb3
+    import torch
+
+    if request.param == "cuda":
+        if not torch.cuda.is_available():
+            pytest.skip("needs a CUDA device")
+        yield "cuda"
+        return
+    falls_back = sb3.get_device  # to the CPU, in silence
+    for module in list(sys.modules.values()):
+        if vars(module).get("get_device") is falls_back:
+            monkeypatch.setattr(module, "get_device", torch.device)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    with stand_in_device.stand_in() as operations:
+        yield "cuda"
+    assert stand_in_device.without_cuda(operations.used) == []
 
 
 @pytest.fixture(autouse=True)

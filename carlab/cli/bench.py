@@ -61,18 +61,24 @@ class Bench:
     steps: int | None = None
     """Steps of the optimiser; those of the way unless given."""
 
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where models learn. speed: of learning alone, the other parts are the CPU's."""
+
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
         """Measure and print."""
+        from learning.devices import available
+
+        available(self.device)
         return self._speed() if self.what == "speed" else self._regression()
 
     def _speed(self) -> int:
         from carlab.experiment.speed import measure_speed
 
         above_zero(seconds=self.seconds)
-        figures = measure_speed(seconds=self.seconds, note=lambda text: console.print(text))
+        figures = measure_speed(seconds=self.seconds, device=self.device, note=lambda text: console.print(text))
         rows = [[part, name, f"{value:.4g}"] for part, values in figures.items() for name, value in _flat(values)]
         table("Speed", ["part", "figure", "value"], rows)
         if self.out is not None:
@@ -92,7 +98,7 @@ class Bench:
             task = bar.add_task(self.case, total=None, note="")
             study = run_study(
                 case, rows=self.rows, seeds=self.seeds, methods=self.methods, way=self.way, data=self.data,
-                steps=self.steps,
+                steps=self.steps, device=self.device,
                 progress=lambda what, done, total: bar.update(task, completed=done, total=total, note=what),
             )  # fmt: skip
             for score in study:
@@ -111,7 +117,7 @@ class Bench:
         )  # fmt: skip
         if self.out is not None:
             command = " ".join(["carlab", *sys.argv[1:]])
-            self.out.write_text(json.dumps(as_json(scores, command), indent=2) + "\n", encoding="utf-8")
+            self.out.write_text(json.dumps(as_json(scores, command, self.device), indent=2) + "\n", encoding="utf-8")
             picture = self.out.with_suffix(".png")
             draw(found, picture)
             console.print(f"{self.out}, {picture}")

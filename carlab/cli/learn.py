@@ -67,11 +67,16 @@ class Learn:
     seed: int = 0
     """Of everything that is drawn."""
 
+    device: Literal["cpu", "cuda"] | None = None
+    """Where model and policy learn: cpu unless given; of a run that is taken up, where they did. The car is driven from
+    the CPU."""
+
     place: bool = True
     """Start each episode at the task's start pose; off: from where the car stands."""
 
     resume: Path | None = None
-    """A run's folder that is taken up again; --car must be as it was, the other options are those of the run."""
+    """A run's folder that is taken up again; --car must be as it was, the other options but --device are those of the
+    run."""
 
     out: Path = Path("runs")
     """Folder that receives the run's folder."""
@@ -89,10 +94,12 @@ class Learn:
         """Learn and say how it went."""
         from carlab.experiment.campaign import Campaign, taken_up
         from carlab.experiment.interrupts import Interrupts
+        from learning.devices import available
 
         above_zero(episodes=self.episodes, updates=self.updates, ticks=self.ticks, **{"model-steps": self.model_steps})
         if self.history < 0 or self.seed < 0:
             raise ConfigError("--history and --seed: 0 or more.")
+        available(self.device or "cpu")
         choice = self.which_car.choose(seed=self.seed)
         figures: list[EpisodeFigures] = []
         with contextlib.ExitStack() as stack:
@@ -109,7 +116,8 @@ class Learn:
                 campaign = Campaign(choice, plan, self.episodes, run, hooks, self.ticks, self.place, self.rerun)
                 campaign.write_plan()
             else:
-                campaign = taken_up(run, choice, hooks)
+                campaign = taken_up(run, choice, hooks, self.device)
+                available(campaign.plan.device)
             results = list(self._watched(campaign, figures))
         return self._report(campaign, results, figures)
 
@@ -127,7 +135,8 @@ class Learn:
             simulator = prior_simulator(load_car_file(Path(self.prior)).simulator, "nominal")
         text = tomli_w.dumps(simulator.to_tables())
         return TrainingPlan(
-            text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed
+            text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed,
+            device=self.device or "cpu",
         )  # fmt: skip
 
     def _hooks(

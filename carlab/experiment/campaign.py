@@ -167,12 +167,13 @@ class Campaign:
         return found
 
 
-def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks) -> Campaign:
-    """A run that goes on as it was started. Raises DataError where it is no campaign."""
+def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device: str | None = None) -> Campaign:
+    """A run that goes on as it was started, or on another device. Raises DataError where it is no campaign."""
     path = run.path / CAMPAIGN_FILE
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         plan = TrainingPlan(**content["plan"])
+        plan = plan if device is None else replace(plan, device=device)
         SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
         ticks = content["ticks"]
         return Campaign(

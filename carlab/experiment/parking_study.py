@@ -155,7 +155,8 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
 
     figure, (reward, distance, parked) = pyplot.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
     rows = summarised(curves)
-    ticks, labels = [], []
+    ticks: list[int] = []
+    labels: list[str] = []
     for row in rows:
         own = [c for c in curves if c.method == row.method and c.episodes]
         numbers = np.arange(1, row.episodes + 1)

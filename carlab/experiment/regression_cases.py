@@ -33,6 +33,10 @@ class Data:
     test_inputs: Tensor
     test_outputs: Tensor
 
+    def to(self, device: torch.device | str) -> Data:
+        """The same on a device."""
+        return Data(*(v.to(device) for v in (self.inputs, self.outputs, self.test_inputs, self.test_outputs)))
+
 
 @dataclass(frozen=True, slots=True)
 class Case:

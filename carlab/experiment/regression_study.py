@@ -21,12 +21,14 @@ from torch import Tensor
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
 from carlab.experiment.regression_cases import CASES, Case, Data
+from learning.devices import described
 from learning.domain_models import DomainModel, draw_parameters
 from learning.ensemble import deep_ensemble
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood, root_mean_square_error
 from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, SimulatorPrior, fit
 from learning.function_posterior import infer
 from learning.function_prior import RbfCovariance
+from learning.normaliser import Normaliser
 from learning.ridge import Ridge
 from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_points
 from learning.system_identification import GreyBox, Identified, grey_box, identify
@@ -80,6 +82,16 @@ class _Task:
     way: Way
     steps: int | None
 
+    @property
+    def normaliser(self) -> Normaliser:
+        """Of the case, where the data is."""
+        return self.case.normaliser.to(self.data.inputs.device)
+
+    @property
+    def noise_std(self) -> Tensor:
+        """Expected noise (O,), where the data is."""
+        return torch.tensor(self.case.expected_noise_std).to(self.data.inputs.device)
+
     def settings(self) -> FsvgdSettings:
         """How particles are fitted in the authors' way, and the networks of an ensemble."""
         case, rows = self.case, len(self.data.inputs)
@@ -102,7 +114,7 @@ class _Task:
 
     def pool(self) -> Tensor:
         """Inputs of the domain."""
-        return self.case.prior.inputs(POOL, torch.Generator().manual_seed(20_000 + self.seed))
+        return self.case.prior.inputs(POOL, torch.Generator().manual_seed(20_000 + self.seed)).to(self.data.inputs)
 
     def function_prior(self) -> RbfCovariance:
         """Of FSVGD and of a grey box: one normalised unit everywhere."""
@@ -112,10 +124,10 @@ class _Task:
         """Our way: particles led to what data, simulator and gap say together."""
         case = self.case
         generator = torch.Generator().manual_seed(30_000 + self.seed)
-        normaliser = case.normaliser
+        normaliser = self.normaliser
         gap = None if expected_gap is None else expected_gap * normaliser.output_std
         posterior = infer(
-            simulator, self.data.inputs, outputs, normaliser, torch.tensor(case.expected_noise_std), gap_std=gap,
+            simulator, self.data.inputs, outputs, normaliser, self.noise_std, gap_std=gap,
             with_gap=expected_gap is not None, seed=self.seed,
         )  # fmt: skip
         points = measurement_points(simulator or case.prior, self.data.inputs, normaliser, generator)
@@ -123,14 +135,15 @@ class _Task:
 
     def sim_fsvgd(self, *, gap: bool) -> Model:
         """Particles under draws of the simulator."""
-        case, normaliser = self.case, self.case.normaliser
+        case, normaliser = self.case, self.normaliser
         if self.way == "ours":
             process = case.process if gap and case.process is not None else case.prior
             return self.inferred(process, self.data.outputs, case.expected_gap if gap else None)
         pool, generator = self.pool(), torch.Generator().manual_seed(30_000 + self.seed)
         everything = torch.cat([self.data.inputs, pool])
         with torch.no_grad():
-            bank = normaliser.outputs(case.prior(everything, draw_parameters(case.prior, DRAWS, generator)))
+            drawn = draw_parameters(case.prior, DRAWS, generator).to(everything)
+            bank = normaliser.outputs(case.prior(everything, drawn))
         prior = SimulatorPrior(bank, everything, case.gap() if gap else None)
         return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings())
 
@@ -138,14 +151,13 @@ class _Task:
         """Particles under a Gaussian process, properly weighted."""
         if self.way == "ours":
             return self.inferred(None, self.data.outputs, EXPECTED_FUNCTION)
-        normaliser, pool = self.case.normaliser, self.pool()
+        normaliser, pool = self.normaliser, self.pool()
         prior = GaussianProcessPrior(normaliser.inputs(torch.cat([self.data.inputs, pool])), self.function_prior())
         return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings())
 
     def sysid(self) -> Identified:
         """The simulator with its parameters at maximum likelihood."""
-        noise = torch.tensor(self.case.expected_noise_std)
-        return identify(self.case.prior, self.data.inputs, self.data.outputs, noise, self.seed)
+        return identify(self.case.prior, self.data.inputs, self.data.outputs, self.noise_std, self.seed)
 
     def grey_box(self) -> Model:
         """The same and particles for what it leaves."""
@@ -155,17 +167,17 @@ class _Task:
                 left = self.data.outputs - simulator.mean(self.data.inputs)
             return GreyBox(simulator, self.inferred(None, left, self.case.expected_gap or LEAST_GAP))
         return grey_box(
-            simulator, self.data.inputs, self.data.outputs, self.pool(), self.function_prior(), self.case.normaliser,
+            simulator, self.data.inputs, self.data.outputs, self.pool(), self.function_prior(), self.normaliser,
             self.settings(),
         )  # fmt: skip
 
     def ensemble(self) -> Model:
         """Networks that differ by their start."""
-        return deep_ensemble(self.data.inputs, self.data.outputs, self.case.normaliser, self.settings())
+        return deep_ensemble(self.data.inputs, self.data.outputs, self.normaliser, self.settings())
 
     def ridge(self) -> Model:
         """Linear regression."""
-        return _Linear(Ridge.fit(self.data.inputs.double().numpy(), self.data.outputs.double().numpy()))
+        return _Linear(Ridge.fit(*(v.cpu().double().numpy() for v in (self.data.inputs, self.data.outputs))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,8 +196,8 @@ class _Linear:
     ridge: Ridge
 
     def predict(self, inputs: Tensor) -> Mixture:
-        mean = torch.from_numpy(self.ridge(inputs.double().numpy()))
-        return Mixture(mean[None], torch.from_numpy(self.ridge.std).expand(1, 1, -1))
+        mean, std = self.ridge(inputs.cpu().double().numpy()), self.ridge.std
+        return Mixture(*(torch.from_numpy(v).to(inputs.device) for v in (mean[None], std[None, None])))
 
 
 METHODS: dict[str, Callable[[_Task], Model]] = {
@@ -208,6 +220,7 @@ def run_study(
     way: Way = "ours",
     data: Path | None = None,
     steps: int | None = None,
+    device: str = "cpu",
     progress: Progress = lambda what, done, total: None,
 ) -> Iterator[Score]:
     """Fit every method to every number of rows with every seed, and score it as soon as it is fitted.
@@ -220,6 +233,7 @@ def run_study(
         way: how particles are fitted.
         data: folder of the authors' arrays; the data is drawn here without it.
         steps: of the optimiser; those of the way unless given.
+        device: where models are fitted and judged; what is drawn is drawn on the CPU. Ridge is NumPy's everywhere.
         progress: told what is fitted, how many fits are done, and of how many.
 
     Raises:
@@ -239,7 +253,7 @@ def run_study(
     clock = MonotonicClock()
     for done, (count, seed, name) in enumerate(plan):
         progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
-        found = chosen.data(count, seed) if data is None else chosen.recorded(data, count, seed)
+        found = (chosen.data(count, seed) if data is None else chosen.recorded(data, count, seed)).to(device)
         began_s = clock.now_s()
         model = METHODS[name](_Task(chosen, found, seed, way, steps))
         seconds = clock.now_s() - began_s
@@ -287,11 +301,12 @@ def summarised(scores: Sequence[Score]) -> list[Row]:
 _FIGURES = ("nll", "rmse", "calibration", "seconds")
 
 
-def as_json(scores: Sequence[Score], command: str) -> dict[str, object]:
+def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[str, object]:
     """Everything that was measured, and what made it."""
     return {
         "schema": "carlab.regression/1",
         "command": command,
+        "device": described(device),
         "torch_threads": torch.get_num_threads(),
         "rows": [asdict(row) for row in summarised(scores)],
         "scores": [asdict(score) for score in scores],

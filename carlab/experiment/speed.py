@@ -8,7 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 
-def measure_speed(*, seconds: float = 5.0, note: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+def measure_speed(
+    *, seconds: float = 5.0, device: str = "cpu", note: Callable[[str], None] = lambda text: None
+) -> dict[str, Any]:
     """Measure the simulator, gradients, learning, NatNet decoding and the command sender.
 
     Everything but the sender runs on one core with one thread. The sender is measured on all cores and, pinned with
@@ -16,31 +18,35 @@ def measure_speed(*, seconds: float = 5.0, note: Callable[[str], None] = lambda 
 
     Args:
         seconds: length of each condition of the sender's measurement [s].
+        device: of particles and SAC; everything else is the CPU's.
         note: told what is being measured.
 
     Returns:
         Figures by part and name; the names say the unit.
     """
     from drivers.speed import sender_lateness
+    from learning.devices import described
     from learning.speed import prediction_speed, sac_speed, training_speed
     from mocap.speed import natnet_decode_speed
     from sim_backends.speed import gradient_speed, simulation_speed
 
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
-    figures: dict[str, Any] = {"machine": {"cores_count": len(cores), "python": platform.python_version()}}
+    machine = {"cores_count": len(cores), "python": platform.python_version(), "learning_device": described(device)}
+    figures: dict[str, Any] = {"machine": machine}
     one = {min(cores)}
+    where = "one core" if device == "cpu" else device
     try:
         _pin(one)
         note("simulation against a plain loop, one core")
         figures["simulation"] = simulation_speed()
         note("gradient of a rollout against central differences, one core")
         figures["gradient"] = gradient_speed()
-        note("training of particles, one core")
-        figures["training"] = training_speed()
-        note("predictions of particles against a matrix product, one core")
-        figures["prediction"] = prediction_speed()
-        note("gradient steps of SAC against stable-baselines3, one core")
-        figures["sac"] = sac_speed()
+        note(f"training of particles, {where}")
+        figures["training"] = training_speed(device)
+        note(f"predictions of particles against a matrix product, {where}")
+        figures["prediction"] = prediction_speed(device)
+        note(f"gradient steps of SAC against stable-baselines3, {where}")
+        figures["sac"] = sac_speed(device)
         note("NatNet decoding, one core")
         figures["natnet"] = natnet_decode_speed()
         note("lateness of the command sender, everything on one core")

@@ -53,6 +53,7 @@ class TrainingPlan:
         ticks: of an episode; the task's unless given.
         seed: of everything.
         threads: of torch.
+        device: where model and policy are learned; what drives is on the CPU.
     """
 
     prior_toml: str
@@ -63,6 +64,7 @@ class TrainingPlan:
     ticks: int | None = None
     seed: int = 0
     threads: int = 1
+    device: str = "cpu"
 
     @property
     def task(self) -> ParkingTask:
@@ -122,7 +124,7 @@ def train(
     rows = transitions_of(usable, plan.history) if usable else None
     figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
     earlier = model_folder(models, number - 1)
-    before = load_car(earlier / DYNAMICS_FILE) if earlier.is_dir() else None
+    before = load_car(earlier / DYNAMICS_FILE, plan.device) if earlier.is_dir() else None
     if before is not None and episodes and episodes[-1].ticks > plan.history:
         nll, off = before.surprise(episodes[-1])
         figures |= {"last_episode_nll": nll, "last_episode_calibration_error": off}
@@ -135,11 +137,11 @@ def train(
     began_s = clock.now_s()
     updates = plan.updates_before(number)
     sac = SacSettings()
-    agent = SacAgent(sac, plan.seed)
+    agent = SacAgent(sac, plan.seed, plan.device)
     if before is not None:
-        agent = SacAgent.load(earlier, sac, plan.seed)
+        agent = SacAgent.load(earlier, sac, plan.seed, plan.device)
     recorded = recorded_features(usable, plan.history) if usable else None
-    gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s}
+    gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s, "device": plan.device}
     world = ModelEnv(dynamics, plan.task, sac.cars, recorded=recorded, seed=seed, **gate)
     judging = ModelEnv(dynamics, plan.task, JUDGED_CARS, seed=seed + 1, **gate)
 
@@ -186,10 +188,10 @@ def _fitted(
 
     at(0)
     if not ours:
-        return fit_authors_fsvgd(episodes, plan.history, steps, seed, at)
+        return fit_authors_fsvgd(episodes, plan.history, steps, seed, at, plan.device)
     settings = CarFitSettings(plan.method, steps, seed=seed)
     earlier = before if isinstance(before, CarDynamics) else None
-    return fit_car(rows, model, settings, before=earlier, progress=at)
+    return fit_car(rows, model, settings, before=earlier, progress=at, device=plan.device)
 
 
 def has_ticks(recording: Path) -> bool:

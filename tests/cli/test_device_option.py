@@ -1,0 +1,51 @@
+"""``--device``: refused in a sentence where there is no such device, and kept beside the figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from carlab.experiment.regression_study import run_study
+
+Carlab = Callable[..., tuple[int, str]]
+
+
+@pytest.mark.parametrize("verb", [("learn",), ("bench", "speed"), ("bench", "regression")])
+def test_cuda_that_is_not_there_is_refused(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.chdir(tmp_path)
+    code, text = carlab(*verb, "--device", "cuda")
+    assert code == 2
+    assert "--device cuda: torch finds no CUDA device here" in text
+    assert "use --device cpu" in text
+    assert list(tmp_path.iterdir()) == []
+    code, text = carlab(*verb, "--device", "abacus")
+    assert code == 2
+    assert "invalid choice 'abacus'" in text
+
+
+@pytest.mark.parametrize(("options", "told"), [((), "cpu"), (("--device", "cuda"), "cuda: Imaginary 9000")])
+def test_figures_tell_their_device(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], told: str
+) -> None:
+    asked: list[str] = []
+    study = run_study
+
+    def here(case: str, *, device: str, **others: object) -> object:
+        asked.append(device)
+        return study(case, **others)
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Imaginary 9000")
+    monkeypatch.setattr("carlab.experiment.regression_study.run_study", here)
+    out = tmp_path / "study.json"
+    few = ("--case", "pendulum", "--rows", 5, "--seeds", 1, "--methods", "ridge")
+    code, _ = carlab("bench", "regression", *few, "--out", out, *options)
+    assert code == 0
+    assert json.loads(out.read_text())["device"] == told
+    assert asked == [told.split(":")[0]]
