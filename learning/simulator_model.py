@@ -9,6 +9,7 @@ does it say when: effects that drift act as at one time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import ConfigError
-from learning.domain_models import draw_parameters, within
+from learning.domain_models import draw_parameters
 from learning.measured_states import LATENCY_EFFECT, Measured
 from sim_backends.batch_rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
@@ -27,6 +28,11 @@ LATENCY = "mocap.latency"
 EXTRA_DELAY = "effects.command_delay.extra_delay"
 OF_THE_PLACE = frozenset({"low_friction_patch", "road_slope", "wind"})
 """Effects that depend on where in the world a car is, or on its heading there."""
+DOUBT, LEAST_DOUBT = 2.0, 0.02
+"""Half of what is believed of a diagnosed number lies within so many standard deviations, or shares of itself."""
+FARTHEST = 10.0
+LEAST_SHARE = 0.05
+"""Of its value, what a number that must be above zero is at least."""
 LAG_TICKS = 2
 """Ticks over which a filter on the velocities is taken to remember."""
 FASTEST_MPS = 3.0
@@ -36,6 +42,13 @@ HELD_TICKS = 8
 """Mean time for which a command of a random drive is held."""
 
 
+def known_ranges(config: SimulatorConfig) -> dict[str, tuple[float, float]]:
+    """Ranges of all numbers of a car file that are not certain; of those with a deviation alone, what is possible."""
+    known = config.values()
+    bounds = {name: REGISTRY[name] for name in config.doubts if name in known}
+    return {name: (info.low, info.high) for name, info in bounds.items()} | dict(config.priors)
+
+
 @dataclass(frozen=True, slots=True)
 class CarModel:
     """One step of a simulated car in its own frame, with parameters that are known as ranges.
@@ -43,7 +56,7 @@ class CarModel:
     Attributes:
         config: the simulator.
         history: commands before the one at the step's start that a row holds.
-        ranges: (low, high) by dotted name, effects' numbers among them; those of the car file are ``config.priors``.
+        ranges: (low, high) by dotted name, effects' numbers among them; ``known_ranges`` has those of a car file.
             Everything else is held at its value.
         at_s: time since a recording's first row at which effects that drift act [s].
         velocity_delay_s: by how much measured velocities lag behind measured poses, as differences do [s].
@@ -74,8 +87,26 @@ class CarModel:
         return len(self.ranges)
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """Parameters (P, K) of standard normal numbers, uniform in their ranges."""
-        return within(tuple(self.ranges.values()), torch.special.ndtr(normal))
+        """Parameters (P, K) of standard normal numbers: uniform in their ranges, or about what was diagnosed.
+
+        A number with a standard deviation (``config.doubts``) has Cauchy's distribution within its range: half of it
+        within ``DOUBT`` deviations, and tails (``FARTHEST`` times as far) that let data overrule a diagnosis, which is
+        only as sure as it says if it left nothing out.
+        """
+        shares = torch.special.ndtr(normal)
+        found = [
+            self._about(name, low, high, shares[:, k]) if name in self.config.doubts else low + (high - low) * shares[:, k]
+            for k, (name, (low, high)) in enumerate(self.ranges.items())
+        ]
+        return torch.stack(found, dim=1) if found else shares
+
+    def _about(self, name: str, low: float, high: float, shares: Tensor) -> Tensor:
+        value = self.config.values()[name]
+        scale = max(DOUBT * self.config.doubts[name], LEAST_DOUBT * abs(value))
+        least = LEAST_SHARE * value if REGISTRY[name].positive else -math.inf
+        low, high = max(low, least, value - FARTHEST * scale), min(high, value + FARTHEST * scale)
+        first, last = (math.atan((end - value) / scale) for end in (low, high))
+        return (value + scale * torch.tan(first + (last - first) * shares.double())).clamp(low, high).to(shares)
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
         """Inputs (N, 3 + 2 (H + 1)) of random drives: commands held for a while, cars drawn from the ranges."""
@@ -122,7 +153,7 @@ class CarModel:
         delay = torch.as_tensor(number(DELAY) + latency + number(EXTRA_DELAY)).to(start).clamp_min(0.0)
         left_out = {*seen.effects, *OF_THE_PLACE, "command_delay"}
         effects = {name: v for name, v in self.config.effects.items() if name not in left_out}
-        config = replace(self.config, priors={}, effects=effects)
+        config = replace(self.config, priors={}, doubts={}, effects=effects)
         inner = {
             name: v for name, v in values.items()
             if not name.startswith("mocap.") and not (name.startswith("effects.") and name.split(".")[1] in left_out)
@@ -144,4 +175,4 @@ class CarModel:
         return seen.done(driven(true, commands, past), velocity, period_s, each)
 
 
-__all__ = ["OF_THE_PLACE", "CarModel"]
+__all__ = ["OF_THE_PLACE", "CarModel", "known_ranges"]

@@ -17,12 +17,11 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from carlab.experiment.campaign import prior_simulator
-from carlab.experiment.diagnosed_prior import check_period
+from carlab.experiment.campaign import check_period, prior_simulator
 from carlab.experiment.regression_recordings import DELAY_S, RecordedCase
 from carlab.experiment.regression_study import Progress, Score, scored
 from learning.domain_models import DomainModel
-from learning.simulator_model import DELAY, CarModel
+from learning.simulator_model import DELAY, CarModel, known_ranges
 from learning.transitions import velocity_delay_s
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -62,14 +61,14 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     Args:
         case: recordings, with the history that was found.
         car: simulator of the car's file.
-        diagnosed: what was diagnosed from the recordings that are not held out, with ranges.
+        diagnosed: what was diagnosed from the recordings that are not held out, with its doubts.
 
     Raises:
         ConfigError: the diagnosed car has another control period than the rows.
     """
     assert case.rows is not None
     period_s = car.control_period_s
-    check_period(diagnosed, period_s, "that of the car file is")
+    check_period(diagnosed, period_s, "the car's file")
     late_s = velocity_delay_s(case.rows, period_s)
     late_s = late_s if late_s > LEAST_LATE_S else 0.0
     at_s = float(case.rows.tick.mean()) * period_s
@@ -80,7 +79,7 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
 
     own = prior_simulator(car, "nominal")
     found: dict[str, DomainModel | None] = {NONE: None}
-    nominal = model(own, {DELAY: DELAY_S, **own.priors})
+    nominal = model(own, {DELAY: DELAY_S, **known_ranges(own)})
     rolling = prior_simulator(car, "kinematic")
     # Where the file gives a range, it holds for wheels that do not slip, too.
     rolling_ranges = {name: car.priors.get(name, given) for name, given in rolling.priors.items()}
@@ -89,7 +88,7 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     better = prior_simulator(diagnosed, "nominal")
     half = 0.5 * period_s
     about = max(better.command_delay_s - half, 0.0), better.command_delay_s + half
-    found[DIAGNOSED] = InDomain(model(better, {DELAY: about, **better.priors}), nominal)
+    found[DIAGNOSED] = InDomain(model(better, {DELAY: about, **known_ranges(better)}), nominal)
     return found
 
 
@@ -99,7 +98,7 @@ def check_periods(recordings: Sequence[Sequence[object]], car: SimulatorConfig) 
 
     for episode in itertools.chain.from_iterable(recordings):
         assert isinstance(episode, EpisodeData)
-        check_period(car, float(np.median(np.diff(episode.times_s))), "that of a recording is")
+        check_period(car, float(np.median(np.diff(episode.times_s))), "a recording")
 
 
 def run_prior_study(

@@ -99,7 +99,7 @@ def train(
     from learning.evaluation import calibration_error, negative_log_likelihood
     from learning.model_env import ModelEnv
     from learning.sac_agent import SacAgent, SacSettings
-    from learning.simulator_model import CarModel
+    from learning.simulator_model import CarModel, known_ranges
     from learning.transitions import transitions_of
 
     torch.set_num_threads(plan.threads)
@@ -108,7 +108,7 @@ def train(
     tell("reading the recordings", 0, 1)
     episodes = [read_episode(path) for path in recordings if has_ticks(path)]
     simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
-    model = CarModel(simulator, plan.history, simulator.priors)
+    model = CarModel(simulator, plan.history, known_ranges(simulator))
     usable = [e for e in episodes if e.ticks > plan.history]
     rows = transitions_of(usable, plan.history) if usable else None
     figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
