@@ -65,7 +65,8 @@ class Measured:
         if self.seen is None:
             return velocity
         back = torch.linalg.inv(self.seen).repeat_interleave(each, dim=0)
-        return (back @ velocity[:, :, None])[:, :, 0]
+        true: Tensor = (back @ velocity[:, :, None])[:, :, 0]
+        return true
 
     def done(self, states: Tensor, filtered: Tensor, period_s: float, each: int) -> Tensor:
         """What is measured of true states (P * each, T + 1, 6) that begin with the filter at ``filtered`` (., 3)."""
@@ -74,13 +75,13 @@ class Measured:
         return states if self.seen is None else self._observed(states, each)
 
     def filtered(self, states: Tensor, begin: Tensor, period_s: float, each: int) -> Tensor:
-        """Velocities (P * each, T + 1, 3) of states (., T + 1, 6) after the filter, which begins at ``begin`` (., 3)."""
+        """Velocities (P * each, T + 1, 3) of states (., T + 1, 6) after a filter that begins at ``begin`` (., 3)."""
         assert self.lag_s is not None
         ops, lag_s = torch_ops(begin[:, 0]), self.lag_s.repeat_interleave(each)
         shown = [tuple(begin.unbind(dim=1))]
         for k in range(states.shape[1] - 1):
-            ends = (tuple(states[:, j, 3:].unbind(dim=1)) for j in (k, k + 1))
-            shown.append(filter_velocities(ops, shown[-1], *ends, period_s, lag_s))
+            first, last = (tuple(states[:, j, 3:].unbind(dim=1)) for j in (k, k + 1))
+            shown.append(filter_velocities(ops, shown[-1], first, last, period_s, lag_s))
         return torch.stack([torch.stack(v, dim=1) for v in shown], dim=1)
 
     def _observed(self, states: Tensor, each: int) -> Tensor:

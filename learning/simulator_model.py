@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import ConfigError
-from learning.domain_models import draw_parameters
+from learning.domain_models import draw_parameters, within
 from learning.measured_states import LATENCY_EFFECT, Measured
 from sim_backends.batch_rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
@@ -94,14 +94,15 @@ class CarModel:
         only as sure as it says if it left nothing out.
         """
         shares = torch.special.ndtr(normal)
-        found = [
-            self._about(name, low, high, shares[:, k]) if name in self.config.doubts else low + (high - low) * shares[:, k]
-            for k, (name, (low, high)) in enumerate(self.ranges.items())
+        uniform = within(tuple(self.ranges.values()), shares)
+        about = [
+            self._about(name, shares[:, k]) if name in self.config.doubts else uniform[:, k]
+            for k, name in enumerate(self.names)
         ]
-        return torch.stack(found, dim=1) if found else shares
+        return torch.stack(about, dim=1) if about else shares
 
-    def _about(self, name: str, low: float, high: float, shares: Tensor) -> Tensor:
-        value = self.config.values()[name]
+    def _about(self, name: str, shares: Tensor) -> Tensor:
+        value, (low, high) = self.config.values()[name], self.ranges[name]
         scale = max(DOUBT * self.config.doubts[name], LEAST_DOUBT * abs(value))
         least = LEAST_SHARE * value if REGISTRY[name].positive else -math.inf
         low, high = max(low, least, value - FARTHEST * scale), min(high, value + FARTHEST * scale)

@@ -155,8 +155,8 @@ class SimulatorConfig:
     def from_tables(cls, tables: Mapping[str, Any], where: str = "the car file") -> Self:
         """Read the tables of a car file (``tomllib.load``; without ``[hardware]``). Absent tables mean the defaults.
 
-        A number may be ``{value = 8.2, low = 6.0, high = 10.0, std = 0.5}``, with range, std or both. Raises ConfigError for unknown keys, wrong types
-        and impossible values; ``where`` names the file in messages.
+        A number may be ``{value = 8.2, low = 6.0, high = 10.0, std = 0.5}``, with range, std or both. Raises
+        ConfigError for unknown keys, wrong types and impossible values; ``where`` names the file in messages.
         """
         check_keys(tables, TABLES, where)
         values: dict[str, float] = {}

@@ -68,8 +68,8 @@ class Bench:
     pair: int = 1
     """priors without --data: which two effects are concealed (1, 2 or 3)."""
 
-    recorded_s: tuple[float, float] | None = None
-    """priors without --data: lengths of the recordings to learn from and of the one held out [s]; 100 and 40."""
+    recorded_s: tuple[float, float] = (100.0, 40.0)
+    """priors without --data: lengths of the recordings to learn from and of the one held out [s]."""
 
     steps: int | None = None
     """Steps of the optimiser; those of the way unless given."""

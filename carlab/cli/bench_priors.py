@@ -30,7 +30,7 @@ def run_priors(options: Bench) -> int:
     from carlab.experiment.interrupts import Interrupts
     from carlab.experiment.prior_study import check_periods, prior_models, run_prior_study
     from carlab.experiment.regression_recordings import recorded_case
-    from carlab.experiment.regression_study import Score, summarised
+    from carlab.experiment.regression_study import summarised
 
     with ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -108,7 +108,9 @@ def _recordings(options: Bench, work: Path) -> tuple[Path, list[Path], str]:
     """Car file, recordings, the last of which is held out, and what they are."""
     if options.data is not None:
         if not options.data.is_dir():
-            raise ConfigError(f"--data {options.data} is no folder; name one with two recordings (MCAP or CSV) at least.")
+            raise ConfigError(
+                f"--data {options.data} is no folder; name one with two recordings or more (MCAP or CSV)."
+            )
         files = sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
         if len(files) < 2:
             raise DataError(f"{options.data} has {len(files)} recordings; the last is held out, so two are needed.")
@@ -118,11 +120,10 @@ def _recordings(options: Bench, work: Path) -> tuple[Path, list[Path], str]:
     folder = work / "recordings"
     with progress() as bar:
         task = bar.add_task("recording", total=None, note="sizing two concealed effects")
-        lengths = {} if options.recorded_s is None else dict(zip(("training_s", "held_out_s"), options.recorded_s, strict=True))
-        pair = record_pair(options.pair, folder, **lengths)
+        pair = record_pair(options.pair, folder, *options.recorded_s)
         bar.remove_task(task)
     what = " and ".join(name.replace("_", " ") for name in pair.effects)
-    console.print(f"Concealed in the simulated car, and told to nobody else: {what} (seed {pair.seed}).", soft_wrap=True)
+    console.print(f"Concealed in the simulated car, told to nobody else: {what} (seed {pair.seed}).", soft_wrap=True)
     return folder / CAR_NAME, [folder / TRAINING_NAME, folder / HELD_OUT_NAME], what
 
 

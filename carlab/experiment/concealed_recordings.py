@@ -13,7 +13,6 @@ from carlab.core.errors import ConfigError
 STRENGTH = 4.0
 """Excess of the held-out error that each effect is sized for, in noise floors: the strongest of the proof."""
 TRAINING_NAME, HELD_OUT_NAME, CAR_NAME = "1_training.csv", "2_held_out.csv", "car.toml"
-TRAINING_S, HELD_OUT_S = 100.0, 40.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +33,14 @@ PAIRS = (
 car cannot show; chosen before any of them was learned from."""
 
 
-def record_pair(
-    number: int, folder: Path, *, training_s: float = TRAINING_S, held_out_s: float = HELD_OUT_S
-) -> ConcealedPair:
+def record_pair(number: int, folder: Path, training_s: float, held_out_s: float) -> ConcealedPair:
     """Write a pair's two recordings and the nominal car's file into a folder, and tell what was concealed.
+
+    Args:
+        number: of the pair, from 1.
+        folder: for the files.
+        training_s: length of the recording to learn from [s].
+        held_out_s: length of the other [s].
 
     Raises:
         ConfigError: there is no such pair.

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.experiment.campaign import check_period, prior_simulator
 from carlab.experiment.regression_recordings import DELAY_S, RecordedCase
@@ -92,12 +93,9 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     return found
 
 
-def check_periods(recordings: Sequence[Sequence[object]], car: SimulatorConfig) -> None:
+def check_periods(recordings: Sequence[Sequence[EpisodeData]], car: SimulatorConfig) -> None:
     """Raise ConfigError where recordings were not made with the control period of the car's file."""
-    from carlab.core.episode_data import EpisodeData
-
     for episode in itertools.chain.from_iterable(recordings):
-        assert isinstance(episode, EpisodeData)
         check_period(car, float(np.median(np.diff(episode.times_s))), "a recording")
 
 
@@ -127,8 +125,7 @@ def run_prior_study(
     counts = tuple(rows) or case.counts
     if max(counts) > len(case.rows):
         raise DataError(f"The recordings have {len(case.rows)} rows, not {max(counts)}; ask for fewer with --rows.")
-    domain = priors[NOMINAL] if NOMINAL in priors else case.prior
-    assert domain is not None
+    domain = priors.get(NOMINAL) or case.prior
     plan = list(itertools.product(counts, range(seeds), priors))
     for done, (count, seed, name) in enumerate(plan):
         progress(f"{name}, {count} rows, seed {seed}", done, len(plan))

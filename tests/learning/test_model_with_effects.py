@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.stats import cauchy, norm
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, CarState
 from learning.domain_models import draw_parameters
-from learning.simulator_model import OF_THE_PLACE, CarModel
+from learning.simulator_model import OF_THE_PLACE, CarModel, known_ranges
 from learning.transitions import transitions_of, velocity_delay_s
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
 from sim_backends.effects import EFFECTS
@@ -199,6 +200,26 @@ def test_delays_that_add_up_to_less_than_nothing_are_none():
     model = CarModel(config, HISTORY, ranges)
     found = model(torch.from_numpy(rows.inputs), torch.tensor([[-0.15]], dtype=torch.float64))[0].numpy()
     assert np.allclose(found, rows.targets, atol=2e-5)
+
+
+def test_a_diagnosed_number_is_cauchys_within_what_is_possible():
+    """Quantiles of scipy's distribution, cut off at the range; a number with a range alone is uniform."""
+    config = SimulatorConfig(
+        effects={"motor_lag": {"time_constant": 0.06}},
+        priors={"motor.drive_gain": (6.0, 9.0), "motor.damping": (1.0, 2.0)},
+        doubts={"motor.drive_gain": 0.3, "effects.motor_lag.time_constant": 0.01, "vehicle.yaw_inertia": 1e-9},
+    )
+    model = CarModel(config, HISTORY, known_ranges(config))
+    shares = np.linspace(0.01, 0.99, 99)
+    normal = torch.from_numpy(norm.ppf(shares))[:, None].expand(-1, model.size)
+    drawn = dict(zip(model.names, model.parameters(normal).numpy().T, strict=True))
+    assert set(drawn) == set(config.doubts) | set(config.priors)
+    assert np.allclose(drawn["motor.damping"], 1.0 + shares)
+    spread = {"motor.drive_gain": (8.2, 0.6, 6.0, 9.0), "effects.motor_lag.time_constant": (0.06, 0.02, 0.0, 0.26)}
+    for name, (middle, scale, low, high) in spread.items():
+        ends = cauchy.cdf([low, high], middle, scale)
+        assert np.allclose(drawn[name], cauchy.ppf(ends[0] + (ends[1] - ends[0]) * shares, middle, scale), rtol=1e-6)
+    assert np.ptp(drawn["vehicle.yaw_inertia"]) > 0.02 * 0.06, "nothing is known better than to some per cent"
 
 
 def test_a_choice_has_no_range():
