@@ -63,7 +63,8 @@ class SimulatorConfig:
 
     ``effects`` maps ids of the catalogue to their parameters (all of them, in SI units; a choice may be given by its
     word and is kept as its position); ``priors`` maps dotted
-    names to (low, high) where the car file gives a range. Building one checks it: ConfigError says what is wrong.
+    names to (low, high) where the car file gives a range, ``doubts`` to a standard deviation where it gives one, as a
+    diagnosis does. Building one checks it: ConfigError says what is wrong.
     """
 
     parameters: CarParameters = CarParameters()
@@ -73,6 +74,7 @@ class SimulatorConfig:
     mocap: MocapParameters = MocapParameters()
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    doubts: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(ModelKind):
@@ -94,6 +96,10 @@ class SimulatorConfig:
         for name, (low, high) in self.priors.items():
             if not low <= self.values()[name] <= high:
                 raise ConfigError(f"{name} = {self.values()[name]:g} lies outside its own range {low:g} to {high:g}.")
+        check_keys(self.doubts, REGISTRY, "the doubts")
+        for name, std in self.doubts.items():
+            if not 0.0 < std < float("inf") or REGISTRY[name].choices:
+                raise ConfigError(f"The std of {name} is {std:g}; give a number above zero, and none to a word.")
         for channel, delay_s in zip(("steering", "throttle"), self.delays_s(), strict=True):
             if delay_s < 0.0:
                 raise ConfigError(f"The delay of {channel} adds up to {delay_s:g} s; raise command_delay to 0 or more.")
@@ -149,12 +155,13 @@ class SimulatorConfig:
     def from_tables(cls, tables: Mapping[str, Any], where: str = "the car file") -> Self:
         """Read the tables of a car file (``tomllib.load``; without ``[hardware]``). Absent tables mean the defaults.
 
-        A number may be ``{value = 8.2, low = 6.0, high = 10.0}``. Raises ConfigError for unknown keys, wrong types
-        and impossible values; ``where`` names the file in messages.
+        A number may be ``{value = 8.2, low = 6.0, high = 10.0, std = 0.5}``, with range, std or both. Raises
+        ConfigError for unknown keys, wrong types and impossible values; ``where`` names the file in messages.
         """
         check_keys(tables, TABLES, where)
         values: dict[str, float] = {}
         priors: dict[str, tuple[float, float]] = {}
+        doubts: dict[str, float] = {}
         model = _table(tables, "model", where)
         check_keys(model, ("kind",), f"[model] of {where}")
         for prefix, table in _sections(tables, where):
@@ -163,16 +170,18 @@ class SimulatorConfig:
             for key, entry in table.items():
                 if known[key].choices:
                     entry = known[key].number(entry, where)
-                values[f"{prefix}.{key}"], prior = _number(entry, f"'{key}' in [{prefix}] of {where}")
+                values[f"{prefix}.{key}"], prior, std = _number(entry, f"'{key}' in [{prefix}] of {where}")
                 if prior is not None:
                     priors[f"{prefix}.{key}"] = prior
+                if std is not None:
+                    doubts[f"{prefix}.{key}"] = std
         effects: dict[str, dict[str, float]] = {name: {} for name in _table(tables, "effects", where)}
         try:
             plain = cls(kind=model.get("kind", "dynamic")).with_values(
                 {name: value for name, value in values.items() if not name.startswith("effects.")}
             )
             with_effects = replace(plain, effects=effects).with_values(values) if effects else plain
-            return replace(with_effects, priors=priors)
+            return replace(with_effects, priors=priors, doubts=doubts)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
 
@@ -184,9 +193,12 @@ class SimulatorConfig:
             table = tables
             for part in path:
                 table = table.setdefault(part, {})
-            if name in self.priors:
-                low, high = self.priors[name]
-                table[key] = {"value": value, "low": low, "high": high}
+            if name in self.priors or name in self.doubts:
+                table[key] = {"value": value}
+                if name in self.priors:
+                    table[key] |= dict(zip(("low", "high"), self.priors[name], strict=True))
+                if name in self.doubts:
+                    table[key]["std"] = self.doubts[name]
             elif choices := REGISTRY[name].choices:
                 table[key] = choices[int(value)]
             else:
@@ -229,19 +241,22 @@ def _sections(tables: Mapping[str, Any], where: str) -> Iterator[tuple[str, Mapp
         yield f"effects.{effect_id}", _table(effects, effect_id, f"[effects] of {where}")
 
 
-def _number(entry: Any, where: str) -> tuple[float, tuple[float, float] | None]:
+def _number(entry: Any, where: str) -> tuple[float, tuple[float, float] | None, float | None]:
     if isinstance(entry, Mapping):
-        check_keys(entry, ("value", "low", "high"), where)
-        for key in ("value", "low", "high"):
+        check_keys(entry, ("value", "low", "high", "std"), where)
+        ranged = "low" in entry or "high" in entry or "std" not in entry
+        for key in ("value", "low", "high") if ranged else ("value",):
             if key not in entry:
                 raise ConfigError(f"'{key}' is missing in {where}; write {{value = 1.0, low = 0.5, high = 2.0}}.")
-        value, low, high = (_number(entry[key], f"'{key}' of {where}")[0] for key in ("value", "low", "high"))
-        if not low <= value <= high:
-            raise ConfigError(f"{where}: value {value:g} must lie between low {low:g} and high {high:g}.")
-        return value, (low, high)
+        given = {key: _number(entry[key], f"'{key}' of {where}")[0] for key in entry}
+        if ranged and not given["low"] <= given["value"] <= given["high"]:
+            raise ConfigError(
+                f"{where}: value {given['value']:g} must lie between low {given['low']:g} and high {given['high']:g}."
+            )
+        return given["value"], (given["low"], given["high"]) if ranged else None, given.get("std")
     if isinstance(entry, bool) or not isinstance(entry, (int, float)):
         raise ConfigError(f"{where} must be a number, not {entry!r}.")
-    return float(entry), None
+    return float(entry), None, None
 
 
 __all__ = [

@@ -22,12 +22,16 @@ if TYPE_CHECKING:
 class Bench:
     """Measure how fast the parts are, or how well models learn from few rows."""
 
-    what: Positional[Literal["speed", "regression"]] = "speed"
+    what: Positional[Literal["speed", "regression", "priors", "parking"]] = "speed"
     """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios taken in one run.
-    regression: Sim-FSVGD and its baselines on the cases of the paper."""
+    regression: Sim-FSVGD and its baselines on the cases of the paper. priors: what a diagnosed simulator is worth:
+    Sim-FSVGD without a prior, with the kinematic, the nominal and the diagnosed one, on a simulated car with two
+    concealed effects, or on the recordings in --data. parking: carlab learn on the simulated car, method beside method;
+    runs that are in --runs already are taken up."""
 
     out: Path | None = None
-    """Write the figures as JSON; regression draws a picture of the same name beside it."""
+    """Write the figures as JSON; regression and priors draw a picture of the same name beside it, and priors keeps its
+    recordings and the diagnosis in a folder of that name."""
 
     seconds: float = 10.0
     """Length of each condition of the sender's measurement [s]."""
@@ -44,19 +48,39 @@ class Bench:
     """How many true systems and fits."""
 
     methods: tuple[str, ...] = ()
-    """Some of: Sim-FSVGD, "Sim-FSVGD without gap", FSVGD, SysID, GreyBox, ensemble, ridge. All unless given."""
+    """Some of: Sim-FSVGD, "Sim-FSVGD without gap", FSVGD, SysID, GreyBox, ensemble, ridge; parking: sim-fsvgd, fsvgd,
+    fsvgd-authors. All unless given."""
 
     way: Literal["ours", "authors"] = "ours"
     """How particles are fitted: as carlab does, or with the update and the sizes of the authors' code."""
 
     data: Path | None = None
-    """Folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it."""
+    """Folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it. realcar and
+    priors: folder with recordings, the last one held out."""
 
     car: Path = Path("eth_rc_car")
-    """realcar: the car file whose simulator is the prior."""
+    """realcar: the car file whose simulator is the prior. priors: the nominal one, that is diagnosed."""
 
     history: int | None = None
-    """realcar: past commands; found from the recordings unless given (the paper has 3)."""
+    """realcar and priors: past commands; found from the recordings unless given (the paper has 3)."""
+
+    diagnosed: Path | None = None
+    """priors: model.toml of a diagnosis that did not see the last recording; diagnosed here unless given."""
+
+    pair: int = 1
+    """priors without --data: which two effects are concealed (1, 2 or 3)."""
+
+    recorded_s: tuple[float, float] = (100.0, 40.0)
+    """priors without --data: lengths of the recordings to learn from and of the one held out [s]."""
+
+    runs: Path = Path("parking-runs")
+    """parking: folder of its runs."""
+
+    episodes: int = 20
+    """parking: of each run."""
+
+    updates: int = 30000
+    """parking: gradient steps of SAC before an episode, as for carlab learn."""
 
     steps: int | None = None
     """Steps of the optimiser; those of the way unless given."""
@@ -72,7 +96,21 @@ class Bench:
         from learning.devices import available
 
         available(self.device)
-        return self._speed() if self.what == "speed" else self._regression()
+        if self.what == "speed":
+            return self._speed()
+        above_zero(
+            seeds=self.seeds, steps=self.steps, episodes=self.episodes, updates=self.updates,
+            **{"rows": min(self.rows)} if self.rows else {},
+        )  # fmt: skip
+        if self.what == "priors":
+            from carlab.cli.bench_priors import run_priors
+
+            return run_priors(self)
+        if self.what == "parking":
+            from carlab.cli.bench_parking import run_parking
+
+            return run_parking(self)
+        return self._regression()
 
     def _speed(self) -> int:
         from carlab.experiment.speed import measure_speed
@@ -87,11 +125,11 @@ class Bench:
         return 0
 
     def _regression(self) -> int:
+        from carlab.cli.bench_priors import print_rows
         from carlab.experiment.interrupts import Interrupts
         from carlab.experiment.regression_picture import draw
         from carlab.experiment.regression_study import Score, as_json, run_study, summarised
 
-        above_zero(seeds=self.seeds, steps=self.steps, **{"rows": min(self.rows)} if self.rows else {})
         case = self._recorded() if self.case == "realcar" else self.case
         scores: list[Score] = []
         with Interrupts() as interrupts, progress(speed_estimate_period_s=MINUTES_S) as bar:
@@ -106,15 +144,7 @@ class Bench:
                 if interrupts.requested.is_set():
                     break
         found = summarised(scores)
-        table(
-            f"{self.case}, {self.seeds} seeds, {self.way}",
-            ["rows", "method", "NLL [nat]", "+-", "RMSE", "calibration error", "seconds"],
-            [
-                [f"{r.rows}", r.method, f"{r.nll:.2f}", f"{r.nll_standard_error:.2f}", f"{r.rmse:.3g}",
-                 f"{r.calibration:.3f}", f"{r.seconds:.1f}"]
-                for r in found
-            ],
-        )  # fmt: skip
+        print_rows(f"{self.case}, {self.seeds} seeds, {self.way}", "method", found)
         if self.out is not None:
             command = " ".join(["carlab", *sys.argv[1:]])
             self.out.write_text(json.dumps(as_json(scores, command, self.device), indent=2) + "\n", encoding="utf-8")

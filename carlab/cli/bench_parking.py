@@ -22,8 +22,8 @@ def run_parking(options: Bench) -> int:
     from carlab.experiment.parking_study import as_json, draw, read_curve, run_folder, run_name, summarised
     from learning.car_fit import Method
 
-    methods = options.methods or get_args(Method)
-    if unknown := [m for m in methods if m not in get_args(Method)]:
+    methods: tuple[Method, ...] = tuple(m for m in get_args(Method) if m in options.methods or not options.methods)
+    if unknown := [m for m in options.methods if m not in get_args(Method)]:
         raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(get_args(Method))}.")
     folders = []
     for seed in range(options.seeds):

@@ -49,7 +49,8 @@ class Learn:
 
     prior: str = "kinematic"
     """The simulator that is the prior: kinematic (the car's file, wheels that do not slip), nominal (the car's file as
-    it is), or FILE.toml (a diagnosed model.toml, say). Without ranges in the file they are 30 % about its numbers."""
+    it is), or FILE.toml (a diagnosed model.toml, say, which has its effects and its doubts of each number). Without
+    ranges in the file they are 30 % about its numbers."""
 
     method: Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"] = "sim-fsvgd"
     """sim-fsvgd; fsvgd without a simulator; or that as the authors of Sim-FSVGD set it, to be compared with."""
@@ -125,7 +126,7 @@ class Learn:
         import tomli_w
 
         from carlab.cars import load_car_file
-        from carlab.experiment.campaign import prior_simulator
+        from carlab.experiment.campaign import check_period, prior_simulator
         from carlab.experiment.training import TrainingPlan
 
         if self.prior in ("kinematic", "nominal"):
@@ -133,6 +134,7 @@ class Learn:
             simulator = prior_simulator(choice.simulator, kind)
         else:
             simulator = prior_simulator(load_car_file(Path(self.prior)).simulator, "nominal")
+            check_period(simulator, choice.control_period_s, f"car '{self.which_car.car}'")
         text = tomli_w.dumps(simulator.to_tables())
         return TrainingPlan(
             text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed,

@@ -61,7 +61,7 @@ def _ends(shots: Shots, nominal: SimulatorConfig, max_step_s: float) -> FloatArr
         return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
 
     states = rollout(
-        replace(nominal, control_period_s=shots.period_s, priors={}),
+        replace(nominal, control_period_s=shots.period_s, priors={}, doubts={}),
         tensor(shots.start),
         tensor(shots.commands),
         history=tensor(shots.history),

@@ -61,7 +61,7 @@ class Predictor:
         inner = {n: _broadcast(v, sets) for n, v in given.items() if n not in OBSERVED and not n.startswith("mocap.")}
         inner[DELAY] = np.maximum(_broadcast(numbers[DELAY], sets) + latency, 0.0)
         effects = {name: v for name, v in self.config.effects.items() if name not in _OBSERVATION_EFFECTS}
-        config = replace(self.config, effects=effects, control_period_s=self.shots.period_s, priors={})
+        config = replace(self.config, effects=effects, control_period_s=self.shots.period_s, priors={}, doubts={})
         count = len(self.shots)
 
         def tensor(array: FloatArray) -> torch.Tensor:

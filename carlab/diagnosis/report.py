@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from contextlib import suppress
 from dataclasses import replace
@@ -15,6 +16,7 @@ from carlab.diagnosis import report_text as text
 from carlab.diagnosis.findings import Diagnosis, Exhibits
 from carlab.recording.sink import describe_os_error, make_folder, partial_path
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.registry import REGISTRY
 
 JSON_NAME, HTML_NAME, RRD_NAME, MODEL_NAME = "report.json", "report.html", "report.rrd", "model.toml"
 PICTURE_NAME = "summary.png"
@@ -93,7 +95,21 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
     if scores:
         lines.append(f"Held-out error in noise floors: {', '.join(scores)}.")
     comments = "".join(f"# {row}\n" for line in lines for row in _rows(line))
-    return f"{comments}\n{tomli_w.dumps(model.to_tables())}"
+    return f"{comments}\n{tomli_w.dumps(with_doubts(diagnosis, model).to_tables())}"
+
+
+def with_doubts(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:
+    """The simulator with the standard deviation of every number that was estimated, for who learns from it."""
+    estimates = dict(diagnosis.parameters)
+    for effect in diagnosis.effects:
+        estimates |= {f"effects.{effect.id}.{name}": found for name, found in effect.parameters.items()}
+    known = model.values()
+    doubts = {
+        name: found.std
+        for name, found in estimates.items()
+        if name in known and not REGISTRY[name].choices and 0.0 < found.std < math.inf and math.isfinite(known[name])
+    }
+    return replace(model, doubts=doubts)
 
 
 def _rows(line: str) -> list[str]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from carlab.cars import CarChoice
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
@@ -42,6 +42,8 @@ GOES_ON = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOF
 """Ends of an episode after which the next may follow: a policy that has not learned yet leaves the arena."""
 SPREAD = 0.3
 """How far from its value a number of the car file may lie, where the file gives no range."""
+PERIOD_TOLERANCE = 0.02
+"""Share by which control periods may differ: stamps of recordings do."""
 UNCERTAIN = (
     *("vehicle.yaw_inertia", "tyre.front.B", "tyre.front.mu", "tyre.rear.B", "tyre.rear.mu"),
     *("motor.drive_gain", "motor.damping", "steering.max_angle"),
@@ -57,12 +59,22 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
         kind: which.
     """
     if kind == "kinematic":
-        car = replace(car, kind="kinematic", effects={}, priors={})
-    if car.priors:
+        car = replace(car, kind="kinematic", effects={}, priors={}, doubts={})
+    if car.priors or car.doubts:
         return car
     values = car.values()
     names = KINEMATIC_UNCERTAIN if car.kind == "kinematic" else UNCERTAIN
     return replace(car, priors={n: (values[n] * (1.0 - SPREAD), values[n] * (1.0 + SPREAD)) for n in names})
+
+
+def check_period(prior: SimulatorConfig, period_s: float, of: str) -> None:
+    """Raise ConfigError where a prior's control period is not that of a car or its recordings (``of``)."""
+    own = prior.control_period_s
+    if abs(own - period_s) > PERIOD_TOLERANCE * period_s:
+        raise ConfigError(
+            f"The prior has a control_period of {own:.4g} s, {of} one of {period_s:.4g} s, and one step of the one is "
+            "no step of the other; name a prior with the same control_period."
+        )
 
 
 @dataclass(slots=True)
@@ -184,4 +196,4 @@ def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device:
         raise DataError(f"{run.path} is no run of carlab learn that can be taken up again ({error}).") from error
 
 
-__all__ = ["CAMPAIGN_FILE", "Campaign", "CampaignHooks", "prior_simulator", "taken_up"]
+__all__ = ["CAMPAIGN_FILE", "Campaign", "CampaignHooks", "check_period", "prior_simulator", "taken_up"]

@@ -250,22 +250,29 @@ def run_study(
         chosen = chosen.ours
     names = tuple(methods) or tuple(METHODS)
     plan = [p for p in itertools.product(counts, range(seeds), names) if not (p[2] == "ridge" and p[0] < LEAST_RIDGE)]
-    clock = MonotonicClock()
     for done, (count, seed, name) in enumerate(plan):
         progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
         found = (chosen.data(count, seed) if data is None else chosen.recorded(data, count, seed)).to(device)
-        began_s = clock.now_s()
-        model = METHODS[name](_Task(chosen, found, seed, way, steps))
-        seconds = clock.now_s() - began_s
-        prediction = model.predict(found.test_inputs)
-        yield Score(
-            chosen.name, name, count, seed,
-            negative_log_likelihood(prediction, found.test_outputs),
-            root_mean_square_error(prediction, found.test_outputs),
-            calibration_error(prediction, found.test_outputs),
-            seconds,
-        )  # fmt: skip
+        yield scored(chosen, found, count, seed, name, way=way, steps=steps)
     progress("", len(plan), len(plan))
+
+
+def scored(
+    case: Case, data: Data, count: int, seed: int, method: str, *, way: Way = "ours", steps: int | None = None
+) -> Score:
+    """Fit one method of ``METHODS`` to rows of a case, and score it on the others."""
+    clock = MonotonicClock()
+    began_s = clock.now_s()
+    model = METHODS[method](_Task(case, data, seed, way, steps))
+    seconds = clock.now_s() - began_s
+    prediction = model.predict(data.test_inputs)
+    return Score(
+        case.name, method, count, seed,
+        negative_log_likelihood(prediction, data.test_outputs),
+        root_mean_square_error(prediction, data.test_outputs),
+        calibration_error(prediction, data.test_outputs),
+        seconds,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,4 +320,4 @@ def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[
     }
 
 
-__all__ = ["METHODS", "Row", "Score", "Way", "as_json", "run_study", "summarised"]
+__all__ = ["METHODS", "Row", "Score", "Way", "as_json", "run_study", "scored", "summarised"]

@@ -27,7 +27,7 @@ from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from learning.car_fit import LearnedCar, Method
-from learning.simulator_model import CarModel
+from learning.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, transitions_of
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -119,7 +119,7 @@ def train(
     tell("reading the recordings", 0, 1)
     episodes = [read_episode(path) for path in recordings if has_ticks(path)]
     simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
-    model = CarModel(simulator, plan.history, simulator.priors)
+    model = CarModel(simulator, plan.history, known_ranges(simulator))
     usable = [e for e in episodes if e.ticks > plan.history]
     rows = transitions_of(usable, plan.history) if usable else None
     figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}

@@ -131,3 +131,22 @@ def test_latency_effect_without_a_number_is_the_car_files():
 def test_delays_add_up_per_channel():
     config = SimulatorConfig(effects={"command_delay": {"extra_delay": -0.03}, "steering_delay": {"delay": 0.02}})
     assert config.delays_s() == pytest.approx((0.07, 0.05))
+
+
+def test_a_number_may_have_a_deviation_with_or_without_a_range():
+    tables = {
+        "motor": {
+            "drive_gain": {"value": 8.2, "std": 0.5},
+            "damping": {"value": 1.5, "low": 1.0, "high": 2.0, "std": 0.1},
+        },
+        "effects": {"steering_lag": {"time_constant": {"value": 0.1, "std": 0.02}}},
+    }
+    found = SimulatorConfig.from_tables(tables)
+    assert found.doubts == {"motor.drive_gain": 0.5, "motor.damping": 0.1, "effects.steering_lag.time_constant": 0.02}
+    assert found.priors == {"motor.damping": (1.0, 2.0)}
+    assert SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(found.to_tables()))) == found
+    for wrong in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match=r"std of motor\.drive_gain is"):
+            SimulatorConfig.from_tables({"motor": {"drive_gain": {"value": 8.2, "std": wrong}}})
+    with pytest.raises(ConfigError, match="'low' is missing"):
+        SimulatorConfig.from_tables({"motor": {"drive_gain": {"value": 8.2, "high": 9.0, "std": 0.1}}})

@@ -1,0 +1,115 @@
+"""``carlab bench priors`` as it is called."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+
+from carlab.concealment.measurement import COLUMNS, write_csv
+from carlab.core.quantities import Action, CarState
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.plant import Plant
+
+Carlab = Callable[..., tuple[int, str]]
+CAR = SimulatorConfig.from_preset()
+
+
+def record(path: Path, seed: int, ticks: int = 180) -> None:
+    """A drive of the plain simulator as CSV."""
+    rng = np.random.default_rng(seed)
+    plant, period, rows = Plant(CAR), CAR.control_period_s, []
+    plant.reset(CarState(0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 0.0)
+    held = (0.0, 0.0)
+    for tick in range(ticks):
+        if tick % 6 == 0:
+            held = (float(rng.uniform(-1, 1)), float(rng.uniform(0.1, 0.6)))
+        s = plant.advance(tick * period)
+        noise = rng.normal(size=6) * [3e-4, 3e-4, 1e-3, 5e-3, 5e-3, 0.02]
+        state = np.array([s.x_m, s.y_m, s.yaw_rad, s.vx_mps, s.vy_mps, s.yaw_rate_radps]) + noise
+        rows.append([tick * period, *state, *held])
+        plant.command(tick * period, Action(*held))
+    write_csv(path, dict(zip(COLUMNS, np.array(rows).T, strict=True)))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    data = tmp_path / "data"
+    data.mkdir()
+    record(data / "1.csv", 1)
+    record(data / "2.csv", 2)
+    return data
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    path = tmp_path / "found" / "model.toml"
+    path.parent.mkdir()
+    found = replace(CAR.with_values({"effects.motor_lag.time_constant": 0.02}), doubts={"motor.drive_gain": 0.2})
+    path.write_text(tomli_w.dumps(found.to_tables()))
+    return path
+
+
+def test_recordings_are_learned_under_four_priors(carlab: Carlab, folder: Path, model: Path, tmp_path: Path) -> None:
+    out = tmp_path / "study.json"
+    arguments = ("--rows", 20, "--seeds", 1, "--history", 3, "--steps", 30, "--out", out)
+    code, text = carlab("bench", "priors", "--data", folder, "--car", "rc_car", "--diagnosed", model, *arguments)
+    assert code == 0, text
+    assert "Held out: 2.csv." in text
+    told = json.loads(out.read_text())
+    names = ["none (FSVGD)", "kinematic", "nominal", "diagnosed"]
+    assert [(r["method"], r["rows"], r["seeds"]) for r in told["rows"]] == [(name, 20, 1) for name in names]
+    for row in told["rows"]:
+        assert f"{row['nll']:.2f}" in text
+        assert np.isfinite([row["nll"], row["calibration"]]).all()
+    assert out.with_suffix(".png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_two_effects_are_concealed_diagnosed_and_learned_with(carlab: Carlab, tmp_path: Path) -> None:
+    out = tmp_path / "study.json"
+    arguments = ("--recorded-s", 40, 20, "--rows", 20, "--seeds", 1, "--history", 4, "--steps", 30, "--out", out)
+    code, text = carlab("bench", "priors", *arguments)
+    assert code == 0, text
+    assert "told to nobody else: motor lag and mocap yaw misalignment" in text
+    assert {p.name for p in (tmp_path / "study" / "recordings").iterdir()} == {
+        "car.toml", "1_training.csv", "2_held_out.csv",
+    }  # fmt: skip
+    report = json.loads((tmp_path / "study" / "diagnosis" / "report.json").read_text())
+    assert [Path(use["path"]).name for use in report["recordings"]] == ["1_training.csv"]
+    assert len(json.loads(out.read_text())["scores"]) == 4
+
+
+def test_what_cannot_be_studied_is_said(carlab: Carlab, folder: Path, model: Path, tmp_path: Path) -> None:
+    def said(*arguments: object) -> str:
+        code, text = carlab("bench", "priors", *arguments)
+        assert code == 2
+        return text
+
+    assert "is no folder" in said("--data", tmp_path / "none")
+    assert "no pair 7; choose 1 to 3" in said("--pair", 7)
+    assert "--rows 0: a number above zero" in said("--rows", 0)
+    given = ("--data", folder, "--car", "rc_car", "--diagnosed")
+    assert "none.toml" in said(*given, tmp_path / "none.toml")
+    used = [
+        {"path": "2.csv", "sha256": hashlib.sha256((folder / "2.csv").read_bytes()).hexdigest(), "role": "held out"}
+    ]
+    (model.parent / "report.json").write_text(json.dumps({"recordings": used}))
+    assert "was diagnosed with 2.csv, which is held out here" in said(*given, model)
+    (model.parent / "report.json").write_text(json.dumps({"recordings": []}))
+    slow = tmp_path / "slow.toml"
+    slow.write_text(tomli_w.dumps(replace(CAR, control_period_s=0.05).to_tables()))
+    assert "control_period of 0.05 s, a recording one of 0.033" in said(
+        "--data", folder, "--car", slow, "--diagnosed", model
+    )
+    assert "control_period of 0.05 s, the car's file one of 0.033" in said(*given, slow, "--history", 3)
+    (folder / "2.csv").unlink()
+    code, text = carlab("bench", "priors", "--data", folder)
+    assert code == 1
+    assert "1 recordings; the last is held out" in text

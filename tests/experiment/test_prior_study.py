@@ -1,0 +1,150 @@
+"""What a diagnosed simulator is worth: the same rows for every prior, and none of those that are held out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ConfigError, DataError
+from carlab.experiment import regression_recordings
+from carlab.experiment.campaign import check_period
+from carlab.experiment.concealed_recordings import record_pair
+from carlab.experiment.prior_study import (
+    DIAGNOSED,
+    KINEMATIC,
+    NOMINAL,
+    NONE,
+    InDomain,
+    check_periods,
+    prior_models,
+    run_prior_study,
+)
+from carlab.experiment.regression_recordings import RecordedCase, recorded_case
+from learning.function_posterior import infer
+from learning.history import HistoryChoice
+from learning.simulator_model import CarModel
+from sim_backends.batch_rollout import rollout
+from sim_backends.car_parameters import SimulatorConfig
+
+HISTORY = 5
+TRUTH = SimulatorConfig.from_preset().with_values(
+    {"effects.motor_lag.time_constant": 0.09, "effects.mocap_yaw_misalignment.angle": 0.08}
+)
+KNOWN = replace(TRUTH, doubts={"effects.motor_lag.time_constant": 0.004, "effects.mocap_yaw_misalignment.angle": 0.004})
+
+
+def drive(seed: int, ticks: int = 240) -> EpisodeData:
+    """A recording of the true car, with a little noise."""
+    rng = np.random.default_rng(seed)
+    sent = np.repeat(rng.uniform(-1, 1, size=(ticks // 6, 2)), 6, axis=0)
+    sent[:, 1] = 0.1 + 0.5 * np.abs(sent[:, 1])
+    start = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
+    seen = rollout(TRUTH, start, torch.from_numpy(sent[None]), measured=True).measured
+    assert seen is not None
+    states = seen[0].numpy() + rng.normal(size=(ticks + 1, 6)) * [3e-4, 3e-4, 1e-3, 5e-3, 5e-3, 0.02]
+    return EpisodeData(np.arange(ticks + 1) * TRUTH.control_period_s, states, sent, sent, np.zeros(ticks))
+
+
+def case_of(held_out: EpisodeData, history: int | None = HISTORY) -> RecordedCase:
+    return recorded_case([[drive(1)], [held_out]], Path("rc_car"), history)
+
+
+def test_no_row_that_is_held_out_is_learned_from() -> None:
+    case = case_of(drive(2))
+    for count, seed in ((20, 0), (200, 1)):
+        data = case.recorded(Path(), count, seed)
+        learned = {row.tobytes() for row in data.inputs.numpy()}
+        assert len(learned) == count == len(data.outputs)
+        assert not learned & {row.tobytes() for row in data.test_inputs.numpy()}
+        assert {row.tobytes() for row in data.test_inputs.numpy()} == {
+            row.astype(np.float32).tobytes()
+            for row in case_of(drive(2)).held_out.inputs  # type: ignore[union-attr]
+        }
+
+
+def test_nothing_but_the_scores_depends_on_what_is_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """History, units, ranges and delays are those of the other recordings, whatever is held out."""
+    asked: list[int] = []
+
+    def spied(episodes: list[EpisodeData]) -> HistoryChoice:
+        asked.extend(id(e) for e in episodes)
+        return HistoryChoice(3, {3: -1.0})
+
+    monkeypatch.setattr(regression_recordings, "find_history", spied)
+    first, wild = drive(1), drive(3)
+    wild = replace(wild, states=wild.states * 3.0, sent=-wild.sent)
+    one, other = (recorded_case([[first], [held]], Path("rc_car"), None) for held in (drive(2), wild))
+    assert set(asked) == {id(first)}
+    assert (one.output_std, one.input_std, one.rows.history) == (other.output_std, other.input_std, other.rows.history)  # type: ignore[union-attr]
+    models = [prior_models(case, SimulatorConfig.from_preset(), KNOWN) for case in (one, other)]
+    assert list(models[0]) == [NONE, KINEMATIC, NOMINAL, DIAGNOSED]
+    assert repr(models[0]) == repr(models[1])
+
+
+def test_priors_are_those_of_their_car_files() -> None:
+    case = case_of(drive(2))
+    models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
+    assert models[NONE] is None
+    nominal, rolling, better = models[NOMINAL], models[KINEMATIC], models[DIAGNOSED]
+    assert isinstance(nominal, CarModel)
+    assert isinstance(rolling, InDomain)
+    assert isinstance(better, InDomain)
+    assert isinstance(rolling.model, CarModel)
+    assert isinstance(better.model, CarModel)
+    preset = SimulatorConfig.from_preset()
+    assert rolling.model.config.kind == "kinematic"
+    assert rolling.model.ranges["motor.drive_gain"] == preset.priors.get(
+        "motor.drive_gain", pytest.approx((0.7 * 8.2, 1.3 * 8.2))
+    )
+    assert not nominal.config.effects
+    assert set(better.model.config.effects) == {"motor_lag", "mocap_yaw_misalignment"}
+    assert "effects.motor_lag.time_constant" in better.model.ranges
+    assert rolling.domain is nominal is better.domain
+    assert nominal.at_s == pytest.approx(case.rows.tick.mean() * TRUTH.control_period_s)  # type: ignore[union-attr]
+
+
+def test_the_study_has_a_score_for_every_prior() -> None:
+    case = case_of(drive(2))
+    models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
+    scores = list(run_prior_study(case, models, rows=(20,), seeds=1, steps=20))
+    assert [(s.method, s.rows, s.seed) for s in scores] == [
+        (name, 20, 0) for name in (NONE, KINEMATIC, NOMINAL, DIAGNOSED)
+    ]
+    assert len({s.nll for s in scores}) == 4
+
+
+def test_knowing_the_effects_helps_where_there_is_little_data() -> None:
+    """What data and simulator say together, before particles are led there."""
+    case = case_of(drive(2))
+    models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
+    data, units = case.recorded(Path(), 20, 0), case.normaliser
+    surprise = {}
+    for name in (NOMINAL, DIAGNOSED):
+        found = infer(
+            models[name], data.inputs, data.outputs, units, torch.tensor(case.expected_noise_std),
+            gap_std=0.3 * units.output_std,
+        )  # fmt: skip
+        mean, std = found.predict(data.test_inputs)
+        surprise[name] = -norm.logpdf(data.test_outputs, mean, std).sum(axis=1).mean()
+    assert surprise[DIAGNOSED] < surprise[NOMINAL] - 0.4
+
+
+def test_what_does_not_fit_is_said() -> None:
+    case = case_of(drive(2))
+    models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
+    with pytest.raises(DataError, match="not 5000; ask for fewer with --rows"):
+        next(run_prior_study(case, models, rows=(5000,)))
+    slow = replace(KNOWN, control_period_s=0.05)
+    with pytest.raises(ConfigError, match=r"control_period of 0\.05 s, the car's file one of 0\.03333 s"):
+        prior_models(case, SimulatorConfig.from_preset(), slow)
+    with pytest.raises(ConfigError, match=r"a recording one of 0\.03333 s"):
+        check_periods([[drive(1)]], slow)
+    check_period(slow, 0.0501, "a recording")
+    with pytest.raises(ConfigError, match="no pair 4; choose 1 to 3"):
+        record_pair(4, Path("nowhere"), 100.0, 40.0)
