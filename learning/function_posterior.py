@@ -198,7 +198,7 @@ class _Case:
         factor = torch.linalg.cholesky(_covariance(gap, seen, noise, trust))
         every = y[None]
         if model is not None and parameters is not None:
-            every = y - _simulated(model, inputs, parameters, normaliser) if count else y.expand(len(parameters), 0, -1)
+            every = y - _simulated(model, inputs, parameters, normaliser)
         white = torch.linalg.solve_triangular(factor, every.permute(2, 1, 0), upper=False)
         noise_std = (scale * noise).float()
         return FunctionPosterior(normaliser, noise_std, freedom, model, parameters, gap, seen, factor, white)
@@ -215,6 +215,8 @@ class _Case:
 
 def _simulated(model: DomainModel, inputs: Tensor, parameters: Tensor, normaliser: Normaliser) -> Tensor:
     """Normalised outputs (P, N, O)."""
+    if not len(inputs):
+        return torch.zeros((len(parameters), 0, len(normaliser.output_std)), dtype=torch.float64, device=inputs.device)
     with torch.no_grad():
         return normaliser.outputs(model(inputs, parameters)).double()
 

@@ -83,7 +83,7 @@ class Bench:
     """parking: gradient steps of SAC before an episode, as for carlab learn."""
 
     steps: int | None = None
-    """Steps of the optimiser; those of the way unless given."""
+    """Steps of the model's optimiser; those of the way or the method unless given."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     """Where models learn. speed: of learning alone, the other parts are the CPU's."""

@@ -31,7 +31,8 @@ def run_parking(options: Bench) -> int:
             done = run_folder(options.runs, method, seed)
             console.print(f"{method}, seed {seed}")
             code = Learn(
-                CarOptions("sim"), episodes=options.episodes, updates=options.updates, method=method, seed=seed,
+                CarOptions("sim"), episodes=options.episodes, updates=options.updates, method=method,
+                model_steps=options.steps, seed=seed, device=options.device,
                 resume=done if done is not None and (done / CAMPAIGN_FILE).is_file() else None, out=options.runs,
                 name=run_name(method, seed), rerun=False,
             ).run()  # fmt: skip

@@ -1,0 +1,38 @@
+"""``carlab bench parking`` from the command line: what it drives, takes up, writes and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from carlab.cli import run
+
+SMALL = ["--methods", "sim-fsvgd", "fsvgd-authors", "--updates", "40", "--steps", "50", "--seeds", "1"]
+
+
+def test_two_methods_are_driven_taken_up_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, runs = tmp_path / "parking.json", tmp_path / "runs"
+    arguments = ["bench", "parking", *SMALL, "--runs", str(runs), "--out", str(out)]
+    assert run([*arguments, "--episodes", "1"]) == 0
+    first = {p.name: (p / "models" / "0001" / "dynamics.pt").stat().st_mtime_ns for p in runs.iterdir()}
+    assert len(first) == 2
+    study = json.loads(out.read_text())
+    assert [(r["method"], r["seeds"], r["episodes"]) for r in study["methods"]] == [
+        ("sim-fsvgd", 1, 1),
+        ("fsvgd-authors", 1, 1),
+    ]
+    assert study["command"].startswith("carlab")
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    capsys.readouterr()
+    assert run([*arguments, "--episodes", "1"]) == 0, "nothing is left to do"
+    again = {p.name: (p / "models" / "0001" / "dynamics.pt").stat().st_mtime_ns for p in runs.iterdir()}
+    assert again == first
+    assert "never" in capsys.readouterr().out, "forty gradient steps park nothing"
+
+
+def test_an_unknown_method_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["bench", "parking", "--methods", "ridge", "--runs", str(tmp_path / "runs")]) == 2
+    assert "There is no method 'ridge'" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
