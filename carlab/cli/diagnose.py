@@ -73,8 +73,8 @@ class Diagnose:
         if same:
             raise ConfigError(f"{min(same).name} is both fitted and held out; a judge must not be a witness.")
         car = default_car() if self.car == "sim" else load_car_file(Path(self.car))
-        fit, faults, uses = self._load(self.recordings, "fit")
-        held, more, others = self._load(self.holdout, "held out")
+        fit, faults, uses = self._load(self.recordings, "fit", car.simulator.mocap.latency_s)
+        held, more, others = self._load(self.holdout, "held out", car.simulator.mocap.latency_s)
         texts = Texts(effect_sentence, separating_drive, LOOK_ALIKES)
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("diagnosis", total=100, note="")
@@ -105,9 +105,10 @@ class Diagnose:
         return 0
 
     def _load(
-        self, paths: tuple[Path, ...], role: str
+        self, paths: tuple[Path, ...], role: str, latency_s: float
     ) -> tuple[list[EpisodeData], list[DataFault], list[RecordingUse]]:
         from carlab.diagnosis.findings import DataFault, RecordingUse
+        from carlab.diagnosis.own_recordings import as_captured
         from carlab.recording.audit_report import Severity
         from carlab.recording.forgiving_import import import_mended
         from carlab.recording.mcap_source import read_episode
@@ -126,7 +127,7 @@ class Diagnose:
                     if f.id in DATA_FAULTS and f.id != "dropouts"
                 ]
             else:
-                episodes.append(read_episode(path))
+                episodes.append(as_captured(read_episode(path), latency_s))
             uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))
         return episodes, faults, uses
 
