@@ -9,6 +9,7 @@ line through its own poses (a filter behind the estimator) is kept.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,11 +62,30 @@ def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
     )
 
 
+def window_variance_s2(episodes: Sequence[EpisodeData]) -> float | None:
+    """Variance [s2] of the window that ``as_captured`` differentiates by; None where it leaves recordings as they are.
+
+    A line through evenly spaced poses at t gives v + s2 / 2 d2v/dt2 with s2 = sum(t^4) / (3 sum(t^2)).
+    """
+    for episode in episodes:
+        gaps = np.diff(np.unique(episode.poses[:, 0]))
+        if POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra and len(gaps) >= 2 * LEAST_ASIDE:
+            gap_s = float(np.median(gaps))
+            t = gap_s * np.arange(1, _half(gap_s) + 1)
+            return float(np.sum(t**4) / (3.0 * np.sum(t**2)))
+    return None
+
+
+def _half(gap_s: float) -> int:
+    return max(LEAST_ASIDE, round(HALF_WINDOW_S / gap_s))
+
+
 def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
     """States (n, 6) at times (n,) of local quadratics through poses (P, 4); NaN where poses lie on one side only."""
     t_s = poses[:, 0]
-    half = max(LEAST_ASIDE, round(HALF_WINDOW_S / float(np.median(np.diff(t_s)))))
-    widest_s = 2.0 * half * 1.5 * float(np.median(np.diff(t_s)))
+    gap_s = float(np.median(np.diff(t_s)))
+    half = _half(gap_s)
+    widest_s = 2.0 * half * 1.5 * gap_s
     states = np.full((len(at_s), 6), np.nan)
     for k, moment_s in enumerate(at_s):
         nearest = int(np.argmin(np.abs(t_s - moment_s)))
@@ -101,4 +121,4 @@ def _behind_the_line(episode: EpisodeData, poses: FloatArray) -> FloatArray:
     return np.asarray(left)
 
 
-__all__ = ["as_captured"]
+__all__ = ["as_captured", "window_variance_s2"]
