@@ -25,7 +25,7 @@ from carlab.diagnosis.measurement_noise import estimate_noise
 from carlab.diagnosis.own_recordings import as_captured, window_variance_s2
 from carlab.diagnosis.prediction import Predictor, errors
 from carlab.diagnosis.scoring import noise_floor
-from carlab.diagnosis.shots import Shots, cut, tracks_of
+from carlab.diagnosis.shots import HISTORY_S, Shots, cut, tracks_of
 from carlab.diagnosis.starts import corrected
 from carlab.diagnosis.velocity_window import smear_s2
 from sim_backends.car_parameters import SimulatorConfig
@@ -117,28 +117,27 @@ def look(episodes: Sequence[EpisodeData], simulator: SimulatorConfig) -> LightDi
     told = LightDiagnosis("undecided", episodes=len(episodes), seconds=float(seconds))
     usable = [e for e in episodes if e.ticks >= 2]
     if not usable:
-        return replace(told, why="Nothing was driven yet.")
+        return replace(told, why="nothing was driven.")
     captured = [as_captured(e, simulator.mocap.latency_s) for e in usable]
     healed, _, faults = data_faults.check(captured, [], simulator)
     spoilt = [f for f in faults if f.action.startswith("unusable")]
     if spoilt:
-        return replace(told, why=f"The recordings are at fault ({spoilt[0].id} of {spoilt[0].channel}).")
+        return replace(told, why=f"the recordings are at fault ({spoilt[0].id} of {spoilt[0].channel}).")
     try:
         shots, floor = _shots(healed, simulator, window_variance_s2(usable))
-    except DataError as error:
-        return replace(told, why=str(error))
+    except DataError:
+        return replace(told, why=f"no recording has a stretch of {HORIZON_S + HISTORY_S:.1f} s in which the car moves.")
     if len(shots) < LEAST_SHOTS:
-        return replace(told, why=f"The car moved too little: {len(shots)} stretches of {HORIZON_S:.1f} s.")
-    error = errors(Predictor(shots, simulator)(), shots)[0]
-    error = np.nan_to_num(error, nan=1e3, posinf=1e3, neginf=-1e3)
-    final = np.clip(error[:, -1] / floor[-1], -_DISASTER, _DISASTER)
+        return replace(told, why=f"the car moved too little: {len(shots)} stretches of {HORIZON_S:.1f} s.")
+    last = errors(Predictor(shots, simulator)(), shots)[0, :, -1]
+    final = np.nan_to_num(last / floor[-1], nan=_DISASTER).clip(-_DISASTER, _DISASTER)
     score, spread = _score(final, shots)
     channels = _channels(final, floor[-1])
     told = replace(told, score=score, score_std=spread, channels=channels, shots=len(shots))
     if score <= LEFT_SCORE:
         return replace(told, verdict="explains")
     if _blocks_beyond(final, shots) < REPEATED:
-        return replace(told, why="The errors are larger than the noise in one stretch alone, which may be an accident.")
+        return replace(told, why="the errors are larger than the noise in one stretch alone, which may be an accident.")
     worst = STATE_NAMES.index(channels[0].channel)
     return replace(
         told,

@@ -126,8 +126,8 @@ def causes_of(shots: Shots, floor: FloatArray, simulator: SimulatorConfig) -> tu
         gap, error = clustered_gain(loss, judged[0][1], shots)
         alike = bool(causes) and gap < EQUAL_STANDARD_ERRORS * error
         seen.add(candidate.id)
-        numbers = _numbers(candidate, parts, simulator)
-        causes.append(Cause(candidate.id, share, own, candidate.beside, alike, numbers))
+        fitted = _numbers(candidate, parts, simulator)
+        causes.append(Cause(candidate.id, share, own, candidate.beside, alike, fitted))
     return tuple(causes)
 
 
