@@ -57,9 +57,9 @@ def _guesses(told: LightDiagnosis, decide: str) -> str:
     if not told.causes:
         return f"No single effect of the catalogue and no number of the car file explains it; {decide}."
     parts = [_cause(c) for c in told.causes]
-    text = "First guess: " + parts[0]
+    text = f"First guess: {parts[0]} of the excess explained on stretches that were not fitted"
     for cause, part in zip(told.causes[1:], parts[1:], strict=True):
-        text += f"; {'as likely' if cause.like_the_first else 'less likely'}: {part}"
+        text += f"; {'not told apart from it' if cause.like_the_first else 'less likely'}: {part}"
     return f"{text}; {decide}."
 
 
@@ -72,8 +72,8 @@ def _cause(cause: Cause) -> str:
         if p.before is not None and (cause.id == NUMBERS or not key.startswith("effects.")):
             text += f" instead of {number(p.before)}"
         values.append(text)
-    beside = ", with the car file's numbers fitted beside it" if cause.beside_numbers else ""
-    return f"{name} ({', '.join(values)}) explains {percent(cause.share)} of the excess on other stretches{beside}"
+    beside = " beside other numbers of the car file" if cause.beside_numbers else ""
+    return f"{name} ({', '.join(values)}){beside}, {percent(cause.share)}"
 
 
 __all__ = ["sentences", "short"]

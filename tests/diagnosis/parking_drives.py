@@ -5,7 +5,8 @@ On the simulated car, recorded as ``carlab learn`` records; and on the cars of t
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,12 +15,13 @@ import numpy as np
 
 from carlab.concealment.base_car import BaseCar
 from carlab.concealment.catalogue import Draw, index
-from carlab.concealment.measurement import Noise, record
+from carlab.concealment.measurement import Noise, Recording, record
 from carlab.concealment.physics import World
+from carlab.concealment.refit import channel_scores, cut_shots
 from carlab.concealment.simulation import drive
 from carlab.core.episode_data import EpisodeData
 from carlab.core.policy import PolicyInput
-from carlab.core.quantities import Action, CarState
+from carlab.core.quantities import STATE_NAMES, Action, CarState
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from carlab.experiment.scripted_policies import ReverseParkingPolicy
@@ -30,6 +32,22 @@ from sim_backends.simulated_car import SimulatedCar
 
 TASK = ParkingTask()
 TICKS = 100
+
+
+@dataclass(frozen=True)
+class Concealed:
+    """Episodes, the simulator without what is concealed in them, its parameters, and the channels' true scores."""
+
+    episodes: list[EpisodeData]
+    simulator: SimulatorConfig
+    parameters: dict[str, float]
+    scores: dict[str, float]
+
+    @property
+    def main_channels(self) -> list[str]:
+        """The channels with at least half of the largest squared excess, by the generator's own simulator."""
+        excess = {name: max(score**2 - 1.0, 0.0) for name, score in self.scores.items()}
+        return [name for name, e in excess.items() if e >= 0.5 * max(excess.values()) > 0.0]
 
 
 class ErringParker:
@@ -77,9 +95,7 @@ def drive_like_learning(
     return run
 
 
-def concealed_drives(
-    effect: str | None, size: float, seed: int, episodes: int = 5, share: float = 0.0
-) -> tuple[list[EpisodeData], SimulatorConfig]:
+def concealed_drives(effect: str | None, size: float, seed: int, episodes: int = 5, share: float = 0.0) -> Concealed:
     """Episodes of a car of the independent generator with one concealed effect, and the simulator without it.
 
     Args:
@@ -94,12 +110,13 @@ def concealed_drives(
     true = nominal.perturbed(draws, share)
     x, y = np.meshgrid(np.arange(0.5, 1.6, 0.25), np.arange(-1.2, 0.1, 0.25))
     drawn = Draw.from_rng(draws, true, np.stack([x.ravel(), y.ravel()], axis=1))
-    found = []
+    found, recordings, parameters = [], [], dict[str, float]()
     for k in range(episodes):
         world = World(true)
         if effect is not None:
             form = index()[(effect, "catalogue")]
-            form.attach(world, form.sized(size * form.typical, drawn))
+            parameters = form.sized(size * form.typical, drawn)
+            form.attach(world, parameters)
         rng = np.random.default_rng((seed, 2, k))
         policy = ErringParker(rng, k / max(episodes, 1))
         start = TASK.sample_start(rng).to_array()
@@ -111,6 +128,17 @@ def concealed_drives(
         )
         noise = Noise(nominal.position_std, nominal.yaw_std)
         seen = record(what, world, noise, np.random.default_rng((seed, 3, k)))
+        recordings.append(seen)
         sent, nothing = seen.commands[:-1], np.full(len(seen.commands) - 1, np.nan)
         found.append(EpisodeData(seen.t_s, seen.measured, sent, sent, nothing))
-    return found, SimulatorConfig.from_tables(nominal.table())
+    return Concealed(
+        found, SimulatorConfig.from_tables(nominal.table()), parameters, _scores(recordings, nominal, true)
+    )
+
+
+def _scores(recordings: Sequence[Recording], nominal: BaseCar, true: BaseCar) -> dict[str, float]:
+    """Scores of the nominal car by channel, by the generator's own shots, simulator and floor."""
+    squared = [
+        (channel_scores(cut_shots(r, true, horizon_s=0.8, every_s=0.2), nominal.free()) ** 2) for r in recordings
+    ]
+    return dict(zip(STATE_NAMES, map(float, np.sqrt(np.mean(squared, axis=0))), strict=True))
