@@ -34,7 +34,7 @@ class Diagnose:
     """
 
     recordings: Positional[tuple[Path, ...]]
-    """MCAP or CSV files to fit."""
+    """MCAP or CSV files to fit, or folders of runs: every third episode of a run is held out."""
 
     car: str = "sim"
     """Simulator to question: a car file, a car that comes along (eth_rc_car, dart_jetracer ...), or sim."""
@@ -69,12 +69,15 @@ class Diagnose:
         for name in self.effects:
             if name not in EFFECTS:
                 raise ConfigError(f"There is no effect '{name}'; there are: {', '.join(EFFECTS)}.")
-        same = {p.resolve() for p in self.recordings} & {p.resolve() for p in self.holdout}
+        of_runs = [_of_run(path) for path in self.recordings]
+        to_fit = tuple(path for fitted, _ in of_runs for path in fitted)
+        to_judge = (*self.holdout, *(path for _, held_out in of_runs for path in held_out))
+        same = {p.resolve() for p in to_fit} & {p.resolve() for p in to_judge}
         if same:
             raise ConfigError(f"{min(same).name} is both fitted and held out; a judge must not be a witness.")
         car = default_car() if self.car == "sim" else load_car_file(Path(self.car))
-        fit, faults, uses = self._load(self.recordings, "fit")
-        held, more, others = self._load(self.holdout, "held out")
+        fit, faults, uses = self._load(to_fit, "fit", car.simulator.mocap.latency_s)
+        held, more, others = self._load(to_judge, "held out", car.simulator.mocap.latency_s)
         texts = Texts(effect_sentence, separating_drive, LOOK_ALIKES)
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("diagnosis", total=100, note="")
@@ -105,9 +108,10 @@ class Diagnose:
         return 0
 
     def _load(
-        self, paths: tuple[Path, ...], role: str
+        self, paths: tuple[Path, ...], role: str, latency_s: float
     ) -> tuple[list[EpisodeData], list[DataFault], list[RecordingUse]]:
         from carlab.diagnosis.findings import DataFault, RecordingUse
+        from carlab.diagnosis.own_recordings import as_captured
         from carlab.recording.audit_report import Severity
         from carlab.recording.forgiving_import import import_mended
         from carlab.recording.mcap_source import read_episode
@@ -126,7 +130,7 @@ class Diagnose:
                     if f.id in DATA_FAULTS and f.id != "dropouts"
                 ]
             else:
-                episodes.append(read_episode(path))
+                episodes.append(as_captured(read_episode(path), latency_s))
             uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))
         return episodes, faults, uses
 
@@ -160,3 +164,16 @@ class Diagnose:
         columns = ["held out", "position [m]", "yaw [rad]", "vx [m/s]", "vy [m/s]", "yaw rate [rad/s]", "score"]
         table(f"Error after {diagnosis.horizon_s:.1f} s", columns, rows)
         console.print(f"Read {self.out / 'report.html'}; drive what was found with --car {self.out / 'model.toml'}.")
+
+
+def _of_run(path: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Recordings to fit and to judge by: of a run's folder its episodes in which something was driven, else itself."""
+    if not (path / "episodes").is_dir():
+        return (path,), ()
+    from carlab.experiment.training import has_ticks
+
+    driven = [recording for recording in sorted((path / "episodes").glob("*.mcap")) if has_ticks(recording)]
+    if not driven:
+        raise ConfigError(f"{path} has no finished episode yet.")
+    held_out = driven[2::3]
+    return tuple(p for p in driven if p not in held_out), tuple(held_out)

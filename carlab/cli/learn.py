@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,9 +25,11 @@ if TYPE_CHECKING:
     from carlab.experiment.campaign import Campaign, CampaignHooks
     from carlab.experiment.campaign_figures import EpisodeFigures
     from carlab.experiment.interrupts import Interrupts
+    from carlab.experiment.reality_check import RealityCheck
     from carlab.experiment.session import EpisodeResult
     from carlab.experiment.training import TrainingPlan
     from carlab.recording.run_directory import RunDirectory
+    from sim_backends.car_parameters import SimulatorConfig
 
 STEPS_PERIOD_S = 600.0
 
@@ -114,7 +117,9 @@ class Learn:
             interrupts = stack.enter_context(Interrupts())
             hooks = self._hooks(bar, run, figures, interrupts)
             if self.resume is None:
-                campaign = Campaign(choice, plan, self.episodes, run, hooks, self.ticks, self.place, self.rerun)
+                campaign = Campaign(
+                    choice, plan, self.episodes, run, hooks, self.ticks, self.place, self.rerun, self._questioned()
+                )
                 campaign.write_plan()
             else:
                 campaign = taken_up(run, choice, hooks, self.device)
@@ -141,10 +146,17 @@ class Learn:
             device=self.device or "cpu",
         )  # fmt: skip
 
+    def _questioned(self) -> SimulatorConfig | None:
+        """The simulator that episodes are checked against, where it is not that of the car's file."""
+        from carlab.cars import load_car_file
+
+        return None if self.prior in ("kinematic", "nominal") else load_car_file(Path(self.prior)).simulator
+
     def _hooks(
         self, bar: Progress, run: RunDirectory, figures: list[EpisodeFigures], interrupts: Interrupts
     ) -> CampaignHooks:
         from carlab.experiment.campaign import CampaignHooks
+        from carlab.experiment.campaign_report import keep_check, keep_row
         from carlab.experiment.session import SessionHooks
 
         rows: dict[str, TaskID] = {}
@@ -170,6 +182,7 @@ class Learn:
 
         def on_figures(row: EpisodeFigures) -> None:
             figures.append(row)
+            keep_row(run, row)
             parked = "parked" if row.parked else f"{row.distance_m:.2f} m from the goal"
             bar.console.print(
                 f"episode {row.episode}: return {row.total_reward:.1f} (foretold {row.foretold:.1f}), {parked}; "
@@ -177,11 +190,19 @@ class Learn:
                 soft_wrap=True,
             )
 
+        def on_check(told: RealityCheck) -> None:
+            if figures and figures[-1].episode == told.episode:
+                figures[-1] = figures[-1].with_check(told)
+            keep_check(run, told)
+            for sentence in told.sentences:
+                bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False)
+
         session = SessionHooks(
             place_by_hand=ask_to_place(bar, "use --no-place or a terminal"), on_episode=on_episode, on_tick=on_tick,
             on_abandon=on_abandon,
         )  # fmt: skip
-        return CampaignHooks(session, at, on_figures, interrupts.requested.is_set)
+        checking = functools.partial(at, "asking whether the simulator still explains it", 0, 1)
+        return CampaignHooks(session, at, on_figures, checking, on_check, interrupts.requested.is_set)
 
     def _watched(self, campaign: Campaign, figures: list[EpisodeFigures]) -> list[EpisodeResult]:
         from carlab.experiment.campaign_report import write_report

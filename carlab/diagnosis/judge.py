@@ -162,7 +162,8 @@ class Judge:
             return "mismatch"
         shots = self.search.shots
         score = {name: self.held_out.score(error) for name, error in self.errors.items()}
-        if (more and score["refit"] > MISSING_SCORE) or score["refit"] > MISSING_WITHOUT_FORMULA_SCORE:
+        best = min(score["refit"], score["nominal"])  # few recordings may lead a refit astray
+        if (more and best > MISSING_SCORE) or best > MISSING_WITHOUT_FORMULA_SCORE:
             return "unexplained"
         nominal_loss = self.fitter.loss(self.search.nominal)
         gain, spread = clustered_gain(nominal_loss, self.found.base.loss, shots)

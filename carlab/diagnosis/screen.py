@@ -65,7 +65,7 @@ class Screen:
         slopes, white = fitter.linear(best)
         self.white = white.reshape(-1)
         self.weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(self.white), 1e-12)))
-        jacobian = (slopes.reshape(len(best.free), -1) * self.weight).T
+        jacobian = (slopes.reshape(len(best.free), len(self.white)) * self.weight).T
         prior = np.diag([1.0 / f.prior_z for f in best.free])
         basis, _ = np.linalg.qr(np.vstack([jacobian, prior]))
         self._inside = basis[: len(self.white)]
@@ -84,7 +84,7 @@ class Screen:
         along = np.zeros(len(points))
         for part in np.array_split(np.arange(len(points)), max(1, math.ceil(len(points) / _AT_A_TIME))):
             for k, moved in zip(part, self._moved(config, tuple(free), points[part]), strict=True):
-                gains[k], along[k] = self._gain(moved)
+                gains[k], along[k] = self.gain(moved)
         order = np.argsort(-gains)[:STARTS]
         order = order[gains[order] >= NEARLY * gains[order[0]]]
         scalable = np.array([not f.logarithmic and not f.choice for f in free])
@@ -98,7 +98,8 @@ class Screen:
         starts = np.where(scalable, points[order] * factor, points[order])
         return Promise(effect, float(gains[order[0]]) / self.share, starts)
 
-    def _gain(self, moved: FloatArray) -> tuple[float, float]:
+    def gain(self, moved: FloatArray) -> tuple[float, float]:
+        """Fall of the loss along the way to the whitened errors ``moved`` (S, U, 6), and how far along it is best."""
         left = self.projected(np.clip(moved.reshape(-1) - self.white, -_CLIP, _CLIP))
         size = float(left @ left)
         slope = -float(left @ self.residual)

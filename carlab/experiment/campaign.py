@@ -24,6 +24,7 @@ from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign_figures import EpisodeFigures, figures_of
+from carlab.experiment.reality_check import RealityCheck, check_beside, check_path
 from carlab.experiment.session import EpisodeResult, Session, SessionHooks
 from carlab.experiment.training import (
     FIGURES_FILE,
@@ -84,12 +85,17 @@ class CampaignHooks:
     session: SessionHooks = field(default_factory=SessionHooks)
     on_training: Tell = lambda what, done, total: None
     on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
+    on_checking: Callable[[], None] = lambda: None
+    on_check: Callable[[RealityCheck], None] = lambda told: None
     stop: Callable[[], bool] = lambda: False
 
 
 @dataclass(slots=True)
 class Campaign:
-    """A run of ``carlab learn`` on an open car."""
+    """A run of ``carlab learn`` on an open car.
+
+    ``questioned`` is the simulator that each episode is checked against; that of the car's file unless given.
+    """
 
     choice: CarChoice
     plan: TrainingPlan
@@ -99,10 +105,14 @@ class Campaign:
     max_ticks: int | None = None
     place: bool = True
     record_rerun: bool = True
+    questioned: SimulatorConfig | None = None
 
     def write_plan(self) -> None:
         """Write what is wanted, for taking the run up again."""
-        wanted = {"episodes": self.episodes, "ticks": self.max_ticks, "place": self.place, "rerun": self.record_rerun}
+        wanted: dict[str, Any] = {"episodes": self.episodes, "ticks": self.max_ticks}
+        wanted |= {"place": self.place, "rerun": self.record_rerun}
+        if self.questioned is not None:
+            wanted["questioned"] = self.questioned.to_tables()
         self.run.write_json(CAMPAIGN_FILE, {**wanted, "plan": plan_as_json(self.plan)})
 
     def go_on(self) -> Iterator[EpisodeResult]:
@@ -113,6 +123,7 @@ class Campaign:
         Raises:
             DataError: what training says.
         """
+        self._check()
         while (done := len(self.run.recordings())) < self.episodes:
             folder = model_folder(self.run.models, done + 1)
             if not folder.is_dir():
@@ -135,9 +146,21 @@ class Campaign:
             if goes_on and result.reason.is_safety_stop:
                 self.choice.car.reset_fault()
             self.hooks.on_figures(figures_of(result, self._training(done + 1)))
+            self._check()
             yield result
             if not goes_on:
                 return
+
+    def _check(self) -> None:
+        """Check the recordings against the simulator where that was not done after the last of them."""
+        number = len(self.run.recordings())
+        path = check_path(self.run, number)
+        if not number or not path.parent.is_dir() or path.is_file() or self.hooks.stop():
+            return
+        self.hooks.on_checking()
+        told = check_beside(self.run, self.questioned or self.choice.simulator, self.hooks.stop)
+        if told is not None:
+            self.hooks.on_check(told)
 
     def _may_go_on(self, reason: EndReason) -> bool:
         """A real car goes on after a safety stop only where a person puts it at its start, and says so."""
@@ -187,10 +210,11 @@ def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device:
         plan = TrainingPlan(**content["plan"])
         plan = plan if device is None else replace(plan, device=device)
         SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
-        ticks = content["ticks"]
+        ticks, tables = content["ticks"], content.get("questioned")
+        questioned = None if tables is None else SimulatorConfig.from_tables(tables)
         return Campaign(
             choice, plan, int(content["episodes"]), run, hooks, None if ticks is None else int(ticks),
-            bool(content["place"]), bool(content["rerun"]),
+            bool(content["place"]), bool(content["rerun"]), questioned,
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{run.path} is no run of carlab learn that can be taken up again ({error}).") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import encode
 from carlab.core.quantities import FloatArray
+from carlab.experiment.reality_check import RealityCheck
 from carlab.experiment.session import EpisodeResult
 from learning.car_dynamics import OneStep
 
@@ -35,6 +36,11 @@ class EpisodeFigures:
         model_seconds, policy_seconds: that learning took.
         updates: gradient steps of SAC.
         end: why the episode ended.
+        reality: verdict of the light diagnosis of all episodes so far (explains, left, undecided, failed); empty
+            where there is none.
+        excess: noise floors by which the errors of the simulator exceed one, NaN where that is not known.
+        excess_std: its standard error.
+        diagnosis: what the light diagnosis says, in words.
     """
 
     episode: int
@@ -51,10 +57,19 @@ class EpisodeFigures:
     policy_seconds: float
     updates: int
     end: str
+    reality: str = ""
+    excess: float = float("nan")
+    excess_std: float = float("nan")
+    diagnosis: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """For a file; what is no number is null."""
         return {k: None if isinstance(v, float) and v != v else v for k, v in asdict(self).items()}
+
+    def with_check(self, told: RealityCheck) -> EpisodeFigures:
+        """The same with what a light diagnosis says."""
+        text = " ".join(told.sentences)
+        return replace(self, reality=told.verdict, excess=told.excess, excess_std=told.excess_std, diagnosis=text)
 
     @classmethod
     def from_dict(cls, row: Mapping[str, Any]) -> EpisodeFigures:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,8 @@ def draw(
     for axis in (curve, surprise):
         axis.grid(alpha=0.3)
         axis.xaxis.get_major_locator().set_params(integer=True)
+    if rows[-1].reality:
+        figure.suptitle(textwrap.shorten(rows[-1].diagnosis, 300, placeholder=" …"), fontsize=8, wrap=True)
     _plan(plan, episode, foretold, task)
     plan.set_title(f"episode {numbers[-1]}: driven, and foretold a second ahead", fontsize=9)
     figure.savefig(path, dpi=120)

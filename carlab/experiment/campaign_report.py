@@ -10,6 +10,7 @@ import numpy as np
 from carlab.core.errors import DataError
 from carlab.experiment.campaign_figures import EpisodeFigures, foretell
 from carlab.experiment.campaign_picture import draw
+from carlab.experiment.reality_check import RealityCheck
 from carlab.experiment.training import DYNAMICS_FILE, TrainingPlan, has_ticks, model_folder
 from carlab.recording.learning_curve import write_learning_curve
 from carlab.recording.mcap_source import read_episode
@@ -30,10 +31,23 @@ def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
         raise DataError(f"{path} cannot be read ({error}); remove it, and it is begun anew.") from error
 
 
+def keep_row(run: RunDirectory, row: EpisodeFigures) -> list[EpisodeFigures]:
+    """Put an episode's row into learn.json in place of the one that it has, if any; all rows."""
+    rows = sorted([r for r in learning_curve(run) if r.episode != row.episode] + [row], key=lambda r: r.episode)
+    run.write_json(CURVE_FILE, {"schema": "carlab.learn/1", "episodes": [r.to_dict() for r in rows]})
+    return rows
+
+
+def keep_check(run: RunDirectory, told: RealityCheck) -> None:
+    """Add a light diagnosis to the row of its episode, where there is one."""
+    for row in learning_curve(run):
+        if row.episode == told.episode:
+            keep_row(run, row.with_check(told))
+
+
 def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> None:
     """Add an episode to learn.json, learn.png and learn.rrd of a run."""
-    rows = [r for r in learning_curve(run) if r.episode != row.episode] + [row]
-    run.write_json(CURVE_FILE, {"schema": "carlab.learn/1", "episodes": [r.to_dict() for r in rows]})
+    rows = keep_row(run, row)
     recordings = run.recordings()
     driven, told = [], []
     shown = [r for r in rows if r.episode <= len(recordings) and has_ticks(recordings[r.episode - 1])]
@@ -44,10 +58,9 @@ def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> 
         told.append((foretold.mean[..., :2], foretold.std[..., :2]))
         if r is shown[-1]:
             draw(rows, episode, foretold, plan.task, run.path / "learn.png")
-    numbers = [f.name for f in fields(EpisodeFigures) if f.name != "end"]
-    write_learning_curve(
-        run.path / "learn.rrd", [{n: float(np.float64(getattr(r, n))) for n in numbers} for r in shown], driven, told
-    )
+    numbers = [f.name for f in fields(EpisodeFigures) if f.type != "str"]
+    figures = [{n: float(np.float64(getattr(r, n))) for n in numbers} for r in shown]
+    write_learning_curve(run.path / "learn.rrd", figures, driven, told, [r.diagnosis for r in shown])
 
 
-__all__ = ["CURVE_FILE", "learning_curve", "write_report"]
+__all__ = ["CURVE_FILE", "keep_check", "keep_row", "learning_curve", "write_report"]

@@ -20,6 +20,7 @@ def write_learning_curve(
     rows: Sequence[Mapping[str, float]],
     driven: Sequence[FloatArray],
     foretold: Sequence[tuple[FloatArray, FloatArray]],
+    diagnoses: Sequence[str] = (),
 ) -> None:
     """Write a recording whose timeline is the episode: every figure as a curve, paths in the plan view.
 
@@ -28,17 +29,21 @@ def write_learning_curve(
         rows: figures by name, one mapping an episode, ``episode`` among them.
         driven: x, y [m] of each episode (T, 2).
         foretold: mean and standard deviation of x, y [m] of stretches of each episode (S, T, 2).
+        diagnoses: what is said of the simulator after each episode, empty where nothing is; none at all unless given.
     """
     unfinished = partial_path(path)
     unfinished.unlink(missing_ok=True)
     stream = rr.RecordingStream(APPLICATION, recording_id=path.parent.name)
     try:
         stream.save(unfinished)
-        for row, line, (mean, std) in zip(rows, driven, foretold, strict=True):
+        texts = diagnoses or [""] * len(rows)
+        for row, line, (mean, std), text in zip(rows, driven, foretold, texts, strict=True):
             stream.set_time("episode", sequence=int(row["episode"]))
             for name, value in row.items():
                 if name != "episode" and np.isfinite(value):
                     stream.log(f"learning/{name}", rr.Scalars(float(value)))
+            if text:
+                stream.log("diagnosis", rr.TextLog(text, level=rr.TextLogLevel.INFO))
             stream.log("plan/driven", rr.LineStrips2D([line], colors=[(0, 0, 0)]))
             stream.log("plan/foretold", rr.LineStrips2D(list(mean), colors=[(230, 130, 0)]))
             stream.log("plan/foretold/doubt", rr.Boxes2D(centers=mean[:, -1], half_sizes=2.0 * std[:, -1]))

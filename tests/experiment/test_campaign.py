@@ -132,7 +132,7 @@ def test_a_run_goes_on_where_it_was_ended(story: Story) -> None:
     assert names(story.run) == ["episodes/0001.mcap", "episodes/0002.mcap", "models/0001", "models/0002"]
     assert [r.reason for r in story.results] == [EndReason.COMPLETED] * 2
     assert [p.name for p in sorted((story.run.models / "0002").iterdir())] == [
-        "agent.zip", "dynamics.pt", "moments.pt", "training.json",
+        "agent.zip", "diagnosis.json", "dynamics.pt", "moments.pt", "training.json",
     ]  # fmt: skip
     assert (story.run.models / "0001" / "agent.zip").read_bytes() == story.first_model, "it was not learned again"
 

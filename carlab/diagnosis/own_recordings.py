@@ -1,0 +1,124 @@
+"""Recordings that carlab made itself, as a diagnosis expects them: every state ``latency`` old, no velocity older.
+
+A control loop knows the newest pose, whose age changes with the phase of motion capture, and velocities of a line
+through the poses before it, which are older still. Both ages are in the recording, and so are all the poses, those
+that arrived later among them. A local quadratic through them gives the state of the one instant that the simulator
+means: that of the tick less the latency of motion capture in the car file. What a velocity column differs from the
+line through its own poses (a filter behind the estimator) is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.quantities import FloatArray
+from carlab.core.state_estimator import MIN_SAMPLES, fit_velocity
+from carlab.recording.episode_builder import POSE_AGE, VELOCITY_DELAY
+
+HALF_WINDOW_S = 0.025
+"""Half of the quadratic's window: seven poses at 120 Hz; two on either side at least."""
+LEAST_ASIDE = 2
+MOST_POSES = 64
+MATCH_S = 5e-4
+"""The line behind a velocity is known where the mean time of some number of poses matches its stated age so well."""
+
+
+def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
+    """States of ``latency_s`` before each tick, from all recorded poses.
+
+    Args:
+        episode: as read; one that does not tell the ages of its poses and velocities comes back as it is.
+        latency_s: of motion capture, by the car file.
+
+    Returns:
+        The episode, without the first and last rows about which there are no poses; rows inside that have too few
+        poses about them are not a number, so that they break the recording.
+    """
+    poses = episode.poses[np.unique(episode.poses[:, 0], return_index=True)[1]]
+    known = POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra
+    if not known or len(poses) < 2 * LEAST_ASIDE + 1:
+        return episode
+    poses = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
+    states = _quadratic(poses, episode.times_s - latency_s)
+    states[:, 3:] += _behind_the_line(episode, poses)
+    states[:, 2] = (states[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    seen = np.flatnonzero(np.isfinite(states).all(axis=1))
+    if len(seen) < MIN_SAMPLES:
+        return episode
+    first, last = int(seen[0]), int(seen[-1])
+    rows, ticks = slice(first, last + 1), slice(first, last)
+    return replace(
+        episode,
+        times_s=episode.times_s[rows],
+        states=states[rows],
+        requested=episode.requested[ticks],
+        sent=episode.sent[ticks],
+        rewards=episode.rewards[ticks],
+        extra={name: column[rows] for name, column in episode.extra.items()},
+    )
+
+
+def window_variance_s2(episodes: Sequence[EpisodeData]) -> float | None:
+    """Variance [s2] of the window that ``as_captured`` differentiates by; None where it leaves recordings as they are.
+
+    A line through evenly spaced poses at t gives v + s2 / 2 d2v/dt2 with s2 = sum(t^4) / (3 sum(t^2)).
+    """
+    for episode in episodes:
+        gaps = np.diff(np.unique(episode.poses[:, 0]))
+        if POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra and len(gaps) >= 2 * LEAST_ASIDE:
+            gap_s = float(np.median(gaps))
+            t = gap_s * np.arange(1, _half(gap_s) + 1)
+            return float(np.sum(t**4) / (3.0 * np.sum(t**2)))
+    return None
+
+
+def _half(gap_s: float) -> int:
+    return max(LEAST_ASIDE, round(HALF_WINDOW_S / gap_s))
+
+
+def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
+    """States (n, 6) at times (n,) of local quadratics through poses (P, 4); NaN where poses lie on one side only."""
+    t_s = poses[:, 0]
+    gap_s = float(np.median(np.diff(t_s)))
+    half = _half(gap_s)
+    widest_s = 2.0 * half * 1.5 * gap_s
+    states = np.full((len(at_s), 6), np.nan)
+    for k, moment_s in enumerate(at_s):
+        nearest = int(np.argmin(np.abs(t_s - moment_s)))
+        window = slice(max(nearest - half, 0), nearest + half + 1)
+        t = t_s[window] - moment_s
+        if min((t <= 1e-6).sum(), (t >= -1e-6).sum()) < LEAST_ASIDE or t[-1] - t[0] > widest_s:
+            continue
+        scale = float(np.abs(t).max())
+        design = np.stack([np.ones_like(t), t / scale, (t / scale) ** 2], axis=1)
+        value, slope = (np.linalg.pinv(design) @ poses[window, 1:])[:2]
+        x, y, yaw = value
+        vx, vy, rate = slope / scale
+        sin, cos = np.sin(yaw), np.cos(yaw)
+        states[k] = (x, y, yaw, cos * vx + sin * vy, cos * vy - sin * vx, rate)
+    return states
+
+
+def _behind_the_line(episode: EpisodeData, poses: FloatArray) -> FloatArray:
+    """Velocity columns less those of the lines that they were estimated by (n, 3); zero where that is not known."""
+    left = np.zeros((len(episode.times_s), 3))
+    capture_s = episode.times_s - episode.extra[POSE_AGE]
+    mean_s = capture_s - episode.extra[VELOCITY_DELAY]
+    for k, (end_s, middle_s) in enumerate(zip(capture_s, mean_s, strict=True)):
+        end = int(np.searchsorted(poses[:, 0], end_s + 1e-6))
+        counts = np.arange(MIN_SAMPLES, min(end, MOST_POSES) + 1)
+        if not np.isfinite(middle_s) or not len(counts):
+            continue
+        sums = np.cumsum(poses[:end, 0][::-1])[counts - 1] / counts
+        best = int(np.argmin(np.abs(sums - middle_s)))
+        if abs(float(sums[best]) - middle_s) < MATCH_S:
+            line = fit_velocity(poses[end - counts[best] : end])
+            left[k] = episode.states[k, 3:] - (line.vx_mps, line.vy_mps, line.yaw_rate_radps)
+    return np.asarray(left)
+
+
+__all__ = ["as_captured", "window_variance_s2"]

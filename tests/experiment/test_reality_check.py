@@ -1,0 +1,109 @@
+"""After an episode: whether reality has left the simulator; nothing that goes wrong with it ends a run."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from carlab.cars import choose_car
+from carlab.core.errors import DataError
+from carlab.experiment.campaign import Campaign, CampaignHooks
+from carlab.experiment.campaign_figures import EpisodeFigures
+from carlab.experiment.campaign_report import keep_check, keep_row, learning_curve
+from carlab.experiment.reality_check import RealityCheck, check, check_beside, check_path
+from carlab.experiment.training import TrainingPlan
+from carlab.recording.run_directory import RunDirectory
+from sim_backends.car_parameters import SimulatorConfig
+
+_spec = importlib.util.spec_from_file_location(
+    "parking_drives", Path(__file__).parents[1] / "diagnosis" / "parking_drives.py"
+)
+assert _spec is not None
+assert _spec.loader is not None
+drives = importlib.util.module_from_spec(_spec)
+sys.modules["parking_drives"] = drives
+_spec.loader.exec_module(drives)
+
+SIMULATOR = SimulatorConfig.from_preset()
+LAGGING = replace(SIMULATOR, effects={"motor_lag": {"time_constant": 0.08}})
+ROW = EpisodeFigures(1, 20.0, 30.0, False, 0.5, 0.1, 0.0, 97, 1.0, 0.1, 3.0, 60.0, 100, "COMPLETED")
+
+
+def a_run(folder: Path, true: SimulatorConfig, episodes: int) -> RunDirectory:
+    run: RunDirectory = drives.drive_like_learning(true, folder, episodes, seed=21)
+    for number in range(1, episodes + 1):
+        (run.models / f"{number:04d}").mkdir()
+    return run
+
+
+def test_the_check_is_kept_beside_the_model_and_names_the_next_step(tmp_path: Path) -> None:
+    run = a_run(tmp_path, LAGGING, 4)
+    told = check_beside(run, SIMULATOR)
+    assert told is not None
+    assert (told.episode, told.verdict) == (4, "left")
+    assert told.excess > 1.0
+    assert "motor_lag" in told.sentences[1]
+    kept = json.loads(check_path(run, 4).read_text())
+    assert kept["sentences"] == list(told.sentences)
+    assert kept["causes"][0]["id"] == "motor_lag"
+    assert kept["next"] == f"carlab diagnose {run.path} --car {run.path}/simulator.toml --out {run.path}/diagnosis"
+    assert kept["next"] in told.sentences[1]
+    assert not check_path(run, 3).exists()
+
+
+def test_what_goes_wrong_is_told_in_one_sentence(tmp_path: Path) -> None:
+    run = a_run(tmp_path, SIMULATOR, 1)
+    run.recordings()[0].write_bytes(b"rubbish")
+    told = check_beside(run, SIMULATOR)
+    assert told is not None
+    assert told.verdict == "failed"
+    (sentence,) = told.sentences
+    assert "learning goes on" in sentence
+    assert "MCAP" in sentence
+    assert "\n" not in sentence
+    assert json.loads(check_path(run, 1).read_text())["verdict"] == "failed", "it is not tried again"
+    with pytest.raises(DataError):
+        check(run.path, run.recordings(), SIMULATOR)
+
+
+def test_a_check_that_is_stopped_leaves_nothing_and_is_made_up_for(tmp_path: Path) -> None:
+    run = a_run(tmp_path, SIMULATOR, 1)
+    assert check_beside(run, SIMULATOR, stop=lambda: True) is None
+    assert not check_path(run, 1).exists()
+    keep_row(run, ROW)
+    heard: list[RealityCheck] = []
+
+    def on_check(told: RealityCheck) -> None:
+        heard.append(told)
+        keep_check(run, told)
+
+    campaign = Campaign(choose_car("sim"), TrainingPlan(""), 1, run, CampaignHooks(on_check=on_check))
+    assert list(campaign.go_on()) == []
+    assert [t.verdict for t in heard] == ["explains"]
+    (row,) = learning_curve(run)
+    assert (row.reality, row.excess) == ("explains", heard[0].excess)
+    assert row.diagnosis == heard[0].sentences[0]
+    assert row.total_reward == ROW.total_reward
+    assert list(campaign.go_on()) == []
+    assert len(heard) == 1, "once an episode"
+
+
+def test_rows_of_a_learning_curve_come_back_with_a_check_without_and_from_older_runs(tmp_path: Path) -> None:
+    run = a_run(tmp_path, SIMULATOR, 0)
+    told = RealityCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
+    keep_row(run, replace(ROW, episode=2))
+    keep_check(run, told)
+    keep_row(run, ROW)
+    content = json.loads((run.path / "learn.json").read_text())
+    for name in ("reality", "excess", "excess_std", "diagnosis"):
+        del content["episodes"][0][name]
+    (run.path / "learn.json").write_text(json.dumps(content))
+    first, second = learning_curve(run)
+    assert str(first) == str(ROW)
+    assert str(second) == str(replace(ROW, episode=2).with_check(told))
+    assert content["episodes"][1]["excess_std"] is None
