@@ -1,0 +1,81 @@
+"""The pendulum that loses energy behind a lagging motor, against scipy and the laws of energy."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from learning.domain_models import Pendulum, draw_parameters
+from learning.motor_pendulum import SLIDING_RADPS, MotorPendulum
+
+LOSSES = {"frictions": (0.4, 0.6), "drags": (0.4, 0.6), "dry": (0.1, 0.4), "lags": (0.02, 0.06)}
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.mark.parametrize("gap", [{}, {"rate_gap": (0.8, 0.3, 0.3, 0.7), "command_gap": 0.5}])
+def test_it_follows_its_equations_with_the_torque_as_a_state(gap):
+    model = MotorPendulum(**LOSSES, **gap)
+    x, parameters = model.inputs(12, generator()).double(), draw_parameters(model, 4, generator(1)).double()
+    ours = model(x, parameters)
+    for k, p in enumerate(parameters.tolist()):
+        m, length, g, nu, drag, dry, lag, linear, odd, even, sliding, of_command, of_past = p
+        for n, (sin, cos, rate, past, command) in enumerate(x.tolist()):
+
+            def rates(t, s, past=past, command=command):
+                theta, omega, torque = s
+                sign = math.tanh(omega / SLIDING_RADPS)
+                lost = nu * omega / (m * length) + drag / m * omega * abs(omega) + dry * sign / (m * length**2)
+                missing = linear * omega + odd * omega * abs(omega) + even * omega**2 + sliding * sign
+                missing += (of_command * command + of_past * past) / (m * length**2)
+                driven = g / length * math.sin(theta) + torque / (m * length**2)
+                return [omega, driven - lost + missing, (command - torque) / lag]
+
+            end = solve_ivp(rates, (0, 0.05), [math.atan2(sin, cos), rate, past], rtol=1e-11, atol=1e-12).y[:, -1]
+            theirs = np.array([math.sin(end[0]), math.cos(end[0]), end[1]]) - np.array([sin, cos, rate])
+            assert np.allclose(ours[k, n], theirs, atol=2e-5)
+
+
+def test_without_lag_the_past_command_changes_nothing_and_with_it_something():
+    x = MotorPendulum().inputs(6, generator())
+    other = x.clone()
+    other[:, 3] = -other[:, 3]
+    for model, same in ((MotorPendulum(), True), (MotorPendulum(lags=(0.02, 0.06)), False)):
+        parameters = draw_parameters(model, 3, generator(1))
+        assert torch.isfinite(model(x, parameters)).all()
+        assert torch.equal(model(x, parameters), model(other, parameters)) == same
+
+
+def energies(model, commands, steps=60):
+    """Energy by m l^2 of free pendulums after each step: (steps + 1, P * N)."""
+    parameters = draw_parameters(model, 6, generator(2)).double()
+    states = MotorPendulum().inputs(16, generator(3)).double()[:, :3]
+    found = []
+    for drawn in parameters:
+        state, pull = states, drawn[2] / drawn[1]
+        own = []
+        for _ in range(steps + 1):
+            own.append(0.5 * state[:, 2] ** 2 + pull * state[:, 1])
+            after = state + model(torch.cat([state, torch.zeros((len(state), commands))], dim=1), drawn[None])[0]
+            state = torch.cat([after[:, :2] / after[:, :2].norm(dim=1, keepdim=True), after[:, 2:]], dim=1)
+        found.append(torch.stack(own))
+    return torch.cat(found, dim=1)
+
+
+def test_energy_without_torque_stays_without_losses_and_never_grows_with_them():
+    kept = energies(MotorPendulum(), 2)
+    assert torch.allclose(kept, kept[:1].expand_as(kept), atol=1e-5)
+    lost = energies(MotorPendulum(**LOSSES), 2)
+    assert float(lost.diff(dim=0).max()) < 1e-7
+    assert bool((lost[-1] < lost[0] - 0.1).all())
+
+
+def test_drag_by_the_square_of_the_rate_alone_can_feed_energy():
+    """The drag of the authors' code, alone: a pendulum that turns backwards gains from it, soon without bounds."""
+    fine = {"substeps": 200, "drags": (0.4, 0.6)}
+    assert float(energies(Pendulum(**fine), 1, steps=2).diff(dim=0).max()) > 0.1
+    assert float(energies(Pendulum(**fine, dissipative=True), 1, steps=2).diff(dim=0).max()) < 0.02
