@@ -24,7 +24,7 @@ class MotorPendulum:
 
     ``theta'' = (g/l) sin theta + (torque - dry sign(rate)) / (m l^2) - nu rate / (m l) - drag / m rate |rate|`` with
     ``torque' = (command - torque) / lag``; without lag the torque is the command. Drag, friction and their units are
-    those of ``Pendulum``, except that drag always brakes. Classical Runge-Kutta steps of 5 ms, the torque in closed form.
+    those of ``Pendulum``, except that drag always brakes. Runge-Kutta steps of 5 ms, the torque in closed form.
 
     The torque is a hidden state. As with a car's delay, a row holds the past command for it: the motor has come to that
     when the step begins, so that the row says all that the true system needs to know.
@@ -52,7 +52,7 @@ class MotorPendulum:
     substeps: int = 10
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Sine and cosine of angles all around, rates within 5 rad/s, past and present command within 2.5 N m: (N, 5)."""
+        """Sine, cosine of angles all around, rates within 5 rad/s, past and present command within 2.5 N m: (N, 5)."""
         spans = (math.pi, 5.0, 2.5, 2.5)
         drawn = uniform(tuple((-v, v) for v in spans), count, generator)
         return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)

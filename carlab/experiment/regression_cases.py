@@ -42,8 +42,8 @@ class Case:
     Attributes:
         name: as on the command line, and of the authors' arrays.
         prior: the simulator that is known.
-        process: the same with a gap inside its dynamics, as the prior of Sim-FSVGD, beside which only the sensor's noise
-            is left; where it is None, ``prior`` and a gap on its outputs.
+        process: the same with a gap inside its dynamics, as the prior of Sim-FSVGD, beside which only the sensor's
+            noise is left; where it is None, ``prior`` and a gap on its outputs.
         truth: the simulator that makes the data, with a distribution of its parameters; None where only the authors'
             arrays have it.
         counts: numbers of rows that are tried.
