@@ -8,7 +8,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 from learning.domain_models import Pendulum, draw_parameters
+from learning.function_posterior import infer
 from learning.motor_pendulum import SLIDING_RADPS, MotorPendulum
+from learning.normaliser import Normaliser
 
 LOSSES = {"frictions": (0.4, 0.6), "drags": (0.4, 0.6), "dry": (0.1, 0.4), "lags": (0.02, 0.06)}
 
@@ -83,3 +85,20 @@ def test_drag_by_the_square_of_the_rate_alone_can_feed_energy():
     fine = {"substeps": 200, "drags": (0.4, 0.6)}
     assert float(energies(Pendulum(**fine), 1, steps=2).diff(dim=0).max()) > 0.1
     assert float(energies(Pendulum(**fine, dissipative=True), 1, steps=2).diff(dim=0).max()) < 0.02
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.06])
+def test_a_gap_in_the_dynamics_finds_what_the_motor_does(lag):
+    """Over a step the past command has the share ``lag / T (1 - exp(-T / lag))`` of the mean torque."""
+    truth = MotorPendulum(lags=(lag, lag), dry=(0.2, 0.2), drags=(0.5, 0.5))
+    inputs = truth.inputs(60, generator(4))
+    outputs = truth(inputs, draw_parameters(truth, 1, generator(5)))[0]
+    outputs = outputs + 0.005 * torch.randn(outputs.shape, generator=generator(6))
+    units = Normaliser(torch.zeros(5), torch.tensor([1.0, 1.0, 3.5, 2.0, 2.0]), torch.zeros(3), torch.full((3,), 0.5))
+    process = MotorPendulum(rate_gap=(1.0, 0.5, 0.5, 1.0), command_gap=0.5)
+    found = infer(process, inputs, outputs, units, torch.full((3,), 0.005), with_gap=False)
+    of_command, of_past = found.parameters[:, 11], found.parameters[:, 12]
+    ratio = of_past / (1.0 + of_command)
+    share = lag / 0.05 * (1.0 - math.exp(-0.05 / lag))
+    assert float(ratio.std()) < 0.15 * share / (1.0 - share)
+    assert abs(float(ratio.mean()) - share / (1.0 - share)) < 3.0 * float(ratio.std())
