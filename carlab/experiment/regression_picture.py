@@ -111,9 +111,9 @@ def _scale(axis: Axes, rows: Sequence[Row], name: str, highest: float | None) ->
             if value > highest:
                 place = beyond.setdefault(row.rows, 0)
                 beyond[row.rows] += 1
-                colour = _look(row.method)["color"]
+                colour, number = _look(row.method)["color"], f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
                 axis.annotate(
-                    f"↑ {value:.3g}", (row.rows, highest + room), (0, -3 - 11 * place), textcoords="offset points",
+                    f"↑ {number}", (row.rows, highest + room), (0, -3 - 11 * place), textcoords="offset points",
                     ha="center", va="top", fontsize=8, color=str(colour), zorder=4.0,
                     bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
                 )  # fmt: skip
