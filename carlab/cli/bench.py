@@ -36,8 +36,9 @@ class Bench:
     seconds: float = 10.0
     """Length of each condition of the sender's measurement [s]."""
 
-    case: Literal["1d", "pendulum", "car", "racecar", "realcar"] = "1d"
-    """What is learned. 1d: sinusoids, two points. pendulum: friction and drag hidden from the prior. car: one step of a
+    case: Literal["1d", "pendulum", "pendulum_motor", "car", "racecar", "realcar"] = "1d"
+    """What is learned. 1d: sinusoids, two points. pendulum: friction and drag hidden from the prior, as in the authors'
+    code. pendulum_motor: as in the paper; drag that brakes, dry friction and the motor's lag hidden. car: one step of a
     car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of theirs (with --data). realcar: recordings
     in the folder --data, the last one held out."""
 

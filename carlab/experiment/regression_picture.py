@@ -4,23 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from carlab.experiment.regression_study import Row
+from carlab.experiment.regression_study import METHODS, Row
 
-FAR_OFF_NAT = 30.0
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN_NAT = 12.0
+"""How far behind the best of its number of rows a method may be and still be on the axis."""
+SHOWN_CALIBRATION = 0.25
 _FIGURES = (
     ("nll", "negative log-likelihood [nat]"),
     ("rmse", "root mean square error"),
     ("calibration", "calibration error"),
 )
+_SAME_COLOUR = {"Sim-FSVGD without gap": "Sim-FSVGD"}
+"""A method without one of its parts is the same colour, dashed."""
 
 
 def draw(rows: Sequence[Row], path: Path) -> None:
-    """Write a PNG: one panel a figure, one line a method, a band of one standard error about the likelihood.
+    """Write a PNG.
 
     Args:
         rows: of one case.
         path: to write to.
+    """
+    from matplotlib import pyplot
+
+    figure = picture(rows)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+def picture(rows: Sequence[Row]) -> Figure:
+    """One panel a figure, one line a method, a band of one standard error about the likelihood.
+
+    A method has the same colour in every picture. Values far above the others are arrows at the upper edge with their
+    number beside them, so that what is close can be told apart.
     """
     import matplotlib
 
@@ -28,27 +50,80 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     from matplotlib import pyplot
 
     methods = list(dict.fromkeys(row.method for row in rows))
-    figure, axes = pyplot.subplots(1, len(_FIGURES), figsize=(13, 4), layout="constrained")
+    counts = sorted({row.rows for row in rows})
+    figure, axes = pyplot.subplots(1, len(_FIGURES), figsize=(13, 4.4), layout="constrained")
     for axis, (name, label) in zip(axes, _FIGURES, strict=True):
+        highest = _highest(rows, name)
         for method in methods:
             own = sorted((r for r in rows if r.method == method), key=lambda r: r.rows)
-            counts, values = [r.rows for r in own], [float(getattr(r, name)) for r in own]
-            (line,) = axis.plot(counts, values, marker="o", markersize=4, label=method)
+            values = [float(getattr(r, name)) for r in own]
+            look = _look(method)
+            axis.plot([r.rows for r in own], values, marker="o", markersize=4, label=method, **look)
             if name == "nll" and own[0].seeds > 1:
                 low, high = ([r.nll + sign * r.nll_standard_error for r in own] for sign in (-1, 1))
-                axis.fill_between(counts, low, high, alpha=0.2, color=line.get_color())
+                axis.fill_between([r.rows for r in own], low, high, alpha=0.15, color=look["color"], linewidth=0)
         axis.set(xscale="log", xlabel="rows", ylabel=label)
-        counts = sorted({row.rows for row in rows})
         axis.set_xticks(counts, [str(c) for c in counts])
         axis.minorticks_off()
-        if name == "nll" and max(row.nll for row in rows) > FAR_OFF_NAT:
-            axis.set_yscale("symlog", linthresh=20.0)
-        elif name == "rmse" and max(row.rmse for row in rows) > 3.0 * min(row.rmse for row in rows):
-            axis.set_yscale("log")
+        axis.margins(x=0.08)
+        _scale(axis, rows, name, highest)
         axis.grid(alpha=0.3)
-    axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=130)
-    pyplot.close(figure)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(methods), fontsize=9)
+    return figure
 
 
-__all__ = ["draw"]
+def _look(method: str) -> dict[str, object]:
+    """Colour and line of a method."""
+    names = [name for name in METHODS if name not in _SAME_COLOUR]
+    parent = _SAME_COLOUR.get(method, method)
+    number = names.index(parent) if parent in names else len(names)
+    return {
+        "color": f"C{number}",
+        "linestyle": "--" if method in _SAME_COLOUR else "-",
+        "markerfacecolor": "white" if method in _SAME_COLOUR else f"C{number}",
+        "linewidth": 2.2 if number == 0 else 1.3,
+        "zorder": 3.0 if number == 0 else 2.0,
+    }
+
+
+def _highest(rows: Sequence[Row], name: str) -> float | None:
+    """Where an axis ends; None where all values are on it."""
+    values = [float(getattr(row, name)) for row in rows]
+    best = max(min(row.nll for row in rows if row.rows == count) for count in {row.rows for row in rows})
+    end = {"nll": best + SHOWN_NAT, "calibration": SHOWN_CALIBRATION}.get(name)
+    if end is None or max(values) <= end or sum(v <= end for v in values) < len(values) / 2:
+        return None
+    return end
+
+
+def _scale(axis: Axes, rows: Sequence[Row], name: str, highest: float | None) -> None:
+    """Limits and scale of the values; arrows for what is beyond them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    values = [float(getattr(row, name)) for row in rows]
+    low, high = min(values), max(values)
+    if highest is not None:
+        room = 0.06 * (highest - low)
+        axis.set_ylim(low - room, highest + room)
+        beyond: dict[int, int] = {}
+        for row in rows:
+            value = float(getattr(row, name))
+            if value > highest:
+                place = beyond.setdefault(row.rows, 0)
+                beyond[row.rows] += 1
+                colour, number = _look(row.method)["color"], f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
+                axis.annotate(
+                    f"↑ {number}", (row.rows, highest + room), (0, -3 - 11 * place), textcoords="offset points",
+                    ha="center", va="top", fontsize=8, color=str(colour), zorder=4.0,
+                    bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
+                )  # fmt: skip
+    elif name == "nll" and high - low > SHOWN_NAT:
+        axis.set_yscale("symlog", linthresh=10.0)
+    elif name == "rmse" and high > 3.0 * low > 0.0:
+        axis.set_yscale("log")
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.minorticks_off()
+
+
+__all__ = ["draw", "picture"]

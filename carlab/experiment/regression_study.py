@@ -120,15 +120,22 @@ class _Task:
         """Of FSVGD and of a grey box: one normalised unit everywhere."""
         return RbfCovariance((1.0,) * len(self.case.output_std), (self.case.function_lengthscale,))
 
-    def inferred(self, simulator: DomainModel | None, outputs: Tensor, expected_gap: float | None) -> Particles:
+    def inferred(
+        self,
+        simulator: DomainModel | None,
+        outputs: Tensor,
+        expected_gap: float | None,
+        noise_std: tuple[float, ...] | None = None,
+    ) -> Particles:
         """Our way: particles led to what data, simulator and gap say together."""
         case = self.case
+        noise = self.noise_std if noise_std is None else torch.tensor(noise_std).to(self.noise_std)
         generator = torch.Generator().manual_seed(30_000 + self.seed)
         normaliser = self.normaliser
         gap = None if expected_gap is None else expected_gap * normaliser.output_std
         posterior = infer(
-            simulator, self.data.inputs, outputs, normaliser, self.noise_std, gap_std=gap,
-            with_gap=expected_gap is not None, seed=self.seed,
+            simulator, self.data.inputs, outputs, normaliser, noise, gap_std=gap, with_gap=gap is not None,
+            seed=self.seed,
         )  # fmt: skip
         points = measurement_points(simulator or case.prior, self.data.inputs, normaliser, generator)
         return Particles(fit_particles(posterior, points, ParticleSettings(steps=self.steps or 3000, seed=self.seed)))
@@ -137,8 +144,9 @@ class _Task:
         """Particles under draws of the simulator."""
         case, normaliser = self.case, self.normaliser
         if self.way == "ours":
-            process = case.process if gap and case.process is not None else case.prior
-            return self.inferred(process, self.data.outputs, case.expected_gap if gap else None)
+            if gap and case.process is not None:
+                return self.inferred(case.process, self.data.outputs, None, case.noise_std)
+            return self.inferred(case.prior, self.data.outputs, case.expected_gap if gap else None)
         pool, generator = self.pool(), torch.Generator().manual_seed(30_000 + self.seed)
         everything = torch.cat([self.data.inputs, pool])
         with torch.no_grad():
