@@ -19,6 +19,7 @@ import tomli_w
 import torch
 
 from carlab.cars import CarChoice, choose_car
+from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
@@ -31,7 +32,7 @@ from carlab.core.task import ParkingTask
 from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator, taken_up
 from carlab.experiment.campaign_figures import EpisodeFigures, foretell
 from carlab.experiment.campaign_report import learning_curve, write_report
-from carlab.experiment.session import EpisodeResult, Session
+from carlab.experiment.session import EpisodeResult, Session, SessionHooks
 from carlab.experiment.training import TrainingPlan, recorded_features, train, train_beside
 from carlab.recording.mcap_source import read_documents, read_episode
 from carlab.recording.run_directory import RunDirectory
@@ -247,6 +248,40 @@ def test_over_the_wire_a_row_ends_in_what_the_firmware_heard(
     last = values[np.searchsorted(times_s, driven.times_s[rows.tick + 1]) - 1]
     per_throttle = last / rows.inputs[:, -1]
     assert np.mean(np.abs(per_throttle / np.median(per_throttle) - 1.0) < 0.01) > 0.7
+
+
+@pytest.mark.realtime
+def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_something_learns(
+    story: Story, tmp_path: Path
+) -> None:
+    """On the wire: no process but the one that drives is alive at any tick; the firmware hears neutral in between."""
+    run = RunDirectory.create(tmp_path, "late")
+    choice = choose_car("emulated", seed=0)
+    choice.log_to(run.path)
+    clock = MonotonicClock()
+    alive: list[str] = []
+    learning_s: list[float] = []
+    ticks_s: list[float] = []
+
+    def on_tick(tick: Tick) -> None:
+        alive.extend(child.name for child in multiprocessing.active_children())
+        ticks_s.append(tick.t_s)
+
+    hooks = CampaignHooks(
+        SessionHooks(on_tick=on_tick), on_training=lambda what, done, total: learning_s.append(clock.now_s())
+    )
+    with choice.car:
+        campaign = Campaign(choice, story.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
+        assert len(list(campaign.go_on())) == 2
+    assert len(ticks_s) > TICKS
+    assert not {"training", "reality check"} & set(alive)
+    learning = np.array(learning_s)
+    second = learning[learning > ticks_s[0]]
+    assert len(second) > 3, "it learned a second time, after the first episode"
+    currents = [e for e in read_log(run.path / "firmware.jsonl") if e.name == "current"]
+    heard = [e for e in currents if second.min() < e.t_s < second.max()]
+    assert len(heard) > 3
+    assert all(e.value == 0.0 for e in heard), "neutral, again and again"
 
 
 def drive(folder: Path, ticks: int, start: CarState | None = None) -> RunDirectory:
