@@ -120,7 +120,7 @@ def causes_of(shots: Shots, floor: FloatArray, simulator: SimulatorConfig) -> tu
         share = own = min(float((reference - loss).sum()) / excess, 1.0)
         if candidate.beside:
             own = _own_share(before, loss, perfect, shots)
-        enough = own >= (LEAST_BESIDE if candidate.beside else LEAST_SHARE)
+        enough = share >= LEAST_SHARE and own >= (LEAST_BESIDE if candidate.beside else LEAST_SHARE)
         if candidate.id in seen or not enough or len(causes) == MOST:
             continue
         gap, error = clustered_gain(loss, judged[0][1], shots)
