@@ -24,7 +24,10 @@ PATIENT_S = 20.0
 MOTOR_TIMEOUT_S = 0.4
 
 CHILD = """
-import os, sys, threading, time
+import os, signal, sys, threading, time
+# Signals that the shell which started the tests ignores (nohup, a job in the background) would be ignored here, too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from carlab.core.errors import CarlabError
 from carlab.core.quantities import Action
 from drivers.actuator import Actuator
