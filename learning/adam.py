@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 FIRST, SECOND, LEAST = 0.9, 0.999, 1e-8
+"""Decays of the mean and of the mean square of the gradient; what keeps a step finite where that is zero."""
 
 
 @dataclass
@@ -22,6 +23,7 @@ class Adam:
 
     numbers: Tensor
     weight_decay: float = 0.0
+    second: float = SECOND
     steps: int = 0
     mean: Tensor = field(init=False)
     square: Tensor = field(init=False)
@@ -35,9 +37,9 @@ class Adam:
         if self.weight_decay:
             self.numbers.mul_(1.0 - rate * self.weight_decay)
         self.mean.lerp_(gradient, 1.0 - FIRST)
-        self.square.mul_(SECOND).addcmul_(gradient, gradient, value=1.0 - SECOND)
-        scale = math.sqrt(1.0 - SECOND**self.steps)
-        # rate mean / (1 - FIRST^k) over sqrt(square / (1 - SECOND^k)) + LEAST, both multiplied by ``scale``.
+        self.square.mul_(self.second).addcmul_(gradient, gradient, value=1.0 - self.second)
+        scale = math.sqrt(1.0 - self.second**self.steps)
+        # rate mean / (1 - FIRST^k) over sqrt(square / (1 - second^k)) + LEAST, both multiplied by ``scale``.
         below = self.square.sqrt().add_(LEAST * scale)
         self.numbers.addcdiv_(self.mean, below, value=-rate * scale / (1.0 - FIRST**self.steps))
 

@@ -25,7 +25,7 @@ from learning.transitions import OUTPUTS, Transitions
 
 Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
 LearnedCar = CarDynamics | WorldDynamics
-FILE_VERSION = 2
+FILE_VERSION = 3
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
 """Expected noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
 EXPECTED_GAP = 0.3
@@ -117,6 +117,7 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
         "frame": "body" if isinstance(dynamics, CarDynamics) else "world",
         "history": dynamics.history,
         "network": [posterior.network.inputs, posterior.network.outputs, *posterior.network.hidden],
+        "activation": posterior.network.activation,
         "parameters": posterior.parameters,
         "noise_std": posterior.noise_std,
         "tails": posterior.tails,
@@ -132,7 +133,7 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
         content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
         version = content["version"]
         inputs, outputs, *hidden = content["network"]
-        network = Network(inputs, outputs, tuple(hidden))
+        network = Network(inputs, outputs, tuple(hidden), content["activation"])
         parameters: Tensor = content["parameters"]
         found = parameters.shape[1]
         posterior = Posterior(

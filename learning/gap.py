@@ -55,11 +55,14 @@ class GapCovariance:
 
     @classmethod
     def before_data(cls, inputs: int, expected: Tensor) -> GapCovariance:
-        """The medians of what may be learned, for gaps of an expected size (O,)."""
+        """The medians of what may be learned, for gaps of an expected size (O,).
+
+        Each part has that size at inputs that lie as far out as their units say, the plane over all of its slopes.
+        """
         size = expected.double()
         wide = torch.ones((len(size), inputs), dtype=torch.float64, device=size.device)
         long = MIDDLE_LENGTH * wide
-        return cls(size, long, size[:, None] * wide, size, size, long)
+        return cls(size, long, size[:, None] * wide / math.sqrt(inputs), size, size, long)
 
     def __call__(self, first: Tensor, second: Tensor | None = None) -> Tensor:
         """Covariances (O, ..., N, M) between inputs (..., N, D) and (..., M, D).
@@ -130,10 +133,11 @@ def learn_gap(
         covariance = gap(inputs) + torch.diag_embed(torch.exp(2.0 * logs[6])[:, None] / trust + TINY)
         if known is not None:
             covariance = covariance + known
-        surprise: Tensor = -log_evidence(residual, torch.linalg.cholesky(covariance))
+        held = torch.zeros_like(residual[0, 0])
         for value, middle, width in zip(logs, middles, widths, strict=True):
-            surprise = surprise + 0.5 * (((value - middle) / width) ** 2).sum()
-        for value, gradient in zip(logs, torch.autograd.grad(surprise, logs), strict=True):
+            held = held + 0.5 * (((value - middle) / width) ** 2).sum()
+        ways = (evidence_gradient(residual, covariance.detach()), torch.ones_like(held))
+        for value, gradient in zip(logs, torch.autograd.grad((covariance, held), logs, ways), strict=True):
             value.grad = gradient
         optimiser.step()
         schedule.step()
@@ -150,12 +154,14 @@ def _covariance_of(logs: list[Tensor]) -> GapCovariance:
     )  # fmt: skip
 
 
-def log_evidence(residual: Tensor, factor: Tensor) -> Tensor:
-    """Log density of residuals (n, O) under zero-mean Gaussians with Cholesky factors (O, n, n)."""
-    white = torch.linalg.solve_triangular(factor, residual.T[:, :, None], upper=False)
-    logs = factor.diagonal(dim1=1, dim2=2).log().sum()
-    density: Tensor = -0.5 * (white * white).sum() - logs - 0.5 * residual.numel() * math.log(2.0 * math.pi)
-    return density
+def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
+    """Gradient (O, n, n) of the negative log density of residuals (n, O) by the covariances (O, n, n) of zero-mean
+    Gaussians: ``(K^-1 - K^-1 r r^T K^-1) / 2`` (Rasmussen and Williams 2006, equation 5.9), a third of the work of a
+    tape through Cholesky's factor."""
+    factor = torch.linalg.cholesky(covariance)
+    solved = torch.cholesky_solve(residual.T[:, :, None], factor)
+    gradient: Tensor = 0.5 * (torch.cholesky_inverse(factor) - solved @ solved.transpose(1, 2))
+    return gradient
 
 
-__all__ = ["GapCovariance", "learn_gap", "log_evidence"]
+__all__ = ["GapCovariance", "evidence_gradient", "learn_gap"]

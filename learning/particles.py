@@ -1,7 +1,7 @@
 """Particles of a Bayesian neural network: many small networks of one shape as one tensor of parameters.
 
-Every particle is an MLP with leaky ReLUs and a linear head. Parameters of all particles lie in one tensor (L, P), so
-that one batched product runs all of them and an optimiser sees one leaf.
+Every particle is an MLP with a linear head. Parameters of all particles lie in one tensor (L, P), so that one batched
+product runs all of them and an optimiser sees one leaf.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -18,6 +19,7 @@ from torch.nn import functional
 Layers = Sequence[tuple[Tensor, Tensor]]
 """Weights (L, in, out) and biases (L, 1, out) of each layer."""
 
+Activation = Literal["leaky_relu", "silu"]
 SLOPE = 0.01
 """Of the leaky ReLU below zero."""
 
@@ -30,12 +32,15 @@ class Network:
         inputs: number of inputs.
         outputs: number of outputs.
         hidden: width of each hidden layer; the authors use three of 64.
+        activation: of hidden units. Smooth ones (``silu``: Elfwing, Uchibe and Doya 2018, equation 9) follow a smooth
+            function more closely; the authors have leaky ReLUs.
         slope: of the leaky ReLU below zero; 0 is a ReLU.
     """
 
     inputs: int
     outputs: int
     hidden: tuple[int, ...] = (64, 64, 64)
+    activation: Activation = "leaky_relu"
     slope: float = SLOPE
 
     @property
@@ -75,35 +80,61 @@ class Network:
 
     def __call__(self, parameters: Tensor, inputs: Tensor) -> Tensor:
         """Outputs (L, N, O) of all particles at inputs (N, D), or at inputs of their own (L, N, D)."""
-        return self.through(self.split(parameters), inputs)[-1]
+        *hidden, (weights, biases) = self.split(parameters)
+        given = self._dealt(inputs, len(parameters))
+        inplace = not torch.is_grad_enabled()  # A tape needs what was summed.
+        for w, b in hidden:
+            given = self._bent(torch.baddbmm(b, given, w), inplace=inplace)
+        return torch.baddbmm(biases, given, weights)
 
     def values_and_pullback(self, parameters: Tensor, inputs: Tensor) -> tuple[Tensor, Pullback]:
         """Outputs (L, N, O) at inputs (N, D), or (L, N, D), and what turns directions on them into ones on parameters.
 
         No tape: at these sizes the chain rule by hand costs a fraction of what autograd's bookkeeping does.
         """
-        layers = self.split(parameters)
-        *seen, outputs = self.through(layers, inputs)
-        return outputs, Pullback(layers, seen, self.slope)
+        return self.through(self.split(parameters), inputs)
 
-    def through(self, layers: Layers, inputs: Tensor) -> list[Tensor]:
-        """What each layer is given, and last the outputs (L, N, O)."""
-        found = [inputs if inputs.ndim == 3 else inputs.expand(len(layers[0][0]), *inputs.shape)]
+    def through(self, layers: Layers, inputs: Tensor) -> tuple[Tensor, Pullback]:
+        """The same of layers that are split already."""
+        seen, summed = [self._dealt(inputs, len(layers[0][0]))], []
         *hidden, (weights, biases) = layers
         for w, b in hidden:
-            summed = torch.baddbmm(b, found[-1], w)
-            found.append(functional.leaky_relu(summed, self.slope) if self.slope else torch.relu(summed))
-        found.append(torch.baddbmm(biases, found[-1], weights))
+            summed.append(torch.baddbmm(b, seen[-1], w))
+            seen.append(self._bent(summed[-1]))
+        return torch.baddbmm(biases, seen[-1], weights), Pullback(self, layers, seen, summed)
+
+    @staticmethod
+    def _dealt(inputs: Tensor, particles: int) -> Tensor:
+        """Inputs (L, N, D), the same for all particles unless each has its own."""
+        return inputs if inputs.ndim == 3 else inputs.expand(particles, *inputs.shape)
+
+    def _bent(self, summed: Tensor, *, inplace: bool = False) -> Tensor:
+        """What hidden units make of what they sum."""
+        if self.activation == "silu":
+            return functional.silu(summed, inplace=inplace)
+        return functional.leaky_relu(summed, self.slope, inplace=inplace)
+
+    def straightened(self, direction: Tensor, summed: Tensor) -> Tensor:
+        """A direction on what hidden units summed, from one on what they made of it.
+
+        One pass over the memory where a mask, a product and a choice would be three.
+        """
+        found: Tensor
+        if self.activation == "silu":
+            found = torch.ops.aten.silu_backward(direction, summed)
+        else:
+            found = torch.ops.aten.leaky_relu_backward(direction, summed, self.slope, False)
         return found
 
 
 @dataclass(frozen=True, slots=True)
 class Pullback:
-    """The derivative of a forward pass: the layers, what each was given, and the slope below zero."""
+    """The derivative of a forward pass: the layers, what each was given, and what hidden units summed."""
 
+    network: Network
     layers: Layers
     seen: Sequence[Tensor]
-    slope: float
+    summed: Sequence[Tensor]
 
     def __call__(self, direction: Tensor) -> Tensor:
         """Gradient (L, P) of ``sum(direction * outputs)`` by the parameters."""
@@ -122,14 +153,13 @@ class Pullback:
 
     def of_first(self, count: int) -> Pullback:
         """The derivative for the first ``count`` inputs alone."""
-        return Pullback(self.layers, [given[:, :count] for given in self.seen], self.slope)
+        seen, summed = ([v[:, :count] for v in parts] for parts in (self.seen, self.summed))
+        return Pullback(self.network, self.layers, seen, summed)
 
     def _through(self, k: int, direction: Tensor) -> Tensor:
-        """Direction on what layer k - 1 summed, from one on what layer k gave."""
+        """Direction on what the hidden layer before layer k summed, from one on what layer k gave."""
         back = torch.bmm(direction, self.layers[k][0].transpose(1, 2))
-        # One pass over the memory where a mask, a product and a choice would be three.
-        through: Tensor = torch.ops.aten.leaky_relu_backward(back, self.seen[k], self.slope, True)
-        return through
+        return self.network.straightened(back, self.summed[k - 1])
 
 
-__all__ = ["Layers", "Network", "Pullback"]
+__all__ = ["Activation", "Layers", "Network", "Pullback"]

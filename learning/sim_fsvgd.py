@@ -21,11 +21,13 @@ from learning.fsvgd import Posterior
 from learning.function_posterior import JITTER, FunctionPosterior
 from learning.normaliser import Normaliser
 from learning.outliers import tail_scales
-from learning.particles import Network, Pullback
+from learning.particles import Activation, Network
 from learning.stein import moment_direction
 
 TOLD_EVERY = 200
-LAST_RATE = 0.01
+LAST_RATE = 0.001
+SECOND = 0.99
+"""Decay of the mean square of a gradient: what is followed changes while the particles come near it."""
 FEW_ROWS = 20
 """Rows below which the domain alone tells where particles are held to the posterior."""
 LEAST_NOISE_SHARE = 0.5
@@ -44,16 +46,18 @@ class ParticleSettings:
         steps: of Adam.
         sets: measurement sets of a step.
         points: of a set; fewer than particles, for their covariance is to be matched.
-        learning_rate: at the start; it falls to a hundredth along a half cosine.
+        learning_rate: at the start; it falls to a thousandth along a half cosine.
+        activation: of the particles' hidden units.
         seed: of everything that is drawn.
     """
 
     particles: int = 20
     hidden: tuple[int, ...] = (64, 64, 64)
-    steps: int = 3000
+    steps: int = 5000
     sets: int = 16
     points: int = 4
-    learning_rate: float = 5e-3
+    learning_rate: float = 1.5e-2
+    activation: Activation = "silu"
     seed: int = 0
 
 
@@ -84,11 +88,11 @@ def fit_particles(
     device, normaliser = points.device, target.normaliser
     generator = torch.Generator().manual_seed(settings.seed)
     outputs = len(target.noise_std)
-    network = Network(points.shape[1], outputs, settings.hidden)
+    network = Network(points.shape[1], outputs, settings.hidden, settings.activation)
     if start is None:
         start = network.initial(settings.particles, generator, device)
     numbers = start.to(points).clone()
-    layers, adam = network.split(numbers), Adam(numbers)
+    layers, adam = network.split(numbers), Adam(numbers, second=SECOND)
     count = len(points) // settings.points
     chosen = torch.randperm(len(points), generator=generator)[: count * settings.points].to(device)
     sets = points[chosen].view(count, settings.points, -1)
@@ -98,20 +102,20 @@ def fit_particles(
     order = torch.randint(count, (settings.steps, settings.sets), generator=generator).to(device)
     with torch.no_grad():
         for step, own in enumerate(order):
-            *seen, values = network.through(layers, inputs[own].flatten(0, 1))
+            values, pullback = network.through(layers, inputs[own].flatten(0, 1))
             shaped = values.view(len(numbers), settings.sets, settings.points, outputs)
             # One set and output a row: (L, sets * outputs, points).
             rows = shaped.transpose(2, 3).flatten(1, 2)
             way = moment_direction(rows, mean[own].flatten(0, 1), factor[own].flatten(0, 1))
             way = (way * weight[own].flatten(0, 1)).view(len(numbers), settings.sets, outputs, settings.points)
-            gradient = -Pullback(layers, seen, network.slope)(way.transpose(2, 3).flatten(1, 2))
+            gradient = -pullback(way.transpose(2, 3).flatten(1, 2))
             share = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
             adam.step(gradient, settings.learning_rate * (LAST_RATE + (1.0 - LAST_RATE) * share))
             if (step + 1) % TOLD_EVERY == 0:
                 progress(step + 1)
         if not bool(torch.isfinite(numbers).all()):
             raise DataError("The fit diverged; fit again with a smaller learning rate.")
-        found = network.through(layers, inputs.flatten(0, 1))[-1].view(-1, count, settings.points, outputs)
+        found = network(numbers, inputs.flatten(0, 1)).view(-1, count, settings.points, outputs)
         off = found.transpose(2, 3) - mean
         # The mean square of a particle's error is that of their mean and their spread; the target's own is allowed.
         own = covariance.diagonal(dim1=2, dim2=3).to(off)

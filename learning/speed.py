@@ -64,16 +64,15 @@ def training_speed(device: str = "cpu") -> dict[str, Any]:
 
 def prediction_speed(device: str = "cpu") -> dict[str, Any]:
     """A batch of 256 one-step predictions of 20 particles against one matrix product of as many operations."""
-    network = Network(15, 6)
+    network = Network(15, 6, activation=ParticleSettings().activation)
     generator = torch.Generator().manual_seed(0)
     numbers = network.initial(20, generator, device)
-    layers = network.split(numbers)
     inputs = torch.randn((256, 15), generator=generator).to(device)
     operations = 20 * 256 * sum(a * b for a, b in network.layers)
     side = 256
     left, right = torch.randn((operations // side**2, side)).to(device), torch.randn((side, side)).to(device)
     with torch.no_grad():
-        ours_s = _seconds(lambda: network.through(layers, inputs), device)
+        ours_s = _seconds(lambda: network(numbers, inputs), device)
         product_s = _seconds(lambda: left @ right, device)
     return {
         "batch_ms": 1e3 * ours_s,

@@ -228,7 +228,7 @@ class TestWithoutRows:
         distance = ((x[:, None] - x[None]) ** 2).sum(axis=2)
         for k in range(2):
             near, own = np.exp(-0.5 * distance / MIDDLE_LENGTH**2), drawn[:, k].mean(axis=0)
-            of_gap = size[k] ** 2 * (near + x @ x.T + 1.0 + own[:, None] * own * near)
+            of_gap = size[k] ** 2 * (near + x @ x.T / 2 + 1.0 + own[:, None] * own * near)
             exact = np.cov(drawn[:, k].T, bias=True) + of_gap
             assert np.allclose(means[:, k].flatten(), drawn[:, k].mean(axis=0), atol=1e-5)
             for b in range(2):
