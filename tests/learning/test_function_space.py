@@ -23,10 +23,14 @@ def normal(*shape, seed=0):
 
 class TestNetwork:
     network = Network(3, 2, (8, 5))
+    smooth = Network(3, 2, (8, 5), "silu")
 
-    def test_each_particle_is_an_ordinary_network(self):
-        parameters, inputs = self.network.initial(4, generator()).double(), normal(6, 3)
-        ours = self.network(parameters, inputs)
+    @pytest.mark.parametrize(
+        ("network", "activation"), [(network, torch.nn.LeakyReLU(SLOPE)), (smooth, torch.nn.SiLU())]
+    )
+    def test_each_particle_is_an_ordinary_network(self, network, activation):
+        parameters, inputs = network.initial(4, generator()).double(), normal(6, 3)
+        ours = network(parameters, inputs)
         for particle in range(4):
             layers, begin = [], 0
             for fan_in, fan_out in ((3, 8), (8, 5), (5, 2)):
@@ -37,7 +41,7 @@ class TestNetwork:
                     layer.weight.copy_(weights.T)
                     layer.bias.copy_(parameters[particle, begin : begin + fan_out])
                 begin += fan_out
-                layers += [layer, torch.nn.LeakyReLU(SLOPE)]
+                layers += [layer, activation]
             theirs = torch.nn.Sequential(*layers[:-1])(inputs)
             assert torch.allclose(ours[particle], theirs, atol=1e-12)
         assert begin == self.network.parameters
@@ -49,15 +53,21 @@ class TestNetwork:
             alone = self.network(parameters[particle : particle + 1], inputs[particle])
             assert torch.allclose(ours[particle], alone[0], atol=1e-12)
 
-    def test_the_gradient_without_a_tape_is_autograds(self):
-        parameters = self.network.initial(4, generator()).double().requires_grad_()
-        inputs, direction = normal(6, 3), normal(4, 6, 2, seed=1)
-        (self.network(parameters, inputs) * direction).sum().backward()
+    @pytest.mark.parametrize("network", [network, smooth])
+    def test_the_gradient_without_a_tape_is_autograds(self, network):
+        parameters = network.initial(4, generator()).double().requires_grad_()
+        inputs, direction = normal(6, 3).requires_grad_(), normal(4, 6, 2, seed=1)
+        (network(parameters, inputs) * direction).sum().backward()
         with torch.no_grad():
-            outputs, pullback = self.network.values_and_pullback(parameters, inputs)
-            ours = pullback(direction)
-        assert torch.allclose(outputs, self.network(parameters, inputs), atol=1e-12)
+            outputs, pullback = network.values_and_pullback(parameters, inputs)
+            ours, first = pullback(direction), pullback.of_first(2)(direction[:, :2])
+            by_input = pullback.on_inputs(direction).sum(dim=0)
+        assert torch.allclose(outputs, network(parameters, inputs), atol=1e-12)
         assert torch.allclose(ours, parameters.grad, atol=1e-12)
+        assert torch.allclose(by_input, inputs.grad, atol=1e-12)
+        parameters.grad = None
+        (network(parameters, inputs[:2]) * direction[:, :2]).sum().backward()
+        assert torch.allclose(first, parameters.grad, atol=1e-12)
 
     def test_a_seed_means_the_same_numbers_and_particles_differ(self):
         first, second = self.network.initial(3, generator(4)), self.network.initial(3, generator(4))
