@@ -14,10 +14,14 @@ LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.977, 0.99)
 
 @dataclass(frozen=True, slots=True)
 class Mixture:
-    """Equally weighted Gaussians: means (L, N, O) and standard deviations that broadcast against them."""
+    """Equally weighted Gaussians: means (L, N, O) and standard deviations that broadcast against them.
+
+    ``tails`` (L,) is what the width of each is multiplied by where together they are a distribution with heavy tails.
+    """
 
     means: Tensor
     stds: Tensor
+    tails: Tensor | None = None
 
     @property
     def mean(self) -> Tensor:
@@ -45,13 +49,19 @@ class Mixture:
         A few components far apart against their own width are a poor picture of the density that they are drawn from,
         the more outputs the worse. Each is drawn to the mean by ``sqrt(1 - b^2)`` and widened by the share ``b^2`` of
         the spread (West 1993, "Approximating posterior distributions by mixture", section 3.2); 1 makes it a Gaussian.
+        With heavy tails the widths have them too, as a Student process has in all of its doubt (Shah, Wilson and
+        Ghahramani 2014, "Student-t processes as alternatives to Gaussian processes", equation 5), and the variance
+        grows by theirs.
 
         Args:
             bandwidth: b, from 0 to 1.
         """
         shrink = math.sqrt(1.0 - bandwidth**2)
         means = self.mean + shrink * (self.means - self.mean)
-        return Mixture(means, (self.stds**2 + (bandwidth * self.epistemic_std) ** 2).sqrt())
+        spread = bandwidth * self.epistemic_std
+        if self.tails is not None:
+            spread = self.tails[:, None, None] * spread
+        return Mixture(means, (self.stds**2 + spread**2).sqrt())
 
     def log_density(self, targets: Tensor) -> Tensor:
         """Joint log density (N,) of targets (N, O)."""

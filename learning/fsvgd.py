@@ -151,7 +151,8 @@ class Posterior:
         """Prediction at raw inputs (N, D), in raw units."""
         with torch.no_grad():
             values = self.network(self.parameters, self.normaliser.inputs(inputs))
-        return Mixture(self.normaliser.raw_outputs(values), self.noise_stds * self.normaliser.output_std)
+        means, stds = self.normaliser.raw_outputs(values), self.noise_stds * self.normaliser.output_std
+        return Mixture(means, stds, self.tails)
 
     def to(self, device: torch.device | str) -> Posterior:
         """The same on a device."""

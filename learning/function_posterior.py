@@ -63,6 +63,15 @@ class FunctionPosterior:
     factor: Tensor
     white: Tensor
 
+    @property
+    def data(self) -> Tensor:
+        """Raw inputs (n, D) of the data."""
+        width = len(self.normaliser.input_mean)
+        return (
+            self.inputs[:, :width].to(self.normaliser.input_mean) * self.normaliser.input_std
+            + self.normaliser.input_mean
+        )
+
     def marginals(self, sets: Tensor) -> tuple[Tensor, Tensor]:
         """Means (B, O, N) and covariances (B, O, N, N), double, without noise, at raw inputs (B, N, D)."""
         parts = [self._some(part) for part in torch.split(sets, max(_AT_ONCE // sets.shape[1], 1))]

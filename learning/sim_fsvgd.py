@@ -18,7 +18,7 @@ from carlab.core.errors import DataError
 from learning.adam import Adam
 from learning.domain_models import DomainModel
 from learning.fsvgd import Posterior
-from learning.function_posterior import JITTER, FunctionPosterior
+from learning.function_posterior import JITTER, ROWS_FOR_TAILS, FunctionPosterior
 from learning.normaliser import Normaliser
 from learning.outliers import tail_scales
 from learning.particles import Activation, Network
@@ -78,7 +78,8 @@ def fit_particles(
         start: parameters of earlier particles (L, P) to start from.
 
     Returns:
-        The particles. Their noise is that of the measurements and what they miss of the target's mean where it is sure.
+        The particles. Their noise is that of the measurements and what they miss of the target's mean: at the data, or
+        where the target is sure if there is little.
 
     Raises:
         DataError: the particles diverged, or there are too few points.
@@ -115,13 +116,16 @@ def fit_particles(
                 progress(step + 1)
         if not bool(torch.isfinite(numbers).all()):
             raise DataError("The fit diverged; fit again with a smaller learning rate.")
-        found = network(numbers, inputs.flatten(0, 1)).view(-1, count, settings.points, outputs)
+        if len(target.inputs) >= ROWS_FOR_TAILS:
+            sets = target.data[:, None]
+            mean, covariance = target.marginals(sets)
+            weight = torch.ones_like(mean)
+        found = network(numbers, normaliser.inputs(sets.flatten(0, 1))).view(-1, *sets.shape[:2], outputs)
         off = found.transpose(2, 3) - mean
         # The mean square of a particle's error is that of their mean and their spread; the target's own is allowed.
         own = covariance.diagonal(dim1=2, dim2=3).to(off)
-        beyond = (weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + own)).sum(dim=(0, 2)) / weight.sum(
-            dim=(0, 2)
-        )
+        missed = weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + own)
+        beyond = missed.sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
         noise = (target.noise_std**2 + beyond).clamp_min(LEAST_NOISE_SHARE * target.noise_std**2).sqrt()
     tails = tail_scales(target.freedom, len(numbers)).to(numbers)
     return Posterior(network, numbers, noise, normaliser, tails)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import norm
+from scipy.stats import t as student
 
 from learning.evaluation import (
     LEVELS,
@@ -13,6 +14,7 @@ from learning.evaluation import (
     negative_log_likelihood,
     root_mean_square_error,
 )
+from learning.outliers import tail_scales
 
 
 def random(*shape, seed=0):
@@ -76,6 +78,18 @@ def test_wholly_smoothed_it_is_a_gaussian_and_not_at_all_it_is_itself():
     theirs = norm(mean, np.sqrt(variance)).logpdf(targets.numpy()).sum(axis=1)
     assert np.allclose(sharp.smoothed(1.0).log_density(targets), theirs, atol=1e-12)
     assert np.allclose(sharp.smoothed(0.0).log_density(targets), sharp.log_density(targets), atol=1e-12)
+
+
+def test_with_heavy_tails_spread_and_noise_are_one_student_distribution():
+    """400 components of noise 0.3 whose means spread by 0.4: of scale 0.5 and mean 1, in any order."""
+    tails, generator = tail_scales(4.0, 400).double(), torch.Generator().manual_seed(0)
+    means = torch.randn(400, dtype=torch.float64, generator=generator)
+    means = 1.0 + 0.4 * (means - means.mean()) / means.std(correction=0)
+    stds = 0.3 * tails[:, None, None]
+    at = np.linspace(-4.0, 6.0, 21)
+    found = Mixture(means[:, None, None].expand(-1, 21, 1), stds, tails).smoothed(1.0)
+    theirs = student(4.0, loc=1.0, scale=0.5).logpdf(at)
+    assert np.allclose(found.log_density(torch.from_numpy(at)[:, None]), theirs, atol=0.02)
 
 
 def test_calibration_is_by_the_mixtures_own_quantiles():
