@@ -76,15 +76,17 @@ def run_priors(options: Bench) -> int:
 
 def print_rows(title: str, first: str, rows: Sequence[Row]) -> None:
     """Scores as a table; ``first`` says what is compared."""
-    table(
-        title,
-        ["rows", first, "NLL [nat]", "+-", "RMSE", "calibration error", "seconds"],
-        [
-            [f"{r.rows}", r.method, f"{r.nll:.2f}", f"{r.nll_standard_error:.2f}", f"{r.rmse:.3g}",
-             f"{r.calibration:.3f}", f"{r.seconds:.1f}"]
-            for r in rows
-        ],
-    )  # fmt: skip
+    columns = ["rows", first, "NLL [nat]", "+-", "RMSE", "calibration error", "seconds"]
+    cells = [
+        [f"{r.rows}", r.method, f"{r.nll:.2f}", f"{r.nll_standard_error:.2f}", f"{r.rmse:.3g}",
+         f"{r.calibration:.3f}", f"{r.seconds:.1f}"]
+        for r in rows
+    ]  # fmt: skip
+    if any(r.nll_in_world is not None for r in rows):
+        columns.append("NLL, seven outputs\nin the world")
+        for cell, r in zip(cells, rows, strict=True):
+            cell.append("" if r.nll_in_world is None else f"{r.nll_in_world:.2f}")
+    table(title, columns, cells)
 
 
 def check_unseen(model: Path, held_out: Path) -> None:

@@ -27,16 +27,21 @@ LEAST_NOISE = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Data:
-    """Rows to learn from and rows to be judged by: inputs (n, D), outputs (n, O), which are changes of a state."""
+    """Rows to learn from and rows to be judged by: inputs (n, D), outputs (n, O), which are changes of a state.
+
+    ``test_yaw`` (n,) is where a car headed that the rows are of, if that is known.
+    """
 
     inputs: Tensor
     outputs: Tensor
     test_inputs: Tensor
     test_outputs: Tensor
+    test_yaw: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Data:
         """The same on a device."""
-        return Data(*(v.to(device) for v in (self.inputs, self.outputs, self.test_inputs, self.test_outputs)))
+        moved = Data(*(v.to(device) for v in (self.inputs, self.outputs, self.test_inputs, self.test_outputs)))
+        return moved if self.test_yaw is None else replace(moved, test_yaw=self.test_yaw.to(device))
 
 
 @dataclass(frozen=True, slots=True)

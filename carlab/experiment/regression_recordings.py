@@ -32,21 +32,24 @@ class RecordedCase(Case):
     Attributes:
         rows: to draw from.
         held_out: of the last recording.
+        held_out_yaw: heading at each of those (n,) [rad].
         told: how the history was chosen, in words.
     """
 
     rows: Transitions | None = None
     held_out: Transitions | None = None
+    held_out_yaw: np.ndarray | None = None
     told: str = ""
 
     def recorded(self, folder: Path, count: int, seed: int) -> Data:
         """Rows drawn from all but the last recording, and the last one whole. Raises DataError for too few."""
         assert self.rows is not None
         assert self.held_out is not None
+        assert self.held_out_yaw is not None
         if count > len(self.rows):
             raise DataError(f"The recordings have {len(self.rows)} rows, not {count}; ask for fewer with --rows.")
         chosen = self.rows.take(np.random.default_rng(seed).choice(len(self.rows), count, replace=False))
-        parts = (chosen.inputs, chosen.targets, self.held_out.inputs, self.held_out.targets)
+        parts = (chosen.inputs, chosen.targets, self.held_out.inputs, self.held_out.targets, self.held_out_yaw)
         return Data(*(torch.from_numpy(part).float() for part in parts))
 
 
@@ -71,6 +74,7 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
             raise DataError("The recordings are too short to tell how many past commands count; give --history.")
         history, told = choice.history, choice.words()
     rows, held_out = (_ordinary(transitions_of(episodes, history)) for episodes in (fitted, recordings[-1]))
+    yaw = np.array([recordings[-1][e].states[t, 2] for e, t in zip(held_out.episode, held_out.tick, strict=True)])
     simulator = load_car_file(car).simulator
     ranges = {"timing.command_delay": DELAY_S, **simulator.priors}
     output_std = tuple(float(v) for v in rows.targets.std(axis=0))
@@ -90,6 +94,7 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
         function_lengthscale=3.0,
         rows=rows,
         held_out=held_out,
+        held_out_yaw=yaw,
         told=told,
     )
 

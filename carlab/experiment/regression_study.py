@@ -32,6 +32,7 @@ from learning.normaliser import Normaliser
 from learning.ridge import Ridge
 from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_points
 from learning.system_identification import GreyBox, Identified, grey_box, identify
+from learning.world_outputs import in_world, truth_in_world
 
 Way = Literal["ours", "authors"]
 Progress = Callable[[str, int, int], None]
@@ -62,6 +63,7 @@ class Score:
         rmse: root of the squared error summed over outputs, in mixed units.
         calibration: mean absolute difference of coverage.
         seconds: that the fit took.
+        nll_in_world: of the seven outputs that the authors score, for a real car.
     """
 
     case: str
@@ -72,6 +74,7 @@ class Score:
     rmse: float
     calibration: float
     seconds: float
+    nll_in_world: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,7 +283,15 @@ def scored(
         root_mean_square_error(prediction, data.test_outputs),
         calibration_error(prediction, data.test_outputs),
         seconds,
+        _in_world(prediction, data),
     )  # fmt: skip
+
+
+def _in_world(prediction: Mixture, data: Data) -> float | None:
+    if data.test_yaw is None:
+        return None
+    there = (data.test_inputs[:, :2], data.test_yaw)
+    return negative_log_likelihood(in_world(prediction, *there), truth_in_world(data.test_outputs, *there))
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,6 +306,7 @@ class Row:
     rmse: float
     calibration: float
     seconds: float
+    nll_in_world: float | None = None
 
 
 def summarised(scores: Sequence[Score]) -> list[Row]:
@@ -305,10 +317,11 @@ def summarised(scores: Sequence[Score]) -> list[Row]:
     found = []
     for (count, method), own in groups.items():
         nll, rmse, off, seconds = (np.array([getattr(s, k) for s in own]) for k in _FIGURES)
+        worlds = [s.nll_in_world for s in own if s.nll_in_world is not None]
         spread = float(nll.std(ddof=1) / np.sqrt(len(own))) if len(own) > 1 else float("nan")
         found.append(
             Row(method, count, len(own), float(nll.mean()), spread, float(rmse.mean()), float(off.mean()),
-                float(seconds.mean()))
+                float(seconds.mean()), float(np.mean(worlds)) if worlds else None)
         )  # fmt: skip
     return found
 

@@ -26,8 +26,10 @@ from carlab.experiment.prior_study import (
     run_prior_study,
 )
 from carlab.experiment.regression_recordings import RecordedCase, recorded_case
+from carlab.experiment.regression_study import run_study
 from learning.function_posterior import infer
 from learning.history import HistoryChoice
+from learning.ridge import Ridge
 from learning.simulator_model import CarModel
 from sim_backends.batch_rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
@@ -53,6 +55,33 @@ def drive(seed: int, ticks: int = 240) -> EpisodeData:
 
 def case_of(held_out: EpisodeData, history: int | None = HISTORY) -> RecordedCase:
     return recorded_case([[drive(1)], [held_out]], Path("rc_car"), history)
+
+
+def test_seven_outputs_in_the_world_are_scored_at_the_states_that_were_measured() -> None:
+    """Ridge's Gaussians as draws, turned by the recorded headings, against the recorded states of the world."""
+    held_out = drive(2)
+    case = case_of(held_out)
+    (score,) = run_study(case, rows=(100,), seeds=1, methods=("ridge",), data=Path())
+    data = case.recorded(Path(), 100, 0)
+    model = Ridge.fit(data.inputs.double().numpy(), data.outputs.double().numpy())
+    mean = model(data.test_inputs.double().numpy())
+    rows = np.arange(HISTORY, held_out.ticks)
+    assert len(mean) == len(rows)  # No row was left out: each is a tick.
+    before, after = held_out.states[rows], held_out.states[rows + 1]
+    drawn = mean[:, None] + model.std * np.random.default_rng(0).normal(size=(len(mean), 20_000, 6))
+    yaw = before[:, 2:3]
+    ahead, left = drawn[..., 0], drawn[..., 1]
+    moved = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
+    turned, vx, vy = yaw + drawn[..., 2], before[:, 3:4] + drawn[..., 3], before[:, 4:5] + drawn[..., 4]
+    velocity = np.cos(turned) * vx - np.sin(turned) * vy, np.sin(turned) * vx + np.cos(turned) * vy
+    seven = np.stack([*moved, np.sin(turned), np.cos(turned), *velocity, drawn[..., 5]], axis=-1)
+    sin, cos = np.sin(after[:, 2]), np.cos(after[:, 2])
+    truth = np.column_stack([
+        *(after[:, :2] - before[:, :2]).T, sin, cos,
+        cos * after[:, 3] - sin * after[:, 4], sin * after[:, 3] + cos * after[:, 4], after[:, 5] - before[:, 5],
+    ])  # fmt: skip
+    theirs = -norm.logpdf(truth, seven.mean(axis=1), seven.std(axis=1)).sum(axis=1).mean()
+    assert score.nll_in_world == pytest.approx(theirs, abs=0.05)
 
 
 def test_no_row_that_is_held_out_is_learned_from() -> None:

@@ -1,0 +1,59 @@
+"""Seven outputs in the world: moments against draws, and measured ones against the world's own states."""
+
+import numpy as np
+import torch
+from scipy.stats import norm
+
+from carlab.core.angles import wrap
+from learning.evaluation import Mixture
+from learning.world_outputs import in_world, truth_in_world
+
+MEANS = torch.tensor([[[0.1, -0.02, 0.3, 0.5, -0.4, 1.0]], [[0.0, 0.05, -0.2, -0.3, 0.2, -2.0]]])
+STDS = torch.tensor([[[0.02, 0.01, 0.1, 0.2, 0.3, 0.5]], [[0.01, 0.04, 0.3, 0.1, 0.2, 0.4]]])
+VELOCITY, YAW = torch.tensor([[2.0, -0.5]]), torch.tensor([0.9])
+
+
+def world(changes, velocity, yaw):
+    """The seven outputs one by one, in numpy."""
+    ahead, left, turn, vx, vy, rate = np.moveaxis(np.asarray(changes, dtype=float), -1, 0)
+    after, vx, vy = yaw + turn, velocity[0] + vx, velocity[1] + vy
+    x, y = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
+    turned = np.cos(after) * vx - np.sin(after) * vy, np.sin(after) * vx + np.cos(after) * vy
+    return np.stack([x, y, np.sin(after), np.cos(after), *turned, rate], axis=-1)
+
+
+def test_each_component_has_the_moments_of_its_draws():
+    found = in_world(Mixture(MEANS, STDS), VELOCITY, YAW)
+    rng = np.random.default_rng(0)
+    for component in range(2):
+        drawn = rng.normal(MEANS[component, 0], STDS[component, 0], (400_000, 6))
+        theirs = world(drawn, VELOCITY[0].numpy(), 0.9)
+        assert np.allclose(found.means[component, 0], theirs.mean(axis=0), atol=4e-3)
+        assert np.allclose(found.stds[component, 0], theirs.std(axis=0), rtol=0.01)
+
+
+def test_measured_changes_become_the_states_that_were_measured():
+    """Both ends of a step as world states, and the changes that lead from one to the other."""
+    rng = np.random.default_rng(1)
+    before, after = rng.normal(size=(2, 50, 6))
+    sin, cos = np.sin(before[:, 2]), np.cos(before[:, 2])
+    moved = after[:, :2] - before[:, :2]
+    ahead, left = cos * moved[:, 0] + sin * moved[:, 1], cos * moved[:, 1] - sin * moved[:, 0]
+    changes = np.column_stack([ahead, left, wrap(after[:, 2] - before[:, 2]), after[:, 3:] - before[:, 3:]])
+    found = truth_in_world(*(torch.from_numpy(v) for v in (changes, before[:, 3:5], before[:, 2])))
+    sin, cos = np.sin(after[:, 2]), np.cos(after[:, 2])
+    vx, vy = cos * after[:, 3] - sin * after[:, 4], sin * after[:, 3] + cos * after[:, 4]
+    theirs = np.column_stack([moved, sin, cos, vx, vy, after[:, 5] - before[:, 5]])
+    assert np.allclose(found, theirs, atol=1e-12)
+
+
+def test_a_car_that_faces_along_x_and_is_sure_of_its_yaw_has_the_density_of_the_other_five():
+    """Nothing turns then: the two more outputs add what a nearly certain number has, whatever else happens."""
+    means, stds = MEANS[:1].clone(), STDS[:1].clone()
+    means[..., 2], stds[..., 2] = 0.0, 1e-4
+    found = in_world(Mixture(means, stds), VELOCITY, torch.zeros(1))
+    at = means[0] + 0.7 * stds[0] * torch.tensor([1.0, -1.0, 0.0, 1.0, 1.0, -1.0])
+    truth = truth_in_world(at, VELOCITY, torch.zeros(1))
+    five = norm.logpdf(0.7, 0.0, 1.0) * 5 - np.log(stds[0, 0, [0, 1, 3, 4, 5]].numpy()).sum()
+    angle = norm(found.means[0, 0, 2:4], found.stds[0, 0, 2:4]).logpdf(truth[0, 2:4]).sum()
+    assert np.isclose(float(found.log_density(truth)[0]), five + angle, atol=1e-3)
