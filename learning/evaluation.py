@@ -80,19 +80,6 @@ def root_mean_square_error(prediction: Mixture, targets: Tensor) -> float:
     return float(((prediction.mean - targets) ** 2).sum(dim=1).mean().sqrt())
 
 
-def calibration_scale(prediction: Mixture, targets: Tensor) -> float:
-    """Factor on all standard deviations of a prediction that makes held-out targets most likely.
-
-    The spread of the means stays, the noise grows or shrinks; 1 where there are no targets. Searched on a grid of two
-    per cent, for the likelihood of a mixture may have several maxima.
-    """
-    if len(targets) == 0:
-        return 1.0
-    grid = torch.logspace(-1.0, 1.0, 231, dtype=torch.float64)
-    losses = [negative_log_likelihood(Mixture(prediction.means, prediction.stds * float(s)), targets) for s in grid]
-    return float(grid[int(torch.tensor(losses).argmin())])
-
-
 def calibration_error(prediction: Mixture, targets: Tensor) -> float:
     """Mean absolute difference of empirical and nominal coverage over ``LEVELS`` and outputs.
 
@@ -110,7 +97,6 @@ __all__ = [
     "LEVELS",
     "Mixture",
     "calibration_error",
-    "calibration_scale",
     "negative_log_likelihood",
     "root_mean_square_error",
 ]

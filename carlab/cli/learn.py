@@ -96,7 +96,7 @@ class Learn:
 
     def run(self) -> int:
         """Learn and say how it went."""
-        from carlab.experiment.campaign import Campaign, taken_up
+        from carlab.experiment.campaign import Campaign, check_same_car, taken_up
         from carlab.experiment.interrupts import Interrupts
         from learning.devices import available
 
@@ -112,6 +112,7 @@ class Learn:
                 run = stack.enter_context(new_run(self.out, self.name, choice, keep="models"))
             else:
                 run = stack.enter_context(existing_run(self.resume, choice))
+                check_same_car(run, choice)
             stack.enter_context(choice.car)
             bar = stack.enter_context(progress(speed_estimate_period_s=STEPS_PERIOD_S))
             interrupts = stack.enter_context(Interrupts())

@@ -202,6 +202,19 @@ class Campaign:
         return found
 
 
+def check_same_car(run: RunDirectory, choice: CarChoice) -> None:
+    """Raise ConfigError where a campaign was started with another car, or with other numbers of the same."""
+    path = run.path / "config.toml"
+    if not ((run.path / CAMPAIGN_FILE).is_file() and path.is_file()) or run.config_toml == choice.config_toml:
+        return
+    was, now = (text.partition("\n")[0].removeprefix("# --car ") for text in (run.config_toml, choice.config_toml))
+    other = f"car '{was}', this is '{now}'" if was != now else f"other numbers of car '{was}'"
+    raise ConfigError(
+        f"{run.path} was started with {other}; go on with the same --car (what its file said is in {path}), or start "
+        "a new run."
+    )
+
+
 def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device: str | None = None) -> Campaign:
     """A run that goes on as it was started, or on another device. Raises DataError where it is no campaign."""
     path = run.path / CAMPAIGN_FILE
@@ -220,4 +233,12 @@ def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device:
         raise DataError(f"{run.path} is no run of carlab learn that can be taken up again ({error}).") from error
 
 
-__all__ = ["CAMPAIGN_FILE", "Campaign", "CampaignHooks", "check_period", "prior_simulator", "taken_up"]
+__all__ = [
+    "CAMPAIGN_FILE",
+    "Campaign",
+    "CampaignHooks",
+    "check_period",
+    "check_same_car",
+    "prior_simulator",
+    "taken_up",
+]

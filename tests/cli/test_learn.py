@@ -86,6 +86,23 @@ def test_what_cannot_be_meant_is_refused_in_a_sentence_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_goes_on_with_its_own_car_alone(carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(learned[2], folder)
+    files = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "log.jsonl"}
+    code, text = carlab("learn", "--resume", folder, "--car", "emulated")
+    assert code == 2
+    assert "was started with car 'sim', this is 'emulated'; go on with the same --car" in text
+    heavier = tmp_path / "heavier.toml"
+    text = (folder / "config.toml").read_text()
+    assert text.count("value = 1.65") == 1
+    heavier.write_text(text.replace("value = 1.65", "value = 1.69"))
+    code, text = carlab("learn", "--resume", folder, "--car", heavier)
+    assert code == 2
+    assert "was started with other numbers of car 'sim'" in text
+    assert {path: path.read_bytes() for path in files} == files
+
+
 def test_only_a_run_of_learning_is_taken_up_again(carlab: Carlab, tmp_path: Path) -> None:
     (tmp_path / "some").mkdir()
     code, text = carlab("learn", "--resume", tmp_path / "some")

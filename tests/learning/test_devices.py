@@ -25,7 +25,7 @@ from learning.car_dynamics import CarDynamics
 from learning.car_fit import CarFitSettings, fit_car, load_car, save_car
 from learning.devices import settle
 from learning.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids, draw_parameters
-from learning.evaluation import Mixture, calibration_error, calibration_scale, negative_log_likelihood
+from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, fit
 from learning.function_posterior import FunctionPosterior, infer
 from learning.function_prior import RbfCovariance
@@ -223,7 +223,7 @@ def test_figures_of_a_prediction(device: str) -> None:
     there = Mixture(means.to(device), stds.to(device)).smoothed()
     here = Mixture(means, stds).smoothed()
     close(there.std, here.std)
-    for figure in (negative_log_likelihood, calibration_error, calibration_scale):
+    for figure in (negative_log_likelihood, calibration_error):
         assert figure(there, targets.to(device)) == pytest.approx(figure(here, targets), rel=1e-5)
 
 

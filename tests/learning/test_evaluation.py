@@ -10,7 +10,6 @@ from learning.evaluation import (
     LEVELS,
     Mixture,
     calibration_error,
-    calibration_scale,
     negative_log_likelihood,
     root_mean_square_error,
 )
@@ -49,15 +48,6 @@ def test_calibration_sees_spreads_that_are_too_wide_or_too_narrow(factor, least,
     truth = random(20_000, 2)
     error = calibration_error(Mixture(torch.zeros(1, 20_000, 2).double(), factor * torch.ones(1, 1, 2)), truth)
     assert least <= error <= most
-
-
-def test_calibration_scale_undoes_a_wrong_noise():
-    """Targets with noise 0.3 about the mean, predicted with 0.1: three times too sure."""
-    generator = torch.Generator().manual_seed(3)
-    targets = 0.3 * torch.randn(4000, 2, generator=generator)
-    sure = Mixture(torch.zeros(1, 4000, 2), torch.tensor(0.1).expand(1, 1, 2))
-    assert calibration_scale(sure, targets) == pytest.approx(3.0, rel=0.03)
-    assert calibration_scale(sure, targets[:0]) == 1.0
 
 
 @pytest.mark.parametrize("bandwidth", [0.0, 0.4, 0.9, 1.0])
