@@ -241,7 +241,8 @@ class Learn:
             console.print(f"Learned and recorded in {campaign.run.path} (learn.png, learn.rrd).", soft_wrap=True)
         if done < campaign.episodes:
             console.print(
-                f"{done} of {campaign.episodes} episodes; go on with: carlab learn --resume {campaign.run.path}",
+                f"{done} of {campaign.episodes} episodes; go on with: "
+                f"carlab learn --resume {campaign.run.path}{self.which_car.typed()}",
                 soft_wrap=True,
             )
             last = results[-1].reason if results else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,13 @@ class CarOptions:
 
     dry_run: bool = False
     """Real inputs, but no command is sent."""
+
+    def typed(self) -> str:
+        """These options as one would type them, each with a space before it; nothing for those that need no word."""
+        words = [] if self.car == CarOptions().car else ["--car", self.car]
+        words += [] if self.vehicle is None else ["--vehicle", str(self.vehicle)]
+        words += ["--dry-run"] if self.dry_run else []
+        return "".join(f" {shlex.quote(word)}" for word in words)
 
     def choose(self, *, seed: int, log_folder: Path | None = None) -> CarChoice:
         """Build the car; nothing is opened yet."""

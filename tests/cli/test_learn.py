@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shlex
 import shutil
 import signal
 from collections.abc import Callable
@@ -13,9 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 
 from carlab.cli import run
 from carlab.cli.learn import Learn
+from carlab.cli.options import CarOptions
 from carlab.recording.mcap_source import read_episode
 from carlab.recording.run_directory import RunDirectory
 
@@ -188,6 +191,20 @@ def test_an_interrupted_run_tells_how_it_goes_on(
     code, text = carlab("learn", "--resume", folder)
     assert code == 130
     assert f"2 of 5 episodes; go on with: carlab learn --resume {folder}" in text
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        CarOptions(),
+        CarOptions("emulated"),
+        CarOptions("my car.toml", dry_run=True),
+        CarOptions("sim", Path("a b.toml")),
+    ],
+)
+def test_the_car_that_a_command_names_is_the_one_that_it_was(options: CarOptions) -> None:
+    """What one is told to type means the same options when it is read."""
+    assert tyro.cli(CarOptions, args=shlex.split(options.typed())) == options
 
 
 def test_a_run_that_learned_nothing_is_not_to_be_taken_up(
