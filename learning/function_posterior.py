@@ -18,7 +18,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.domain_models import DomainModel, draw_parameters
-from learning.gap import EXPECTED_GAP, TINY, GapCovariance, learn_gap
+from learning.gap import EXPECTED_GAP, TINY, GapCovariance, learn_gap, learn_noise
 from learning.normaliser import Normaliser
 from learning.outliers import first_trust, left_out, student_weights, typical_scale
 from learning.parameter_posterior import posterior_parameters
@@ -119,6 +119,7 @@ def infer(
     *,
     gap_std: Tensor | None = None,
     with_gap: bool = True,
+    noise_known: bool = False,
     seed: int = 0,
 ) -> FunctionPosterior:
     """What data and simulator say.
@@ -131,6 +132,7 @@ def infer(
         noise_std: expected noise, raw (O,).
         gap_std: expected error of the simulator, raw (O,); ``EXPECTED_GAP`` of the outputs' units unless given.
         with_gap: whether the simulator is allowed to be wrong.
+        noise_known: whether the noise is what is expected where there is no gap; with one it is learned.
         seed: of draws.
 
     Raises:
@@ -145,7 +147,7 @@ def infer(
     expected = EXPECTED_GAP * torch.ones_like(noise_std) if gap_std is None else gap_std / normaliser.output_std
     return _Case(
         model, inputs, outputs, normaliser, (noise_std / normaliser.output_std).double(), expected.double(), with_gap,
-        seed,
+        noise_known, seed,
     ).explained()  # fmt: skip
 
 
@@ -160,6 +162,7 @@ class _Case:
     noise: Tensor
     expected: Tensor
     with_gap: bool
+    noise_known: bool
     seed: int
 
     def explained(self) -> FunctionPosterior:
@@ -193,6 +196,8 @@ class _Case:
                     x[rows], left[rows], known_there, self.noise, self.expected, trust[rows],
                     None if model is None else seen[rows, width:],
                 )  # fmt: skip
+            elif not self.noise_known:
+                noise = learn_noise(left[rows], known_there, self.noise, trust[rows])
             if model is not None:
                 factor = torch.linalg.cholesky(_covariance(gap, seen[rows], noise, trust[rows]))
                 parameters = posterior_parameters(

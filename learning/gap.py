@@ -9,6 +9,7 @@ normalised inputs and outputs.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -125,14 +126,36 @@ def learn_gap(
         *(WIDTH_SCALE, WIDTH_OWN, WIDTH_OWN, WIDTH_SCALE, WIDTH_SCALE, WIDTH_OWN),
         *(WIDTH_NOISE, WIDTH_SIZE, WIDTH_REACH),
     )
+
+    def covariance_of(logs: list[Tensor]) -> Tensor:
+        found = _gap_of(logs)(inputs) + _noise_covariance(logs[6], trust)
+        return found if known is None else found + known
+
+    logs = _most_probable(middles, widths, residual, covariance_of)
+    return _gap_of(logs), logs[6].exp()
+
+
+def learn_noise(residual: Tensor, known: Tensor | None, noise_std: Tensor, trust: Tensor) -> Tensor:
+    """The noise (O,) alone, of a simulator without a gap; arguments as for ``learn_gap``."""
+    logs = _most_probable(
+        [noise_std.double().log()], (WIDTH_NOISE,), residual.double(),
+        lambda logs: _noise_covariance(logs[0], trust) + (0.0 if known is None else known),
+    )  # fmt: skip
+    return logs[0].exp()
+
+
+def _most_probable(
+    middles: list[Tensor],
+    widths: Sequence[float],
+    residual: Tensor,
+    covariance_of: Callable[[list[Tensor]], Tensor],
+) -> list[Tensor]:
+    """Logarithms under Gaussian priors that make residuals (n, O) with covariances (O, n, n) most probable."""
     logs = [m.clone().requires_grad_() for m in middles]
     optimiser = torch.optim.Adam(logs, lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS, eta_min=0.05 * RATE)
     for _ in range(STEPS):
-        gap = _covariance_of(logs)
-        covariance = gap(inputs) + torch.diag_embed(torch.exp(2.0 * logs[6])[:, None] / trust + TINY)
-        if known is not None:
-            covariance = covariance + known
+        covariance = covariance_of(logs)
         held = torch.zeros_like(residual[0, 0])
         for value, middle, width in zip(logs, middles, widths, strict=True):
             held = held + 0.5 * (((value - middle) / width) ** 2).sum()
@@ -141,11 +164,14 @@ def learn_gap(
             value.grad = gradient
         optimiser.step()
         schedule.step()
-    with torch.no_grad():
-        return _covariance_of(logs), logs[6].exp()
+    return [value.detach() for value in logs]
 
 
-def _covariance_of(logs: list[Tensor]) -> GapCovariance:
+def _noise_covariance(log_noise: Tensor, trust: Tensor) -> Tensor:
+    return torch.diag_embed(torch.exp(2.0 * log_noise)[:, None] / trust + TINY)
+
+
+def _gap_of(logs: list[Tensor]) -> GapCovariance:
     """The covariance of logarithms: of its six parts, of the noise, of a factor on all sizes, of one on all lengths."""
     scales, lengths, slopes, offsets, doubts, doubt_lengths, _, size, reach = logs
     return GapCovariance(
@@ -166,4 +192,4 @@ def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
     return gradient
 
 
-__all__ = ["GapCovariance", "evidence_gradient", "learn_gap"]
+__all__ = ["GapCovariance", "evidence_gradient", "learn_gap", "learn_noise"]

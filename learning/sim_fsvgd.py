@@ -53,7 +53,7 @@ class ParticleSettings:
 
     particles: int = 20
     hidden: tuple[int, ...] = (64, 64, 64)
-    steps: int = 5000
+    steps: int = 3000
     sets: int = 16
     points: int = 4
     learning_rate: float = 1.5e-2

@@ -138,10 +138,11 @@ class _Task:
         gap = None if expected_gap is None else expected_gap * normaliser.output_std
         posterior = infer(
             simulator, self.data.inputs, outputs, normaliser, noise, gap_std=gap, with_gap=gap is not None,
-            seed=self.seed,
+            noise_known=noise_std is not None or not case.learn_noise, seed=self.seed,
         )  # fmt: skip
         points = measurement_points(simulator or case.prior, self.data.inputs, normaliser, generator)
-        return Particles(fit_particles(posterior, points, ParticleSettings(steps=self.steps or 3000, seed=self.seed)))
+        steps = self.steps or ParticleSettings().steps
+        return Particles(fit_particles(posterior, points, ParticleSettings(steps=steps, seed=self.seed)))
 
     def sim_fsvgd(self, *, gap: bool) -> Model:
         """Particles under draws of the simulator."""

@@ -175,7 +175,9 @@ def over_seeds(x, y, at, count, **settings):
 class TestWithSimulator:
     at, _ = rows(40, seed=1)
 
-    @pytest.mark.parametrize("settings", [{}, {"gap_std": torch.tensor([0.1, 0.03])}, {"with_gap": False}])
+    @pytest.mark.parametrize(
+        "settings", [{}, {"gap_std": torch.tensor([0.1, 0.03])}, {"with_gap": False, "noise_known": True}]
+    )
     def test_it_is_the_gaussian_process_of_simulator_and_gap(self, settings):
         """Within the error of 128 draws of the parameters, and closer on the average of six seeds."""
         off, ratios = over_seeds(*rows(12), self.at, 6, **settings)
@@ -197,11 +199,23 @@ class TestWithSimulator:
             scaled = (covariances[k].numpy() - exact) / (std[:, :, None] * std[:, None, :])
             assert np.abs(scaled).max() < 0.5
 
-    def test_without_a_gap_the_noise_is_the_expected_one(self):
-        found = infer(Linear(), *rows(12), UNITS, NOISE, with_gap=False)
+    def test_without_a_gap_noise_that_is_known_is_the_expected_one(self):
+        found = infer(Linear(), *rows(12), UNITS, NOISE, with_gap=False, noise_known=True)
         assert found.gap is None
         assert np.allclose(raw_noise(found), NOISE)
         assert math.isinf(found.freedom)
+
+    def test_without_a_gap_what_no_parameters_explain_is_noise(self):
+        """Least squares' own estimate of it, on rows with waves that the simulator cannot make, and on rows without."""
+        x, wrong = rows(30)
+        (right,) = tensors((features(x) @ np.array([0.8, -1.1, 0.4])).T)
+        right += NOISE * torch.randn(right.shape, generator=torch.Generator().manual_seed(1))
+        for y in (right, wrong):
+            found = infer(Linear(), x, y, UNITS, NOISE, with_gap=False)
+            a, b = features(x).reshape(-1, 3), y.double().numpy().T.reshape(-1)
+            left = (b - a @ np.linalg.lstsq(a, b, rcond=None)[0]).reshape(2, -1)
+            theirs = np.sqrt((left**2).sum(axis=1) / (30 - 1.5))
+            assert np.allclose(raw_noise(found), theirs, rtol=0.35)
 
     def test_of_a_right_simulator_the_gap_is_smaller(self):
         """Rows of the simulator itself, and rows with waves that it cannot make."""

@@ -96,7 +96,7 @@ def test_a_gap_in_the_dynamics_finds_what_the_motor_does(lag):
     outputs = outputs + 0.005 * torch.randn(outputs.shape, generator=generator(6))
     units = Normaliser(torch.zeros(5), torch.tensor([1.0, 1.0, 3.5, 2.0, 2.0]), torch.zeros(3), torch.full((3,), 0.5))
     process = MotorPendulum(rate_gap=(1.0, 0.5, 0.5, 1.0), command_gap=0.5)
-    found = infer(process, inputs, outputs, units, torch.full((3,), 0.005), with_gap=False)
+    found = infer(process, inputs, outputs, units, torch.full((3,), 0.005), with_gap=False, noise_known=True)
     of_command, of_past = found.parameters[:, 11], found.parameters[:, 12]
     ratio = of_past / (1.0 + of_command)
     share = lag / 0.05 * (1.0 - math.exp(-0.05 / lag))
