@@ -132,6 +132,8 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
     try:
         content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
         version = content["version"]
+        if version != FILE_VERSION:
+            raise DataError(f"{path} is of version {version}, this program reads {FILE_VERSION}; {remedy}.")
         inputs, outputs, *hidden = content["network"]
         network = Network(inputs, outputs, tuple(hidden), content["activation"])
         parameters: Tensor = content["parameters"]
@@ -141,10 +143,10 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
         )  # fmt: skip
         frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
         car: LearnedCar = frames[content.get("frame", "body")](posterior.to(device), content["history"])
+    except DataError:
+        raise
     except _BROKEN as error:
         raise DataError(f"The learned car in {path} cannot be read ({_first(error)}); {remedy}.") from error
-    if version != FILE_VERSION:
-        raise DataError(f"{path} is of version {version}, this program reads {FILE_VERSION}; {remedy}.")
     if found != network.parameters:
         raise DataError(f"{path} holds {found} numbers a particle for {network.parameters}; {remedy}.")
     return car

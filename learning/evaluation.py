@@ -44,14 +44,13 @@ class Mixture:
         return (self.epistemic_std**2 + self.aleatoric_std**2).sqrt()
 
     def smoothed(self, bandwidth: float = 0.9) -> Mixture:
-        """The same mean and variance, with components that overlap.
+        """The same mean and, unless there are heavy tails, variance, with components that overlap.
 
         A few components far apart against their own width are a poor picture of the density that they are drawn from,
         the more outputs the worse. Each is drawn to the mean by ``sqrt(1 - b^2)`` and widened by the share ``b^2`` of
         the spread (West 1993, "Approximating posterior distributions by mixture", section 3.2); 1 makes it a Gaussian.
-        With heavy tails the widths have them too, as a Student process has in all of its doubt (Shah, Wilson and
-        Ghahramani 2014, "Student-t processes as alternatives to Gaussian processes", equation 5), and the variance
-        grows by theirs.
+        Where there are heavy tails, that share of the spread has them as well: they are those of rows left out, in
+        units of noise and function's doubt together.
 
         Args:
             bandwidth: b, from 0 to 1.

@@ -66,11 +66,8 @@ class FunctionPosterior:
     @property
     def data(self) -> Tensor:
         """Raw inputs (n, D) of the data."""
-        width = len(self.normaliser.input_mean)
-        return (
-            self.inputs[:, :width].to(self.normaliser.input_mean) * self.normaliser.input_std
-            + self.normaliser.input_mean
-        )
+        units = self.normaliser
+        return units.raw_inputs(self.inputs[:, : len(units.input_mean)].to(units.input_mean))
 
     def marginals(self, sets: Tensor) -> tuple[Tensor, Tensor]:
         """Means (B, O, N) and covariances (B, O, N, N), double, without noise, at raw inputs (B, N, D)."""

@@ -184,7 +184,7 @@ def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
     """Gradient (O, n, n) of the surprise at residuals (n, O) by the covariances (O, n, n) of zero-mean Gaussians.
 
     The surprise is the negative log density, its gradient ``(K^-1 - K^-1 r r^T K^-1) / 2`` (Rasmussen and Williams
-    2006, equation 5.9): less than half of the work of a tape through Cholesky's factor.
+    2006, equation 5.9), which needs no tape through Cholesky's factor.
     """
     factor = torch.linalg.cholesky(covariance)
     solved = torch.cholesky_solve(residual.T[:, :, None], factor)

@@ -25,6 +25,10 @@ class Normaliser:
         """Normalised outputs."""
         return (raw - self.output_mean) / self.output_std
 
+    def raw_inputs(self, normalised: Tensor) -> Tensor:
+        """Inputs in their own units."""
+        return normalised * self.input_std + self.input_mean
+
     def raw_outputs(self, normalised: Tensor) -> Tensor:
         """Outputs in their own units."""
         return normalised * self.output_std + self.output_mean

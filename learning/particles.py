@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -42,6 +42,10 @@ class Network:
     hidden: tuple[int, ...] = (64, 64, 64)
     activation: Activation = "leaky_relu"
     slope: float = SLOPE
+
+    def __post_init__(self) -> None:
+        if self.activation not in get_args(Activation):
+            raise ValueError(f"no activation '{self.activation}'")
 
     @property
     def layers(self) -> tuple[tuple[int, int], ...]:
@@ -84,7 +88,7 @@ class Network:
         given = self._dealt(inputs, len(parameters))
         inplace = not torch.is_grad_enabled()  # A tape needs what was summed.
         for w, b in hidden:
-            given = self._bent(torch.baddbmm(b, given, w), inplace=inplace)
+            given = self._activated(torch.baddbmm(b, given, w), inplace=inplace)
         return torch.baddbmm(biases, given, weights)
 
     def values_and_pullback(self, parameters: Tensor, inputs: Tensor) -> tuple[Tensor, Pullback]:
@@ -100,7 +104,7 @@ class Network:
         *hidden, (weights, biases) = layers
         for w, b in hidden:
             summed.append(torch.baddbmm(b, seen[-1], w))
-            seen.append(self._bent(summed[-1]))
+            seen.append(self._activated(summed[-1]))
         return torch.baddbmm(biases, seen[-1], weights), Pullback(self, layers, seen, summed)
 
     @staticmethod
@@ -108,16 +112,16 @@ class Network:
         """Inputs (L, N, D), the same for all particles unless each has its own."""
         return inputs if inputs.ndim == 3 else inputs.expand(particles, *inputs.shape)
 
-    def _bent(self, summed: Tensor, *, inplace: bool = False) -> Tensor:
+    def _activated(self, summed: Tensor, *, inplace: bool = False) -> Tensor:
         """What hidden units make of what they sum."""
         if self.activation == "silu":
             return functional.silu(summed, inplace=inplace)
         return functional.leaky_relu(summed, self.slope, inplace=inplace)
 
-    def straightened(self, direction: Tensor, summed: Tensor) -> Tensor:
+    def activation_pullback(self, direction: Tensor, summed: Tensor) -> Tensor:
         """A direction on what hidden units summed, from one on what they made of it.
 
-        One pass over the memory where a mask, a product and a choice would be three.
+        One pass over the memory, where a derivative and a product would be two.
         """
         found: Tensor
         if self.activation == "silu":
@@ -159,7 +163,7 @@ class Pullback:
     def _through(self, k: int, direction: Tensor) -> Tensor:
         """Direction on what the hidden layer before layer k summed, from one on what layer k gave."""
         back = torch.bmm(direction, self.layers[k][0].transpose(1, 2))
-        return self.network.straightened(back, self.summed[k - 1])
+        return self.network.activation_pullback(back, self.summed[k - 1])
 
 
 __all__ = ["Activation", "Layers", "Network", "Pullback"]

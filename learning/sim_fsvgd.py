@@ -18,7 +18,7 @@ from carlab.core.errors import DataError
 from learning.adam import Adam
 from learning.domain_models import DomainModel
 from learning.fsvgd import Posterior
-from learning.function_posterior import JITTER, ROWS_FOR_TAILS, FunctionPosterior
+from learning.function_posterior import JITTER, FunctionPosterior
 from learning.normaliser import Normaliser
 from learning.outliers import tail_scales
 from learning.particles import Activation, Network
@@ -26,10 +26,12 @@ from learning.stein import moment_direction
 
 TOLD_EVERY = 200
 LAST_RATE = 0.001
-SECOND = 0.99
+SQUARE_DECAY = 0.99
 """Decay of the mean square of a gradient: what is followed changes while the particles come near it."""
 FEW_ROWS = 20
 """Rows below which the domain alone tells where particles are held to the posterior."""
+ROWS_FOR_NOISE = 40
+"""Rows from which on what particles miss is counted at the data: fewer tell nothing of the places between them."""
 LEAST_NOISE_SHARE = 0.5
 """Of the measurements' variance, what is left as noise at least where particles spread more than they should."""
 NEARBY = 0.5
@@ -93,7 +95,7 @@ def fit_particles(
     if start is None:
         start = network.initial(settings.particles, generator, device)
     numbers = start.to(points).clone()
-    layers, adam = network.split(numbers), Adam(numbers, second=SECOND)
+    layers, adam = network.split(numbers), Adam(numbers, second=SQUARE_DECAY)
     count = len(points) // settings.points
     chosen = torch.randperm(len(points), generator=generator)[: count * settings.points].to(device)
     sets = points[chosen].view(count, settings.points, -1)
@@ -116,17 +118,13 @@ def fit_particles(
                 progress(step + 1)
         if not bool(torch.isfinite(numbers).all()):
             raise DataError("The fit diverged; fit again with a smaller learning rate.")
-        if len(target.inputs) >= ROWS_FOR_TAILS:
+        if len(target.inputs) >= ROWS_FOR_NOISE:
             sets = target.data[:, None]
             mean, covariance = target.marginals(sets)
             weight = torch.ones_like(mean)
         found = network(numbers, normaliser.inputs(sets.flatten(0, 1))).view(-1, *sets.shape[:2], outputs)
-        off = found.transpose(2, 3) - mean
-        # The mean square of a particle's error is that of their mean and their spread; the target's own is allowed.
-        own = covariance.diagonal(dim1=2, dim2=3).to(off)
-        missed = weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + own)
-        beyond = missed.sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
-        noise = (target.noise_std**2 + beyond).clamp_min(LEAST_NOISE_SHARE * target.noise_std**2).sqrt()
+        variance = covariance.diagonal(dim1=2, dim2=3).to(found)
+        noise = _noise(found.transpose(2, 3), mean, variance, weight, target.noise_std)
     tails = tail_scales(target.freedom, len(numbers)).to(numbers)
     return Posterior(network, numbers, noise, normaliser, tails)
 
@@ -169,6 +167,17 @@ def measurement_points(
     elif others is not None:
         found.append(others[torch.randint(len(others), (count - near,), generator=generator).to(others.device)])
     return torch.cat(found)
+
+
+def _noise(values: Tensor, mean: Tensor, variance: Tensor, weight: Tensor, noise_std: Tensor) -> Tensor:
+    """Noise (O,) of particles with values (L, B, O, N), of a target's noise and what they miss of its marginals.
+
+    The mean square of a particle's error is that of their mean and their spread; the target's variance is allowed.
+    """
+    off = values - mean
+    missed = weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + variance)
+    beyond = missed.sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
+    return (noise_std**2 + beyond).clamp_min(LEAST_NOISE_SHARE * noise_std**2).sqrt()
 
 
 def _factors(covariance: Tensor, noise_std: Tensor) -> tuple[Tensor, Tensor]:

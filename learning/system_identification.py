@@ -67,7 +67,7 @@ class GreyBox:
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at inputs (N, D)."""
         error = self.error.predict(inputs)
-        return Mixture(error.means + self.simulator.mean(inputs), error.stds)
+        return replace(error, means=error.means + self.simulator.mean(inputs))
 
 
 def identify(model: DomainModel, inputs: Tensor, outputs: Tensor, noise_std: Tensor, seed: int = 0) -> Identified:

@@ -13,9 +13,10 @@ from torch import Tensor
 from learning.evaluation import Mixture
 
 LEAST_STD = 1e-6
+"""Below it a standard deviation is this: the sine of an angle near its end has next to none."""
 
 
-def in_world(prediction: Mixture, velocity_mps: Tensor, yaw_rad: Tensor) -> Mixture:
+def seven_outputs(prediction: Mixture, velocity_mps: Tensor, yaw_rad: Tensor) -> Mixture:
     """The same components with the exact mean and variance of each of the seven outputs, as independent Gaussians.
 
     Args:
@@ -30,21 +31,21 @@ def in_world(prediction: Mixture, velocity_mps: Tensor, yaw_rad: Tensor) -> Mixt
     variance = (prediction.stds.double() ** 2).expand_as(mean)
     speed = mean[..., 3:5] + velocity_mps.double()
     sin, cos = _circle(yaw_rad.double(), torch.zeros_like(yaw_rad.double()))
-    place = _turned(mean[..., :2], variance[..., :2], sin, cos, 0.5 * torch.sin(2.0 * yaw_rad.double()))
+    place = _to_world(mean[..., :2], variance[..., :2], sin, cos, 0.5 * torch.sin(2.0 * yaw_rad.double()))
     yaw, doubt = yaw_rad.double() + mean[..., 2], variance[..., 2]
     sin, cos = _circle(yaw, doubt)
     both = 0.5 * torch.exp(-2.0 * doubt) * torch.sin(2.0 * yaw)
-    moved = _turned(speed, variance[..., 3:5], sin, cos, both)
+    moved = _to_world(speed, variance[..., 3:5], sin, cos, both)
     parts = [*place, sin, cos, *moved, (mean[..., 5], mean[..., 5] ** 2 + variance[..., 5])]
     means = torch.stack([first for first, _ in parts], dim=-1)
     squares = torch.stack([second for _, second in parts], dim=-1)
     return Mixture(means, (squares - means**2).clamp_min(LEAST_STD**2).sqrt())
 
 
-def truth_in_world(changes: Tensor, velocity_mps: Tensor, yaw_rad: Tensor) -> Tensor:
+def measured_seven_outputs(changes: Tensor, velocity_mps: Tensor, yaw_rad: Tensor) -> Tensor:
     """The seven outputs (N, 7) of measured changes (N, 6)."""
     exact = Mixture(changes[None], torch.zeros_like(changes[None]))
-    return in_world(exact, velocity_mps, yaw_rad).means[0]
+    return seven_outputs(exact, velocity_mps, yaw_rad).means[0]
 
 
 Moments = tuple[Tensor, Tensor]
@@ -57,7 +58,7 @@ def _circle(angle: Tensor, variance: Tensor) -> tuple[Moments, Moments]:
     return (once * angle.sin(), 0.5 * (1.0 - twice)), (once * angle.cos(), 0.5 * (1.0 + twice))
 
 
-def _turned(vector: Tensor, variance: Tensor, sin: Moments, cos: Moments, both: Tensor) -> tuple[Moments, Moments]:
+def _to_world(vector: Tensor, variance: Tensor, sin: Moments, cos: Moments, both: Tensor) -> tuple[Moments, Moments]:
     """A vector (..., 2) turned by an angle that it does not depend on; ``both`` is the mean of sine times cosine."""
     ahead, left = vector.unbind(-1)
     ahead_square, left_square = (vector**2 + variance).unbind(-1)
@@ -67,4 +68,4 @@ def _turned(vector: Tensor, variance: Tensor, sin: Moments, cos: Moments, both: 
     return x, y
 
 
-__all__ = ["in_world", "truth_in_world"]
+__all__ = ["measured_seven_outputs", "seven_outputs"]

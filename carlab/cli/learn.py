@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -112,15 +113,16 @@ class Learn:
                 run = stack.enter_context(new_run(self.out, self.name, choice, keep="models"))
             else:
                 run = stack.enter_context(existing_run(self.resume, choice))
-                check_same_car(run, choice)
+                check_same_car(run, choice, self.which_car.typed())
             stack.enter_context(choice.car)
             bar = stack.enter_context(progress(speed_estimate_period_s=STEPS_PERIOD_S))
             interrupts = stack.enter_context(Interrupts())
             hooks = self._hooks(bar, run, figures, interrupts)
             if self.resume is None:
                 campaign = Campaign(
-                    choice, plan, self.episodes, run, hooks, self.ticks, self.place, self.rerun, self._questioned()
-                )
+                    choice, plan, self.episodes, run, hooks, self.ticks, self.place, self.rerun, self._questioned(),
+                    self.which_car.typed(),
+                )  # fmt: skip
                 campaign.write_plan()
             else:
                 campaign = taken_up(run, choice, hooks, self.device)
@@ -242,7 +244,7 @@ class Learn:
         if done < campaign.episodes:
             console.print(
                 f"{done} of {campaign.episodes} episodes; go on with: "
-                f"carlab learn --resume {campaign.run.path}{self.which_car.typed()}",
+                f"carlab learn --resume {shlex.quote(str(campaign.run.path))}{self.which_car.typed()}",
                 soft_wrap=True,
             )
             last = results[-1].reason if results else None

@@ -43,6 +43,7 @@ GOES_ON = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOF
 """Ends of an episode after which the next may follow: a policy that has not learned yet leaves the arena."""
 SPREAD = 0.3
 """How far from its value a number of the car file may lie, where the file gives no range."""
+DRY_RUN = "--dry-run"
 PERIOD_TOLERANCE = 0.02
 """Share by which control periods may differ: stamps of recordings do."""
 UNCERTAIN = (
@@ -94,7 +95,8 @@ class CampaignHooks:
 class Campaign:
     """A run of ``carlab learn`` on an open car.
 
-    ``questioned`` is the simulator that each episode is checked against; that of the car's file unless given.
+    ``questioned`` is the simulator that each episode is checked against; that of the car's file unless given. ``car``
+    is how the car is named on a command line.
     """
 
     choice: CarChoice
@@ -106,11 +108,12 @@ class Campaign:
     place: bool = True
     record_rerun: bool = True
     questioned: SimulatorConfig | None = None
+    car: str = ""
 
     def write_plan(self) -> None:
         """Write what is wanted, for taking the run up again."""
         wanted: dict[str, Any] = {"episodes": self.episodes, "ticks": self.max_ticks}
-        wanted |= {"place": self.place, "rerun": self.record_rerun}
+        wanted |= {"place": self.place, "rerun": self.record_rerun, "car": self.car}
         if self.questioned is not None:
             wanted["questioned"] = self.questioned.to_tables()
         self.run.write_json(CAMPAIGN_FILE, {**wanted, "plan": plan_as_json(self.plan)})
@@ -202,16 +205,32 @@ class Campaign:
         return found
 
 
-def check_same_car(run: RunDirectory, choice: CarChoice) -> None:
-    """Raise ConfigError where a campaign was started with another car, or with other numbers of the same."""
-    path = run.path / "config.toml"
-    if not ((run.path / CAMPAIGN_FILE).is_file() and path.is_file()) or run.config_toml == choice.config_toml:
+WIRES = ("hardware", "mocap")
+"""Parts of a car's file that say how it is reached, not what it is."""
+
+
+def check_same_car(run: RunDirectory, choice: CarChoice, typed: str) -> None:
+    """Raise ConfigError where a campaign was started with another car, with other numbers of it, or dry.
+
+    Args:
+        run: the campaign's folder.
+        choice: the car that is to go on with it.
+        typed: the options that name it.
+    """
+    try:
+        content = json.loads((run.path / CAMPAIGN_FILE).read_text(encoding="utf-8"))
+        was, now = run.config_toml, choice.config_toml
+        numbers = [{k: v for k, v in tomllib.loads(text).items() if k not in WIRES} for text in (was, now)]
+        before = str(content.get("car", typed))
+    except (OSError, ValueError, AttributeError):
+        return  # No campaign: ``taken_up`` says so.
+    kinds = [text.partition("\n")[0] for text in (was, now)]
+    if kinds[0] == kinds[1] and numbers[0] == numbers[1] and (DRY_RUN in before) == (DRY_RUN in typed):
         return
-    was, now = (text.partition("\n")[0].removeprefix("# --car ") for text in (run.config_toml, choice.config_toml))
-    other = f"car '{was}', this is '{now}'" if was != now else f"other numbers of car '{was}'"
+    what = "other options" if before != typed else "other numbers in the car's file"
     raise ConfigError(
-        f"{run.path} was started with {other}; go on with the same --car (what its file said is in {path}), or start "
-        "a new run."
+        f"{run.path} was started with {what}; go on with '{before.strip() or '--car sim'}' and what is in "
+        f"{run.path / 'config.toml'}, or start a new run."
     )
 
 

@@ -32,7 +32,7 @@ from learning.normaliser import Normaliser
 from learning.ridge import Ridge
 from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_points
 from learning.system_identification import GreyBox, Identified, grey_box, identify
-from learning.world_outputs import in_world, truth_in_world
+from learning.world_outputs import measured_seven_outputs, seven_outputs
 
 Way = Literal["ours", "authors"]
 Progress = Callable[[str, int, int], None]
@@ -292,7 +292,7 @@ def _in_world(prediction: Mixture, data: Data) -> float | None:
     if data.test_yaw is None:
         return None
     there = (data.test_inputs[:, :2], data.test_yaw)
-    return negative_log_likelihood(in_world(prediction, *there), truth_in_world(data.test_outputs, *there))
+    return negative_log_likelihood(seven_outputs(prediction, *there), measured_seven_outputs(data.test_outputs, *there))
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,17 +93,29 @@ def test_a_run_goes_on_with_its_own_car_alone(carlab: Carlab, learned: tuple[int
     folder = tmp_path / "run"
     shutil.copytree(learned[2], folder)
     files = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "log.jsonl"}
-    code, text = carlab("learn", "--resume", folder, "--car", "emulated")
-    assert code == 2
-    assert "was started with car 'sim', this is 'emulated'; go on with the same --car" in text
+    for options in (("--car", "emulated"), ("--car", "eth_rc_car"), ("--dry-run",)):
+        code, text = carlab("learn", "--resume", folder, *options)
+        assert code == 2
+        assert "was started with other options; go on with '--car sim'" in text
     heavier = tmp_path / "heavier.toml"
     text = (folder / "config.toml").read_text()
     assert text.count("value = 1.65") == 1
     heavier.write_text(text.replace("value = 1.65", "value = 1.69"))
     code, text = carlab("learn", "--resume", folder, "--car", heavier)
     assert code == 2
-    assert "was started with other numbers of car 'sim'" in text
+    assert "was started with other options; go on with '--car sim'" in text
     assert {path: path.read_bytes() for path in files} == files
+
+
+def test_the_same_numbers_in_other_words_are_the_same_car(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
+) -> None:
+    folder, same = tmp_path / "run", tmp_path / "same.toml"
+    shutil.copytree(learned[2], folder)
+    same.write_text("# A remark.\n" + (folder / "config.toml").read_text())
+    code, text = carlab("learn", "--resume", folder, "--car", same)
+    assert code == 0
+    assert "has nothing left to do" in text
 
 
 def test_only_a_run_of_learning_is_taken_up_again(carlab: Carlab, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from carlab.core.quantities import Action, CarState
 from carlab.core.task import ParkingTask
 from carlab.experiment.episode import EpisodeHooks, run_episode
 from learning.car_dynamics import CarDynamics, inputs_of, moved
-from learning.car_fit import CarFitSettings, fit_car, load_car, save_car
+from learning.car_fit import FILE_VERSION, CarFitSettings, fit_car, load_car, save_car
 from learning.fsvgd import Posterior
 from learning.normaliser import Normaliser
 from learning.particles import Network
@@ -156,7 +156,7 @@ def test_a_row_is_answered_for_its_own_inputs() -> None:
 
 def some_car(tails: Tensor | None = None) -> CarDynamics:
     generator = torch.Generator().manual_seed(5)
-    network = Network(INPUTS, 6, (8, 4))
+    network = Network(INPUTS, 6, (8, 4), "silu")
     units = Normaliser(*(torch.rand(n, generator=generator) + 0.5 for n in (INPUTS, INPUTS, 6, 6)))
     noise = torch.rand(6, generator=generator)
     return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, tails), HISTORY)
@@ -188,6 +188,8 @@ def damaged(path: Path, kind: str) -> None:
         torch.save(content | {"parameters": content["parameters"][0]}, path)
     elif kind == "of another network":
         torch.save(content | {"network": [INPUTS + 2, 6, 8, 4]}, path)
+    elif kind == "of an unknown activation":
+        torch.save(content | {"activation": "tanh"}, path)
     elif kind == "without a part":
         del content["units"]
         torch.save(content, path)
@@ -199,8 +201,22 @@ def damaged(path: Path, kind: str) -> None:
         path.write_bytes({"cut short": whole[: len(whole) // 2], "empty": b"", "text": b"rubbish\n"}[kind])
 
 
+def test_a_file_of_an_earlier_version_is_called_that(tmp_path: Path) -> None:
+    """Such a file lacks what came later."""
+    path = tmp_path / "car.pt"
+    save_car(some_car(), path)
+    content: dict[str, Any] = torch.load(path, weights_only=True)
+    del content["activation"]
+    torch.save(content | {"version": 2}, path)
+    with pytest.raises(
+        DataError, match=rf"^[^ ]*car\.pt is of version 2, this program reads {FILE_VERSION}; remove its folder"
+    ):
+        load_car(path)
+
+
 KINDS = (
     *("of another version", "a particle short of a number", "of another network", "without a part", "a list"),
+    "of an unknown activation",
     *("not there", "cut short", "empty", "one particle alone", "text"),
 )
 

@@ -220,8 +220,9 @@ def test_figures_of_a_prediction(device: str) -> None:
     generator = torch.Generator().manual_seed(5)
     means, stds = torch.randn((4, 30, 3), generator=generator), 0.1 + torch.rand((4, 1, 3), generator=generator)
     targets = torch.randn((30, 3), generator=generator)
-    there = Mixture(means.to(device), stds.to(device)).smoothed()
-    here = Mixture(means, stds).smoothed()
+    tails = torch.tensor([0.5, 0.8, 1.2, 2.0])
+    there = Mixture(means.to(device), stds.to(device), tails.to(device)).smoothed()
+    here = Mixture(means, stds, tails).smoothed()
     close(there.std, here.std)
     for figure in (negative_log_likelihood, calibration_error):
         assert figure(there, targets.to(device)) == pytest.approx(figure(here, targets), rel=1e-5)

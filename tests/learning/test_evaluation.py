@@ -50,6 +50,20 @@ def test_calibration_sees_spreads_that_are_too_wide_or_too_narrow(factor, least,
     assert least <= error <= most
 
 
+def test_twenty_components_with_tails_are_nearer_to_a_student_distribution_than_those_without():
+    """Draws of one of scale 0.5, three fifths of it noise, as a mixture of as few components as there are particles."""
+    means = torch.from_numpy(norm.ppf((np.arange(20) + 0.5) / 20))
+    means = (0.4 * means / means.std(correction=0))[torch.randperm(20, generator=torch.Generator().manual_seed(1))]
+    tails = tail_scales(2.5, 20).double()
+    targets = torch.from_numpy(student(2.5, scale=0.5).rvs(20_000, random_state=0))[:, None]
+    exact = student(2.5, scale=0.5).logpdf(targets.numpy()).mean()
+    found = []
+    for own in (tails, None):
+        mixture = Mixture(means[:, None, None], 0.3 * tails[:, None, None], own)
+        found.append(float(mixture.smoothed().log_density(targets.expand(-1, 1)).mean()) - exact)
+    assert found[1] < 2.0 * found[0] < 0.0
+
+
 @pytest.mark.parametrize("bandwidth", [0.0, 0.4, 0.9, 1.0])
 def test_a_smoothed_mixture_keeps_mean_and_spread(bandwidth):
     sharp = Mixture(random(4, 5, 3), random(4, 1, 3, seed=1).exp())

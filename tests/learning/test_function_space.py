@@ -30,7 +30,10 @@ class TestNetwork:
     )
     def test_each_particle_is_an_ordinary_network(self, network, activation):
         parameters, inputs = network.initial(4, generator()).double(), normal(6, 3)
-        ours = network(parameters, inputs)
+        ours, given = network(parameters, inputs), inputs.clone()
+        with torch.no_grad():  # Where the work is done in place.
+            assert torch.equal(network(parameters, inputs), ours)
+        assert torch.equal(inputs, given)
         for particle in range(4):
             layers, begin = [], 0
             for fan_in, fan_out in ((3, 8), (8, 5), (5, 2)):

@@ -132,17 +132,18 @@ class TestNoise:
 
     @pytest.mark.parametrize(("rows", "at_data"), [(39, False), (40, True)])
     def test_with_data_it_is_what_is_missed_there(self, rows, at_data):
-        """Particles at 0.3, all in one place, under a target that is nearly so at the data and not elsewhere."""
-        x = torch.linspace(10.0, 10.1, rows)[:, None]
+        """Particles about 0.3 under a target that is nearly so at the data and not elsewhere; one row is far away."""
+        heights = ((0.25, 0.4), (0.3, 0.3), (0.35, 0.2))
+        x = torch.cat([torch.linspace(8.0, 12.0, rows - 1), torch.tensor([40.0])])[:, None]
         y = torch.tensor([[1.0 + 2.0 * 0.3, -3.0 + 0.5 * 0.3]]).expand(rows, 2)
         y = y + torch.tensor([[0.2, 0.2]]) * torch.randn((rows, 2), generator=generator(4))
         target = infer(None, x, y, self.units, torch.tensor([0.2, 0.2]), gap_std=torch.tensor([0.6, 0.6]))
-        found = fit_particles(target, self.points, self.settings, start=constant(*[(0.3, 0.3)] * 3))
+        found = fit_particles(target, self.points, self.settings, start=constant(*heights))
         mean, std = target.predict(x if at_data else self.points)
         missed = ((mean - self.units.raw_outputs(torch.tensor([0.3, 0.3]))) / self.units.output_std) ** 2
         noise = target.noise_std**2
-        own = (std / self.units.output_std) ** 2 - noise
-        weight = torch.ones_like(own) if at_data else 1.0 / (own + noise)
+        own = (std / self.units.output_std) ** 2 - noise - torch.tensor(heights).var(dim=0, correction=0)
+        weight = torch.ones_like(own) if at_data else (std / self.units.output_std) ** -2
         theirs = (noise + (weight * (missed + own)).sum(dim=0) / weight.sum(dim=0)).sqrt()
         assert np.allclose(found.noise_std, theirs, rtol=2e-3)
         assert (bool((found.noise_std < 1.5 * target.noise_std).all())) is at_data

@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from carlab.core.angles import wrap
 from learning.evaluation import Mixture
-from learning.world_outputs import in_world, truth_in_world
+from learning.world_outputs import measured_seven_outputs, seven_outputs
 
 MEANS = torch.tensor([[[0.1, -0.02, 0.3, 0.5, -0.4, 1.0]], [[0.0, 0.05, -0.2, -0.3, 0.2, -2.0]]])
 STDS = torch.tensor([[[0.02, 0.01, 0.1, 0.2, 0.3, 0.5]], [[0.01, 0.04, 0.3, 0.1, 0.2, 0.4]]])
@@ -23,7 +23,7 @@ def world(changes, velocity, yaw):
 
 
 def test_each_component_has_the_moments_of_its_draws():
-    found = in_world(Mixture(MEANS, STDS), VELOCITY, YAW)
+    found = seven_outputs(Mixture(MEANS, STDS), VELOCITY, YAW)
     rng = np.random.default_rng(0)
     for component in range(2):
         drawn = rng.normal(MEANS[component, 0], STDS[component, 0], (400_000, 6))
@@ -40,7 +40,7 @@ def test_measured_changes_become_the_states_that_were_measured():
     moved = after[:, :2] - before[:, :2]
     ahead, left = cos * moved[:, 0] + sin * moved[:, 1], cos * moved[:, 1] - sin * moved[:, 0]
     changes = np.column_stack([ahead, left, wrap(after[:, 2] - before[:, 2]), after[:, 3:] - before[:, 3:]])
-    found = truth_in_world(*(torch.from_numpy(v) for v in (changes, before[:, 3:5], before[:, 2])))
+    found = measured_seven_outputs(*(torch.from_numpy(v) for v in (changes, before[:, 3:5], before[:, 2])))
     sin, cos = np.sin(after[:, 2]), np.cos(after[:, 2])
     vx, vy = cos * after[:, 3] - sin * after[:, 4], sin * after[:, 3] + cos * after[:, 4]
     theirs = np.column_stack([moved, sin, cos, vx, vy, after[:, 5] - before[:, 5]])
@@ -51,9 +51,9 @@ def test_a_car_that_faces_along_x_and_is_sure_of_its_yaw_has_the_density_of_the_
     """Nothing turns then: the two more outputs add what a nearly certain number has, whatever else happens."""
     means, stds = MEANS[:1].clone(), STDS[:1].clone()
     means[..., 2], stds[..., 2] = 0.0, 1e-4
-    found = in_world(Mixture(means, stds), VELOCITY, torch.zeros(1))
+    found = seven_outputs(Mixture(means, stds), VELOCITY, torch.zeros(1))
     at = means[0] + 0.7 * stds[0] * torch.tensor([1.0, -1.0, 0.0, 1.0, 1.0, -1.0])
-    truth = truth_in_world(at, VELOCITY, torch.zeros(1))
+    truth = measured_seven_outputs(at, VELOCITY, torch.zeros(1))
     five = norm.logpdf(0.7, 0.0, 1.0) * 5 - np.log(stds[0, 0, [0, 1, 3, 4, 5]].numpy()).sum()
     angle = norm(found.means[0, 0, 2:4], found.stds[0, 0, 2:4]).logpdf(truth[0, 2:4]).sum()
     assert np.isclose(float(found.log_density(truth)[0]), five + angle, atol=1e-3)
