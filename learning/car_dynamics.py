@@ -87,7 +87,7 @@ def drawn(posterior: Posterior, inputs: Tensor, generator: torch.Generator) -> T
     with torch.no_grad():
         place = torch.randperm(share * particles, generator=generator)[:count].to(inputs.device)
         dealt = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
-        dealt[place] = posterior.normaliser.inputs(inputs)
+        dealt[place] = posterior.seen(inputs)
         values = posterior.network(posterior.parameters, dealt.view(particles, share, inputs.shape[1]))
         noise = torch.randn(values.shape, generator=generator).to(values)
         values = values + noise * posterior.noise_stds

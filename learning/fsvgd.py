@@ -26,6 +26,9 @@ from learning.particles import Network
 from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
 CHECKED_EVERY = 500
+EDGE = 6.0
+"""How far out in their units inputs count; what lies farther is taken to lie there, for nothing was learned of it and a
+network's straight lines grow without bound when it is driven by what it said before."""
 LEAST_NOISE = 1e-4
 """Floor of the likelihood's standard deviation, in normalised units."""
 
@@ -150,9 +153,13 @@ class Posterior:
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at raw inputs (N, D), in raw units."""
         with torch.no_grad():
-            values = self.network(self.parameters, self.normaliser.inputs(inputs))
+            values = self.network(self.parameters, self.seen(inputs))
         means, stds = self.normaliser.raw_outputs(values), self.noise_stds * self.normaliser.output_std
         return Mixture(means, stds, self.tails)
+
+    def seen(self, inputs: Tensor) -> Tensor:
+        """What the networks are given for raw inputs (N, D)."""
+        return self.normaliser.inputs(inputs).clamp(-EDGE, EDGE)
 
     def to(self, device: torch.device | str) -> Posterior:
         """The same on a device."""

@@ -22,7 +22,7 @@ from carlab.core.task import ParkingTask
 from carlab.experiment.episode import EpisodeHooks, run_episode
 from learning.car_dynamics import CarDynamics, inputs_of, moved
 from learning.car_fit import FILE_VERSION, CarFitSettings, fit_car, load_car, save_car
-from learning.fsvgd import Posterior
+from learning.fsvgd import EDGE, Posterior
 from learning.normaliser import Normaliser
 from learning.particles import Network
 from learning.simulator_model import CarModel
@@ -149,9 +149,27 @@ def test_a_row_is_answered_for_its_own_inputs() -> None:
     units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.zeros(6), torch.ones(6))
     car = CarDynamics(Posterior(network, parameters, torch.full((6,), 1e-4), units), HISTORY)
     inputs = torch.zeros(100, INPUTS)
-    inputs[:, 0] = torch.arange(100.0)
+    inputs[:, 0] = torch.arange(100.0) / 20.0
     drawn = car.sample(inputs, torch.Generator().manual_seed(0))
     assert torch.allclose(drawn, inputs[:, :1].expand(100, 6), atol=1e-3)
+
+
+def test_a_world_that_feeds_on_itself_does_not_run_away() -> None:
+    """A yaw rate that doubles at each step is that of the edge from there on: it grows by as much, and no more."""
+    network = Network(INPUTS, 6, (2,), slope=1.0)
+    parameters = torch.zeros(1, network.parameters)
+    (first, _), (last, _) = network.split(parameters)
+    first[:, 2, 0] = last[:, 0, 5] = 1.0
+    units = Normaliser(torch.zeros(INPUTS), torch.full((INPUTS,), 2.0), torch.zeros(6), torch.full((6,), 2.0))
+    car = CarDynamics(Posterior(network, parameters, torch.full((6,), 1e-6), units), HISTORY)
+    features = torch.zeros(1, 7 + 2 * HISTORY)
+    features[0, 3], features[0, 6] = 1.0, 0.75
+    generator, rates = torch.Generator().manual_seed(0), []
+    for _ in range(100):
+        features = car.step(features, torch.zeros(1, 2), generator)
+        rates.append(float(features[0, 6]))
+    assert rates[:5] == pytest.approx([1.5, 3.0, 6.0, 12.0, 24.0], rel=1e-3)
+    assert rates[-1] == pytest.approx(24.0 + 95 * 2.0 * EDGE, rel=1e-3)
 
 
 def some_car(tails: Tensor | None = None) -> CarDynamics:
