@@ -32,7 +32,7 @@ class Network:
         inputs: number of inputs.
         outputs: number of outputs.
         hidden: width of each hidden layer; the authors use three of 64.
-        activation: of hidden units. Smooth ones (``silu``: Elfwing, Uchibe and Doya 2018, equation 9) follow a smooth
+        activation: of hidden units. Smooth ones (``silu``: Elfwing, Uchibe and Doya 2018) follow a smooth
             function more closely; the authors have leaky ReLUs.
         slope: of the leaky ReLU below zero; 0 is a ReLU.
     """

@@ -284,11 +284,11 @@ def scored(
         root_mean_square_error(prediction, data.test_outputs),
         calibration_error(prediction, data.test_outputs),
         seconds,
-        _in_world(prediction, data),
+        _nll_in_world(prediction, data),
     )  # fmt: skip
 
 
-def _in_world(prediction: Mixture, data: Data) -> float | None:
+def _nll_in_world(prediction: Mixture, data: Data) -> float | None:
     if data.test_yaw is None:
         return None
     there = (data.test_inputs[:, :2], data.test_yaw)

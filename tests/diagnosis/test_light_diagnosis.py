@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import parking_drives as drives
 import pytest
 
 from carlab.core.episode_data import EpisodeData
@@ -20,13 +19,6 @@ from carlab.diagnosis.own_recordings import as_captured, window_variance_s2
 from carlab.diagnosis.shots import Shots, cut, tracks_of
 from carlab.recording.mcap_source import read_episode
 from sim_backends.car_parameters import SimulatorConfig
-
-_spec = importlib.util.spec_from_file_location("parking_drives", Path(__file__).with_name("parking_drives.py"))
-assert _spec is not None
-assert _spec.loader is not None
-drives = importlib.util.module_from_spec(_spec)
-sys.modules["parking_drives"] = drives
-_spec.loader.exec_module(drives)
 
 SIMULATOR = SimulatorConfig.from_preset()
 

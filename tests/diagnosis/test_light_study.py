@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+import parking_drives as drives
 import pytest
 
 from carlab.diagnosis.light import look
 from carlab.recording.mcap_source import read_episode
 from sim_backends.car_parameters import SimulatorConfig
-
-_spec = importlib.util.spec_from_file_location("parking_drives", Path(__file__).with_name("parking_drives.py"))
-assert _spec is not None
-assert _spec.loader is not None
-drives = importlib.util.module_from_spec(_spec)
-sys.modules["parking_drives"] = drives
-_spec.loader.exec_module(drives)
 
 pytestmark = pytest.mark.slow
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import parking_drives as drives
 import pytest
 
 from carlab.cars import choose_car
@@ -19,15 +18,6 @@ from carlab.experiment.reality_check import RealityCheck, check, check_beside, c
 from carlab.experiment.training import TrainingPlan
 from carlab.recording.run_directory import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
-
-_spec = importlib.util.spec_from_file_location(
-    "parking_drives", Path(__file__).parents[1] / "diagnosis" / "parking_drives.py"
-)
-assert _spec is not None
-assert _spec.loader is not None
-drives = importlib.util.module_from_spec(_spec)
-sys.modules["parking_drives"] = drives
-_spec.loader.exec_module(drives)
 
 SIMULATOR = SimulatorConfig.from_preset()
 LAGGING = replace(SIMULATOR, effects={"motor_lag": {"time_constant": 0.08}})
