@@ -25,8 +25,8 @@ from learning.parameter_posterior import posterior_parameters
 
 DRAWS = 128
 PRIOR_DRAWS = 1024
-EVIDENCE_ROWS = 300
-"""Rows, drawn from all, by which covariance and parameters are found."""
+PARAMETER_ROWS = 800
+"""Rows, drawn from all, by which the parameters are found."""
 LARGEST = 2000
 """Rows that are conditioned on; of more data so many are drawn."""
 JITTER = 1e-5
@@ -171,7 +171,7 @@ class _Case:
         device = inputs.device
         noise, scale, freedom = self.noise, torch.ones_like(self.noise), math.inf
         gap = GapCovariance.before_data(width, self.expected) if self.with_gap else None
-        rows = torch.randperm(count, generator=generator)[:EVIDENCE_ROWS].to(device)
+        rows = torch.randperm(count, generator=generator)[:PARAMETER_ROWS].to(device)
         trust = torch.ones(count, dtype=torch.float64, device=device)
         parameters: Tensor | None = None
         if model is not None:
@@ -187,14 +187,11 @@ class _Case:
             trust = first_trust(left, before_data, self.noise)
         # The covariance is learned around the prior, then again around what the data leaves of it.
         for _ in range(ROUNDS if count else 0):
-            known_there = None if known is None else known[:, rows][:, :, rows]
             if self.with_gap:
-                gap, noise = learn_gap(
-                    x[rows], left[rows], known_there, self.noise, self.expected, trust[rows],
-                    None if model is None else seen[rows, width:],
-                )  # fmt: skip
+                said = None if model is None else seen[:, width:]
+                gap, noise = learn_gap(x, left, known, self.noise, self.expected, trust, said, self.seed)
             elif not self.noise_known:
-                noise = learn_noise(left[rows], known_there, self.noise, trust[rows])
+                noise = learn_noise(left, known, self.noise, trust, self.seed)
             if model is not None:
                 factor = torch.linalg.cholesky(_covariance(gap, seen[rows], noise, trust[rows]))
                 parameters = posterior_parameters(

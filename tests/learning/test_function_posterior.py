@@ -217,6 +217,24 @@ class TestWithSimulator:
             theirs = np.sqrt((left**2).sum(axis=1) / (30 - 1.5))
             assert np.allclose(raw_noise(found), theirs, rtol=0.35)
 
+    def test_every_one_of_many_rows_tells_of_the_parameters(self):
+        """Of 700 rows the linear simulator's posterior is the conjugate one: with fewer it would be wider."""
+        x, _ = rows(700)
+        rng = np.random.default_rng(6)
+        shape = features(x)
+        y = (shape @ np.array([0.8, -1.1, 0.4])).T + NOISE.numpy() * rng.normal(size=(700, 2))
+        parameters = [
+            infer(Linear(), x, *tensors(y), UNITS, NOISE, with_gap=False, noise_known=True, seed=s).parameters
+            for s in range(3)
+        ]
+        scaled = np.concatenate([shape[k] / NOISE.double().numpy()[k] for k in range(2)])
+        wanted = np.concatenate([y[:, k] / NOISE.double().numpy()[k] for k in range(2)])
+        covariance = np.linalg.inv(np.eye(3) + scaled.T @ scaled)
+        draws = torch.cat(parameters).double().numpy()
+        std = np.sqrt(np.diag(covariance))
+        assert np.allclose(draws.std(axis=0), std, rtol=0.2)
+        assert np.allclose((draws.mean(axis=0) - covariance @ scaled.T @ wanted) / std, 0.0, atol=0.3)
+
     def test_of_a_right_simulator_the_gap_is_smaller(self):
         """Rows of the simulator itself, and rows with waves that it cannot make."""
         x, wrong = rows(100)

@@ -1,11 +1,14 @@
 """The gap's covariance against its formula, and what is learned of it against scipy and known processes."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
+from learning import gap as gap_module
 from learning.gap import (
     MIDDLE_LENGTH,
     TINY,
@@ -184,6 +187,23 @@ class TestOfAKnownProcess:
 
         before = of_others(GapCovariance.before_data(2, torch.tensor([0.3, 0.3])), [0.2, 0.2])
         assert of_others(gap, noise) > before + 15.0
+
+
+def test_of_many_rows_all_are_heard(monkeypatch):
+    """Half of the rows are three times as noisy: steps of 60 of 240 rows find the noise of all, whatever is drawn."""
+    monkeypatch.setattr(gap_module, "EVIDENCE_ROWS", 60)
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-2, 2, (240, 1))
+    spread = np.where(np.arange(240) < 120, 0.1, 0.3)[:, None]
+    y = np.sin(2 * x) + spread * rng.normal(size=x.shape)
+    tensors = [torch.tensor(v) for v in (x, y)]
+    settings = (torch.tensor([0.2]), torch.tensor([0.5]))
+    noises = [float(learn_gap(*tensors, None, *settings, torch.ones(240), seed=k)[1]) for k in range(3)]
+    first = float(learn_gap(*(v[:60] for v in tensors), None, *settings, torch.ones(60))[1])
+    # One noise for two halves with each its own.
+    together = math.sqrt(0.5 * (0.1**2 + 0.3**2))
+    assert np.allclose(noises, together, rtol=0.15)
+    assert abs(first - together) > 0.3 * together
 
 
 def test_what_the_simulator_doubts_is_no_gap():
