@@ -34,6 +34,9 @@ JITTER = 1e-5
 ROUNDS = 2
 ROWS_FOR_TAILS = 40
 """Rows from which on outliers are told from noise."""
+ROWS_OF_A_FREEDOM, LEAST_FREEDOM = 8.0, 6.0
+"""A covariance that is learned is uncertain itself: predictions have at most one degree of freedom for so many rows, or
+the least. By race cars in simulation and training rows: of 20 rows -15.6 -> -18.1, of 100 -22.32 -> -22.40."""
 _AT_ONCE = 1024
 
 
@@ -169,7 +172,9 @@ class _Case:
         x, y = normaliser.inputs(inputs).double(), normaliser.outputs(self.outputs).double()
         count, width = x.shape
         device = inputs.device
-        noise, scale, freedom = self.noise, torch.ones_like(self.noise), math.inf
+        noise, scale = self.noise, torch.ones_like(self.noise)
+        learned = count and (self.with_gap or not self.noise_known)
+        most = freedom = max(count / ROWS_OF_A_FREEDOM, LEAST_FREEDOM) if learned else math.inf
         gap = GapCovariance.before_data(width, self.expected) if self.with_gap else None
         rows = torch.randperm(count, generator=generator)[:PARAMETER_ROWS].to(device)
         trust = torch.ones(count, dtype=torch.float64, device=device)
@@ -201,7 +206,8 @@ class _Case:
             if count >= ROWS_FOR_TAILS:
                 covariance = _covariance(gap, seen, noise, trust)
                 surprise, _ = left_out(left, covariance if known is None else covariance + known, noise, trust)
-                freedom, trust = student_weights(surprise.sum(dim=1), len(noise))
+                found, trust = student_weights(surprise.sum(dim=1), len(noise))
+                freedom = min(found, most)
                 scale = typical_scale(surprise, freedom)
         factor = torch.linalg.cholesky(_covariance(gap, seen, noise, trust))
         every = y[None]

@@ -21,6 +21,10 @@ _MEDIAN_SQUARE = 0.455
 """Median of a squared standard normal number."""
 SCALES = (0.3, 2.0)
 """Within which a doubt is corrected."""
+WIDTH_DOUBT = 0.1
+"""Standard deviation of the logarithm of what a doubt is wrong by, before rows tell."""
+VARIANCE_OF_MEDIAN = 1.36
+"""Of the logarithm of half of the rows' error, times their number: ``1 / (4 f(m)^2 m^2)`` for a normal one's size."""
 
 
 def first_trust(left: Tensor, covariance: Callable[[Tensor], Tensor], noise: Tensor) -> Tensor:
@@ -81,12 +85,16 @@ def student_weights(surprise: Tensor, outputs: int) -> tuple[float, Tensor]:
 def typical_scale(surprise: Tensor, freedom: float) -> Tensor:
     """Of each output, by what a doubt is to be multiplied for half of the rows to lie within it (O,).
 
+    As far as rows can tell: half of a few is itself a guess, and a doubt is rarely wrong by much.
+
     Args:
         surprise: squared (n, O).
         freedom: of the Student distribution that the doubt stands for.
     """
     half = float(student.ppf(0.75, min(freedom, 1e6))) ** 2
-    return (surprise.median(dim=0).values / half).sqrt().clamp(*SCALES)
+    scale = (surprise.median(dim=0).values / half).sqrt().clamp(*SCALES)
+    told: Tensor = scale ** (WIDTH_DOUBT**2 / (WIDTH_DOUBT**2 + VARIANCE_OF_MEDIAN / len(surprise)))
+    return told
 
 
 def tail_scales(freedom: float, count: int) -> Tensor:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from scipy.stats import norm
+from scipy.stats import t as student
 from torch import Tensor
 
 from learning import function_posterior
@@ -302,8 +304,31 @@ class TestOutliers:
         theirs = ordinary(self.x, y, self.at, found.gap, raw_noise(found))[0]
         assert (self.error(theirs) > 3.0 * ours).all()
 
-    def test_what_is_learned_of_few_rows_is_gaussian(self):
-        assert math.isinf(infer(None, self.x[:39], self.spoilt(3.0)[:39], UNITS, self.noise).freedom)
+    def test_of_few_rows_they_are_told_no_more_than_of_clean_ones(self):
+        found, clean = (infer(None, self.x[:39], v[:39], UNITS, self.noise) for v in (self.spoilt(3.0), self.y))
+        assert found.freedom == clean.freedom
+
+
+class TestFewRows:
+    """What is learned of a covariance from few rows is uncertain."""
+
+    def test_predictions_have_heavy_tails_where_it_is_learned(self):
+        x, y = rows(15)
+        assert infer(None, x, y, UNITS, NOISE).freedom < 10.0
+        assert infer(Linear(), x, y, UNITS, NOISE, with_gap=False).freedom < 10.0
+        assert math.isinf(infer(Linear(), x, y, UNITS, NOISE, with_gap=False, noise_known=True).freedom)
+        assert math.isinf(infer(Linear(), EMPTY, EMPTY, UNITS, NOISE).freedom)
+
+    def test_other_rows_are_less_surprising_with_them(self):
+        """Over eight draws of twelve rows, of their marginal densities by scipy."""
+        gained = []
+        for seed in range(8):
+            found = infer(None, *rows(12, seed), UNITS, NOISE, seed=seed)
+            x, y = rows(200, 100 + seed)
+            mean, std = (v.double().numpy() for v in found.predict(x))
+            off = (y.double().numpy() - mean) / std
+            gained.append((student(found.freedom).logpdf(off) - norm.logpdf(off)).mean())
+        assert np.mean(gained) > 0.02
 
 
 def test_the_same_seed_gives_the_same_numbers():

@@ -98,7 +98,17 @@ class TestTypicalScale:
         found = typical_scale(torch.tensor(draws**2), 4.0)
         assert np.allclose(found, [1.5, 0.5], rtol=0.03)
         within = np.abs(draws) <= found.numpy() * student.ppf(0.75, 4.0)
-        assert np.allclose(within.mean(axis=0), 0.5, atol=1e-4)
+        assert np.allclose(within.mean(axis=0), 0.5, atol=4e-3)
+
+    def test_of_few_rows_it_is_what_a_doubt_is_wrong_by_on_average(self):
+        """Of doubts that are wrong by a tenth: regression of the truth on what 50 rows tell has slope one."""
+        rng = np.random.default_rng(8)
+        truth = 0.1 * rng.normal(size=4000)
+        draws = np.exp(truth) * rng.normal(size=(51, 4000))
+        found = np.log(typical_scale(torch.tensor(draws**2), math.inf).numpy())
+        assert np.polyfit(found, truth, 1)[0] == pytest.approx(1.0, abs=0.1)
+        half = np.log(np.median(np.abs(draws), axis=0) / norm.ppf(0.75))
+        assert ((found - truth) ** 2).mean() < 0.4 * ((half - truth) ** 2).mean()
 
     def test_a_few_wild_rows_do_not_count(self):
         draws = np.random.default_rng(7).normal(size=(1001, 1))
@@ -106,6 +116,5 @@ class TestTypicalScale:
         assert float(typical_scale(torch.tensor(draws**2), math.inf)) == pytest.approx(1.0, rel=0.1)
 
     def test_it_stays_within_bounds(self):
-        assert torch.allclose(
-            typical_scale(torch.tensor([[1e-9, 1e9]] * 5), 4.0), torch.tensor(SCALES), rtol=1e-6, atol=0.0
-        )
+        found = typical_scale(torch.tensor([[1e-9, 1e9]] * 5000), 4.0)
+        assert torch.allclose(found, torch.tensor(SCALES), rtol=0.04, atol=0.0)
