@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from carlab.core.geofence import stopping_distance_m
+from carlab.core.geofence import each_can_stop_inside, stopping_distance_m
 from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import Task
@@ -84,10 +84,7 @@ class ModelEnv(VecEnv):
         self._features = torch.zeros((cars, width), device=self._device)
         self._ticks = np.zeros(cars, dtype=np.int64)
         self._actions = torch.zeros((cars, ACTION_SIZE), device=self._device)
-        corners = np.array(self._envelope.arena_m or task.arena_m).reshape(-1, 2)
-        far: NDArray[np.float64] = np.full(2, np.inf)
-        self._low: NDArray[np.float64] = corners.min(axis=0) if len(corners) else -far
-        self._high: NDArray[np.float64] = corners.max(axis=0) if len(corners) else far
+        self._arena_m = self._envelope.arena_m or task.arena_m
 
     def reset(self) -> NDArray[np.float32]:
         """Start all cars; their episodes end at different ticks, so that no batch is all starts."""
@@ -166,16 +163,14 @@ class ModelEnv(VecEnv):
         return torch.where(asked.abs() <= previous.abs(), asked, held)
 
     def _stopped(self, features: Tensor) -> NDArray[np.bool_]:
-        """Whether the gate stops a car: too fast, or not able to stop inside the arena's bounding box. On the CPU."""
+        """Whether the gate stops a car: too fast, or not able to stop inside the arena. On the CPU."""
         state = decode_state(features).numpy()
         speed = np.hypot(state[:, 3], state[:, 4])
         course = state[:, 2] + np.arctan2(state[:, 4], state[:, 3])
         needed = stopping_distance_m(speed, self._envelope.reaction_s, self._envelope.deceleration_mps2)
-        along = needed[:, None] * np.stack([np.cos(course), np.sin(course)], axis=1)
-        inside = np.ones(len(state), dtype=bool)
-        for place in (state[:, :2], state[:, :2] + along):
-            inside &= np.all((place >= self._low) & (place <= self._high), axis=1)
-        found: NDArray[np.bool_] = ~(inside & (speed <= self._envelope.max_speed_mps))
+        found: NDArray[np.bool_] = ~(speed <= self._envelope.max_speed_mps)
+        if self._arena_m:
+            found |= ~each_can_stop_inside(self._arena_m, state[:, :2], course, needed)
         return found
 
     def _start(self, cars: NDArray[np.int64]) -> NDArray[np.float32]:

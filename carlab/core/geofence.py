@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import CarState, FloatArray
@@ -70,6 +71,42 @@ def can_stop_inside(corners_m: Polygon, state: CarState, reaction_s: float, dece
     needed = stopping_distance_m(speed, reaction_s, deceleration_mps2)
     # From inside, every way meets an edge somewhere: infinity means a course that is none, or an edge just touched.
     return bool(needed < free_distance_m(corners_m, state.x_m, state.y_m, course_rad) < math.inf)
+
+
+def each_can_stop_inside(
+    corners_m: Polygon, places_m: FloatArray, course_rad: FloatArray, needed_m: FloatArray
+) -> NDArray[np.bool_]:
+    """``can_stop_inside`` of many cars at once.
+
+    Args:
+        corners_m: the polygon.
+        places_m: where the cars are (n, 2).
+        course_rad: which way they move over ground (n,).
+        needed_m: their stopping distances (n,).
+
+    Returns:
+        True where a car can (n,).
+    """
+    corners = corners_array(corners_m)
+    before = np.roll(corners, 1, axis=0)
+    edge = corners - before
+    to = before - places_m[:, None]  # (n, edges, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing = places_m[:, :1] - edge[:, 0] / edge[:, 1] * to[:, :, 1] + to[:, :, 0]
+        spans = (corners[:, 1] > places_m[:, 1:]) != (before[:, 1] > places_m[:, 1:])
+        inside = np.sum(spans & (places_m[:, :1] < crossing), axis=1) % 2 == 1
+        direction = np.stack([np.cos(course_rad), np.sin(course_rad)], axis=1)[:, None]
+        cross = _cross(direction, edge)
+        along, on_edge = _cross(to, edge) / cross, _cross(to, direction) / cross
+    met = (np.abs(cross) > 1e-12) & (along >= 0.0) & (on_edge >= -1e-9) & (on_edge <= 1.0 + 1e-9)
+    free = np.where(met, along, np.inf).min(axis=1)
+    found: NDArray[np.bool_] = inside & (needed_m < free) & (free < np.inf)
+    return found
+
+
+def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    found: FloatArray = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    return found
 
 
 def rectangle(x_low_m: float, x_high_m: float, y_low_m: float, y_high_m: float) -> tuple[tuple[float, float], ...]:

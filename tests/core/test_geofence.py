@@ -11,6 +11,7 @@ from carlab.core.geofence import (
     as_polygon,
     can_stop_inside,
     contains,
+    each_can_stop_inside,
     free_distance_m,
     rectangle,
     stopping_distance_m,
@@ -62,6 +63,37 @@ def test_the_nearest_of_several_edges_on_the_way_counts_in_either_sense() -> Non
 )
 def test_a_car_can_stop_inside_where_its_way_over_ground_is_long_enough(state: CarState, can: bool) -> None:
     assert can_stop_inside(rectangle(-1.0, 1.0, -1.0, 1.0), state, 0.1, 2.0) is can
+
+
+def test_of_many_cars_each_can_stop_where_its_way_stays_inside(rng: np.random.Generator) -> None:
+    """Against matplotlib at 400 points of each way; those that end within a hundredth of an edge are not asked."""
+    places, course = rng.uniform(-0.3, 4.3, (1500, 2)), rng.uniform(-4.0, 4.0, 1500)
+    needed = rng.uniform(0.0, 2.0, 1500)
+
+    def stays(corners: tuple[tuple[float, float], ...], share: float) -> np.ndarray:
+        way = share * needed[:, None, None] * np.linspace(0.0, 1.0, 400)[None, :, None]
+        points = places[:, None] + way * np.stack([np.cos(course), np.sin(course)], axis=1)[:, None]
+        inside = MplPath([*corners, corners[0]]).contains_points(points.reshape(-1, 2)).reshape(1500, 400)
+        return inside.all(axis=1)
+
+    for corners in (CONCAVE, CONCAVE[::-1], rectangle(-0.2, 3.0, 0.5, 4.0)):
+        found = each_can_stop_inside(corners, places, course, needed)
+        longer, shorter = stays(corners, 1.02), stays(corners, 0.98)
+        clear = longer == shorter
+        assert clear.sum() > 1400
+        assert np.array_equal(found[clear], shorter[clear])
+        assert 200 < found.sum() < 1300
+
+
+def test_of_many_cars_it_is_what_is_said_of_each(rng: np.random.Generator) -> None:
+    places, course = rng.uniform(-0.3, 4.3, (300, 2)), rng.uniform(-4.0, 4.0, 300)
+    speed = rng.uniform(-3.0, 3.0, 300)
+    places[0, 0], course[1] = math.nan, math.nan
+    needed = stopping_distance_m(np.abs(speed), 0.1, 2.0)
+    # Driven backwards, the way over ground is the other one.
+    found = each_can_stop_inside(CONCAVE, places, course + np.where(speed < 0.0, math.pi, 0.0), needed)
+    states = [CarState(x, y, yaw, v) for (x, y), yaw, v in zip(places, course, speed, strict=True)]
+    assert found.tolist() == [can_stop_inside(CONCAVE, s, 0.1, 2.0) for s in states]
 
 
 def test_stopping_distance_is_the_closed_form() -> None:

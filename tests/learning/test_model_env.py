@@ -110,9 +110,14 @@ def test_commands_pass_the_gate_of_the_real_car() -> None:
     assert max(abs(a.throttle) for a in sent) > 0.3
 
 
-def test_a_car_ends_where_the_gate_would_stop_it() -> None:
+ROOM = ((-1.0, -1.5), (2.0, -1.5), (2.0, 0.5), (0.5, 0.5), (0.5, -0.5), (-1.0, -0.5))
+"""With a corner that is not part of it."""
+
+
+@pytest.mark.parametrize("arena_m", [rectangle(-1.0, 2.0, -1.5, 0.5), ROOM])
+def test_a_car_ends_where_the_gate_would_stop_it(arena_m) -> None:
     """For good, not cut off: there is nothing to be had from a car that was stopped."""
-    envelope = SafetyEnvelope(max_speed_mps=2.5, arena_m=rectangle(-1.0, 2.0, -1.5, 0.5))
+    envelope = SafetyEnvelope(max_speed_mps=2.5, arena_m=arena_m)
     rng = np.random.default_rng(0)
     states = rng.uniform([-1.0, -1.5, -math.pi, -3.0, -1.0, -4.0], [2.0, 0.5, math.pi, 3.0, 1.0, 4.0], (600, 6))
     states[::10] = [2.1, 0.0, 0.3, 0.0, 0.0, 0.0]  # it stands outside
