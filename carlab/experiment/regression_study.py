@@ -109,11 +109,12 @@ class _Task:
         if case.name == "1d":
             return FsvgdSettings(
                 steps=self.steps or 20_000, batch=4, measurement_points=8, bandwidth=1.0, natural=False,
-                noise_std=noise, learn_noise=False, seed=self.seed,
+                falling_rate=False, noise_std=noise, learn_noise=False, seed=self.seed,
             )  # fmt: skip
         return FsvgdSettings(
-            steps=steps, batch=8, measurement_points=32, bandwidth=2.0, natural=False, noise_std=noise, seed=self.seed
-        )
+            steps=steps, batch=8, measurement_points=32, bandwidth=2.0, natural=False, falling_rate=False,
+            noise_std=noise, noise_rate=1.0, seed=self.seed,
+        )  # fmt: skip
 
     def pool(self) -> Tensor:
         """Inputs of the domain."""

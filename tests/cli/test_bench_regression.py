@@ -1,6 +1,7 @@
 """``carlab bench regression``: figures that follow from the definition, files that hold what was printed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,11 @@ from scipy.stats import norm
 
 from carlab.cli import run
 from carlab.core.errors import ConfigError, DataError
+from carlab.experiment import regression_study
 from carlab.experiment.regression_cases import CASES
 from carlab.experiment.regression_study import run_study, summarised
 from learning.domain_models import draw_parameters
+from learning.fsvgd import fit
 from learning.ridge import Ridge
 
 
@@ -54,6 +57,27 @@ def test_what_is_printed_is_written(tmp_path, capsys, monkeypatch):
         assert row["nll_standard_error"] == pytest.approx(np.std(own, ddof=1) / np.sqrt(2))
         assert f"{row['nll']:.2f}" in printed
     assert out.with_suffix(".png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("rows", "steps"), [(5, 5000), (400, 8000)])
+def test_the_authors_way_is_that_of_their_public_code(monkeypatch, rows, steps):
+    """lasgroup/simulation_transfer at 547fa14, run_regression_exp.py and the commands of its sweeps."""
+    asked = []
+
+    def instead(inputs, outputs, pool, prior, normaliser, settings):
+        asked.append(settings)
+        return fit(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
+
+    monkeypatch.setattr(regression_study, "fit", instead)
+    list(run_study("pendulum", rows=(rows,), seeds=1, methods=("Sim-FSVGD",), way="authors"))
+    (told,) = asked
+    assert (told.particles, told.hidden, told.batch, told.measurement_points) == (20, (64, 64, 64), 8, 32)
+    assert (told.bandwidth, told.learning_rate, told.weight_decay, told.steps) == (2.0, 1e-3, 1e-3, steps)
+    # One optimiser for networks and noise, without a schedule: a noise that learns faster vanishes at five rows.
+    assert told.learn_noise
+    assert told.noise_rate == 1.0
+    assert not told.falling_rate
+    assert np.allclose(told.noise_std, np.array([0.05, 0.05, 0.5]) / np.array([0.158, 0.150, 0.951]))
 
 
 def test_a_study_is_the_same_again():
