@@ -34,6 +34,9 @@ ROWS_FOR_NOISE = 40
 """Rows from which on what particles miss is counted at the data: fewer tell nothing of the places between them."""
 LEAST_NOISE_SHARE = 0.5
 """Of the measurements' variance, what is left as noise at least where particles spread more than they should."""
+FARTHEST_MISS = 3.0
+"""In units of the noise, what particles miss of the data counts as at most: of a row that nothing else is like, as in
+collisions, they can miss a hundred, and that says nothing of the noise elsewhere."""
 NEARBY = 0.5
 """How far from the data its neighbourhood reaches at most, in units of the inputs."""
 
@@ -118,13 +121,14 @@ def fit_particles(
                 progress(step + 1)
         if not bool(torch.isfinite(numbers).all()):
             raise DataError("The fit diverged; fit again with a smaller learning rate.")
+        most = math.inf
         if len(target.inputs) >= ROWS_FOR_NOISE:
             sets = target.data[:, None]
             mean, covariance = target.marginals(sets)
-            weight = torch.ones_like(mean)
+            weight, most = torch.ones_like(mean), FARTHEST_MISS
         found = network(numbers, normaliser.inputs(sets.flatten(0, 1))).view(-1, *sets.shape[:2], outputs)
         variance = covariance.diagonal(dim1=2, dim2=3).to(found)
-        noise = _noise(found.transpose(2, 3), mean, variance, weight, target.noise_std)
+        noise = _noise(found.transpose(2, 3), mean, variance, weight, target.noise_std, most)
     tails = tail_scales(target.freedom, len(numbers)).to(numbers)
     return Posterior(network, numbers, noise, normaliser, tails)
 
@@ -169,14 +173,16 @@ def measurement_points(
     return torch.cat(found)
 
 
-def _noise(values: Tensor, mean: Tensor, variance: Tensor, weight: Tensor, noise_std: Tensor) -> Tensor:
+def _noise(values: Tensor, mean: Tensor, variance: Tensor, weight: Tensor, noise_std: Tensor, most: float) -> Tensor:
     """Noise (O,) of particles with values (L, B, O, N), of a target's noise and what they miss of its marginals.
 
-    The mean square of a particle's error is that of their mean and their spread; the target's variance is allowed.
+    The mean square of a particle's error is that of their mean and their spread; the target's variance is allowed. What
+    they miss in one place counts as ``most`` noises at most.
     """
     off = values - mean
-    missed = weight * (2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + variance)
-    beyond = missed.sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
+    missed = 2.0 * off.mean(dim=0) ** 2 - (off**2).mean(dim=0) + variance
+    missed = torch.minimum(missed, (most * noise_std)[:, None] ** 2)
+    beyond = (weight * missed).sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
     return (noise_std**2 + beyond).clamp_min(LEAST_NOISE_SHARE * noise_std**2).sqrt()
 
 

@@ -148,6 +148,19 @@ class TestNoise:
         assert np.allclose(found.noise_std, theirs, rtol=2e-3)
         assert (bool((found.noise_std < 1.5 * target.noise_std).all())) is at_data
 
+    @pytest.mark.parametrize("far", [5.0, 50.0])
+    def test_one_row_that_is_missed_by_far_says_little_of_the_noise(self, far):
+        """Sixty rows at 0.3, which the particles meet, and one of great moment far from all others."""
+        x = torch.cat([torch.linspace(8.0, 12.0, 60), torch.tensor([60.0])])[:, None]
+        y = torch.tensor([[1.0 + 2.0 * 0.3, -3.0 + 0.5 * 0.3]]).repeat(61, 1)
+        y = y + torch.tensor([[0.2, 0.2]]) * torch.randn((61, 2), generator=generator(4))
+        y[-1] += far
+        target = infer(None, x, y, self.units, torch.tensor([0.2, 0.2]), gap_std=torch.tensor([0.6, 0.6]))
+        found = fit_particles(target, self.points, self.settings, start=constant(*[(0.3, 0.3)] * 2))
+        missed = (target.predict(x[-1:])[0] - self.units.raw_outputs(torch.tensor([0.3, 0.3]))) / self.units.output_std
+        assert (missed[0] > 4.0 * target.noise_std).any()
+        assert torch.allclose(found.noise_std, target.noise_std, rtol=0.25)
+
     def test_half_of_the_measurements_variance_is_left_at_least(self):
         found = fit_particles(self.target, self.points, self.settings, start=constant((2.0, 2.0), (-2.0, -2.0)))
         assert np.allclose(found.noise_std, [0.1 * np.sqrt(0.5), 0.4 * np.sqrt(0.5)], rtol=1e-5)
