@@ -47,7 +47,8 @@ class FunctionPosterior:
     Attributes:
         normaliser: of inputs and outputs.
         noise_std: of the measurements (O,).
-        freedom: degrees of freedom of their multivariate Student distribution; infinite for a Gaussian.
+        freedom: degrees of freedom of their multivariate Student distribution, at most what the rows that chose the
+            covariance allow; infinite for a Gaussian.
         model: the simulator; zero where it is None.
         parameters: draws of its parameters given the data (P, K).
         gap: covariance of what it leaves out; nothing where it is None.
