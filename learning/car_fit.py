@@ -25,7 +25,7 @@ from learning.transitions import OUTPUTS, Transitions
 
 Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
 LearnedCar = CarDynamics | WorldDynamics
-FILE_VERSION = 3
+FILE_VERSION = 4
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
 """Expected noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
 EXPECTED_GAP = 0.3
@@ -120,7 +120,7 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
         "activation": posterior.network.activation,
         "parameters": posterior.parameters,
         "noise_std": posterior.noise_std,
-        "tails": posterior.tails,
+        "freedom": posterior.freedom,
         "units": [units.input_mean, units.input_std, units.output_mean, units.output_std],
     }
     torch.save(content, path)
@@ -139,7 +139,7 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
         parameters: Tensor = content["parameters"]
         found = parameters.shape[1]
         posterior = Posterior(
-            network, parameters, content["noise_std"], Normaliser(*content["units"]), content["tails"]
+            network, parameters, content["noise_std"], Normaliser(*content["units"]), float(content["freedom"])
         )  # fmt: skip
         frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
         car: LearnedCar = frames[content.get("frame", "body")](posterior.to(device), content["history"])

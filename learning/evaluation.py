@@ -6,7 +6,10 @@ import math
 from dataclasses import dataclass
 
 import torch
+from scipy.special import stdtr
 from torch import Tensor
+
+from learning.outliers import log_student, tail_scales
 
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.977, 0.99)
 """Nominal coverages at which calibration is read."""
@@ -14,14 +17,18 @@ LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.977, 0.99)
 
 @dataclass(frozen=True, slots=True)
 class Mixture:
-    """Equally weighted Gaussians: means (L, N, O) and standard deviations that broadcast against them.
+    """Equally weighted components, each Gaussian or Student's.
 
-    ``tails`` (L,) is what the width of each is multiplied by where together they are a distribution with heavy tails.
+    Attributes:
+        means: (L, N, O).
+        stds: scales that broadcast against them; of Gaussians the standard deviations.
+        freedom: degrees of freedom of the components' multivariate Student distributions: one scale of a row widens
+            all of its outputs (Lange, Little and Taylor 1989, section 2); infinite for Gaussians.
     """
 
     means: Tensor
     stds: Tensor
-    tails: Tensor | None = None
+    freedom: float = math.inf
 
     @property
     def mean(self) -> Tensor:
@@ -35,8 +42,12 @@ class Mixture:
 
     @property
     def aleatoric_std(self) -> Tensor:
-        """Root of the components' mean variance (N, O)."""
-        return (self.stds**2).expand_as(self.means).mean(dim=0).sqrt()
+        """Root of the components' mean variance (N, O); infinite for two degrees of freedom or fewer."""
+        if math.isinf(self.freedom):
+            widened = 1.0
+        else:
+            widened = self.freedom / (self.freedom - 2.0) if self.freedom > 2.0 else math.inf
+        return (widened * self.stds**2).expand_as(self.means).mean(dim=0).sqrt()
 
     @property
     def std(self) -> Tensor:
@@ -44,11 +55,11 @@ class Mixture:
         return (self.epistemic_std**2 + self.aleatoric_std**2).sqrt()
 
     def smoothed(self, bandwidth: float = 0.9) -> Mixture:
-        """The same mean and, unless there are heavy tails, variance, with components that overlap.
+        """The same mean and, of Gaussians, variance, with components that overlap.
 
         A few components far apart against their own width are a poor picture of the density that they are drawn from,
         the more outputs the worse. Each is drawn to the mean by ``sqrt(1 - b^2)`` and widened by the share ``b^2`` of
-        the spread (West 1993, "Approximating posterior distributions by mixture", section 3.2); 1 makes it a Gaussian.
+        the spread (West 1993, "Approximating posterior distributions by mixture", section 3.2); 1 makes them one.
         Where there are heavy tails, that share of the spread has them as well: they are those of rows left out, in
         units of noise and function's doubt together.
 
@@ -58,15 +69,22 @@ class Mixture:
         shrink = math.sqrt(1.0 - bandwidth**2)
         means = self.mean + shrink * (self.means - self.mean)
         spread = bandwidth * self.epistemic_std
-        if self.tails is not None:
-            spread = self.tails[:, None, None] * spread
-        return Mixture(means, (self.stds**2 + spread**2).sqrt())
+        return Mixture(means, (self.stds**2 + spread**2).sqrt(), self.freedom)
+
+    def gaussians(self, each: int = 20) -> Mixture:
+        """Nearly the same of Gaussians alone, ``each`` of a Student component; the farthest of its tails is lost."""
+        if math.isinf(self.freedom):
+            return self
+        scales = tail_scales(self.freedom, each).to(self.stds)[:, None, None, None]
+        means = self.means.expand(each, *self.means.shape)
+        return Mixture(means.flatten(0, 1), (scales * self.stds.expand_as(self.means)).flatten(0, 1))
 
     def log_density(self, targets: Tensor) -> Tensor:
         """Joint log density (N,) of targets (N, O)."""
-        white = (targets - self.means) / self.stds
-        each = -0.5 * white**2 - self.stds.log() - 0.5 * math.log(2.0 * math.pi)
-        return torch.logsumexp(each.sum(dim=2), dim=0) - math.log(len(self.means))
+        square = (((targets - self.means) / self.stds) ** 2).sum(dim=2)
+        widths = self.stds.log().expand_as(self.means).sum(dim=2)
+        each = log_student(square, self.means.shape[2], self.freedom) - widths
+        return torch.logsumexp(each, dim=0) - math.log(len(self.means))
 
 
 def negative_log_likelihood(prediction: Mixture, targets: Tensor) -> float:
@@ -85,7 +103,11 @@ def calibration_error(prediction: Mixture, targets: Tensor) -> float:
     Central intervals of the mixture's own distribution function, output by output. Of one Gaussian they are those by
     mean and standard deviation that the authors of Sim-FSVGD measure.
     """
-    below = torch.special.ndtr((targets - prediction.means) / prediction.stds).mean(dim=0)
+    white = (targets - prediction.means) / prediction.stds
+    if math.isinf(prediction.freedom):
+        below = torch.special.ndtr(white).mean(dim=0)
+    else:
+        below = torch.from_numpy(stdtr(prediction.freedom, white.cpu().double().numpy())).mean(dim=0).to(white)
     reached = (2.0 * below - 1.0).abs()
     levels = torch.tensor(LEVELS, dtype=reached.dtype, device=reached.device)
     covered = (reached[None] <= levels[:, None, None]).to(reached.dtype).mean(dim=1)

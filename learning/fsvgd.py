@@ -22,6 +22,7 @@ from carlab.core.errors import DataError
 from learning.evaluation import Mixture, negative_log_likelihood
 from learning.function_prior import JITTER, Marginal, RbfCovariance, gaussian_process, simulator_marginal
 from learning.normaliser import Normaliser
+from learning.outliers import tail_scales
 from learning.particles import Network
 from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
@@ -134,28 +135,26 @@ class Posterior:
         parameters: (L, P).
         noise_std: of the likelihood, normalised (O,).
         normaliser: between raw and normalised units.
-        tails: of each particle, what its noise is multiplied by (L,); ones unless given. A mixture of several is a
-            noise with heavy tails.
+        freedom: degrees of freedom of the noise's multivariate Student distribution; infinite for a Gaussian.
     """
 
     network: Network
     parameters: Tensor
     noise_std: Tensor
     normaliser: Normaliser
-    tails: Tensor | None = None
+    freedom: float = math.inf
 
     @property
     def noise_stds(self) -> Tensor:
-        """Noise of each particle, normalised (L, 1, O)."""
-        tails = torch.ones(len(self.parameters)).to(self.noise_std) if self.tails is None else self.tails
-        return tails[:, None, None] * self.noise_std
+        """Noise of each particle to draw from, normalised (L, 1, O); some are wide, so that all have the tails."""
+        return tail_scales(self.freedom, len(self.parameters)).to(self.noise_std)[:, None, None] * self.noise_std
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at raw inputs (N, D), in raw units."""
         with torch.no_grad():
             values = self.network(self.parameters, self.seen(inputs))
-        means, stds = self.normaliser.raw_outputs(values), self.noise_stds * self.normaliser.output_std
-        return Mixture(means, stds, self.tails)
+        noise = (self.noise_std * self.normaliser.output_std).expand(len(values), 1, -1)
+        return Mixture(self.normaliser.raw_outputs(values), noise, self.freedom)
 
     def seen(self, inputs: Tensor) -> Tensor:
         """What the networks are given for raw inputs (N, D)."""
@@ -163,9 +162,8 @@ class Posterior:
 
     def to(self, device: torch.device | str) -> Posterior:
         """The same on a device."""
-        tails = None if self.tails is None else self.tails.to(device)
         own = (self.parameters.to(device), self.noise_std.to(device), self.normaliser.to(device))
-        return Posterior(self.network, *own, tails)
+        return Posterior(self.network, *own, self.freedom)
 
 
 @dataclass

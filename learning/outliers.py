@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 
 import torch
 from scipy.stats import chi2
@@ -97,6 +98,7 @@ def typical_scale(surprise: Tensor, freedom: float) -> Tensor:
     return told
 
 
+@cache
 def tail_scales(freedom: float, count: int) -> Tensor:
     """Scales (count,) of Gaussians whose even mixture is nearly a Student distribution."""
     if math.isinf(freedom):

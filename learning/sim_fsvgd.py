@@ -20,7 +20,6 @@ from learning.domain_models import DomainModel
 from learning.fsvgd import Posterior
 from learning.function_posterior import JITTER, FunctionPosterior
 from learning.normaliser import Normaliser
-from learning.outliers import tail_scales
 from learning.particles import Activation, Network
 from learning.stein import moment_direction
 
@@ -129,8 +128,7 @@ def fit_particles(
         found = network(numbers, normaliser.inputs(sets.flatten(0, 1))).view(-1, *sets.shape[:2], outputs)
         variance = covariance.diagonal(dim1=2, dim2=3).to(found)
         noise = _noise(found.transpose(2, 3), mean, variance, weight, target.noise_std, most)
-    tails = tail_scales(target.freedom, len(numbers)).to(numbers)
-    return Posterior(network, numbers, noise, normaliser, tails)
+    return Posterior(network, numbers, noise, normaliser, target.freedom)
 
 
 def measurement_points(

@@ -20,13 +20,15 @@ def seven_outputs(prediction: Mixture, velocity_mps: Tensor, yaw_rad: Tensor) ->
     """The same components with the exact mean and variance of each of the seven outputs, as independent Gaussians.
 
     Args:
-        prediction: changes of the six ``transitions.OUTPUTS`` over a step, of components (L, N, 6) independent in each.
+        prediction: changes of the six ``transitions.OUTPUTS`` over a step, of components (L, N, 6) independent in each;
+            of Student's distributions several Gaussians each.
         velocity_mps: vx, vy along the body at the step's start (N, 2).
         yaw_rad: there (N,).
 
     Returns:
         Change of x and y, sine and cosine of the yaw, vx, vy in the world, the change of the yaw rate (L, N, 7).
     """
+    prediction = prediction.gaussians()
     mean = prediction.means.double()
     variance = (prediction.stds.double() ** 2).expand_as(mean)
     speed = mean[..., 3:5] + velocity_mps.double()

@@ -39,6 +39,9 @@ Progress = Callable[[str, int, int], None]
 EXPECTED_FUNCTION = 1.0
 """Size of a function of which nothing is known, in units of the outputs."""
 LEAST_GAP = 0.03
+HIDDEN, STEPS = (64, 64), 8000
+"""Of particles: on rows of train_1 of the ETH car 0.07 nats nearer to their target than three layers in 3000 steps,
+in time alike to three layers in 6000."""
 POOL = 1024
 DRAWS = 2048
 LEAST_RIDGE = 3
@@ -142,8 +145,8 @@ class _Task:
             noise_known=noise_std is not None or not case.learn_noise, seed=self.seed,
         )  # fmt: skip
         points = measurement_points(simulator or case.prior, self.data.inputs, normaliser, generator)
-        steps = self.steps or ParticleSettings().steps
-        return Particles(fit_particles(posterior, points, ParticleSettings(steps=steps, seed=self.seed)))
+        settings = ParticleSettings(hidden=HIDDEN, steps=self.steps or STEPS, seed=self.seed)
+        return Particles(fit_particles(posterior, points, settings))
 
     def sim_fsvgd(self, *, gap: bool) -> Model:
         """Particles under draws of the simulator."""
@@ -210,7 +213,8 @@ class _Linear:
 
     def predict(self, inputs: Tensor) -> Mixture:
         mean, std = self.ridge(inputs.cpu().double().numpy()), self.ridge.std
-        return Mixture(*(torch.from_numpy(v).to(inputs.device) for v in (mean[None], std[None, None])))
+        means, stds = (torch.from_numpy(v).to(inputs.device) for v in (mean[None], std[None, None]))
+        return Mixture(means, stds)
 
 
 METHODS: dict[str, Callable[[_Task], Model]] = {

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2
 from torch import Tensor
 
 from carlab.cars import choose_car
@@ -91,25 +92,29 @@ def test_without_a_history_a_step_forgets_the_command() -> None:
     assert after[0].tolist() == pytest.approx([0.9, 2.2, 0.0, -1.0, 0.6, 0.0, -0.2], abs=1e-6)
 
 
-def known_car(values: Tensor, tails: Tensor | None = None, noise: float = 0.5) -> CarDynamics:
+def known_car(values: Tensor, freedom: float = math.inf, noise: float = 0.5) -> CarDynamics:
     """Particles that each say one value (L, 6), whatever the input."""
     network = Network(INPUTS, 6, (4,))
     parameters = torch.zeros(len(values), network.parameters)
     parameters[:, -6:] = values
     units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.full((6,), 0.3), torch.arange(1.0, 7.0))
-    return CarDynamics(Posterior(network, parameters, torch.full((6,), noise), units, tails), HISTORY)
+    return CarDynamics(Posterior(network, parameters, torch.full((6,), noise), units, freedom), HISTORY)
 
 
-@pytest.mark.parametrize("tails", [None, torch.tensor([0.5, 1.0, 1.5, 3.0])])
-def test_draws_are_those_of_the_mixture(tails: Tensor | None) -> None:
-    """Equal shares of four Gaussians: mean and variance by the law of total variance, kurtosis by their moments."""
+@pytest.mark.parametrize("freedom", [math.inf, 5.0])
+def test_draws_are_those_of_the_mixture(freedom: float) -> None:
+    """Equal shares of four Gaussians: mean and variance by the law of total variance, kurtosis by their moments.
+
+    Of Student noise each has a scale of its own: the root of 5 over the middle of a quarter of chi square.
+    """
     values = torch.randn(4, 6, generator=torch.Generator().manual_seed(2))
-    car = known_car(values, tails, noise=0.85)
+    car = known_car(values, freedom, noise=0.85)
     count = 40_000
     drawn = car.sample(torch.zeros(count, INPUTS), torch.Generator().manual_seed(0)).double()
     unit = torch.arange(1.0, 7.0).double()
     means = 0.3 + values.double() * unit
-    stds = 0.85 * unit * (torch.ones(4) if tails is None else tails).double()[:, None]
+    scales = np.ones(4) if math.isinf(freedom) else np.sqrt(freedom / chi2.ppf([0.125, 0.375, 0.625, 0.875], freedom))
+    stds = 0.85 * unit * torch.from_numpy(scales)[:, None]
     mean = means.mean(dim=0)
     away = means - mean
     variance = (away**2 + stds**2).mean(dim=0)
@@ -119,6 +124,7 @@ def test_draws_are_those_of_the_mixture(tails: Tensor | None) -> None:
     assert torch.all((found - variance).abs() < 4 * ((fourth - variance**2) / count).sqrt())
     predicted = car.predict(torch.zeros(1, INPUTS))
     torch.testing.assert_close(predicted.mean[0].double(), mean, rtol=1e-5, atol=1e-5)
+    variance = (away**2).mean(dim=0) + (0.85 * unit) ** 2 * (1.0 if math.isinf(freedom) else 5.0 / 3.0)
     torch.testing.assert_close(predicted.std[0].double(), variance.sqrt(), rtol=1e-5, atol=1e-5)
 
 
@@ -172,17 +178,17 @@ def test_a_world_that_feeds_on_itself_does_not_run_away() -> None:
     assert rates[-1] == pytest.approx(24.0 + 95 * 2.0 * EDGE, rel=1e-3)
 
 
-def some_car(tails: Tensor | None = None) -> CarDynamics:
+def some_car(freedom: float = math.inf) -> CarDynamics:
     generator = torch.Generator().manual_seed(5)
     network = Network(INPUTS, 6, (8, 4), "silu")
     units = Normaliser(*(torch.rand(n, generator=generator) + 0.5 for n in (INPUTS, INPUTS, 6, 6)))
     noise = torch.rand(6, generator=generator)
-    return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, tails), HISTORY)
+    return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, freedom), HISTORY)
 
 
-@pytest.mark.parametrize("tails", [None, torch.tensor([0.5, 1.0, 2.0])])
-def test_a_car_from_its_file_predicts_alike(tmp_path: Path, tails: Tensor | None) -> None:
-    car = some_car(tails)
+@pytest.mark.parametrize("freedom", [math.inf, 2.5])
+def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float) -> None:
+    car = some_car(freedom)
     save_car(car, tmp_path / "car.pt")
     again = load_car(tmp_path / "car.pt")
     assert again.history == HISTORY
@@ -190,6 +196,7 @@ def test_a_car_from_its_file_predicts_alike(tmp_path: Path, tails: Tensor | None
     ours, theirs = car.predict(inputs), again.predict(inputs)
     assert torch.equal(ours.means, theirs.means)
     assert torch.equal(ours.stds, theirs.stds)
+    assert ours.freedom == theirs.freedom == freedom
     first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, again))
     assert torch.equal(first, second)
 

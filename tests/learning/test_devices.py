@@ -220,9 +220,8 @@ def test_figures_of_a_prediction(device: str) -> None:
     generator = torch.Generator().manual_seed(5)
     means, stds = torch.randn((4, 30, 3), generator=generator), 0.1 + torch.rand((4, 1, 3), generator=generator)
     targets = torch.randn((30, 3), generator=generator)
-    tails = torch.tensor([0.5, 0.8, 1.2, 2.0])
-    there = Mixture(means.to(device), stds.to(device), tails.to(device)).smoothed()
-    here = Mixture(means, stds, tails).smoothed()
+    there = Mixture(means.to(device), stds.to(device), 3.0).smoothed()
+    here = Mixture(means, stds, 3.0).smoothed()
     close(there.std, here.std)
     for figure in (negative_log_likelihood, calibration_error):
         assert figure(there, targets.to(device)) == pytest.approx(figure(here, targets), rel=1e-5)
@@ -275,8 +274,7 @@ def learned(device: str) -> CarDynamics:
     network = Network(width, 6, (16,))
     units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(6), torch.full((6,), 0.05))
     numbers = network.initial(5, torch.Generator().manual_seed(6))
-    tails = torch.linspace(0.5, 2.0, 5)
-    return CarDynamics(Posterior(network, numbers, torch.full((6,), 0.1), units, tails).to(device), HISTORY)
+    return CarDynamics(Posterior(network, numbers, torch.full((6,), 0.1), units, 3.0).to(device), HISTORY)
 
 
 TASKS = [ParkingTask(history_length=HISTORY, max_ticks=6), PathTask(history_length=HISTORY, max_ticks=6)]

@@ -1,9 +1,11 @@
 """Figures of merit against scipy and against draws."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
-from scipy.stats import norm
+from scipy.stats import multivariate_t, norm
 from scipy.stats import t as student
 
 from learning.evaluation import (
@@ -13,7 +15,6 @@ from learning.evaluation import (
     negative_log_likelihood,
     root_mean_square_error,
 )
-from learning.outliers import tail_scales
 
 
 def random(*shape, seed=0):
@@ -50,18 +51,33 @@ def test_calibration_sees_spreads_that_are_too_wide_or_too_narrow(factor, least,
     assert least <= error <= most
 
 
-def test_twenty_components_with_tails_are_nearer_to_a_student_distribution_than_those_without():
-    """Draws of one of scale 0.5, three fifths of it noise, as a mixture of as few components as there are particles."""
-    means = torch.from_numpy(norm.ppf((np.arange(20) + 0.5) / 20))
-    means = (0.4 * means / means.std(correction=0))[torch.randperm(20, generator=torch.Generator().manual_seed(1))]
-    tails = tail_scales(2.5, 20).double()
-    targets = torch.from_numpy(student(2.5, scale=0.5).rvs(20_000, random_state=0))[:, None]
-    exact = student(2.5, scale=0.5).logpdf(targets.numpy()).mean()
-    found = []
-    for own in (tails, None):
-        mixture = Mixture(means[:, None, None], 0.3 * tails[:, None, None], own)
-        found.append(float(mixture.smoothed().log_density(targets.expand(-1, 1)).mean()) - exact)
-    assert found[1] < 2.0 * found[0] < 0.0
+def test_components_of_student_noise_have_one_scale_for_all_outputs():
+    rng = np.random.default_rng(3)
+    means, targets, stds = rng.normal(size=(4, 6, 3)), 5.0 * rng.normal(size=(6, 3)), np.array([0.5, 1.0, 2.0])
+    found = Mixture(*(torch.from_numpy(v) for v in (means, stds[None, None])), 3.5).log_density(torch.tensor(targets))
+    each = [
+        [multivariate_t(m, np.diag(stds**2), 3.5).pdf(y) for m, y in zip(own, targets, strict=True)] for own in means
+    ]
+    assert np.allclose(found, np.log(np.mean(each, axis=0)), atol=1e-12)
+
+
+@pytest.mark.parametrize(("freedom", "factor"), [(2.5, 5.0), (4.0, 2.0), (np.inf, 1.0), (2.0, np.inf), (1.5, np.inf)])
+def test_the_noise_of_heavy_tails_deviates_by_more_than_its_scale(freedom, factor):
+    mixture = Mixture(torch.tensor([[[1.0]], [[3.0]]]), torch.tensor([[[0.5]]]), freedom)
+    assert float(mixture.aleatoric_std) == pytest.approx(0.5 * np.sqrt(factor))
+    assert float(mixture.std) == pytest.approx(np.sqrt(1.0 + 0.25 * factor))
+
+
+def test_as_gaussians_a_student_mixture_is_nearly_itself():
+    mixture = Mixture(torch.tensor([[[-1.0]], [[2.0]]]).double().expand(2, 9, 1), torch.tensor([[[0.5]], [[1.5]]]), 4.0)
+    at = torch.linspace(-6.0, 8.0, 9).double()[:, None]
+    exact = [student(4.0, m, s).pdf(at[:, 0].numpy()) for m, s in ((-1.0, 0.5), (2.0, 1.5))]
+    found = mixture.gaussians(200)
+    assert found.means.shape == (400, 9, 1)
+    assert math.isinf(found.freedom)
+    assert np.allclose(found.log_density(at), np.log(np.mean(exact, axis=0)), atol=0.05)
+    sharp = Mixture(random(4, 5, 3), random(4, 1, 3, seed=1).exp())
+    assert sharp.gaussians() is sharp
 
 
 @pytest.mark.parametrize("bandwidth", [0.0, 0.4, 0.9, 1.0])
@@ -85,15 +101,23 @@ def test_wholly_smoothed_it_is_a_gaussian_and_not_at_all_it_is_itself():
 
 
 def test_with_heavy_tails_spread_and_noise_are_one_student_distribution():
-    """400 components of noise 0.3 whose means spread by 0.4: of scale 0.5 and mean 1, in any order."""
-    tails, generator = tail_scales(4.0, 400).double(), torch.Generator().manual_seed(0)
-    means = torch.randn(400, dtype=torch.float64, generator=generator)
+    """400 components of noise 0.3 whose means spread by 0.4: of scale 0.5 and mean 1."""
+    means = torch.randn(400, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     means = 1.0 + 0.4 * (means - means.mean()) / means.std(correction=0)
-    stds = 0.3 * tails[:, None, None]
     at = np.linspace(-4.0, 6.0, 21)
-    found = Mixture(means[:, None, None].expand(-1, 21, 1), stds, tails).smoothed(1.0)
+    found = Mixture(means[:, None, None].expand(-1, 21, 1), torch.tensor([[[0.3]]]).double(), 4.0).smoothed(1.0)
     theirs = student(4.0, loc=1.0, scale=0.5).logpdf(at)
-    assert np.allclose(found.log_density(torch.from_numpy(at)[:, None]), theirs, atol=0.02)
+    assert np.allclose(found.log_density(torch.from_numpy(at)[:, None]), theirs, atol=1e-6)
+
+
+@pytest.mark.parametrize("freedom", [2.5, 20.0])
+def test_calibration_of_heavy_tails_is_by_their_own_quantiles(freedom):
+    draws = torch.tensor(student(freedom).rvs((50_000, 2), random_state=2) * [0.5, 2.0])
+    stds = torch.tensor([[[0.5, 2.0]]]).double()
+    assert calibration_error(Mixture(torch.zeros(1, 50_000, 2).double(), stds, freedom), draws) < 0.003
+    assert calibration_error(Mixture(torch.zeros(1, 50_000, 2).double(), stds), draws) > (
+        0.04 if freedom < 3.0 else 0.004
+    )
 
 
 def test_calibration_is_by_the_mixtures_own_quantiles():

@@ -32,6 +32,19 @@ def test_each_component_has_the_moments_of_its_draws():
         assert np.allclose(found.stds[component, 0], theirs.std(axis=0), rtol=0.01)
 
 
+def test_components_with_heavy_tails_are_several_gaussians():
+    """Of four degrees of freedom: density of draws of the two components, each with one scale of a row."""
+    found = seven_outputs(Mixture(MEANS, 0.1 * STDS, 4.0), VELOCITY, YAW)
+    rng = np.random.default_rng(0)
+    scales = np.sqrt(4.0 / rng.chisquare(4.0, (2, 200_000, 1)))
+    drawn = MEANS.numpy() + 0.1 * STDS.numpy() * scales * rng.normal(size=(2, 200_000, 6))
+    theirs = np.concatenate(world(drawn, VELOCITY[0].numpy(), 0.9))
+    shares = np.array([0.1, 0.5, 0.9])
+    quantiles = np.quantile(theirs, shares, axis=0)[:, None]
+    below = norm.cdf((quantiles - found.means[:, 0].numpy()) / found.stds[:, 0].numpy()).mean(axis=1)
+    assert np.allclose(below, shares[:, None], atol=0.02)
+
+
 def test_measured_changes_become_the_states_that_were_measured():
     """Both ends of a step as world states, and the changes that lead from one to the other."""
     rng = np.random.default_rng(1)
