@@ -88,8 +88,10 @@ def drawn(posterior: Posterior, inputs: Tensor, generator: torch.Generator) -> T
         place = torch.randperm(share * particles, generator=generator)[:count].to(inputs.device)
         dealt = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
         dealt[place] = posterior.seen(inputs)
-        values = posterior.network(posterior.parameters, dealt.view(particles, share, inputs.shape[1]))
+        values = posterior.values(dealt.view(particles, share, inputs.shape[1]))
         noise = torch.randn(values.shape, generator=generator).to(values)
+        if posterior.correlation is not None:
+            noise = noise @ torch.linalg.cholesky_ex(posterior.correlation).L.T
         values = values + noise * posterior.noise_stds
         return posterior.normaliser.raw_outputs(values.flatten(0, 1)[place])
 

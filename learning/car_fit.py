@@ -25,7 +25,7 @@ from learning.transitions import OUTPUTS, Transitions
 
 Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
 LearnedCar = CarDynamics | WorldDynamics
-FILE_VERSION = 4
+FILE_VERSION = 5
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
 """Expected noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
 EXPECTED_GAP = 0.3
@@ -87,7 +87,7 @@ def fit_car(
     if rows is not None and rows.history != model.history:
         raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; make them alike.")
     generator = torch.Generator().manual_seed(settings.seed)
-    units = (car_units(model, generator) if before is None else before.posterior.normaliser).to(device)
+    units = (car_units(model, generator) if before is None else before.posterior.normaliser.unturned()).to(device)
     width = 3 + 2 * (model.history + 1)
     inputs, outputs = torch.zeros((0, width)), torch.zeros((0, len(OUTPUTS)))
     if rows is not None and len(rows):
@@ -104,7 +104,7 @@ def fit_car(
     )  # fmt: skip
     points = measurement_points(model, inputs, units, generator)
     particles = ParticleSettings(particles=settings.particles, steps=settings.steps, seed=settings.seed)
-    start = None if before is None else before.posterior.parameters
+    start = None if before is None else before.posterior.to(device).parameters_for(target.normaliser)
     return CarDynamics(fit_particles(target, points, particles, progress, start), model.history)
 
 
@@ -122,6 +122,9 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
         "noise_std": posterior.noise_std,
         "freedom": posterior.freedom,
         "units": [units.input_mean, units.input_std, units.output_mean, units.output_std],
+        "turn": units.output_turn,
+        "trend": posterior.trend,
+        "correlation": posterior.correlation,
     }
     torch.save(content, path)
 
@@ -138,9 +141,11 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
         network = Network(inputs, outputs, tuple(hidden), content["activation"])
         parameters: Tensor = content["parameters"]
         found = parameters.shape[1]
-        posterior = Posterior(
-            network, parameters, content["noise_std"], Normaliser(*content["units"]), float(content["freedom"])
-        )  # fmt: skip
+        units = Normaliser(*content["units"])
+        if content["turn"] is not None:
+            units = units.turned(content["turn"])
+        noise_std, freedom = content["noise_std"], float(content["freedom"])
+        posterior = Posterior(network, parameters, noise_std, units, freedom, content["trend"], content["correlation"])
         frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
         car: LearnedCar = frames[content.get("frame", "body")](posterior.to(device), content["history"])
     except DataError:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from scipy.special import stdtr
 from torch import Tensor
 
-from learning.outliers import log_student, tail_scales
+from learning.outliers import joint_surprise, log_student, tail_scales
 
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.977, 0.99)
 """Nominal coverages at which calibration is read."""
@@ -21,14 +21,19 @@ class Mixture:
 
     Attributes:
         means: (L, N, O).
-        stds: scales that broadcast against them; of Gaussians the standard deviations.
+        stds: scales that broadcast against them; of Gaussians the standard deviations; of turned errors if they are.
         freedom: degrees of freedom of the components' multivariate Student distributions: one scale of a row widens
             all of its outputs (Lange, Little and Taylor 1989, section 2); infinite for Gaussians.
+        turn: what a component's errors are multiplied by (O, O) from the left before anything is said of them; nothing
+            unless given.
+        correlation: of these errors within each component (O, O); none unless given.
     """
 
     means: Tensor
     stds: Tensor
     freedom: float = math.inf
+    turn: Tensor | None = None
+    correlation: Tensor | None = None
 
     @property
     def mean(self) -> Tensor:
@@ -47,7 +52,21 @@ class Mixture:
             widened = 1.0
         else:
             widened = self.freedom / (self.freedom - 2.0) if self.freedom > 2.0 else math.inf
-        return (widened * self.stds**2).expand_as(self.means).mean(dim=0).sqrt()
+        return (widened * self.own_stds**2).expand_as(self.means).mean(dim=0).sqrt()
+
+    @property
+    def own_stds(self) -> Tensor:
+        """Scale of each output on its own, whatever the others are; broadcasts against the means."""
+        if self.turn is None:
+            return self.stds
+        back: Tensor = torch.linalg.inv_ex(self.turn).inverse
+        if self.correlation is None:
+            return (self.stds**2 @ (back**2).T).sqrt()
+        factor: Tensor = back * self.stds[..., None, :] @ torch.linalg.cholesky_ex(self.correlation).L
+        return factor.square().sum(dim=-1).sqrt()
+
+    def _turned(self, errors: Tensor) -> Tensor:
+        return errors if self.turn is None else errors @ self.turn.T
 
     @property
     def std(self) -> Tensor:
@@ -67,9 +86,9 @@ class Mixture:
             bandwidth: b, from 0 to 1.
         """
         shrink = math.sqrt(1.0 - bandwidth**2)
-        means = self.mean + shrink * (self.means - self.mean)
-        spread = bandwidth * self.epistemic_std
-        return Mixture(means, (self.stds**2 + spread**2).sqrt(), self.freedom)
+        away = self.means - self.mean
+        spread = bandwidth * self._turned(away).std(dim=0, correction=0)
+        return replace(self, means=self.mean + shrink * away, stds=(self.stds**2 + spread**2).sqrt())
 
     def gaussians(self, each: int = 20) -> Mixture:
         """Nearly the same of Gaussians alone, ``each`` of a Student component; the farthest of its tails is lost."""
@@ -77,12 +96,20 @@ class Mixture:
             return self
         scales = tail_scales(self.freedom, each).to(self.stds)[:, None, None, None]
         means = self.means.expand(each, *self.means.shape)
-        return Mixture(means.flatten(0, 1), (scales * self.stds.expand_as(self.means)).flatten(0, 1))
+        stds = (scales * self.stds.expand_as(self.means)).flatten(0, 1)
+        return Mixture(means.flatten(0, 1), stds, turn=self.turn, correlation=self.correlation)
 
     def log_density(self, targets: Tensor) -> Tensor:
         """Joint log density (N,) of targets (N, O)."""
-        square = (((targets - self.means) / self.stds) ** 2).sum(dim=2)
+        white = self._turned(targets - self.means) / self.stds
         widths = self.stds.log().expand_as(self.means).sum(dim=2)
+        if self.correlation is None:
+            square = (white**2).sum(dim=2)
+        else:
+            square = joint_surprise(white, self.correlation)
+            widths = widths + 0.5 * torch.linalg.slogdet(self.correlation).logabsdet
+        if self.turn is not None:
+            widths = widths - torch.linalg.slogdet(self.turn).logabsdet
         each = log_student(square, self.means.shape[2], self.freedom) - widths
         return torch.logsumexp(each, dim=0) - math.log(len(self.means))
 
@@ -103,7 +130,7 @@ def calibration_error(prediction: Mixture, targets: Tensor) -> float:
     Central intervals of the mixture's own distribution function, output by output. Of one Gaussian they are those by
     mean and standard deviation that the authors of Sim-FSVGD measure.
     """
-    white = (targets - prediction.means) / prediction.stds
+    white = (targets - prediction.means) / prediction.own_stds
     if math.isinf(prediction.freedom):
         below = torch.special.ndtr(white).mean(dim=0)
     else:

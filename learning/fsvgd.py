@@ -136,6 +136,9 @@ class Posterior:
         noise_std: of the likelihood, normalised (O,).
         normaliser: between raw and normalised units.
         freedom: degrees of freedom of the noise's multivariate Student distribution; infinite for a Gaussian.
+        trend: what all particles' normalised outputs have besides, linear in the normalised inputs: a constant and
+            slopes (1 + D, O); nothing where it is None.
+        correlation: of the noise of the normalised outputs (O, O); none unless given.
     """
 
     network: Network
@@ -143,6 +146,8 @@ class Posterior:
     noise_std: Tensor
     normaliser: Normaliser
     freedom: float = math.inf
+    trend: Tensor | None = None
+    correlation: Tensor | None = None
 
     @property
     def noise_stds(self) -> Tensor:
@@ -152,9 +157,27 @@ class Posterior:
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at raw inputs (N, D), in raw units."""
         with torch.no_grad():
-            values = self.network(self.parameters, self.seen(inputs))
-        noise = (self.noise_std * self.normaliser.output_std).expand(len(values), 1, -1)
-        return Mixture(self.normaliser.raw_outputs(values), noise, self.freedom)
+            values = self.values(self.seen(inputs))
+        turn = self.normaliser.error_turn
+        noise = self.noise_std if turn is not None else self.noise_std * self.normaliser.output_std
+        return Mixture(
+            self.normaliser.raw_outputs(values), noise.expand(len(values), 1, -1), self.freedom, turn, self.correlation
+        )
+
+    def parameters_for(self, normaliser: Normaliser) -> Tensor:
+        """Parameters (L, P) of the same functions, without the trend, in outputs turned as another normaliser's."""
+        parameters = self.parameters.clone()
+        eye = torch.eye(len(self.noise_std), dtype=torch.float64, device=parameters.device)
+        own, other = (eye if n.output_turn is None else n.output_turn.double() for n in (self.normaliser, normaliser))
+        across = (other @ torch.linalg.inv_ex(own).inverse).to(parameters).T
+        for head in self.network.split(parameters)[-1]:
+            head.copy_(head @ across)
+        return parameters
+
+    def values(self, seen: Tensor) -> Tensor:
+        """Normalised outputs (L, N, O) where the networks see (N, D), or each its own (L, N, D)."""
+        found = self.network(self.parameters, seen)
+        return found if self.trend is None else found + self.trend[0] + seen @ self.trend[1:]
 
     def seen(self, inputs: Tensor) -> Tensor:
         """What the networks are given for raw inputs (N, D)."""
@@ -163,7 +186,8 @@ class Posterior:
     def to(self, device: torch.device | str) -> Posterior:
         """The same on a device."""
         own = (self.parameters.to(device), self.noise_std.to(device), self.normaliser.to(device))
-        return Posterior(self.network, *own, self.freedom)
+        rest = (None if v is None else v.to(device) for v in (self.trend, self.correlation))
+        return Posterior(self.network, *own, self.freedom, *rest)
 
 
 @dataclass

@@ -57,15 +57,16 @@ class GapCovariance:
     doubt_lengths: Tensor
 
     @classmethod
-    def before_data(cls, inputs: int, expected: Tensor) -> GapCovariance:
+    def before_data(cls, inputs: int, expected: Tensor, share: float = 1.0) -> GapCovariance:
         """The medians of what may be learned, for gaps of an expected size (O,).
 
-        Each part has that size at inputs that lie as far out as their units say, the plane over all of its slopes.
+        Each part has that size at inputs that lie as far out as their units say, the plane over all of its slopes; the
+        simulator's share of itself is ``share`` as large.
         """
         size = expected.double()
         wide = torch.ones((len(size), inputs), dtype=torch.float64, device=size.device)
         long = MIDDLE_LENGTH * wide
-        return cls(size, long, size[:, None] * wide / math.sqrt(inputs), size, size, long)
+        return cls(size, long, size[:, None] * wide / math.sqrt(inputs), size, share * size, long)
 
     def __call__(self, first: Tensor, second: Tensor | None = None) -> Tensor:
         """Covariances (O, ..., N, M) between inputs (..., N, D) and (..., M, D).
@@ -104,6 +105,7 @@ def learn_gap(
     trust: Tensor,
     said: Tensor | None = None,
     seed: int = 0,
+    share: float = 1.0,
 ) -> tuple[GapCovariance, Tensor]:
     """Find the covariance of the gap and the noise by the evidence.
 
@@ -119,12 +121,13 @@ def learn_gap(
         trust: what a row's noise variance is divided by (n,), 1 unless it is an outlier.
         said: normalised outputs of the simulator (n, O), where there is one.
         seed: of the rows that are drawn.
+        share: of the expected size, what the simulator is expected to be wrong by in proportion to what it says.
 
     Returns:
         The covariance and the noise (O,).
     """
     residual, inputs = residual.double(), inputs.double()
-    start = GapCovariance.before_data(inputs.shape[1], expected)
+    start = GapCovariance.before_data(inputs.shape[1], expected, share)
     inputs = inputs if said is None else torch.cat([inputs, said.double()], dim=1)
     of_gap = (start.scales, start.lengths, start.slopes, start.offsets, start.doubts, start.doubt_lengths)
     reach = torch.zeros_like(start.lengths[0])

@@ -68,8 +68,8 @@ def find_history(episodes: Sequence[EpisodeData], seed: int = 0) -> HistoryChoic
         inputs = torch.cat([everything[:, :3], everything[:, 3 + 2 * (longest - history) :]], dim=1)
         gap, noise = learn_gap(inputs, outputs, None, 0.1 * one, one, trust)
         covariance = gap(inputs) + torch.diag_embed((noise**2 + TINY)[:, None] / trust)
-        square, doubt = left_out(outputs, covariance, noise, trust)
-        density = log_student(square, 1, FREEDOM) - 0.5 * doubt.log()
+        white, doubt = left_out(outputs, covariance, noise, trust)
+        density = log_student(white**2, 1, FREEDOM) - 0.5 * doubt.log()
         surprise[history] = -float(density.sum(dim=1).mean())
     best = TRIED[0]
     for history in TRIED[1:]:

@@ -24,6 +24,11 @@ SCALES = (0.3, 2.0)
 """Within which a doubt is corrected."""
 WIDTH_DOUBT = 0.1
 """Standard deviation of the logarithm of what a doubt is wrong by, before rows tell."""
+CORRELATION_FREEDOM, CORRELATION_ROUNDS = 4.0, 20
+CORRELATION_ROWS = 1.0
+"""Rows of uncorrelated errors that are believed in before there are any."""
+TELLING, LEAST_EIGENVALUE = 2.5, 1e-3
+"""Correlations of fewer standard errors than this are none."""
 VARIANCE_OF_MEDIAN = 1.36
 """Of the logarithm of half of the rows' error, times their number: ``1 / (4 f(m)^2 m^2)`` for a normal one's size."""
 
@@ -40,7 +45,8 @@ def first_trust(left: Tensor, covariance: Callable[[Tensor], Tensor], noise: Ten
     """
     trust = torch.ones(len(left), dtype=left.dtype, device=left.device)
     for _ in range(FIRST_ROUNDS):
-        surprise, _ = left_out(left, covariance(trust), noise, trust)
+        white, _ = left_out(left, covariance(trust), noise, trust)
+        surprise = white**2
         # The ordinary row sets the scale, whatever the expected gap and noise were.
         ordinary = (surprise.median(dim=0).values / _MEDIAN_SQUARE).clamp_min(1.0)
         _, trust = student_weights((surprise / ordinary).sum(dim=1), left.shape[1])
@@ -48,7 +54,7 @@ def first_trust(left: Tensor, covariance: Callable[[Tensor], Tensor], noise: Ten
 
 
 def left_out(left: Tensor, covariance: Tensor, noise: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared surprise (n, O) of each row by all others, in units of an ordinary row's doubt; and its variance.
+    """How far (n, O) each row is off what all others say, in units of an ordinary row's doubt, and its variance.
 
     Leave-one-out residuals in closed form (Rasmussen and Williams 2006, equations 5.10 to 5.12).
 
@@ -63,7 +69,59 @@ def left_out(left: Tensor, covariance: Tensor, noise: Tensor, trust: Tensor) -> 
     error = (precision @ left.T[:, :, None])[:, :, 0] / own
     ordinary = 1.0 / own + (noise**2)[:, None] * (1.0 - 1.0 / trust)
     doubt = ordinary.clamp_min(1e-12).T
-    return error.T**2 / doubt, doubt
+    return error.T / doubt.sqrt(), doubt
+
+
+def output_correlation(white: Tensor) -> tuple[Tensor, Tensor]:
+    """Correlation (O, O) and scales (O,) of errors, such as of a step and of the velocity that is its difference.
+
+    That of a multivariate Student distribution by expectation maximisation (Lange, Little and Taylor 1989, section 3),
+    with degrees of freedom few enough that outliers have little say; none where rows are too few to tell it from none.
+
+    Args:
+        white: errors in units of their doubt (n, O).
+    """
+    count, outputs = white.shape
+    found = torch.eye(outputs, dtype=white.dtype, device=white.device)
+    width = (white**2).median(dim=0).values.clamp_min(1e-12).sqrt()
+    for _ in range(CORRELATION_ROUNDS):
+        own = white / width
+        weight = (CORRELATION_FREEDOM + outputs) / (CORRELATION_FREEDOM + joint_surprise(own, found))
+        scatter = (weight[:, None] * own).T @ own / count
+        wider = scatter.diagonal().clamp_min(1e-12).sqrt()
+        width = width * wider
+        found = (scatter / (wider[:, None] * wider)) * (count / (count + CORRELATION_ROWS))
+        found.fill_diagonal_(1.0)
+    told = torch.where(found.abs() > TELLING / math.sqrt(count), found, 0.0).fill_diagonal_(1.0)
+    least = float(torch.linalg.eigvalsh(told)[0])
+    # Entries that are left out may leave what is no correlation.
+    return (found if least < LEAST_EIGENVALUE else told), width
+
+
+def joint_surprise(white: Tensor, correlation: Tensor) -> Tensor:
+    """Squared surprise (...) of all outputs of errors (..., O) in units of their doubt, that are correlated (O, O)."""
+    factor = torch.linalg.cholesky_ex(correlation).L
+    alone: Tensor = torch.linalg.solve_triangular(factor, white.flatten(0, -2).T, upper=False)
+    return (alone**2).sum(dim=0).view(white.shape[:-1])
+
+
+def turn_of(correlation: Tensor, size: Tensor) -> Tensor:
+    """What errors are multiplied by (O, O) to be uncorrelated, each of its own size as before.
+
+    The largest stays as it is, and each other one is told from those before (Cholesky's factor): a step less its share
+    of the velocity that is its difference.
+
+    Args:
+        correlation: of the errors (O, O).
+        size: of each error (O,).
+    """
+    order = size.argsort(descending=True)
+    factor = torch.linalg.cholesky(correlation[order][:, order])
+    eye = torch.eye(len(size), dtype=size.dtype, device=size.device)
+    alone = torch.linalg.solve_triangular(factor, eye, upper=False)
+    turn = torch.empty_like(alone)
+    turn[order[:, None], order] = alone
+    return size[:, None] * turn / size
 
 
 def student_weights(surprise: Tensor, outputs: int) -> tuple[float, Tensor]:
@@ -116,4 +174,14 @@ def log_student(surprise: Tensor, outputs: int, freedom: float) -> Tensor:
     return constant - 0.5 * (freedom + outputs) * torch.log1p(surprise / freedom)
 
 
-__all__ = ["first_trust", "left_out", "log_student", "student_weights", "tail_scales", "typical_scale"]
+__all__ = [
+    "first_trust",
+    "joint_surprise",
+    "left_out",
+    "log_student",
+    "output_correlation",
+    "student_weights",
+    "tail_scales",
+    "turn_of",
+    "typical_scale",
+]

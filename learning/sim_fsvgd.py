@@ -36,6 +36,8 @@ LEAST_NOISE_SHARE = 0.5
 FARTHEST_MISS = 3.0
 """In units of the noise, what particles miss of the data counts as at most: of a row that nothing else is like, as in
 collisions, they can miss a hundred, and that says nothing of the noise elsewhere."""
+LEAST_SLOPES = 1e-6
+"""Of a trend's least squares: the share of the weight that holds slopes at zero where inputs never change."""
 NEARBY = 0.5
 """How far from the data its neighbourhood reaches at most, in units of the inputs."""
 
@@ -104,6 +106,8 @@ def fit_particles(
     mean, covariance = target.marginals(sets)
     factor, weight = _factors(covariance, target.noise_std)
     inputs = normaliser.inputs(sets)
+    trend = _trend(inputs, mean, weight)
+    wanted = mean - _linear(trend, inputs)
     order = torch.randint(count, (settings.steps, settings.sets), generator=generator).to(device)
     with torch.no_grad():
         for step, own in enumerate(order):
@@ -111,7 +115,7 @@ def fit_particles(
             shaped = values.view(len(numbers), settings.sets, settings.points, outputs)
             # One set and output a row: (L, sets * outputs, points).
             rows = shaped.transpose(2, 3).flatten(1, 2)
-            way = moment_direction(rows, mean[own].flatten(0, 1), factor[own].flatten(0, 1))
+            way = moment_direction(rows, wanted[own].flatten(0, 1), factor[own].flatten(0, 1))
             way = (way * weight[own].flatten(0, 1)).view(len(numbers), settings.sets, outputs, settings.points)
             gradient = -pullback(way.transpose(2, 3).flatten(1, 2))
             share = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
@@ -125,10 +129,11 @@ def fit_particles(
             sets = target.data[:, None]
             mean, covariance = target.marginals(sets)
             weight, most = torch.ones_like(mean), FARTHEST_MISS
-        found = network(numbers, normaliser.inputs(sets.flatten(0, 1))).view(-1, *sets.shape[:2], outputs)
+            inputs = normaliser.inputs(sets)
+        found = network(numbers, inputs.flatten(0, 1)).view(-1, *sets.shape[:2], outputs).transpose(2, 3)
         variance = covariance.diagonal(dim1=2, dim2=3).to(found)
-        noise = _noise(found.transpose(2, 3), mean, variance, weight, target.noise_std, most)
-    return Posterior(network, numbers, noise, normaliser, target.freedom)
+        noise = _noise(found + _linear(trend, inputs), mean, variance, weight, target.noise_std, most)
+    return Posterior(network, numbers, noise, normaliser, target.freedom, trend, target.correlation)
 
 
 def measurement_points(
@@ -182,6 +187,25 @@ def _noise(values: Tensor, mean: Tensor, variance: Tensor, weight: Tensor, noise
     missed = torch.minimum(missed, (most * noise_std)[:, None] ** 2)
     beyond = (weight * missed).sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
     return (noise_std**2 + beyond).clamp_min(LEAST_NOISE_SHARE * noise_std**2).sqrt()
+
+
+def _trend(inputs: Tensor, mean: Tensor, weight: Tensor) -> Tensor:
+    """Constant and slopes (1 + D, O) of the weighted least squares line through means (B, O, N) at inputs (B, N, D).
+
+    Networks are left with what is not linear: a step is the velocity's to a few thousandths of its size.
+    """
+    one = torch.ones_like(inputs[..., :1])
+    given = torch.cat([one, inputs], dim=2).flatten(0, 1).double()
+    wanted, weight = (v.transpose(1, 2).flatten(0, 1).double().T for v in (mean, weight))
+    squares = torch.einsum("on,nd,ne->ode", weight, given, given)
+    squares = squares + LEAST_SLOPES * weight.sum(dim=1)[:, None, None] * torch.eye(given.shape[1]).to(given)
+    found: Tensor = torch.linalg.solve(squares, torch.einsum("on,nd,on->od", weight, given, wanted))
+    return found.T.to(mean)
+
+
+def _linear(trend: Tensor, inputs: Tensor) -> Tensor:
+    """Values (B, O, N) of a trend (1 + D, O) at inputs (B, N, D)."""
+    return (trend[0] + inputs @ trend[1:]).transpose(1, 2)
 
 
 def _factors(covariance: Tensor, noise_std: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,6 +21,8 @@ OUTPUTS = ("ahead_m", "left_m", "yaw_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
 GAP = 1.5
 """A step longer than this many periods is no step."""
 
+LEAST_LATE_S = 0.002
+"""Velocities that lag by less are on time."""
 TRIMMED = 4
 KEPT = 0.9
 
@@ -102,8 +104,8 @@ def velocity_delay_s(rows: Transitions, period_s: float) -> float:
     """By how much the velocities of some rows lag behind their poses [s]; about half a period for backward differences.
 
     A step is as long as a mean of the velocities at both of its ends says, in equal parts where these are on time; the
-    share of the later one is told by least squares, over the middle rows by error so that collisions have no say. Never
-    less than zero.
+    share of the later one is told by least squares, over the middle rows by error so that collisions have no say. Zero
+    if it is less than ``LEAST_LATE_S``.
 
     Args:
         rows: rows.
@@ -116,7 +118,8 @@ def velocity_delay_s(rows: Transitions, period_s: float) -> float:
         share = (kept * off * change).sum(axis=0) / np.maximum((kept * change * change).sum(axis=0), 1e-12)
         error = np.abs(off - share * change)
         kept = error <= np.quantile(error, KEPT, axis=0)
-    return float(np.clip(share.mean() - 0.5, 0.0, 1.0)) * period_s
+    late_s = float(np.clip(share.mean() - 0.5, 0.0, 1.0)) * period_s
+    return late_s if late_s > LEAST_LATE_S else 0.0
 
 
 __all__ = ["OUTPUTS", "Transitions", "transitions_of", "velocity_delay_s"]

@@ -30,7 +30,7 @@ def seven_outputs(prediction: Mixture, velocity_mps: Tensor, yaw_rad: Tensor) ->
     """
     prediction = prediction.gaussians()
     mean = prediction.means.double()
-    variance = (prediction.stds.double() ** 2).expand_as(mean)
+    variance = (prediction.own_stds.double() ** 2).expand_as(mean)
     speed = mean[..., 3:5] + velocity_mps.double()
     sin, cos = _circle(yaw_rad.double(), torch.zeros_like(yaw_rad.double()))
     place = _to_world(mean[..., :2], variance[..., :2], sin, cos, 0.5 * torch.sin(2.0 * yaw_rad.double()))

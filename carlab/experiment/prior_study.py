@@ -27,8 +27,6 @@ from learning.transitions import velocity_delay_s
 from sim_backends.car_parameters import SimulatorConfig
 
 NONE, KINEMATIC, NOMINAL, DIAGNOSED = "none (FSVGD)", "kinematic", "nominal", "diagnosed"
-LEAST_LATE_S = 0.002
-"""Velocities that are less late are on time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +69,6 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     period_s = car.control_period_s
     check_period(diagnosed, period_s, "the car's file")
     late_s = velocity_delay_s(case.rows, period_s)
-    late_s = late_s if late_s > LEAST_LATE_S else 0.0
     at_s = float(case.rows.tick.mean()) * period_s
     history = case.rows.history
 

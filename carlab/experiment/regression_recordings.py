@@ -16,7 +16,7 @@ from carlab.experiment.regression_cases import Case, Data
 from learning.car_fit import NOISE_STD
 from learning.history import find_history
 from learning.simulator_model import CarModel
-from learning.transitions import Transitions, transitions_of
+from learning.transitions import Transitions, transitions_of, velocity_delay_s
 
 FASTEST_TURN_RADPS = 10.0
 """Rows that turn faster are spikes of a differentiated angle."""
@@ -76,11 +76,12 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
     rows, held_out = (_ordinary(transitions_of(episodes, history)) for episodes in (fitted, recordings[-1]))
     yaw = np.array([recordings[-1][e].states[t, 2] for e, t in zip(held_out.episode, held_out.tick, strict=True)])
     simulator = load_car_file(car).simulator
+    late_s = velocity_delay_s(rows, simulator.control_period_s)
     ranges = {"timing.command_delay": DELAY_S, **simulator.priors}
     output_std = tuple(float(v) for v in rows.targets.std(axis=0))
     return RecordedCase(
         name=NAME,
-        prior=CarModel(simulator, history, ranges),
+        prior=CarModel(simulator, history, ranges, velocity_delay_s=late_s),
         process=None,
         truth=None,
         counts=COUNTS,

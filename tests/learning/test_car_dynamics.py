@@ -178,6 +178,35 @@ def test_a_world_that_feeds_on_itself_does_not_run_away() -> None:
     assert rates[-1] == pytest.approx(24.0 + 95 * 2.0 * EDGE, rel=1e-3)
 
 
+TURN = torch.eye(6).double() + 0.4 * torch.randn(6, 6, generator=torch.Generator().manual_seed(8)).double()
+
+
+def turned(car: CarDynamics, by: torch.Tensor = TURN) -> CarDynamics:
+    """The same numbers in turned units."""
+    return replace(car, posterior=replace(car.posterior, normaliser=car.posterior.normaliser.turned(by)))
+
+
+def test_noise_of_one_draw_is_correlated_as_the_turn_says() -> None:
+    car = turned(known_car(torch.zeros(4, 6)))
+    drawn = car.sample(torch.zeros(40_000, INPUTS), torch.Generator().manual_seed(0)).double().numpy()
+    unit = np.arange(1.0, 7.0)
+    back = np.linalg.inv(TURN.numpy())
+    shape = 0.25 * unit[:, None] * (back @ back.T) * unit
+    assert np.allclose(np.cov(drawn.T), shape, atol=0.03 * np.sqrt(np.outer(np.diag(shape), np.diag(shape))))
+    predicted = car.predict(torch.zeros(1, INPUTS))
+    assert np.allclose(predicted.own_stds[0, 0], np.sqrt(np.diag(shape)), rtol=1e-4)
+    assert np.allclose(predicted.mean, 0.3, atol=1e-5)
+
+
+def test_particles_taken_over_into_other_units_are_the_same_functions() -> None:
+    inputs = torch.randn(50, INPUTS, generator=torch.Generator().manual_seed(1))
+    for car in (some_car(), turned(some_car(), TURN.T)):
+        for normaliser in (car.posterior.normaliser.unturned().turned(TURN), car.posterior.normaliser.unturned()):
+            parameters = car.posterior.parameters_for(normaliser)
+            there = replace(car.posterior, parameters=parameters, normaliser=normaliser).predict(inputs)
+            torch.testing.assert_close(there.means, car.predict(inputs).means, rtol=1e-4, atol=1e-5)
+
+
 def some_car(freedom: float = math.inf) -> CarDynamics:
     generator = torch.Generator().manual_seed(5)
     network = Network(INPUTS, 6, (8, 4), "silu")
@@ -189,6 +218,8 @@ def some_car(freedom: float = math.inf) -> CarDynamics:
 @pytest.mark.parametrize("freedom", [math.inf, 2.5])
 def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float) -> None:
     car = some_car(freedom)
+    if math.isfinite(freedom):
+        car = turned(car)
     save_car(car, tmp_path / "car.pt")
     again = load_car(tmp_path / "car.pt")
     assert again.history == HISTORY
@@ -196,6 +227,7 @@ def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float) -> N
     ours, theirs = car.predict(inputs), again.predict(inputs)
     assert torch.equal(ours.means, theirs.means)
     assert torch.equal(ours.stds, theirs.stds)
+    assert (ours.turn is None) == (theirs.turn is None) == math.isinf(freedom)
     assert ours.freedom == theirs.freedom == freedom
     first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, again))
     assert torch.equal(first, second)

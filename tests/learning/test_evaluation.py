@@ -1,11 +1,13 @@
 """Figures of merit against scipy and against draws."""
 
 import math
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_t, norm
+from scipy.stats import multivariate_normal, multivariate_t, norm
 from scipy.stats import t as student
 
 from learning.evaluation import (
@@ -37,6 +39,46 @@ def test_the_spread_is_that_of_draws_from_it():
     draws = prediction.means.numpy()[which] + stds[which] * rng.normal(size=(len(which), 2, 2))
     assert np.allclose(prediction.mean, draws.mean(axis=0), atol=0.02)
     assert np.allclose(prediction.std, draws.std(axis=0), rtol=0.01)
+
+
+class TestTurnedErrors:
+    """Errors of an output that follow another's."""
+
+    TURN = np.array([[1.7, 0.0, -0.2], [0.3, 1.0, 0.0], [0.0, 0.0, 2.0]])
+    STDS = np.array([0.5, 1.0, 2.0])
+    BACK = np.linalg.inv(TURN)
+    SHAPE = BACK @ np.diag(STDS**2) @ BACK.T
+
+    def mixture(self, freedom=math.inf):
+        return Mixture(random(4, 6, 3), torch.tensor(self.STDS)[None, None], freedom, torch.tensor(self.TURN))
+
+    @pytest.mark.parametrize("freedom", [3.5, math.inf])
+    def test_the_joint_density_is_scipys(self, freedom):
+        mixture, targets = self.mixture(freedom), 2.0 * random(6, 3, seed=1)
+        one = multivariate_normal if math.isinf(freedom) else partial(multivariate_t, df=freedom)
+        each = [[one(m, self.SHAPE).pdf(y) for m, y in zip(k, targets.numpy(), strict=True)] for k in mixture.means]
+        assert np.allclose(mixture.log_density(targets), np.log(np.mean(each, axis=0)), atol=1e-12)
+
+    def test_each_output_has_the_spread_that_it_has_alone(self):
+        assert np.allclose(self.mixture().own_stds, np.sqrt(np.diag(self.SHAPE)))
+        assert np.allclose(self.mixture().aleatoric_std, np.sqrt(np.diag(self.SHAPE)))
+
+    def test_its_calibration_is_that_of_draws(self):
+        draws = np.random.default_rng(5).multivariate_normal(np.zeros(3), self.SHAPE, 40_000)
+        flat = Mixture(torch.zeros(1, 40_000, 3).double(), *self.mixture().stds.expand(1, 1, 1, 3), math.inf)
+        flat = replace(flat, turn=torch.tensor(self.TURN))
+        assert calibration_error(flat, torch.tensor(draws)) < 0.005
+        assert calibration_error(replace(flat, turn=None), torch.tensor(draws)) > 0.05
+
+    def test_smoothed_it_has_the_same_covariance(self):
+        sharp = self.mixture()
+        for mixture in (sharp, sharp.smoothed(0.6), sharp.gaussians()):
+            turned = mixture.means.numpy() @ self.TURN.T
+            # Of the turned errors, whose components are independent of each other.
+            variance = turned.var(axis=0) + (mixture.stds.numpy() ** 2).mean(axis=0)
+            exact = (sharp.means.numpy() @ self.TURN.T).var(axis=0) + self.STDS**2
+            assert np.allclose(variance, exact)
+            assert np.allclose(mixture.mean, sharp.mean)
 
 
 def test_the_error_is_summed_over_outputs():

@@ -14,8 +14,10 @@ from learning.outliers import (
     WIDTH_DOUBT,
     left_out,
     log_student,
+    output_correlation,
     student_weights,
     tail_scales,
+    turn_of,
     typical_scale,
 )
 
@@ -35,15 +37,66 @@ def test_a_rows_surprise_is_that_of_a_fit_without_it(trusted):
     trust = np.ones(n) if trusted else rng.uniform(0.05, 1.0, n)
     known, left = gap(n), rng.normal(size=(n, 2))
     covariance = known + np.stack([np.diag(s**2 / trust) for s in noise])
-    surprise, doubt = left_out(*(torch.tensor(v) for v in (left, covariance, noise, trust)))
-    assert surprise.shape == doubt.shape == (n, 2)
+    white, doubt = left_out(*(torch.tensor(v) for v in (left, covariance, noise, trust)))
+    assert white.shape == doubt.shape == (n, 2)
     for k in range(2):
         for row in range(n):
             others = np.arange(n) != row
             gain = np.linalg.solve(covariance[k][np.ix_(others, others)], known[k][others, row])
             variance = known[k][row, row] - gain @ known[k][others, row] + noise[k] ** 2
             assert float(doubt[row, k]) == pytest.approx(variance, rel=1e-9)
-            assert float(surprise[row, k]) == pytest.approx((left[row, k] - gain @ left[others, k]) ** 2 / variance)
+            off = left[row, k] - gain @ left[others, k]
+            assert float(white[row, k]) == pytest.approx(off / np.sqrt(variance))
+
+
+class TestCorrelation:
+    TRUE = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, -0.3], [0.0, -0.3, 1.0]])
+    SIZE = np.array([0.5, 2.0, 1.0])
+
+    def drawn(self, rows, freedom):
+        """Of a multivariate Student distribution."""
+        draws = multivariate_t(np.zeros(3), self.TRUE, df=freedom).rvs(rows, random_state=3)
+        return torch.tensor(draws * self.SIZE)
+
+    @pytest.mark.parametrize("freedom", [2.5, 5.0, 500.0])
+    def test_it_is_found_whatever_the_tails_and_the_scales(self, freedom):
+        assert np.allclose(output_correlation(self.drawn(20_000, freedom))[0], self.TRUE, atol=0.02)
+
+    def test_a_few_outliers_have_little_say(self):
+        white = self.drawn(2000, 500.0)
+        white[:20] = torch.tensor([50.0, -200.0, 100.0])
+        assert np.allclose(output_correlation(white)[0], self.TRUE, atol=0.08)
+        assert np.corrcoef(white.numpy().T)[0, 1] < -0.5
+
+    def test_errors_that_are_independent_stay_so(self):
+        """Of fifteen pairs one in eighty is beyond two and a half standard errors by chance."""
+        apart = torch.tensor(np.random.default_rng(6).normal(size=(50, 80, 6)))
+        pairs = sum(int((output_correlation(white)[0] != 0).sum()) - 6 for white in apart) / 2
+        assert pairs < 0.03 * 50 * 15
+
+    @pytest.mark.parametrize("rows", [1, 2, 5])
+    def test_of_few_rows_it_is_not_told(self, rows):
+        assert torch.equal(output_correlation(torch.ones(rows, 3).double())[0], torch.eye(3).double())
+
+    def test_without_errors_there_is_none(self):
+        assert torch.equal(output_correlation(torch.zeros(50, 3).double())[0], torch.eye(3).double())
+
+    def test_what_is_left_out_leaves_a_correlation(self):
+        """Without the weak tie of a chain's ends, which 200 rows do not tell, its strong ones are impossible."""
+        chain = np.array([[1.0, 0.75, 0.14], [0.75, 1.0, 0.75], [0.14, 0.75, 1.0]])
+        draws = np.random.default_rng(7).normal(size=(200, 3))
+        draws = np.linalg.solve(np.linalg.cholesky(np.cov(draws.T)), draws.T).T @ np.linalg.cholesky(chain).T
+        found, _ = output_correlation(torch.tensor(draws))
+        assert torch.linalg.eigvalsh(found).min() > 0.0
+        assert np.allclose(found, chain, atol=0.1)
+
+    def test_turned_errors_are_independent_and_as_large_as_before(self):
+        size = torch.tensor(self.SIZE)
+        turn = turn_of(torch.tensor(self.TRUE), size).numpy()
+        shape = self.SIZE[:, None] * self.TRUE * self.SIZE
+        assert np.allclose(turn @ shape @ turn.T, np.diag(self.SIZE**2), atol=1e-12)
+        # The largest error is itself still.
+        assert np.allclose(turn[1], [0.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize("freedom", [2.5, 6.0, 20.0])
