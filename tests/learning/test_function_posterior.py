@@ -309,6 +309,42 @@ class TestOutliers:
         assert found.freedom == clean.freedom
 
 
+class TestCorrelatedErrors:
+    """Errors of the second output follow those of the first, as a step's do the velocity's at its end."""
+
+    def both(self, count, seed, tied):
+        rng = np.random.default_rng(seed)
+        x = np.stack([rng.uniform(-3, 4, count), rng.uniform(-2, 0, count)], axis=1)
+        first, second = rng.normal(size=(2, count))
+        second = tied * first + math.sqrt(1.0 - tied**2) * second
+        return tensors(x, truth(x) + 2.0 * NOISE.numpy() * np.stack([first, second], axis=1))
+
+    def gained(self, monkeypatch, model, tied, count=300):
+        """Nats a row of others by knowing, and the prediction."""
+        x, y = self.both(count, 0, tied)
+        found = infer(model, x, y, UNITS, 2.0 * NOISE)
+        monkeypatch.setattr(function_posterior, "output_correlation", lambda w: (torch.eye(2).double(), torch.ones(2)))
+        apart = infer(model, x, y, UNITS, 2.0 * NOISE)
+        at, seen = self.both(500, 1, tied)
+        told, blind = (float(f.prediction(at).log_density(seen).mean()) for f in (found, apart))
+        return told - blind, found.prediction(at)
+
+    def test_other_rows_are_likelier_by_the_information_that_the_outputs_share(self, monkeypatch):
+        """Mutual information of two Gaussians, ``-log(1 - r^2) / 2``, less what the function's own doubt hides."""
+        tied = 0.98
+        shared = -0.5 * math.log(1.0 - tied**2)
+        gained, prediction = self.gained(monkeypatch, Linear(), tied)
+        assert 0.7 * shared < gained < 1.1 * shared
+        back = np.linalg.inv(prediction.turn.double().numpy())
+        scale = prediction.stds[0].median(dim=0).values.double().numpy()
+        shape = back @ (scale[:, None] * prediction.correlation.double().numpy() * scale) @ back.T
+        assert shape[0, 1] / np.sqrt(shape[0, 0] * shape[1, 1]) == pytest.approx(tied, abs=0.03)
+
+    def test_errors_that_are_independent_cost_next_to_nothing(self, monkeypatch):
+        gained, _ = self.gained(monkeypatch, None, 0.0)
+        assert abs(gained) < 0.03
+
+
 class TestFewRows:
     """What is learned of a covariance from few rows is uncertain."""
 

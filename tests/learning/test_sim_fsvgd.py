@@ -11,6 +11,7 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from carlab.core.errors import DataError
+from learning import sim_fsvgd
 from learning.domain_models import uniform
 from learning.function_posterior import infer
 from learning.normaliser import Normaliser
@@ -29,6 +30,22 @@ def generator(seed=0):
 
 def normal(*shape, seed=0):
     return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class OneLine:
+    """``0.7 x - 1.2``, whatever its parameter."""
+
+    size: int = 1
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        return uniform(((-3.0, 4.0),), count, generator)
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        return normal
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        return (0.7 * inputs - 1.2).expand(len(parameters), -1, -1)
 
 
 @dataclass(frozen=True)
@@ -110,6 +127,39 @@ def constant(*heights, hidden=(4,)):
     return numbers
 
 
+class TestTrend:
+    """What all particles have in common, before a step is taken."""
+
+    settings = ParticleSettings(hidden=(4,), steps=0)
+
+    def test_it_is_weighted_least_squares(self):
+        """By numpy, of the target's mean in units of noise and doubt; an input that never changes has no slope."""
+        units = Normaliser(torch.tensor([0.5, 7.0]), torch.tensor([1.5, 1.0]), UNITS.output_mean, UNITS.output_std)
+        x, points = (torch.cat([v, torch.full_like(v, 7.5)], dim=1) for v in (X, torch.linspace(-3, 4, 64)[:, None]))
+        target = infer(None, x, Y, units, NOISE)
+        found = fit_particles(target, points, self.settings, start=torch.zeros(3, Network(2, 1, (4,)).parameters))
+        mean, std = (v.double().numpy()[:, 0] for v in target.predict(points))
+        slope, offset = np.polyfit(points[:, 0].double().numpy(), mean, 1, w=1.0 / std)
+        at = torch.tensor([[-3.0, 7.5], [0.0, 7.5], [4.0, 7.5]])
+        assert np.allclose(found.predict(at).mean[:, 0], slope * at[:, 0].numpy() + offset, atol=2e-3)
+        assert abs(slope) > 0.3
+
+    def test_a_linear_target_is_met_by_it_alone(self):
+        """A simulator of one line."""
+        target = infer(OneLine(), EMPTY, EMPTY, UNITS, NOISE, with_gap=False)
+        points = torch.linspace(-3, 4, 16)[:, None]
+        found = fit_particles(target, points, self.settings, start=constant((0.0,), (0.0,)))
+        assert np.allclose(found.predict(points).mean, 0.7 * points - 1.2, atol=1e-3)
+
+
+@pytest.fixture
+def no_trend(monkeypatch):
+    """Particles without one."""
+    flat = lambda inputs, mean, weight: torch.zeros(1 + inputs.shape[2], mean.shape[1])  # noqa: E731
+    monkeypatch.setattr(sim_fsvgd, "_trend", flat)
+
+
+@pytest.mark.usefixtures("no_trend")
 class TestNoise:
     """Of constant particles without a step taken, under a target that is known, with two outputs."""
 
