@@ -43,6 +43,9 @@ LARGEST = 2000
 JITTER = 1e-5
 """Variance added to a marginal, in normalised outputs."""
 ROUNDS = 3
+"""Of finding covariance, parameters, outliers and the turn of the outputs. Of the first two thirds of train_1 of the
+ETH car and its last: 800 rows -21.1 without a turn, -24.24 with two rounds, -24.61 with three; 200 rows -20.3, -23.7
+and -23.9."""
 ROWS_FOR_TAILS = 40
 """Rows from which on outliers are told from noise."""
 SHARE_OF_MANY = 0.1
@@ -221,7 +224,8 @@ class _Case:
                 return own if doubt is None else own + doubt
 
             trust = first_trust(left, before_data, self.noise)
-        # The covariance is learned around the prior, then again around what the data leaves of it.
+        # The covariance is learned around the prior, then again around what the data leaves of it, in outputs that are
+        # turned so that their errors are independent: a process of its own for each knows nothing of another's.
         for again in reversed(range(ROUNDS if count else 0)):
             if self.with_gap:
                 said = None if model is None else seen[:, width:]

@@ -89,7 +89,7 @@ def output_correlation(white: Tensor) -> tuple[Tensor, Tensor]:
         weight = (CORRELATION_FREEDOM + outputs) / (CORRELATION_FREEDOM + joint_surprise(own, found))
         scatter = (weight[:, None] * own).T @ own / count
         wider = scatter.diagonal().clamp_min(1e-12).sqrt()
-        width = width * wider
+        width = (width * wider).clamp_min(1e-6)
         found = (scatter / (wider[:, None] * wider)) * (count / (count + CORRELATION_ROWS))
         found.fill_diagonal_(1.0)
     told = torch.where(found.abs() > TELLING / math.sqrt(count), found, 0.0).fill_diagonal_(1.0)
