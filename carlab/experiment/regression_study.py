@@ -39,8 +39,9 @@ Progress = Callable[[str, int, int], None]
 EXPECTED_FUNCTION = 1.0
 """Size of a function of which nothing is known, in units of the outputs."""
 LEAST_GAP = 0.03
-HIDDEN, STEPS = (64, 64), 4000
-"""Of particles: on 200 rows of train_1 of the ETH car as good as their target; twice the steps are level."""
+HIDDEN, STEPS = (64, 64), 12_000
+"""Of particles: on 200 rows of train_1 of the ETH car they are as good as their target after 4000 steps, on 100 of race
+cars in simulation 0.1 nats worse after 12 000 and 0.7 after 4000."""
 POOL = 1024
 DRAWS = 2048
 LEAST_RIDGE = 3
