@@ -9,7 +9,7 @@ and points where the likelihood is summed; neither is there a simulator (lasgrou
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.observation import STATE_FEATURES, decode_history, encode, push_action
-from learning.car_dynamics import drawn
+from learning.draws import Draws
 from learning.evaluation import calibration_error, negative_log_likelihood
 from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, fit
 from learning.function_prior import RbfCovariance
@@ -60,11 +60,15 @@ class WorldDynamics:
 
     posterior: Posterior
     history: int
+    _draws: Draws = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_draws", Draws.of(self.posterior))
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
         """Features (N, 7 + 2 H) a step later; sine and cosine are brought back to the circle."""
         now = in_world(features)
-        after = now + drawn(self.posterior, _inputs(now, features, action), generator)
+        after = now + self._draws(_inputs(now, features, action), generator)
         yaw = torch.atan2(after[:, 2:3], after[:, 3:4])
         ahead, left = _turned(after[:, 4], after[:, 5], yaw[:, 0])
         state = torch.cat([after[:, :2], yaw, ahead[:, None], left[:, None], after[:, 6:7]], dim=1)

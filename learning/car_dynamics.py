@@ -8,7 +8,7 @@ noise of the likelihood is added, so that a policy meets both kinds of doubt.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 from carlab.core.angles import wrap
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import STATE_FEATURES, decode_history, decode_state, encode, push_action
+from learning.draws import Draws
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.fsvgd import Posterior
 from learning.transitions import transitions_of
@@ -60,6 +61,10 @@ class CarDynamics(StepInBody):
 
     posterior: Posterior
     history: int
+    _draws: Draws = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_draws", Draws.of(self.posterior))
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Changes at inputs (N, 3 + 2 (H + 1)) with their doubt."""
@@ -67,7 +72,7 @@ class CarDynamics(StepInBody):
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """One draw (N, 6) of the mixture for each row."""
-        return drawn(self.posterior, inputs, generator)
+        return self._draws(inputs, generator)
 
     def surprise(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps [nat a step] and the calibration error there."""
@@ -75,25 +80,6 @@ class CarDynamics(StepInBody):
         inputs, outputs = (torch.from_numpy(v).to(self.posterior.parameters) for v in (rows.inputs, rows.targets))
         predicted = self.predict(inputs).smoothed()
         return negative_log_likelihood(predicted, outputs), calibration_error(predicted, outputs)
-
-
-def drawn(posterior: Posterior, inputs: Tensor, generator: torch.Generator) -> Tensor:
-    """One draw (N, O) of the mixture at raw inputs (N, D).
-
-    Rows are dealt to particles at random and evenly, so that each runs on its share alone.
-    """
-    count, particles = len(inputs), len(posterior.parameters)
-    share = -(-count // particles)
-    with torch.no_grad():
-        place = torch.randperm(share * particles, generator=generator)[:count].to(inputs.device)
-        dealt = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
-        dealt[place] = posterior.seen(inputs)
-        values = posterior.values(dealt.view(particles, share, inputs.shape[1]))
-        noise = torch.randn(values.shape, generator=generator).to(values)
-        if posterior.correlation is not None:
-            noise = noise @ torch.linalg.cholesky_ex(posterior.correlation).L.T
-        values = values + noise * posterior.noise_stds
-        return posterior.normaliser.raw_outputs(values.flatten(0, 1)[place])
 
 
 def inputs_of(features: Tensor, action: Tensor) -> Tensor:
@@ -116,4 +102,4 @@ def moved(features: Tensor, action: Tensor, change: Tensor) -> Tensor:
     return found
 
 
-__all__ = ["CarDynamics", "OneStep", "StepInBody", "drawn", "inputs_of", "moved"]
+__all__ = ["CarDynamics", "OneStep", "StepInBody", "inputs_of", "moved"]

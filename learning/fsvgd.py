@@ -150,9 +150,9 @@ class Posterior:
     correlation: Tensor | None = None
 
     @property
-    def noise_stds(self) -> Tensor:
-        """Noise of each particle to draw from, normalised (L, 1, O); some are wide, so that all have the tails."""
-        return tail_scales(self.freedom, len(self.parameters)).to(self.noise_std)[:, None, None] * self.noise_std
+    def noise_scales(self) -> Tensor:
+        """Of each particle's noise to draw from (L, 1, 1); some are wide, so that all have the tails."""
+        return tail_scales(self.freedom, len(self.parameters)).to(self.noise_std)[:, None, None]
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Prediction at raw inputs (N, D), in raw units."""

@@ -173,7 +173,7 @@ def test_particles(device: str) -> None:
 
     there, here = everywhere(fitted, device)
     close(there.parameters, here.parameters)
-    close(there.noise_stds, here.noise_stds)
+    close(there.noise_scales, here.noise_scales)
     close(there.to("cpu").to(device).predict(pendulum()[0].to(device)).means, here.predict(pendulum()[0]).means, 1e-3)
 
 
