@@ -25,7 +25,7 @@ from learning.transitions import OUTPUTS, Transitions
 
 Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
 LearnedCar = CarDynamics | WorldDynamics
-FILE_VERSION = 5
+FILE_VERSION = 6
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
 """Expected noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
 EXPECTED_GAP = 0.3
@@ -82,10 +82,15 @@ def fit_car(
         progress: told the steps of the optimiser that are done.
 
     Raises:
-        DataError: the history of the rows is not the model's, or the fit diverged.
+        DataError: the history of the rows or of the earlier fit is not the model's, or the fit diverged.
     """
     if rows is not None and rows.history != model.history:
         raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; make them alike.")
+    if before is not None and before.history != model.history:
+        raise DataError(
+            f"The earlier car has {before.history} past commands, the model {model.history}; remove its folder, and it "
+            "is learned anew."
+        )
     generator = torch.Generator().manual_seed(settings.seed)
     units = (car_units(model, generator) if before is None else before.posterior.normaliser.unturned()).to(device)
     width = 3 + 2 * (model.history + 1)
@@ -125,6 +130,7 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
         "turn": units.output_turn,
         "trend": posterior.trend,
         "correlation": posterior.correlation,
+        "reach": posterior.reach,
     }
     torch.save(content, path)
 
@@ -145,7 +151,8 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
         if content["turn"] is not None:
             units = units.turned(content["turn"])
         noise_std, freedom = content["noise_std"], float(content["freedom"])
-        posterior = Posterior(network, parameters, noise_std, units, freedom, content["trend"], content["correlation"])
+        rest = (content[name] for name in ("trend", "correlation", "reach"))
+        posterior = Posterior(network, parameters, noise_std, units, freedom, *rest)
         frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
         car: LearnedCar = frames[content.get("frame", "body")](posterior.to(device), content["history"])
     except DataError:

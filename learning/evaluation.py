@@ -74,7 +74,7 @@ class Mixture:
         return (self.epistemic_std**2 + self.aleatoric_std**2).sqrt()
 
     def smoothed(self, bandwidth: float = 0.9) -> Mixture:
-        """The same mean and, of Gaussians, variance, with components that overlap.
+        """The same mean and, of Gaussians, variance of the (turned) errors, with components that overlap.
 
         A few components far apart against their own width are a poor picture of the density that they are drawn from,
         the more outputs the worse. Each is drawn to the mean by ``sqrt(1 - b^2)`` and widened by the share ``b^2`` of

@@ -28,8 +28,8 @@ from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein
 
 CHECKED_EVERY = 500
 EDGE = 6.0
-"""How far out in their units inputs count; what lies farther is taken to lie there, for nothing was learned of it and a
-network's straight lines grow without bound when it is driven by what it said before."""
+"""How far out in their units inputs count at least; what lies farther than anything that was learned from is taken to
+lie at that edge, for a network's straight lines grow without bound when it is driven by what it said before."""
 LEAST_NOISE = 1e-4
 """Floor of the likelihood's standard deviation, in normalised units."""
 
@@ -139,6 +139,7 @@ class Posterior:
         trend: what all particles' normalised outputs have besides, linear in the normalised inputs: a constant and
             slopes (1 + D, O); nothing where it is None.
         correlation: of the noise of the normalised outputs (O, O); none unless given.
+        reach: how far out each normalised input counts (D,); as far as ``EDGE`` unless given.
     """
 
     network: Network
@@ -148,6 +149,7 @@ class Posterior:
     freedom: float = math.inf
     trend: Tensor | None = None
     correlation: Tensor | None = None
+    reach: Tensor | None = None
 
     @property
     def noise_scales(self) -> Tensor:
@@ -181,13 +183,19 @@ class Posterior:
 
     def seen(self, inputs: Tensor) -> Tensor:
         """What the networks are given for raw inputs (N, D)."""
-        return self.normaliser.inputs(inputs).clamp(-EDGE, EDGE)
+        there = self.normaliser.inputs(inputs)
+        return there.clamp(-EDGE, EDGE) if self.reach is None else there.clamp(-self.reach, self.reach)
 
     def to(self, device: torch.device | str) -> Posterior:
         """The same on a device."""
         own = (self.parameters.to(device), self.noise_std.to(device), self.normaliser.to(device))
-        rest = (None if v is None else v.to(device) for v in (self.trend, self.correlation))
+        rest = (None if v is None else v.to(device) for v in (self.trend, self.correlation, self.reach))
         return Posterior(self.network, *own, self.freedom, *rest)
+
+
+def reach_of(seen: Tensor) -> Tensor:
+    """How far out each input counts (D,) where normalised inputs (..., D) were learned from."""
+    return seen.abs().flatten(0, -2).amax(dim=0).clamp_min(EDGE)
 
 
 @dataclass
@@ -206,9 +214,9 @@ class _State:
             groups.append({"params": [self.log_noise], "weight_decay": 0.0, "faster": settings.noise_rate})
         self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
 
-    def posterior(self, network: Network, normaliser: Normaliser) -> Posterior:
+    def posterior(self, network: Network, normaliser: Normaliser, reach: Tensor) -> Posterior:
         noise = self.log_noise.exp().clamp_min(LEAST_NOISE)
-        return Posterior(network, self.networks.detach().clone(), noise, normaliser)
+        return Posterior(network, self.networks.detach().clone(), noise, normaliser, reach=reach)
 
 
 def fit(
@@ -248,6 +256,7 @@ def fit(
     width = len(normaliser.output_mean)
     network = Network(pool.shape[1], width, settings.hidden)
     everything = normaliser.inputs(torch.cat([inputs, pool]))
+    reach = reach_of(everything)
     targets = normaliser.outputs(outputs)
     noise = torch.as_tensor(settings.noise_std, dtype=everything.dtype).expand(width).to(device)
     state = _State(
@@ -267,10 +276,10 @@ def fit(
         if (step + 1) % CHECKED_EVERY == 0:
             progress(step + 1)
         if held_out is not None and (step + 1) % settings.checked_every == 0:
-            kept.look(state.posterior(network, normaliser), *held_out)
+            kept.look(state.posterior(network, normaliser, reach), *held_out)
             if kept.settled:
                 break
-    found = state.posterior(network, normaliser) if kept.posterior is None else kept.posterior
+    found = state.posterior(network, normaliser, reach) if kept.posterior is None else kept.posterior
     if not torch.isfinite(found.parameters).all():
         raise DataError("The fit diverged; fit again with a smaller learning rate.")
     return found
@@ -343,4 +352,4 @@ def _step(
     state.optimiser.step()
 
 
-__all__ = ["FsvgdSettings", "FunctionPrior", "GaussianProcessPrior", "Posterior", "SimulatorPrior", "fit"]
+__all__ = ["FsvgdSettings", "FunctionPrior", "GaussianProcessPrior", "Posterior", "SimulatorPrior", "fit", "reach_of"]

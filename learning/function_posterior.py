@@ -30,7 +30,7 @@ from learning.outliers import (
     turn_of,
     typical_scale,
 )
-from learning.parameter_posterior import posterior_parameters
+from learning.parameter_posterior import BROKEN_DOWN, posterior_parameters
 
 DRAWS = 128
 PRIOR_DRAWS = 1024
@@ -42,10 +42,14 @@ LARGEST = 2000
 """Rows that are conditioned on; of more data so many are drawn."""
 JITTER = 1e-5
 """Variance added to a marginal, in normalised outputs."""
+DOMAIN_ROWS = 64
+"""Of a simulator's domain: where draws of its prior are tried before there is data."""
 ROUNDS = 3
 """Of finding covariance, parameters, outliers and the turn of the outputs. Of the first two thirds of train_1 of the
 ETH car and its last: 800 rows -21.1 without a turn, -24.24 with two rounds, -24.61 with three; 200 rows -20.3, -23.7
 and -23.9."""
+LEAST_NOISE = 0.01
+"""Of the expected noise, what is left at least."""
 ROWS_FOR_TAILS = 40
 """Rows from which on outliers are told from noise."""
 SHARE_OF_MANY = 0.1
@@ -56,7 +60,7 @@ peculiar to a drive. Of the first two thirds of train_1 of the ETH car and its l
 ROWS_OF_A_FREEDOM, LEAST_FREEDOM = 8.0, 6.0
 """A covariance that is learned is uncertain itself: predictions have at most one degree of freedom for so many rows, or
 the least. By race cars in simulation and training rows: of 20 rows -15.6 -> -18.1, of 100 -22.32 -> -22.40."""
-_AT_ONCE = 1024
+_AT_ONCE = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +138,10 @@ class FunctionPosterior:
             if len(self.inputs):
                 half = torch.linalg.solve_triangular(self.factor, self.gap(self.inputs, at), upper=False)
                 drawn = drawn + self.white.transpose(1, 2) @ half
-                blocks = half.view(outputs, -1, count, points).permute(2, 0, 1, 3)  # (B, O, n, N)
+                blocks = half.view(outputs, len(self.inputs), count, points).permute(2, 0, 1, 3)  # (B, O, n, N)
                 covariance = covariance - blocks.transpose(2, 3) @ blocks
         mean = drawn.mean(dim=1)
-        off = (drawn - mean[:, None]).view(outputs, -1, count, points).permute(2, 0, 1, 3)
+        off = (drawn - mean[:, None]).view(outputs, drawn.shape[1], count, points).permute(2, 0, 1, 3)
         covariance = covariance + off.transpose(2, 3) @ off / drawn.shape[1]
         return mean.view(outputs, count, points).transpose(0, 1).float(), covariance
 
@@ -164,14 +168,19 @@ def infer(
         noise_std: expected noise, raw (O,).
         gap_std: expected error of the simulator, raw (O,); ``EXPECTED_GAP`` of the outputs' units unless given.
         with_gap: whether the simulator is allowed to be wrong.
-        noise_known: whether the noise is what is expected where there is no gap; with one it is learned.
+        noise_known: whether the noise is what is expected where there is no gap; with one it is learned. How heavy its
+            tails are, and its scale by rows left out, is told from ``ROWS_FOR_TAILS`` rows on all the same.
         seed: of draws.
 
     Raises:
-        DataError: numbers are missing or infinite.
+        DataError: numbers are missing or infinite, or a unit is zero; or the simulator gives no finite numbers.
     """
     if not (torch.isfinite(inputs).all() and torch.isfinite(outputs).all()):
         raise DataError("The data holds numbers that are missing or infinite; leave those rows out and fit again.")
+    if len(inputs) != len(outputs):
+        raise DataError(f"There are {len(inputs)} rows of inputs and {len(outputs)} of outputs; each row needs both.")
+    if not all(bool((size > 0.0).all()) for size in (normaliser.input_std, normaliser.output_std, noise_std)):
+        raise DataError("A unit or an expected noise is zero; each input and output needs one that is larger.")
     if len(inputs) > LARGEST:
         generator = torch.Generator().manual_seed(seed)
         some = torch.randperm(len(inputs), generator=generator)[:LARGEST].to(inputs.device)
@@ -215,6 +224,9 @@ class _Case:
         parameters: Tensor | None = None
         if model is not None:
             parameters = draw_parameters(model, PRIOR_DRAWS if count else DRAWS, generator).to(inputs)
+            if not count:
+                domain = model.inputs(DOMAIN_ROWS, torch.Generator().manual_seed(self.seed)).to(inputs)
+                parameters = parameters[_sound(_simulated(model, domain, parameters, normaliser))]
         left, known, seen = self._left(x, y, parameters, normaliser)
         if count >= ROWS_FOR_TAILS:
             before, doubt = gap, known
@@ -247,16 +259,19 @@ class _Case:
                 freedom = min(found, most)
                 scale = typical_scale(white**2, freedom)
                 if again:
-                    expected_noise = wide * noise
+                    # An output that never changes tells of no noise at all.
+                    expected_noise = torch.maximum(wide * noise, LEAST_NOISE * self.noise)
                     normaliser = normaliser.turned(turn_of(correlation, wide * doubt.median(dim=0).values.sqrt()))
                     y = normaliser.outputs(self.outputs).double()
                     left, known, seen = self._left(x, y, parameters, normaliser)
         factor = torch.linalg.cholesky(_covariance(gap, seen, noise, trust))
         every = y[None]
         if model is not None and parameters is not None:
-            every = y - _simulated(model, inputs, parameters, normaliser)
+            there = _simulated(model, inputs, parameters, normaliser)
+            sound = _sound(there)
+            parameters, every = parameters[sound], y - there[sound]
         white = torch.linalg.solve_triangular(factor, every.permute(2, 1, 0), upper=False)
-        noise_std = (scale * noise).float()
+        noise_std = torch.maximum(scale * noise, LEAST_NOISE * self.noise).float()
         return FunctionPosterior(
             normaliser, noise_std, freedom, correlation.float(), model, parameters, gap, seen, factor, white
         )
@@ -268,6 +283,7 @@ class _Case:
         if self.model is None or parameters is None:
             return y, None, x
         there = _simulated(self.model, self.inputs, parameters, normaliser)
+        there = there[_sound(there)]
         mean = there.mean(dim=0)
         off = (there - mean).permute(2, 0, 1)
         return y - mean, off.transpose(1, 2) @ off / len(there), torch.cat([x, mean], dim=1)
@@ -279,6 +295,18 @@ def _simulated(model: DomainModel, inputs: Tensor, parameters: Tensor, normalise
         return torch.zeros((len(parameters), 0, len(normaliser.output_std)), dtype=torch.float64, device=inputs.device)
     with torch.no_grad():
         return normaliser.outputs(model(inputs, parameters)).double()
+
+
+def _sound(simulated: Tensor) -> Tensor:
+    """Which draws (P,) a simulator gives finite outputs (P, N, O) for: it may break down for some.
+
+    Raises:
+        DataError: for none.
+    """
+    found = torch.isfinite(simulated).flatten(1).all(dim=1)
+    if not bool(found.any()):
+        raise DataError(BROKEN_DOWN)
+    return found
 
 
 def _covariance(gap: GapCovariance | None, inputs: Tensor, noise: Tensor, trust: Tensor) -> Tensor:

@@ -15,8 +15,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from learning.adam import Adam
+
 STEPS = 120
-RATE = 0.08
+RATE, LAST_RATE = 0.08, 0.05
+"""Of Adam; the share of it that is left at the end of a half cosine."""
 EVIDENCE_ROWS = 300
 """Rows of a step, drawn anew for each where there are more."""
 TINY = 1e-6
@@ -29,6 +32,10 @@ WIDTH_SCALE, WIDTH_OWN, WIDTH_NOISE = 1.0, 0.3, 0.5
 WIDTH_SIZE, WIDTH_REACH = 1.0, 1.0
 """The same of a factor on all sizes of an output, and of one on the lengthscales of all outputs along an input: a few
 rows cannot tell each output's alone."""
+
+
+Evaluated = tuple[Tensor, Callable[[Tensor], list[Tensor]]]
+"""A covariance, and what turns a gradient by it into those by what it was made of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,24 +83,63 @@ class GapCovariance:
         second = first if second is None else second
         outputs, width = self.lengths.shape
         a, b = first[..., :width], second[..., :width]
-        each = (outputs, *[1] * (first.ndim - 1), width)
         alone = (outputs, *[1] * first.ndim)
-
-        def scaled(by: Tensor) -> Tensor:
-            """Inner products of inputs that are multiplied by ``by`` (O, D)."""
-            return (a * by.view(each) ** 2) @ b.transpose(-1, -2)
-
-        def near(lengths: Tensor) -> Tensor:
-            by = 1.0 / lengths
-            squares = [((x[None] * by.view(each)) ** 2).sum(dim=-1) for x in (a, b)]
-            distance = squares[0][..., :, None] + squares[1][..., None, :] - 2.0 * scaled(by)
-            return torch.exp(-0.5 * distance.clamp_min(0.0))
-
-        found = self.scales.view(alone) ** 2 * near(self.lengths) + scaled(self.slopes) + self.offsets.view(alone) ** 2
+        found = _near(a, b, self.lengths).mul_(self.scales.view(alone) ** 2)
+        found.add_(_inner(a, b, self.slopes)).add_(self.offsets.view(alone) ** 2)
         if first.shape[-1] == width:
             return found
         said = [self.doubts.view(alone[:-1]) * x[..., width:].movedim(-1, 0) for x in (first, second)]
-        return found + said[0][..., :, None] * said[1][..., None, :] * near(self.doubt_lengths)
+        share = _near(a, b, self.doubt_lengths).mul_(said[0][..., :, None]).mul_(said[1][..., None, :])
+        return found.add_(share)
+
+    def with_pullback(self, inputs: Tensor) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
+        """The covariance (O, n, n) of inputs (n, D) or (n, D + O) with themselves, and its derivative.
+
+        The derivative turns a symmetric gradient by the covariance into those by the logarithms of the six parts, in
+        their order. By hand it is a few products where a tape keeps a dozen matrices.
+        """
+        width = self.lengths.shape[1]
+        x = inputs[:, :width]
+        smooth = _near(x, x, self.lengths).mul_(self.scales[:, None, None] ** 2)
+        found = _inner(x, x, self.slopes).add_(smooth).add_(self.offsets[:, None, None] ** 2)
+        share: Tensor | None = None
+        if inputs.shape[1] > width:
+            said = self.doubts[:, None] * inputs[:, width:].T
+            share = _near(x, x, self.doubt_lengths).mul_(said[:, :, None]).mul_(said[:, None, :])
+            found.add_(share)
+
+        def of_lengths(gradient: Tensor, lengths: Tensor) -> Tensor:
+            """By the logarithms of lengths (O, D), of a gradient times the covariance that has them."""
+            return 2.0 * (gradient.sum(dim=2) @ x**2 - ((gradient @ x) * x).sum(dim=1)) / lengths**2
+
+        def pullback(gradient: Tensor) -> list[Tensor]:
+            of_smooth = gradient * smooth
+            parts = [
+                2.0 * of_smooth.sum(dim=(1, 2)),
+                of_lengths(of_smooth, self.lengths),
+                2.0 * self.slopes**2 * ((gradient @ x) * x).sum(dim=1),
+                2.0 * self.offsets**2 * gradient.sum(dim=(1, 2)),
+            ]
+            if share is None:
+                return [*parts, torch.zeros_like(self.doubts), torch.zeros_like(self.doubt_lengths)]
+            of_share = gradient * share
+            return [*parts, 2.0 * of_share.sum(dim=(1, 2)), of_lengths(of_share, self.doubt_lengths)]
+
+        return found, pullback
+
+
+def _inner(a: Tensor, b: Tensor, by: Tensor) -> Tensor:
+    """Inner products (O, ..., N, M) of inputs (..., N, D) and (..., M, D) that are both multiplied by (O, D)."""
+    return (a * by.view(len(by), *[1] * (a.ndim - 1), -1) ** 2) @ b.transpose(-1, -2)
+
+
+def _near(a: Tensor, b: Tensor, lengths: Tensor) -> Tensor:
+    """``exp(-|(a - b) / l|^2 / 2)`` (O, ..., N, M) for lengths (O, D)."""
+    by = 1.0 / lengths
+    each = by.view(len(by), *[1] * (a.ndim - 1), -1)
+    squares = [((x[None] * each) ** 2).sum(dim=-1) for x in (a, b)]
+    distance = _inner(a, b, by).mul_(-2.0).add_(squares[0][..., :, None]).add_(squares[1][..., None, :])
+    return distance.clamp_min_(0.0).mul_(-0.5).exp_()
 
 
 def learn_gap(
@@ -137,54 +183,70 @@ def learn_gap(
         *(WIDTH_NOISE, WIDTH_SIZE, WIDTH_REACH),
     )
 
-    def covariance_of(logs: list[Tensor], rows: Tensor) -> Tensor:
-        found = _gap_of(logs)(inputs[rows]) + _noise_covariance(logs[6], trust[rows])
-        return found if known is None else found + known[:, rows][:, :, rows]
+    def evaluated(logs: list[Tensor], rows: Tensor) -> Evaluated:
+        covariance, of_parts = _gap_of(logs).with_pullback(inputs[rows])
+        of_noise = _noise_variance(logs[6], trust[rows])
+        covariance.diagonal(dim1=1, dim2=2).add_(of_noise + TINY)
+        if known is not None:
+            covariance += known[:, rows][:, :, rows]
 
-    logs = _most_probable(middles, widths, residual, covariance_of, seed)
+        def pullback(gradient: Tensor) -> list[Tensor]:
+            parts = of_parts(gradient)
+            scales, lengths, slopes, offsets, doubts, doubt_lengths = parts
+            size = scales + slopes.sum(dim=1) + offsets + doubts
+            return [*parts, _by_noise(gradient, of_noise), size, (lengths + doubt_lengths).sum(dim=0)]
+
+        return covariance, pullback
+
+    logs = _most_probable(middles, widths, residual, evaluated, seed)
     return _gap_of(logs), logs[6].exp()
 
 
 def learn_noise(residual: Tensor, known: Tensor | None, noise_std: Tensor, trust: Tensor, seed: int = 0) -> Tensor:
     """The noise (O,) alone, of a simulator without a gap; arguments as for ``learn_gap``."""
 
-    def covariance_of(logs: list[Tensor], rows: Tensor) -> Tensor:
-        found = _noise_covariance(logs[0], trust[rows])
-        return found if known is None else found + known[:, rows][:, :, rows]
+    def evaluated(logs: list[Tensor], rows: Tensor) -> Evaluated:
+        of_noise = _noise_variance(logs[0], trust[rows])
+        covariance = torch.diag_embed(of_noise + TINY)
+        if known is not None:
+            covariance += known[:, rows][:, :, rows]
+        return covariance, lambda gradient: [_by_noise(gradient, of_noise)]
 
-    return _most_probable([noise_std.double().log()], (WIDTH_NOISE,), residual.double(), covariance_of, seed)[0].exp()
+    return _most_probable([noise_std.double().log()], (WIDTH_NOISE,), residual.double(), evaluated, seed)[0].exp()
 
 
 def _most_probable(
     middles: list[Tensor],
     widths: Sequence[float],
     residual: Tensor,
-    covariance_of: Callable[[list[Tensor], Tensor], Tensor],
+    evaluated: Callable[[list[Tensor], Tensor], Evaluated],
     seed: int,
 ) -> list[Tensor]:
     """Logarithms under Gaussian priors that make residuals (n, O) with covariances (O, n, n) most probable."""
     generator, count = torch.Generator().manual_seed(seed), len(residual)
     rows = torch.arange(count, device=residual.device)
-    logs = [m.clone().requires_grad_() for m in middles]
-    optimiser = torch.optim.Adam(logs, lr=RATE)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS, eta_min=0.05 * RATE)
-    for _ in range(STEPS):
+    logs = [m.clone() for m in middles]
+    optimisers = [Adam(value) for value in logs]
+    for step in range(STEPS):
         if count > EVIDENCE_ROWS:
             rows = torch.randperm(count, generator=generator)[:EVIDENCE_ROWS].to(residual.device)
-        covariance = covariance_of(logs, rows)
-        held = torch.zeros_like(residual[0, 0])
-        for value, middle, width in zip(logs, middles, widths, strict=True):
-            held = held + 0.5 * (((value - middle) / width) ** 2).sum()
-        ways = (evidence_gradient(residual[rows], covariance.detach()), torch.ones_like(held))
-        for value, gradient in zip(logs, torch.autograd.grad((covariance, held), logs, ways), strict=True):
-            value.grad = gradient
-        optimiser.step()
-        schedule.step()
-    return [value.detach() for value in logs]
+        covariance, pullback = evaluated(logs, rows)
+        gradients = pullback(evidence_gradient(residual[rows], covariance))
+        rate = RATE * (LAST_RATE + (1.0 - LAST_RATE) * 0.5 * (1.0 + math.cos(math.pi * step / STEPS)))
+        held = [(value - middle) / width**2 for value, middle, width in zip(logs, middles, widths, strict=True)]
+        for optimiser, gradient, back in zip(optimisers, gradients, held, strict=True):
+            optimiser.step(gradient + back, rate)
+    return logs
 
 
-def _noise_covariance(log_noise: Tensor, trust: Tensor) -> Tensor:
-    return torch.diag_embed(torch.exp(2.0 * log_noise)[:, None] / trust + TINY)
+def _noise_variance(log_noise: Tensor, trust: Tensor) -> Tensor:
+    """Of each output and row (O, n), the larger the less a row is trusted."""
+    return torch.exp(2.0 * log_noise)[:, None] / trust
+
+
+def _by_noise(gradient: Tensor, variance: Tensor) -> Tensor:
+    """Gradient (O,) by the logarithms of the noise, from one by the covariance (O, n, n)."""
+    return 2.0 * (gradient.diagonal(dim1=1, dim2=2) * variance).sum(dim=1)
 
 
 def _gap_of(logs: list[Tensor]) -> GapCovariance:
@@ -204,8 +266,8 @@ def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
     """
     factor = torch.linalg.cholesky(covariance)
     solved = torch.cholesky_solve(residual.T[:, :, None], factor)
-    gradient: Tensor = 0.5 * (torch.cholesky_inverse(factor) - solved @ solved.transpose(1, 2))
-    return gradient
+    gradient: Tensor = torch.cholesky_inverse(factor)
+    return gradient.baddbmm_(solved, solved.transpose(1, 2), beta=0.5, alpha=-0.5)
 
 
 __all__ = ["GapCovariance", "evidence_gradient", "learn_gap", "learn_noise"]

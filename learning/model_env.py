@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
+from carlab.core.errors import ConfigError, DataError
 from carlab.core.geofence import each_can_stop_inside, stopping_distance_m
 from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
 from carlab.core.safety import SafetyEnvelope
@@ -50,6 +51,10 @@ class ModelEnv(VecEnv):
         period_s: control period, for the slew limits [s].
         seed: of starts, particles and noise.
         device: where the model's tensors are.
+
+    Raises:
+        ConfigError: task and model have other histories.
+        DataError: recorded states have another number of features.
     """
 
     def __init__(
@@ -66,6 +71,13 @@ class ModelEnv(VecEnv):
         device: torch.device | str = "cpu",
     ) -> None:
         width = feature_size(model.history)
+        if task.history_length != model.history:
+            raise ConfigError(
+                f"The task shows {task.history_length} past commands, the learned car takes {model.history}; make them "
+                "alike."
+            )
+        if recorded is not None and recorded.shape[1:] != (width,):
+            raise DataError(f"Recorded starts have {recorded.shape[1:]} features, this car {width}; encode them anew.")
         high = np.full(width, FARTHEST, dtype=np.float32)
         super().__init__(
             cars, gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)

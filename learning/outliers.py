@@ -125,7 +125,7 @@ def turn_of(correlation: Tensor, size: Tensor) -> Tensor:
 
 
 def student_weights(surprise: Tensor, outputs: int) -> tuple[float, Tensor]:
-    """The degrees of freedom that make surprises most likely, and the weight of each row.
+    """The fewest degrees of freedom that none larger beats by a nat in likelihood, and the weight of each row.
 
     Args:
         surprise: squared, summed over outputs (n,).

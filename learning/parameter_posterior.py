@@ -10,9 +10,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from carlab.core.errors import DataError
 from learning.domain_models import DomainModel
 from learning.normaliser import Normaliser
 
+BROKEN_DOWN = (
+    "The simulator gives no finite numbers for this data; narrow the ranges of its parameters, or name another."
+)
 MOVES = 4
 KEPT = 0.5
 """Effective share of the draws that a colder likelihood leaves."""
@@ -42,6 +46,9 @@ def posterior_parameters(
 
     Returns:
         Parameters (count, K).
+
+    Raises:
+        DataError: the simulator gives no finite number for any draw.
     """
     wanted = normaliser.outputs(outputs).double()
     device = wanted.device
@@ -54,9 +61,11 @@ def posterior_parameters(
 
     with torch.no_grad():
         normal = torch.randn((count, model.size), generator=generator).double().to(device)
-        if not len(inputs):
+        if not len(inputs) or not model.size:
             return model.parameters(normal).to(inputs)
         likelihood = log_likelihood(normal)
+        if not bool(torch.isfinite(likelihood).any()):
+            raise DataError(BROKEN_DOWN)
         cold = 0.0
         for _ in range(HOTTEST):
             step = _colder(likelihood, 1.0 - cold)
@@ -106,4 +115,4 @@ def _resampled(weight: Tensor, generator: torch.Generator) -> Tensor:
     return torch.searchsorted(weight.cumsum(dim=0), (points / count).to(weight.device)).clamp_max(count - 1)
 
 
-__all__ = ["posterior_parameters"]
+__all__ = ["BROKEN_DOWN", "posterior_parameters"]

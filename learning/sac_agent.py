@@ -25,7 +25,10 @@ AGENT_FILE = "agent.zip"
 MOMENTS_FILE = "moments.pt"
 NEVER = 2**62
 DIVERGED = "The policy diverged; train it with a smaller learning rate."
-_BROKEN = (OSError, ValueError, LookupError, RuntimeError, EOFError, AssertionError, pickle.UnpicklingError)
+_BROKEN = (
+    *(OSError, ValueError, LookupError, RuntimeError, EOFError, AssertionError, TypeError, AttributeError),
+    pickle.UnpicklingError,
+)
 _NO_REPLAY: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1, "n_steps": 1}
 """An agent that is read drives, or gives its networks to one that learns."""
 
@@ -85,7 +88,7 @@ class SacAgent:
             updates: gradient steps.
             progress: told the gradient steps done.
             judge: says how good the policy is; of those at ``judged`` even distances, the last one among them, the best
-                is kept.
+                is kept, temperature and moments with it.
             judged: how often it is asked.
 
         Returns:
@@ -116,6 +119,7 @@ class SacAgent:
         made.set_logger(Logger(None, []))
         env.seed_anew()
         best, kept = -np.inf, None
+        assert made.log_ent_coef is not None
         self._sac = made
         try:
             made.learn(s.warm_up, log_interval=NEVER)
@@ -126,14 +130,18 @@ class SacAgent:
                 if not all(bool(torch.isfinite(p).all()) for p in made.policy.parameters()):
                     raise DataError(DIVERGED)
                 if judge is not None and (value := judge(self)) > best:
-                    best, kept = value, copy.deepcopy(made.policy.state_dict())
+                    kept = copy.deepcopy((made.policy.state_dict(), made.log_ent_coef.data, made.optimiser_state()))
+                    best = value
         except BaseException as error:
             self._sac = again
             if isinstance(error, ValueError) and "nan" in str(error):  # torch's distributions refuse what is no number.
                 raise DataError(DIVERGED) from error
             raise
         if kept is not None:
-            made.policy.load_state_dict(kept)
+            networks, temperature, moments = kept
+            made.policy.load_state_dict(networks)
+            made.log_ent_coef.data.copy_(temperature)
+            made.load_optimiser_state(moments)
         return {name: float(value) for name, value in made.logger.name_to_value.items()}
 
     def policy(self) -> SacPolicy:
@@ -163,15 +171,7 @@ class SacAgent:
         try:
             found._sac = FastSac.load(folder / AGENT_FILE, device="cpu", custom_objects=_NO_REPLAY)
             found._sac.load_optimiser_state(torch.load(folder / MOMENTS_FILE, weights_only=True, map_location="cpu"))
-        except (
-            OSError,
-            ValueError,
-            LookupError,
-            RuntimeError,
-            EOFError,
-            AssertionError,
-            pickle.UnpicklingError,
-        ) as error:
+        except _BROKEN as error:
             raise DataError(
                 f"The policy in {folder} cannot be read ({error}); remove the folder, and it is trained anew."
             ) from error

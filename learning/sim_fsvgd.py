@@ -17,7 +17,7 @@ from torch import Tensor
 from carlab.core.errors import DataError
 from learning.adam import Adam
 from learning.domain_models import DomainModel
-from learning.fsvgd import Posterior
+from learning.fsvgd import Posterior, reach_of
 from learning.function_posterior import JITTER, FunctionPosterior
 from learning.normaliser import Normaliser
 from learning.particles import Activation, Network
@@ -106,6 +106,7 @@ def fit_particles(
     mean, covariance = target.marginals(sets)
     factor, weight = _factors(covariance, target.noise_std)
     inputs = normaliser.inputs(sets)
+    reach = reach_of(torch.cat([inputs.flatten(0, 1), target.inputs[:, : inputs.shape[2]].to(inputs)]))
     trend = _trend(inputs, mean, weight)
     wanted = mean - _linear(trend, inputs)
     order = torch.randint(count, (settings.steps, settings.sets), generator=generator).to(device)
@@ -133,7 +134,7 @@ def fit_particles(
         found = network(numbers, inputs.flatten(0, 1)).view(-1, *sets.shape[:2], outputs).transpose(2, 3)
         variance = covariance.diagonal(dim1=2, dim2=3).to(found)
         noise = _noise(found + _linear(trend, inputs), mean, variance, weight, target.noise_std, most)
-    return Posterior(network, numbers, noise, normaliser, target.freedom, trend, target.correlation)
+    return Posterior(network, numbers, noise, normaliser, target.freedom, trend, target.correlation, reach)
 
 
 def measurement_points(

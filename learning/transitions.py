@@ -100,6 +100,14 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
     )
 
 
+def has_whole_step(episode: EpisodeData, history: int) -> bool:
+    """Whether ``transitions_of`` finds any row in an episode; a short one with a late stamp may have none."""
+    try:
+        return bool(len(transitions_of([episode], history)))
+    except DataError:
+        return False
+
+
 def velocity_delay_s(rows: Transitions, period_s: float) -> float:
     """By how much the velocities of some rows lag behind their poses [s]; about half a period for backward differences.
 
@@ -110,16 +118,22 @@ def velocity_delay_s(rows: Transitions, period_s: float) -> float:
     Args:
         rows: rows.
         period_s: their period [s].
+
+    Raises:
+        DataError: there are no rows.
     """
+    if not len(rows):
+        raise DataError("No rows tell by how much velocities are late; record longer drives.")
     first, change = rows.inputs[:, [0, 2]], rows.targets[:, [3, 5]]
     off = rows.targets[:, [0, 2]] / period_s - first
-    share, kept = np.full(2, 0.5), np.ones(off.shape, dtype=bool)
+    share, kept, told = np.full(2, 0.5), np.ones(off.shape, dtype=bool), np.zeros(2)
     for _ in range(TRIMMED):
-        share = (kept * off * change).sum(axis=0) / np.maximum((kept * change * change).sum(axis=0), 1e-12)
+        told = (kept * change * change).sum(axis=0)
+        share = np.where(told > 0.0, (kept * off * change).sum(axis=0) / np.maximum(told, 1e-12), 0.5)
         error = np.abs(off - share * change)
         kept = error <= np.quantile(error, KEPT, axis=0)
-    late_s = float(np.clip(share.mean() - 0.5, 0.0, 1.0)) * period_s
+    late_s = float(np.clip(share[told > 0.0].mean() - 0.5, 0.0, 1.0)) * period_s if told.any() else 0.0
     return late_s if late_s > LEAST_LATE_S else 0.0
 
 
-__all__ = ["OUTPUTS", "Transitions", "transitions_of", "velocity_delay_s"]
+__all__ = ["OUTPUTS", "Transitions", "has_whole_step", "transitions_of", "velocity_delay_s"]

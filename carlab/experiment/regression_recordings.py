@@ -21,6 +21,8 @@ from learning.transitions import Transitions, transitions_of, velocity_delay_s
 FASTEST_TURN_RADPS = 10.0
 """Rows that turn faster are spikes of a differentiated angle."""
 NAME = "realcar"
+LEAST_UNIT = 1e-3
+"""Of inputs and outputs: one that never changed has none of its own."""
 COUNTS = (50, 200, 800)
 DELAY_S = (0.0, 0.2)
 
@@ -78,7 +80,9 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
     simulator = load_car_file(car).simulator
     late_s = velocity_delay_s(rows, simulator.control_period_s)
     ranges = {"timing.command_delay": DELAY_S, **simulator.priors}
-    output_std = tuple(float(v) for v in rows.targets.std(axis=0))
+    input_std, output_std = (
+        tuple(float(v) for v in np.maximum(of.std(axis=0), LEAST_UNIT)) for of in (rows.inputs, rows.targets)
+    )
     return RecordedCase(
         name=NAME,
         prior=CarModel(simulator, history, ranges, velocity_delay_s=late_s),
@@ -88,7 +92,7 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
         noise_std=tuple(0.5 * n for n in NOISE_STD),
         likelihood_std=tuple(0.5 * s for s in output_std),
         learn_noise=True,
-        input_std=tuple(float(v) for v in rows.inputs.std(axis=0)),
+        input_std=input_std,
         output_std=output_std,
         gap_std=tuple(0.3 * s for s in output_std),
         gap_lengthscale=3.0,

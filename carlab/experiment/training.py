@@ -28,7 +28,7 @@ from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from learning.car_fit import LearnedCar, Method
 from learning.simulator_model import CarModel, known_ranges
-from learning.transitions import Transitions, transitions_of
+from learning.transitions import Transitions, has_whole_step, transitions_of
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -120,12 +120,12 @@ def train(
     episodes = [read_episode(path) for path in recordings if has_ticks(path)]
     simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
     model = CarModel(simulator, plan.history, known_ranges(simulator))
-    usable = [e for e in episodes if e.ticks > plan.history]
+    usable = [e for e in episodes if has_whole_step(e, plan.history)]
     rows = transitions_of(usable, plan.history) if usable else None
     figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
     earlier = model_folder(models, number - 1)
     before = load_car(earlier / DYNAMICS_FILE, plan.device) if earlier.is_dir() else None
-    if before is not None and episodes and episodes[-1].ticks > plan.history:
+    if before is not None and usable and usable[-1] is episodes[-1]:
         nll, off = before.surprise(episodes[-1])
         figures |= {"last_episode_nll": nll, "last_episode_calibration_error": off}
 

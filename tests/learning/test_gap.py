@@ -98,6 +98,24 @@ class TestCovariance:
         assert np.allclose(found(a[None], b[None])[:, 0, 0], [0.25 * shape, 4.0 * shape], atol=1e-12)
 
 
+@pytest.mark.parametrize("with_simulator", [False, True])
+def test_the_derivative_by_hand_is_that_of_small_steps(with_simulator):
+    """Along a symmetric way, by the logarithms of all six parts, with central differences."""
+    inputs, way = normal(7, 3 + 2 * with_simulator), normal(2, 7, 7, seed=1)
+    way = way + way.transpose(1, 2)
+    logs = [0.3 * normal(*size, seed=2) for size in [(2,), (2, 3), (2, 3), (2,), (2,), (2, 3)]]
+    found, pullback = GapCovariance(*(v.exp() for v in logs)).with_pullback(inputs)
+    assert np.allclose(found, GapCovariance(*(v.exp() for v in logs))(inputs), atol=1e-12)
+    for part, own in enumerate(pullback(way)):
+        for place in np.ndindex(own.shape):
+            both = []
+            for step in (1e-5, -1e-5):
+                moved = [v.clone() for v in logs]
+                moved[part][place] += step
+                both.append(float((GapCovariance(*(v.exp() for v in moved))(inputs) * way).sum()))
+            assert float(own[place]) == pytest.approx((both[0] - both[1]) / 2e-5, abs=1e-6)
+
+
 def test_the_gradient_of_the_evidence_is_that_of_scipys_density():
     """Along symmetric ways, by central differences."""
     residual, roots, way = normal(6, 2), normal(2, 6, 6, seed=1), normal(2, 6, 6, seed=2)

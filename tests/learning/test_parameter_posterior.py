@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from carlab.core.errors import DataError
 from learning.domain_models import uniform
 from learning.normaliser import Normaliser
 from learning.parameter_posterior import posterior_parameters
@@ -169,6 +170,11 @@ def test_where_the_simulator_breaks_down_there_are_no_draws(broken):
     assert draws.min() > 0.7
     assert draws.mean() == pytest.approx(mean, abs=0.15 * std)
     assert draws.std() == pytest.approx(std, rel=0.1)
+
+
+def test_a_simulator_that_breaks_down_everywhere_is_refused():
+    with pytest.raises(DataError, match="narrow the ranges"):
+        of_one(lambda t: torch.full_like(t, float("nan")), [0.5], 0.5)
 
 
 def test_the_same_seed_gives_the_same_draws():

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import SAC
 from torch import Tensor
 
 from carlab.core.errors import DataError
@@ -111,10 +112,13 @@ def test_a_policy_that_was_read_acts_alike_and_learns_on_from_there(trained: Sac
 
 
 @pytest.mark.parametrize(("values", "kept"), [((5, 4, 3, 2), 0), ((1, 2, 3, 4), 3), ((0, 7, 2, 7), 1)])
-def test_the_best_judged_policy_is_kept(values: tuple[float, ...], kept: int) -> None:
+def test_the_best_judged_policy_is_kept_whole(values: tuple[float, ...], kept: int, tmp_path: Path) -> None:
     judged: list[np.ndarray] = []
+    folders = [tmp_path / str(k) for k in range(5)]
 
     def judge(agent: SacAgent) -> float:
+        folders[len(judged)].mkdir()
+        agent.save(folders[len(judged)])
         judged.append(answers(agent))
         return values[len(judged) - 1]
 
@@ -123,6 +127,14 @@ def test_the_best_judged_policy_is_kept(values: tuple[float, ...], kept: int) ->
     assert len(judged) == 4
     assert all(not np.array_equal(a, b) for a, b in pairwise(judged))
     np.testing.assert_array_equal(answers(agent), judged[kept])
+    folders[4].mkdir()
+    agent.save(folders[4])
+    found, then = (torch.load(folders[k] / MOMENTS_FILE, weights_only=True) for k in (4, kept))
+    for name, state in then.items():
+        assert state["steps"] == found[name]["steps"]
+        assert torch.equal(state["square"], found[name]["square"])
+    found, then = (SAC.load(folders[k] / AGENT_FILE).log_ent_coef for k in (4, kept))
+    assert torch.equal(found, then)
 
 
 @pytest.mark.parametrize("how", ["a rate far too large", "a world that is no number"])
@@ -195,6 +207,13 @@ def test_broken_files_are_refused_with_what_to_do(saved: Path, tmp_path: Path, n
         broken = {"empty": b"", "cut short": whole[: len(whole) // 2], "text": b"rubbish\n", "other text": b"hello"}
         path.write_bytes(broken[kind])
     with pytest.raises(DataError, match=r"remove the folder, and it is trained anew\.$"):
+        SacAgent.load(tmp_path, SMALL, 0)
+
+
+@pytest.mark.parametrize("moments", [5, [1], {"actor": {"mean": "a", "square": "b", "steps": 1}}])
+def test_moments_that_are_none_are_refused(saved: Path, tmp_path: Path, moments: object) -> None:
+    torch.save(moments, copied(saved, tmp_path) / MOMENTS_FILE)
+    with pytest.raises(DataError, match="trained anew"):
         SacAgent.load(tmp_path, SMALL, 0)
 
 

@@ -160,6 +160,19 @@ def no_trend(monkeypatch):
 
 
 @pytest.mark.usefixtures("no_trend")
+def test_particles_count_inputs_as_far_out_as_they_were_led():
+    """Nine units here; farther out is as at that edge."""
+    rng = np.random.default_rng(0)
+    x = torch.from_numpy(rng.uniform(-9.0, 9.0, (60, 1))).float()
+    units = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
+    target = infer(None, x, 0.5 * x + 0.05 * torch.from_numpy(rng.normal(size=(60, 1))).float(), units, torch.ones(1))
+    found = fit_particles(target, torch.linspace(-9.0, 9.0, 400)[:, None], ParticleSettings(steps=200, hidden=(16,)))
+    at = torch.tensor([[-8.5], [8.5], [9.0], [30.0]])
+    said = found.predict(at).mean[:, 0]
+    assert said[:2].tolist() == pytest.approx([-4.25, 4.25], abs=0.2)
+    assert said[3] == pytest.approx(float(said[2]), abs=0.05)
+
+
 class TestNoise:
     """Of constant particles without a step taken, under a target that is known, with two outputs."""
 

@@ -13,7 +13,7 @@ from carlab.core.quantities import Action
 from carlab.core.task import ParkingTask
 from carlab.experiment.episode import run_episode
 from learning.ridge import PENALTIES, Ridge
-from learning.transitions import OUTPUTS, transitions_of
+from learning.transitions import OUTPUTS, Transitions, has_whole_step, transitions_of, velocity_delay_s
 
 
 def episode(ticks=30, seed=0):
@@ -75,6 +75,36 @@ def test_episodes_do_not_flow_into_each_other():
 def test_what_makes_no_row_is_said(history, said):
     with pytest.raises(DataError, match=said):
         transitions_of([episode()], history)
+
+
+def test_a_short_episode_with_a_late_stamp_has_no_whole_step():
+    whole = episode(4)
+    assert has_whole_step(whole, 3)
+    assert not has_whole_step(dataclasses.replace(whole, times_s=np.array([0.0, 1.0, 2.0, 6.0, 7.0]) / 30.0), 3)
+    assert not has_whole_step(episode(3), 3)
+
+
+class TestVelocityDelay:
+    """Velocities of a drive that are differences of its poses, half a period late."""
+
+    def late(self, rate):
+        ahead = 0.03 * np.sin(np.arange(60) / 9.0) + 0.05
+        turn = rate / 30.0 * np.cos(np.arange(60) / 7.0)
+        inputs = np.zeros((59, 5))
+        inputs[:, 0], inputs[:, 2] = ahead[:-1] * 30.0, turn[:-1] * 30.0
+        change = np.stack([np.diff(ahead), 0 * turn[1:], np.diff(turn)], axis=1) * 30.0
+        targets = np.hstack([ahead[1:, None], 0 * turn[1:, None], turn[1:, None], change])
+        index = np.arange(59)
+        return velocity_delay_s(Transitions(inputs, targets, 0 * index, index, 0), 1.0 / 30.0)
+
+    @pytest.mark.parametrize("rate", [0.0, 2.0])
+    def test_it_is_half_a_period_whether_or_not_the_car_turns(self, rate):
+        assert self.late(rate) == pytest.approx(0.5 / 30.0, rel=1e-6)
+
+    def test_no_rows_tell_nothing(self):
+        rows = transitions_of([episode()], 3)
+        with pytest.raises(DataError, match="longer drives"):
+            velocity_delay_s(rows.take(np.zeros(len(rows), dtype=bool)), 1.0 / 30.0)
 
 
 class Noise:
