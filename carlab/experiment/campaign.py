@@ -56,17 +56,25 @@ KINEMATIC_UNCERTAIN = ("motor.drive_gain", "motor.damping", "steering.max_angle"
 def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"]) -> SimulatorConfig:
     """The simulator that is the prior: the car's own, or one whose wheels do not slip; with ranges.
 
+    Those of the file hold for wheels that do not slip, too. Where it has none, numbers that are rarely known
+    (``UNCERTAIN``) lie within ``SPREAD`` of their values.
+
     Args:
         car: as its file describes it.
         kind: which.
     """
+    values = car.values()
     if kind == "kinematic":
-        car = replace(car, kind="kinematic", effects={}, priors={}, doubts={})
+        spans = {n: car.priors.get(n, _about(values[n])) for n in KINEMATIC_UNCERTAIN}
+        return replace(car, kind="kinematic", effects={}, priors=spans, doubts={})
     if car.priors or car.doubts:
         return car
-    values = car.values()
     names = KINEMATIC_UNCERTAIN if car.kind == "kinematic" else UNCERTAIN
-    return replace(car, priors={n: (values[n] * (1.0 - SPREAD), values[n] * (1.0 + SPREAD)) for n in names})
+    return replace(car, priors={n: _about(values[n]) for n in names})
+
+
+def _about(value: float) -> tuple[float, float]:
+    return value * (1.0 - SPREAD), value * (1.0 + SPREAD)
 
 
 def check_period(prior: SimulatorConfig, period_s: float, of: str) -> None:

@@ -79,9 +79,7 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     found: dict[str, DomainModel | None] = {NONE: None}
     nominal = model(own, {DELAY: DELAY_S, **known_ranges(own)})
     rolling = prior_simulator(car, "kinematic")
-    # Where the file gives a range, it holds for wheels that do not slip, too.
-    rolling_ranges = {name: car.priors.get(name, given) for name, given in rolling.priors.items()}
-    found[KINEMATIC] = InDomain(model(rolling, {DELAY: DELAY_S, **rolling_ranges}), nominal)
+    found[KINEMATIC] = InDomain(model(rolling, {DELAY: DELAY_S, **rolling.priors}), nominal)
     found[NOMINAL] = nominal
     better = prior_simulator(diagnosed, "nominal")
     half = 0.5 * period_s

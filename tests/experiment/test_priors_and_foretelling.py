@@ -32,7 +32,9 @@ def test_a_prior_has_ranges_about_the_numbers_of_the_car(name: str) -> None:
         for key, (low, high) in found.priors.items():
             value = car.values()[key]
             assert low < value < high
-            if kind == "kinematic" or not car.priors:
+            if key in car.priors:
+                assert (low, high) == car.priors[key], "ranges of the file hold for wheels that do not slip, too"
+            else:
                 assert sorted([low / value, high / value]) == pytest.approx([0.7, 1.3])
         assert SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(found.to_tables()))) == found
 
@@ -44,7 +46,8 @@ def test_a_prior_whose_wheels_do_not_slip_has_neither_effects_nor_ranges_of_tyre
     found = prior_simulator(car, "kinematic")
     assert found.effects == {}
     assert not [name for name in found.priors if name.startswith("tyre")]
-    assert found.priors["motor.drive_gain"][1] == pytest.approx(1.3 * car.values()["motor.drive_gain"])
+    assert found.priors["motor.drive_gain"] == (1.0, 50.0)
+    assert found.priors["motor.damping"][1] == pytest.approx(1.3 * car.values()["motor.damping"])
 
 
 def recording_of(ticks: int) -> EpisodeData:
