@@ -52,8 +52,8 @@ def load_car_file(path: Path) -> CarFile:
         return CarFile(name, text, SimulatorConfig.from_preset(name), None)
     if not path.is_file():
         raise ConfigError(
-            f"There is no car file '{path}'; name a TOML file, one of sim, emulated, emulated-can, "
-            f"or a car that comes with carlab: {', '.join(preset_names())}."
+            f"There is no car file '{path}'; name a TOML file that is there, or a car that comes with carlab: "
+            f"{', '.join(preset_names())}."
         )
     try:
         text = path.read_text(encoding="utf-8")

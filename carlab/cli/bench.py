@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from carlab.cli.console import console, progress, table
-from carlab.cli.options import above_zero
+from carlab.cli.options import above_zero, json_file
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -30,30 +30,30 @@ class Bench:
     runs that are in --runs already are taken up."""
 
     out: Path | None = None
-    """Write the figures as JSON; regression and priors draw a picture of the same name beside it, and priors keeps its
-    recordings and the diagnosis in a folder of that name."""
+    """Write the figures as JSON into FILE.json; all but speed draw a picture of the same name beside it, and priors
+    keeps its recordings and the diagnosis in a folder of that name."""
 
     seconds: float = 10.0
-    """Length of each condition of the sender's measurement [s]."""
+    """speed: length of each condition of the sender's measurement [s]."""
 
     case: Literal["1d", "pendulum", "pendulum_motor", "car", "racecar", "realcar"] = "1d"
-    """What is learned. 1d: sinusoids, two points. pendulum: friction and drag hidden from the prior, as in the authors'
-    code. pendulum_motor: as in the paper; drag that brakes, dry friction and the motor's lag hidden. car: one step of a
-    car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of theirs (with --data). realcar: recordings
-    in the folder --data, the last one held out."""
+    """regression: what is learned. 1d: sinusoids, two points. pendulum: friction and drag hidden from the prior, as in
+    the authors' code. pendulum_motor: as in the paper; drag that brakes, dry friction and the motor's lag hidden. car:
+    one step of a car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of theirs (with --data).
+    realcar: recordings in the folder --data, the last one held out."""
 
     rows: tuple[int, ...] = ()
-    """Numbers of rows to learn from; those of the paper's figure unless given."""
+    """regression and priors: numbers of rows to learn from; those of the paper's figure unless given."""
 
     seeds: int = 3
-    """How many true systems and fits."""
+    """How often each fit is made: with other true systems, other rows of a recording, or (parking) other runs."""
 
     methods: tuple[str, ...] = ()
-    """Some of: Sim-FSVGD, "Sim-FSVGD without gap", FSVGD, SysID, GreyBox, ensemble, ridge; parking: sim-fsvgd, fsvgd,
-    fsvgd-authors. All unless given."""
+    """regression: some of Sim-FSVGD, "Sim-FSVGD without gap", FSVGD, SysID, GreyBox, ensemble, ridge; parking: some of
+    sim-fsvgd, fsvgd, fsvgd-authors. All unless given."""
 
     way: Literal["ours", "authors"] = "ours"
-    """How particles are fitted: as carlab does, or with the update and the sizes of the authors' code."""
+    """regression: how particles are fitted, as carlab does, or with the update and the sizes of the authors' code."""
 
     data: Path | None = None
     """Folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it. realcar and
@@ -84,7 +84,8 @@ class Bench:
     """parking: gradient steps of SAC before an episode, as for carlab learn."""
 
     steps: int | None = None
-    """Steps of the model's optimiser; those of the way or the method unless given."""
+    """Steps of the model's optimiser. Unless given: 12 000 for regression and priors, 2500 for parking, or what the
+    authors' code has."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     """Where models learn. speed: of learning alone, the other parts are the CPU's."""
@@ -97,7 +98,13 @@ class Bench:
         from learning.devices import available
 
         available(self.device)
+        if self.out is not None:
+            json_file(self.out, "--out")
         if self.what == "speed":
+            usual = Bench()
+            for name in ("case", "rows", "seeds", "methods", "data", "history", "steps", "way"):
+                if getattr(self, name) != getattr(usual, name):
+                    raise ConfigError(f"--{name} is no option of 'bench speed'; say which: carlab bench regression ...")
             return self._speed()
         above_zero(
             seeds=self.seeds, steps=self.steps, episodes=self.episodes, updates=self.updates,
@@ -126,6 +133,7 @@ class Bench:
         return 0
 
     def _regression(self) -> int:
+        from carlab.cli import EXIT_INTERRUPTED
         from carlab.cli.bench_priors import print_rows
         from carlab.experiment.interrupts import Interrupts
         from carlab.experiment.regression_picture import draw
@@ -145,21 +153,24 @@ class Bench:
                 if interrupts.requested.is_set():
                     break
         found = summarised(scores)
-        print_rows(f"{self.case}, {self.seeds} seeds, {self.way}", "method", found)
+        stopped = interrupts.requested.is_set()
+        title = f"{self.case}, {self.seeds} seeds, {self.way}{', interrupted' if stopped else ''}"
+        print_rows(title, "method", found)
         if self.out is not None:
             command = " ".join(["carlab", *sys.argv[1:]])
             self.out.write_text(json.dumps(as_json(scores, command, self.device), indent=2) + "\n", encoding="utf-8")
             picture = self.out.with_suffix(".png")
             draw(found, picture)
             console.print(f"{self.out}, {picture}")
-        return 0
+        return EXIT_INTERRUPTED if stopped else 0
 
     def _recorded(self) -> RecordedCase:
         from carlab.cli.recordings import load_episodes
         from carlab.experiment.regression_recordings import recorded_case
 
         if self.data is None or not self.data.is_dir():
-            raise ConfigError("--case realcar needs --data FOLDER, with two recordings (MCAP or CSV) at least.")
+            given = "" if self.data is None else f" ('{self.data}' is none)"
+            raise ConfigError(f"--case realcar needs --data FOLDER{given}, with two recordings (MCAP or CSV) at least.")
         files = sorted(p for p in self.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
         case = recorded_case([load_episodes(path) for path in files], self.car, self.history)
         console.print(f"{case.told} Held out: {files[-1].name}.", soft_wrap=True)

@@ -26,6 +26,7 @@ MINUTES_S = 600.0
 def run_priors(options: Bench) -> int:
     """Record or read, diagnose what is not held out, learn under each prior, and print."""
     from carlab.cars import load_car_file
+    from carlab.cli import EXIT_INTERRUPTED
     from carlab.cli.recordings import load_episodes
     from carlab.experiment.interrupts import Interrupts
     from carlab.experiment.prior_study import check_periods, prior_models, run_prior_study
@@ -55,12 +56,13 @@ def run_priors(options: Bench) -> int:
         task = bar.add_task("priors", total=None, note="")
         study = run_prior_study(
             case, priors, rows=options.rows, seeds=options.seeds, steps=options.steps,
+            device=options.device,
             progress=lambda note, done, total: bar.update(task, completed=done, total=total, note=note),
         )  # fmt: skip
         for score in study:
             scores.append(score)
             if options.out is not None:
-                _write(options.out, scores)
+                _write(options.out, scores, options.device)
             if interrupts.requested.is_set():
                 break
     found = summarised(scores)
@@ -71,7 +73,7 @@ def run_priors(options: Bench) -> int:
         picture = options.out.with_suffix(".png")
         draw(found, picture)
         console.print(f"{options.out}, {picture}, {work}")
-    return 0
+    return EXIT_INTERRUPTED if interrupts.requested.is_set() else 0
 
 
 def print_rows(title: str, first: str, rows: Sequence[Row]) -> None:
@@ -138,8 +140,8 @@ def _diagnosed(files: Sequence[Path], car: Path, folder: Path) -> Path:
     return folder / "model.toml"
 
 
-def _write(out: Path, scores: Sequence[Score]) -> None:
+def _write(out: Path, scores: Sequence[Score], device: str) -> None:
     from carlab.experiment.regression_study import as_json
 
     command = " ".join(["carlab", *sys.argv[1:]])
-    out.write_text(json.dumps(as_json(scores, command), indent=2) + "\n", encoding="utf-8")
+    out.write_text(json.dumps(as_json(scores, command, device), indent=2) + "\n", encoding="utf-8")

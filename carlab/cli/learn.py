@@ -33,28 +33,32 @@ if TYPE_CHECKING:
     from sim_backends.car_parameters import SimulatorConfig
 
 STEPS_PERIOD_S = 600.0
+EPISODES = 20
 
 
 @dataclass
 class Learn:
     """Learn the car, learn to park in the learned car, drive, and again with what was recorded.
 
-    Between episodes another process learns while the car sits in neutral. A run that was ended anywhere goes on with
-    --resume to the number of episodes it was started with.
+    The goal is the origin of the motion capture, facing along x; an episode is 100 ticks (3.3 s at 30 Hz). Before each
+    one a person puts a real car at the start that is named; simulated and emulated ones are put there. Between episodes
+    another process learns while the car sits in neutral. A run that was ended anywhere goes on with --resume.
     """
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    episodes: int = 20
-    """How many, those of a run that is taken up again included."""
+    episodes: int | None = None
+    """How many, those that are driven already included: 20 unless given; of a run that is taken up, as many as it was
+    started with."""
 
     ticks: int | None = None
-    """Ticks an episode; the task's number (100) unless given."""
+    """Ticks an episode; the task's number (100) unless given. More than --history."""
 
     prior: str = "kinematic"
     """The simulator that is the prior: kinematic (the car's file, wheels that do not slip), nominal (the car's file as
-    it is), or FILE.toml (a diagnosed model.toml, say, which has its effects and its doubts of each number). Without
-    ranges in the file they are 30 % about its numbers."""
+    it is), or FILE.toml (a diagnosed model.toml, say, which has its effects and its doubts of each number). Ranges are
+    those of the file; where it has none, 30 % about motor gain, damping and steering angle, and unless the wheels do
+    not slip about yaw inertia and the tyres' stiffness and grip."""
 
     method: Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"] = "sim-fsvgd"
     """sim-fsvgd; fsvgd without a simulator; or that as the authors of Sim-FSVGD set it, to be compared with."""
@@ -63,25 +67,26 @@ class Learn:
     """Past commands that model and policy see."""
 
     model_steps: int | None = None
-    """Steps of the model's optimiser before each episode; those of the method unless given."""
+    """Steps of the model's optimiser before each episode: 2500 unless given (fsvgd-authors: 40 000 at most)."""
 
     updates: int = 30000
     """Gradient steps of SAC before an episode: half as many again before the first, and after the third the fewer the
     smaller the share of new rows is (3 / episode)."""
 
     seed: int = 0
-    """Of everything that is drawn."""
+    """Number from which all that is random follows: the same seed, the same run."""
 
     device: Literal["cpu", "cuda"] | None = None
     """Where model and policy learn: cpu unless given; of a run that is taken up, where they did. The car is driven from
     the CPU."""
 
     place: bool = True
-    """Start each episode at the task's start pose; off: from where the car stands."""
+    """Start each episode at the task's start pose, where a person is asked to put a real car; off: from where the car
+    stands."""
 
     resume: Path | None = None
-    """A run's folder that is taken up again; --car must be as it was, the other options but --device are those of the
-    run."""
+    """A run's folder that is taken up again; --car must be as it was, --episodes and --device may change, all else is
+    as the run was started."""
 
     out: Path = Path("runs")
     """Folder that receives the run's folder."""
@@ -104,6 +109,8 @@ class Learn:
         above_zero(episodes=self.episodes, updates=self.updates, ticks=self.ticks, **{"model-steps": self.model_steps})
         if self.history < 0 or self.seed < 0:
             raise ConfigError("--history and --seed: 0 or more.")
+        if self.ticks is not None and self.ticks <= self.history:
+            raise ConfigError(f"--ticks {self.ticks}: nothing is learned from fewer than --history and one more.")
         available(self.device or "cpu")
         choice = self.which_car.choose(seed=self.seed)
         figures: list[EpisodeFigures] = []
@@ -120,20 +127,24 @@ class Learn:
             hooks = self._hooks(bar, run, figures, interrupts)
             if self.resume is None:
                 campaign = Campaign(
-                    choice, plan, self.episodes, run, hooks, self.ticks, self.place, self.rerun, self._questioned(),
-                    self.which_car.typed(),
+                    choice, plan, self.episodes or EPISODES, run, hooks, self.ticks, self.place, self.rerun,
+                    self._questioned(), self.which_car.typed(),
                 )  # fmt: skip
                 campaign.write_plan()
             else:
                 campaign = taken_up(run, choice, hooks, self.device)
                 available(campaign.plan.device)
+                self._check_as_before(campaign, choice)
+                if self.episodes is not None and self.episodes != campaign.episodes:
+                    campaign.episodes = self.episodes
+                    campaign.write_plan()
             results = list(self._watched(campaign, figures))
         return self._report(campaign, results, figures)
 
     def _plan(self, choice: CarChoice) -> TrainingPlan:
         import tomli_w
 
-        from carlab.cars import load_car_file
+        from carlab.cars import is_preset, load_car_file
         from carlab.experiment.campaign import check_period, prior_simulator
         from carlab.experiment.training import TrainingPlan
 
@@ -141,13 +152,31 @@ class Learn:
             kind: Literal["kinematic", "nominal"] = "kinematic" if self.prior == "kinematic" else "nominal"
             simulator = prior_simulator(choice.simulator, kind)
         else:
-            simulator = prior_simulator(load_car_file(Path(self.prior)).simulator, "nominal")
+            file = Path(self.prior)
+            if file.suffix != ".toml" and not is_preset(file) and not file.is_file():
+                raise ConfigError(f"--prior {self.prior}: neither kinematic nor nominal nor a car file that is there.")
+            simulator = prior_simulator(load_car_file(file).simulator, "nominal")
             check_period(simulator, choice.control_period_s, f"car '{self.which_car.car}'")
         text = tomli_w.dumps(simulator.to_tables())
         return TrainingPlan(
             text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed,
             device=self.device or "cpu",
         )  # fmt: skip
+
+    def _check_as_before(self, campaign: Campaign, choice: CarChoice) -> None:
+        """Raise ConfigError for an option that is given and is not that of the run which is taken up."""
+        plan, usual = campaign.plan, Learn()
+        was = {name: getattr(plan, name) for name in ("method", "history", "model_steps", "updates", "seed", "ticks")}
+        own = {name: getattr(self, name) for name in was}
+        given = [name for name in was if own[name] not in (getattr(usual, name), was[name])]
+        if self.prior != usual.prior and self._plan(choice).prior_toml != plan.prior_toml:
+            raise ConfigError("--prior: this run was started with another one; leave it out, or start a new run.")
+        if given:
+            option = given[0].replace("_", "-")
+            raise ConfigError(
+                f"--{option} {own[given[0]]}: this run was started with {was[given[0]]}; leave it out, or start a new "
+                "run."
+            )
 
     def _questioned(self) -> SimulatorConfig | None:
         """The simulator that episodes are checked against, where it is not that of the car's file."""

@@ -57,6 +57,15 @@ def new_file(path: Path, option: str, suffix: str) -> Path:
     return path
 
 
+def json_file(path: Path, option: str) -> Path:
+    """The path, where a JSON file may be written; ConfigError otherwise."""
+    if path.suffix != ".json" or path.is_dir():
+        raise ConfigError(f"{option} {path}: name a file that ends in .json.")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{option} {path}: there is no folder {path.parent}; make it first.")
+    return path
+
+
 def above_zero(**values: float | None) -> None:
     """Raise ConfigError for an option that is not a finite number above zero; None is none given."""
     for name, value in values.items():

@@ -254,10 +254,13 @@ def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device:
         questioned = None if tables is None else SimulatorConfig.from_tables(tables)
         return Campaign(
             choice, plan, int(content["episodes"]), run, hooks, None if ticks is None else int(ticks),
-            bool(content["place"]), bool(content["rerun"]), questioned,
+            bool(content["place"]), bool(content["rerun"]), questioned, str(content.get("car", "")),
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{run.path} is no run of carlab learn that can be taken up again ({error}).") from error
+        raise DataError(
+            f"{run.path} is no run of carlab learn that can be taken up again ({CAMPAIGN_FILE}: {error}); start a new "
+            "run, or name the folder of one."
+        ) from error
 
 
 __all__ = [

@@ -15,7 +15,7 @@ from carlab.experiment.training import DYNAMICS_FILE, TrainingPlan, has_ticks, m
 from carlab.recording.learning_curve import write_learning_curve
 from carlab.recording.mcap_source import read_episode
 from carlab.recording.run_directory import RunDirectory
-from learning.car_fit import load_car
+from learning.car_fit import LearnedCar, load_car
 
 CURVE_FILE = "learn.json"
 
@@ -46,14 +46,20 @@ def keep_check(run: RunDirectory, told: RealityCheck) -> None:
 
 
 def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> None:
-    """Add an episode to learn.json, learn.png and learn.rrd of a run."""
+    """Add an episode to learn.json, learn.png and learn.rrd of a run.
+
+    What was foretold of an earlier episode is left out where its learned car was removed or is of another version.
+    """
     rows = keep_row(run, row)
     recordings = run.recordings()
     driven, told = [], []
     shown = [r for r in rows if r.episode <= len(recordings) and has_ticks(recordings[r.episode - 1])]
+    models = {r.episode: _learned(run, r.episode) for r in shown}
+    shown = [r for r in shown if models[r.episode] is not None]
     for r in shown:
-        episode = read_episode(recordings[r.episode - 1])
-        foretold = foretell(load_car(model_folder(run.models, r.episode) / DYNAMICS_FILE), episode)
+        episode, model = read_episode(recordings[r.episode - 1]), models[r.episode]
+        assert model is not None
+        foretold = foretell(model, episode)
         driven.append(episode.states[:, :2])
         told.append((foretold.mean[..., :2], foretold.std[..., :2]))
         if r is shown[-1]:
@@ -61,6 +67,14 @@ def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> 
     numbers = [f.name for f in fields(EpisodeFigures) if f.type != "str"]
     figures = [{n: float(np.float64(getattr(r, n))) for n in numbers} for r in shown]
     write_learning_curve(run.path / "learn.rrd", figures, driven, told, [r.diagnosis for r in shown])
+
+
+def _learned(run: RunDirectory, episode: int) -> LearnedCar | None:
+    """The car as it was learned before an episode; None where it was removed, or is of another program."""
+    try:
+        return load_car(model_folder(run.models, episode) / DYNAMICS_FILE)
+    except DataError:
+        return None
 
 
 __all__ = ["CURVE_FILE", "keep_check", "keep_row", "learning_curve", "write_report"]

@@ -101,6 +101,7 @@ def run_prior_study(
     rows: Sequence[int] = (),
     seeds: int = 3,
     steps: int | None = None,
+    device: str = "cpu",
     progress: Progress = lambda what, done, total: None,
 ) -> Iterator[Score]:
     """Fit under every prior to every number of rows with every seed; scores as they come, with the prior as method.
@@ -111,6 +112,7 @@ def run_prior_study(
         rows: numbers of rows; those of the case unless given.
         seeds: how many; rows and fit have the same one.
         steps: of the particles' optimiser; the method's unless given.
+        device: where models are fitted and judged.
         progress: told what is fitted, how many fits are done, and of how many.
 
     Raises:
@@ -124,7 +126,7 @@ def run_prior_study(
     plan = list(itertools.product(counts, range(seeds), priors))
     for done, (count, seed, name) in enumerate(plan):
         progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
-        data = case.recorded(Path(), count, seed)
+        data = case.recorded(Path(), count, seed).to(device)
         prior = priors[name]
         own = replace(case, prior=domain if prior is None else prior)
         score = scored(own, data, count, seed, "FSVGD" if prior is None else "Sim-FSVGD", steps=steps)

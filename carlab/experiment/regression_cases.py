@@ -6,6 +6,7 @@ public code. Data is drawn here, or read from arrays that their code made.
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -126,9 +127,15 @@ class Case:
         name = "sinusoid_n2" if self.name == "1d" else f"{self.name}_seed{seed}_n{count}"
         path = folder / f"{name}.npz"
         if not path.is_file():
-            raise DataError(f"{path} does not exist; leave out --data to draw the data here, or choose other rows.")
-        with np.load(path) as arrays:
-            x, y, tx, ty = (torch.from_numpy(arrays[k].astype(np.float32)) for k in ("x", "y", "x_test", "y_test"))
+            raise DataError(
+                f"{path} does not exist; leave out --data to draw the data here, or choose other --rows or fewer "
+                "--seeds."
+            )
+        try:
+            with np.load(path) as arrays:
+                x, y, tx, ty = (torch.from_numpy(arrays[k].astype(np.float32)) for k in ("x", "y", "x_test", "y_test"))
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path} does not hold the arrays x, y, x_test and y_test; make it anew.") from error
         if self.name == "1d":
             return Data(x, y, tx, ty)
         width = y.shape[1]

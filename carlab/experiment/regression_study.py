@@ -254,8 +254,8 @@ def run_study(
         progress: told what is fitted, how many fits are done, and of how many.
 
     Raises:
-        ConfigError: an unknown case or method.
-        DataError: arrays are missing.
+        ConfigError: an unknown case or method, or too few rows for all methods.
+        DataError: arrays are missing, or there are fewer rows; before the first fit.
     """
     if isinstance(case, str) and case not in CASES:
         raise ConfigError(f"There is no case '{case}'; choose {', '.join(CASES)}.")
@@ -267,10 +267,16 @@ def run_study(
         chosen = chosen.ours
     names = tuple(methods) or tuple(METHODS)
     plan = [p for p in itertools.product(counts, range(seeds), names) if not (p[2] == "ridge" and p[0] < LEAST_RIDGE)]
+    if not plan:
+        raise ConfigError(f"Ridge regression needs {LEAST_RIDGE} rows or more; give --rows, or other methods.")
+    # Data that is missing is told before the first fit, not after hours of them.
+    drawn = {
+        (count, seed): chosen.data(count, seed) if data is None else chosen.recorded(data, count, seed)
+        for count, seed in itertools.product(counts, range(seeds))
+    }
     for done, (count, seed, name) in enumerate(plan):
         progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
-        found = (chosen.data(count, seed) if data is None else chosen.recorded(data, count, seed)).to(device)
-        yield scored(chosen, found, count, seed, name, way=way, steps=steps)
+        yield scored(chosen, drawn[count, seed].to(device), count, seed, name, way=way, steps=steps)
     progress("", len(plan), len(plan))
 
 

@@ -61,6 +61,8 @@ class RunDirectory:
         stamp = datetime.fromtimestamp(wall_clock_ns() * 1e-9).strftime("%Y-%m-%d_%H%M%S")
         slug = re.sub(r"[^\w.-]+", "-", name, flags=re.ASCII).strip("-.") or "run"
         base = Path(root) / f"{stamp}_{slug}"
+        if base.parent.exists() and not base.parent.is_dir():
+            raise DataError(f"{base.parent} is a file, not a folder for runs; choose another one.")
         try:
             base.parent.mkdir(parents=True, exist_ok=True)
             path, number = base, 1

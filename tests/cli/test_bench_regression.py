@@ -95,3 +95,41 @@ def test_what_cannot_be_studied_is_said(tmp_path):
         list(run_study("racecar", rows=(20,), seeds=1, methods=("ridge",)))
     with pytest.raises(DataError, match=r"pendulum_seed0_n5\.npz does not exist"):
         list(run_study("pendulum", rows=(5,), seeds=1, methods=("ridge",), data=tmp_path))
+    with pytest.raises(ConfigError, match="Ridge regression needs 3 rows or more"):
+        list(run_study("1d", seeds=1, methods=("ridge",)))
+
+
+@pytest.mark.parametrize("content", [b"rubbish", None])
+def test_broken_arrays_are_named(tmp_path, content):
+    path = tmp_path / "pendulum_seed0_n5.npz"
+    np.savez(path, x=np.zeros((5, 4)))
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=r"pendulum_seed0_n5\.npz does not hold the arrays x, y, x_test and y_test"):
+        list(run_study("pendulum", rows=(5,), seeds=1, methods=("ridge",), data=tmp_path))
+
+
+def test_data_that_is_missing_is_told_before_anything_is_fitted(tmp_path, monkeypatch):
+    monkeypatch.setattr("carlab.experiment.regression_study.scored", lambda *a, **k: pytest.fail("fitted"))
+    arrays = {name: np.zeros((5, width)) for name, width in (("x", 4), ("y", 3), ("x_test", 4), ("y_test", 3))}
+    np.savez(tmp_path / "pendulum_seed0_n5.npz", **arrays)
+    with pytest.raises(DataError, match=r"seed1_n5\.npz does not exist.*fewer --seeds"):
+        list(run_study("pendulum", rows=(5,), seeds=2, methods=("ridge",), data=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("regression --out none/x.json", "--out none/x.json: there is no folder none; make it first."),
+        ("regression --out x.png", "--out x.png: name a file that ends in .json."),
+        ("regression --out folder.json", "--out folder.json: name a file that ends in .json."),
+        ("speed --case pendulum", "--case is no option of 'bench speed'; say which: carlab bench regression"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_before_anything_is_measured(tmp_path, monkeypatch, capsys, options, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder.json").mkdir()
+    monkeypatch.setattr("carlab.experiment.regression_study.run_study", lambda *a, **k: pytest.fail("measured"))
+    assert run(["bench", *options.split()]) == 2
+    told = capsys.readouterr()
+    assert words in " ".join((told.out + told.err).split())

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import tyro
 
 from carlab.cli import run
@@ -59,9 +60,9 @@ def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFact
     """The same where three were wanted: taken up again."""
     folder = tmp_path_factory.mktemp("longer") / learned[2].name
     shutil.copytree(learned[2], folder)
-    wanted = json.loads((folder / "campaign.json").read_text())
-    (folder / "campaign.json").write_text(json.dumps(wanted | {"episodes": 3}))
-    return *said_by("learn", "--resume", folder), folder
+    found = *said_by("learn", "--resume", folder, "--episodes", 3), folder
+    assert json.loads((folder / "campaign.json").read_text())["episodes"] == 3
+    return found
 
 
 @pytest.mark.parametrize(
@@ -71,6 +72,8 @@ def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFact
         ("--history -1", "--history and --seed: 0 or more."),
         ("--seed -1", "--history and --seed: 0 or more."),
         ("--ticks 0", "--ticks 0: a number above zero."),
+        ("--ticks 3", "--ticks 3: nothing is learned from fewer than --history and one more."),
+        ("--prior Kinematic", "--prior Kinematic: neither kinematic nor nominal nor a car file that is there."),
         ("--updates -5", "--updates -5: a number above zero."),
         ("--model-steps 0", "--model-steps 0: a number above zero."),
         ("--prior missing.toml", "There is no car file 'missing.toml'"),
@@ -105,6 +108,40 @@ def test_a_run_goes_on_with_its_own_car_alone(carlab: Carlab, learned: tuple[int
     assert code == 2
     assert "was started with other options; go on with '--car sim'" in text
     assert {path: path.read_bytes() for path in files} == files
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("--method fsvgd", "--method fsvgd: this run was started with sim-fsvgd; leave it out, or start a new run."),
+        ("--seed 7", "--seed 7: this run was started with"),
+        ("--prior nominal", "--prior: this run was started with another one; leave it out, or start a new run."),
+    ],
+)
+def test_a_run_goes_on_as_it_was_started(
+    carlab: Carlab, learned: tuple[int, str, Path], options: str, words: str
+) -> None:
+    code, text = carlab("learn", "--resume", learned[2], *options.split())
+    assert code == 2
+    assert words in text
+
+
+def test_a_learned_car_of_another_version_is_learned_anew_once_its_folder_is_removed(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(learned[2], folder)
+    done = sorted(path.name for path in (folder / "models").iterdir())
+    torch.save({"version": 1}, folder / "models" / done[-1] / "dynamics.pt")
+    options = ("learn", "--resume", folder, "--episodes", len(done) + 1)
+    code, text = carlab(*options)
+    assert code == 1
+    assert "is of version 1" in text
+    assert "remove its folder, and it is learned anew." in text
+    shutil.rmtree(folder / "models" / done[-1])
+    code, text = carlab(*options)
+    assert code == 0
+    assert len(json.loads((folder / "learn.json").read_text())["episodes"]) == len(done) + 1
 
 
 def test_the_same_numbers_in_other_words_are_the_same_car(
