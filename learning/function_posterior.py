@@ -134,7 +134,7 @@ class FunctionPosterior:
             at = torch.cat([at, drawn.mean(dim=1).T], dim=1)
         covariance = torch.zeros((count, outputs, points, points), dtype=torch.float64, device=flat.device)
         if self.gap is not None:
-            covariance = self.gap(at.view(count, points, -1)).transpose(0, 1)
+            covariance = self.gap(at.view(count, points, at.shape[1])).transpose(0, 1)
             if len(self.inputs):
                 half = torch.linalg.solve_triangular(self.factor, self.gap(self.inputs, at), upper=False)
                 drawn = drawn + self.white.transpose(1, 2) @ half

@@ -159,7 +159,6 @@ def no_trend(monkeypatch):
     monkeypatch.setattr(sim_fsvgd, "_trend", flat)
 
 
-@pytest.mark.usefixtures("no_trend")
 def test_particles_count_inputs_as_far_out_as_they_were_led():
     """Nine units here; farther out is as at that edge."""
     rng = np.random.default_rng(0)
@@ -173,6 +172,7 @@ def test_particles_count_inputs_as_far_out_as_they_were_led():
     assert said[3] == pytest.approx(float(said[2]), abs=0.05)
 
 
+@pytest.mark.usefixtures("no_trend")
 class TestNoise:
     """Of constant particles without a step taken, under a target that is known, with two outputs."""
 
