@@ -102,6 +102,7 @@ class Learn:
 
     def run(self) -> int:
         """Learn and say how it went."""
+        from carlab.core.task import ParkingTask
         from carlab.experiment.campaign import Campaign, check_same_car, taken_up
         from carlab.experiment.interrupts import Interrupts
         from learning.devices import available
@@ -109,8 +110,8 @@ class Learn:
         above_zero(episodes=self.episodes, updates=self.updates, ticks=self.ticks, **{"model-steps": self.model_steps})
         if self.history < 0 or self.seed < 0:
             raise ConfigError("--history and --seed: 0 or more.")
-        if self.ticks is not None and self.ticks <= self.history:
-            raise ConfigError(f"--ticks {self.ticks}: nothing is learned from fewer than --history and one more.")
+        if (ticks := self.ticks or ParkingTask().max_ticks) <= self.history:
+            raise ConfigError(f"--ticks {ticks}: nothing is learned from fewer than --history and one more.")
         available(self.device or "cpu")
         choice = self.which_car.choose(seed=self.seed)
         figures: list[EpisodeFigures] = []

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 SHOWN_NAT = 12.0
 """How far behind the best of its number of rows a method may be and still be on the axis."""
 SHOWN_CALIBRATION = 0.25
+LINEAR_NAT = 10.0
+"""Likelihoods that reach farther up are shown by their logarithm from there on."""
 _FIGURES = (
     ("nll", "negative log-likelihood [nat]"),
     ("rmse", "root mean square error"),
@@ -117,8 +119,8 @@ def _scale(axis: Axes, rows: Sequence[Row], name: str, highest: float | None) ->
                     ha="center", va="top", fontsize=8, color=str(colour), zorder=4.0,
                     bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
                 )  # fmt: skip
-    elif name == "nll" and high - low > SHOWN_NAT:
-        axis.set_yscale("symlog", linthresh=10.0)
+    elif name == "nll" and high - low > SHOWN_NAT and high > LINEAR_NAT:
+        axis.set_yscale("symlog", linthresh=LINEAR_NAT)
     elif name == "rmse" and high > 3.0 * low > 0.0:
         axis.set_yscale("log")
         axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -72,6 +72,7 @@ def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFact
         ("--history -1", "--history and --seed: 0 or more."),
         ("--seed -1", "--history and --seed: 0 or more."),
         ("--ticks 0", "--ticks 0: a number above zero."),
+        ("--history 100", "--ticks 100: nothing is learned from fewer than --history and one more."),
         ("--ticks 3", "--ticks 3: nothing is learned from fewer than --history and one more."),
         ("--prior Kinematic", "--prior Kinematic: neither kinematic nor nominal nor a car file that is there."),
         ("--updates -5", "--updates -5: a number above zero."),

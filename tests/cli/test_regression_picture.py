@@ -61,6 +61,15 @@ def test_where_most_are_far_off_none_is_cut():
         pyplot.close(figure)
 
 
+def test_likelihoods_that_lie_far_apart_can_be_read_off():
+    values = {"Sim-FSVGD": (-23.5, -25.3), "ridge": (-12.6, -15.8)}
+    figure = picture([row(m, n, nll) for m, both in values.items() for n, nll in zip((50, 800), both, strict=True)])
+    axis = figure.axes[0]
+    low, high = axis.get_ylim()
+    assert sum(low <= tick <= high for tick in axis.get_yticks()) >= 3
+    pyplot.close(figure)
+
+
 def test_a_method_is_the_same_colour_in_every_picture_and_no_two_share_one():
     colours = {}
     for names in (list(METHODS), list(METHODS)[::-2]):
