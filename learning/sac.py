@@ -30,11 +30,18 @@ _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class _Batch(NamedTuple):
-    """Rows of a gradient step: view, action, next view, its discount (0 at an end), reward, noise of both actions."""
+    """Rows of a gradient step.
 
-    seen: Tensor
-    action: Tensor
-    after: Tensor
+    Attributes:
+        views: now, and then afterwards (2 N, F).
+        taken: views now and the actions then (N, F + A).
+        kept: discount of what is afterwards, 0 at an end (N, 1).
+        reward: (N, 1).
+        noise: of the actions at both views (2 N, A).
+    """
+
+    views: Tensor
+    taken: Tensor
     kept: Tensor
     reward: Tensor
     noise: Tensor
@@ -85,10 +92,13 @@ class FastSac(SAC):
             noise = torch.randn((gradient_steps, 2 * batch_size, rows.actions.shape[1])).to(self.device)
             discounts = self.gamma if rows.discounts is None else rows.discounts
             kept = (1.0 - rows.dones) * discounts
-            fields = (rows.observations, rows.actions, rows.next_observations, kept, rows.rewards)
-            parts = zip(*(torch.split(f, batch_size) for f in fields), noise, strict=True)
-            for step, batch in enumerate(parts):
-                found = self._gradient_step(_Batch(*batch), rate)
+            seen, after = (v.view(gradient_steps, batch_size, -1) for v in (rows.observations, rows.next_observations))
+            taken = torch.cat([rows.observations, rows.actions], dim=1)
+            fields = (torch.split(f, batch_size) for f in (taken, kept, rows.rewards))
+            found: dict[str, Tensor] = {}
+            for step, batch in enumerate(zip(torch.cat([seen, after], dim=1), *fields, noise, strict=True)):
+                told = self._gradient_step(_Batch(*batch), rate, last=step + 1 == gradient_steps)
+                found = told or found
                 if step % self.target_update_interval == 0:
                     self._targets.numbers.lerp_(self._critics.numbers, self.tau)
         self._n_updates += gradient_steps
@@ -128,10 +138,10 @@ class FastSac(SAC):
     def _adams(self) -> dict[str, Adam]:
         return {"actor": self._actor.adam, "critics": self._critics.adam, "temperature": self._temperature}
 
-    def _gradient_step(self, batch: _Batch, rate: float) -> dict[str, Tensor]:
-        """One step of temperature, critics and actor; the temperature and the losses."""
-        count, width = batch.action.shape
-        heads, through_actor = self._actor(torch.cat([batch.seen, batch.after])[None])
+    def _gradient_step(self, batch: _Batch, rate: float, *, last: bool) -> dict[str, Tensor]:
+        """One step of temperature, critics and actor; of the ``last`` the temperature and the losses."""
+        count, width = len(batch.taken), batch.noise.shape[1]
+        heads, through_actor = self._actor(batch.views[None])
         mean, raw_log_std = heads[0, :, :width], heads[0, :, width:]
         log_std = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
         swing = log_std.exp() * batch.noise
@@ -143,17 +153,18 @@ class FastSac(SAC):
         temperature = self._temperature.numbers.exp()
         self._temperature.step(-(log_density[:count].mean() + float(self.target_entropy)).view(1), rate)
 
-        worth = self._targets(torch.cat([batch.after, action[count:]], dim=1))[0].amin(dim=0)
+        chosen = torch.cat([batch.views, action], dim=1)
+        worth = self._targets(chosen[count:])[0].amin(dim=0)
         worth = worth - (temperature * log_density[count:])[:, None]
         wanted = batch.reward + batch.kept * worth
-        values, through_critics = self._critics(torch.cat([batch.seen, batch.action], dim=1))
+        values, through_critics = self._critics(batch.taken)
         off = values - wanted
         self._critics.adam.step(through_critics(off / count), rate)
 
-        values, through_critics = self._critics(torch.cat([batch.seen, action[:count]], dim=1))
+        values, through_critics = self._critics(chosen[:count])
         least, which = values.min(dim=0, keepdim=True)
-        chosen = torch.zeros_like(values).scatter_(0, which, -1.0 / count)
-        by_action = through_critics.on_inputs(chosen).sum(dim=0)[:, -width:]
+        of_least = torch.zeros_like(values).scatter_(0, which, -1.0 / count)
+        by_action = through_critics.on_inputs(of_least).sum(dim=0)[:, -width:]
         # The logarithm of the density by what tanh is given, its noise held fixed.
         now, bent, raw = action[:count], slope[:count], raw_log_std[:count]
         scale = temperature / count
@@ -161,6 +172,8 @@ class FastSac(SAC):
         by_log_std = (by_mean * swing[:count] - scale) * ((raw >= LOG_STD_MIN) & (raw <= LOG_STD_MAX))
         own = torch.cat([by_mean, by_log_std], dim=1)[None]
         self._actor.adam.step(through_actor.of_first(count)(own), rate)
+        if not last:
+            return {}
         return {
             "ent_coef": temperature,
             "actor_loss": (temperature * log_density[:count]).mean() - least.mean(),
