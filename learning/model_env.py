@@ -49,6 +49,8 @@ class ModelEnv(VecEnv):
         from_recorded: share of starts among them, where there are any.
         envelope: limits of the safety gate, which slews commands and stops a car that could not stop inside the arena.
         period_s: control period, for the slew limits [s].
+        bonus: what a policy gets for features (cars, 7 + 2 H) after a step (cars,) beside the task's reward, so that it
+            learns what is asked at the end; no part of what ``rolled_out`` counts.
         seed: of starts, particles and noise.
         device: where the model's tensors are.
 
@@ -67,6 +69,7 @@ class ModelEnv(VecEnv):
         from_recorded: float = 0.5,
         envelope: SafetyEnvelope | None = None,
         period_s: float = 1.0 / 30.0,
+        bonus: Callable[[Tensor], Tensor] | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -90,6 +93,7 @@ class ModelEnv(VecEnv):
         self._limits = torch.tensor(limits, device=self._device)
         self._recorded = np.zeros((0, width)) if recorded is None else recorded
         self._from_recorded = from_recorded if len(self._recorded) else 0.0
+        self._bonus = bonus
         self._own_seed = seed
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator().manual_seed(seed)
@@ -115,7 +119,10 @@ class ModelEnv(VecEnv):
         with torch.no_grad():
             action = self._gate(before, self._actions)
             after = self._model.step(before, action, self._generator)
-            reward = self._task.reward(before, action, after) * REWARD_SCALE
+            reward = self._task.reward(before, action, after)
+            if self._bonus is not None:
+                reward = reward + self._bonus(after)
+            reward = reward * REWARD_SCALE
         here = after.cpu()
         terminated = self._task.terminated(here).numpy() | self._stopped(here)
         self._features = after

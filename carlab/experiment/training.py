@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Transition
@@ -31,12 +31,19 @@ from learning.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, has_whole_step, transitions_of
 from sim_backends.car_parameters import SimulatorConfig
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 log = logging.getLogger(__name__)
 
 DYNAMICS_FILE = "dynamics.pt"
 FIGURES_FILE = "training.json"
 POLL_S = 0.1
 JUDGED_CARS = 64
+PARKED_BONUS, PARKED_WORTH = 0.3, 10.0
+"""What a policy gets in the learned car for each tick at which it counts as parked, beside the task's reward, and what
+parking always is worth when it is judged. The paper's reward falls by 2 % from the goal to 0.2 m away: two of three cars
+that were learned to drive by it alone came to stand at 0.21 m."""
 Tell = Callable[[str, int, int], None]
 
 
@@ -142,11 +149,17 @@ def train(
         agent = SacAgent.load(earlier, sac, plan.seed, plan.device)
     recorded = recorded_features(usable, plan.history) if usable else None
     gate: dict[str, Any] = {"envelope": envelope, "period_s": simulator.control_period_s, "device": plan.device}
-    world = ModelEnv(dynamics, plan.task, sac.cars, recorded=recorded, seed=seed, **gate)
-    judging = ModelEnv(dynamics, plan.task, JUDGED_CARS, seed=seed + 1, **gate)
+    task = plan.task
+
+    def parked(features: Tensor) -> Tensor:
+        return PARKED_BONUS * task.parked(features).to(features)
+
+    world = ModelEnv(dynamics, task, sac.cars, recorded=recorded, bonus=parked, seed=seed, **gate)
+    judging = ModelEnv(dynamics, task, JUDGED_CARS, seed=seed + 1, **gate)
 
     def judge(candidate: SacAgent) -> float:
-        return float(judging.rolled_out(candidate.act)[0].mean())
+        total, last = judging.rolled_out(candidate.act)
+        return float(total.mean() + PARKED_WORTH * task.parked(last).float().mean())
 
     tell("learning to drive", 0, updates)
     figures |= agent.train(world, updates, lambda done: tell("learning to drive", done, updates), judge)
@@ -155,7 +168,7 @@ def train(
         "policy_seconds": clock.now_s() - began_s,
         "updates": updates,
         "return_in_model": float(total.mean()),
-        "parked_in_model": float(plan.task.parked(last).float().mean()),
+        "parked_in_model": float(task.parked(last).float().mean()),
     }
 
     def write(folder: Path) -> None:
