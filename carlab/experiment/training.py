@@ -42,8 +42,8 @@ POLL_S = 0.1
 JUDGED_CARS = 64
 PARKED_BONUS, PARKED_WORTH = 0.3, 10.0
 """What a policy gets in the learned car for each tick at which it counts as parked, beside the task's reward, and what
-parking always is worth when it is judged. The paper's reward falls by 2 % from the goal to 0.2 m away: two of three cars
-that were learned to drive by it alone came to stand at 0.21 m."""
+parking always is worth when it is judged. The paper's reward falls by 2 % from the goal to 0.2 m away: by it alone two
+of four runs came to stand 0.21 m away in their third episode."""
 Tell = Callable[[str, int, int], None]
 
 
@@ -152,7 +152,8 @@ def train(
     task = plan.task
 
     def parked(features: Tensor) -> Tensor:
-        return PARKED_BONUS * task.parked(features).to(features)
+        found: Tensor = PARKED_BONUS * task.parked(features).to(features)
+        return found
 
     world = ModelEnv(dynamics, task, sac.cars, recorded=recorded, bonus=parked, seed=seed, **gate)
     judging = ModelEnv(dynamics, task, JUDGED_CARS, seed=seed + 1, **gate)

@@ -93,6 +93,18 @@ def test_steps_and_rewards_are_those_by_hand() -> None:
         np.testing.assert_allclose(rewards, REWARD_SCALE * np.array(by_formula), atol=1e-4)
 
 
+def test_a_bonus_is_learned_from_and_not_counted() -> None:
+    """Of x: ten times as much of it in a step's reward, and nothing in what a policy's drive is worth."""
+    plain, other = ModelEnv(Rolling(), TASK, 6, seed=1), ModelEnv(Rolling(), TASK, 6, bonus=lambda f: f[:, 0], seed=1)
+    for env in (plain, other):
+        env.reset()
+    commands = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
+    (_, without, _, _), (_, rewards, _, _) = plain.step(commands), other.step(commands)
+    np.testing.assert_allclose(rewards - without, REWARD_SCALE * other.features[:, 0].numpy(), atol=1e-4)
+    totals = [env.rolled_out(lambda seen: np.zeros((6, 2), np.float32))[0] for env in (plain, other)]
+    assert torch.equal(*totals)
+
+
 def test_commands_pass_the_gate_of_the_real_car() -> None:
     """Limits and slew rates: what the features say was sent is what the scalar gate sends."""
     envelope = SafetyEnvelope(max_steering=0.9, max_throttle=0.5, steering_rate_per_s=12.0, throttle_rate_per_s=4.0)
