@@ -95,7 +95,8 @@ def test_steps_and_rewards_are_those_by_hand() -> None:
 
 def test_a_bonus_is_learned_from_and_not_counted() -> None:
     """Of x: ten times as much of it in a step's reward, and nothing in what a policy's drive is worth."""
-    plain, other = ModelEnv(Rolling(), TASK, 6, seed=1), ModelEnv(Rolling(), TASK, 6, bonus=lambda f: f[:, 0], seed=1)
+    task = replace(TASK, max_ticks=200)
+    plain, other = ModelEnv(Rolling(), task, 6, seed=1), ModelEnv(Rolling(), task, 6, bonus=lambda f: f[:, 0], seed=1)
     for env in (plain, other):
         env.reset()
     commands = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
