@@ -32,18 +32,18 @@ class Draws:
     def of(cls, posterior: Posterior) -> Draws:
         """Draws of a posterior, where it is."""
         units, noise = posterior.normaliser, posterior.noise_std.double().diag()
-        back = units.output_std.double().diag()
+        to_raw = units.output_std.double().diag()
         if units.output_turn is not None:
-            back = torch.linalg.inv_ex(units.output_turn.double()).inverse.T @ back
+            to_raw = torch.linalg.inv_ex(units.output_turn.double()).inverse.T @ to_raw
         if posterior.correlation is not None:
             noise = torch.linalg.cholesky_ex(posterior.correlation.double()).L.T @ noise
         width = len(units.input_mean)
         trend = torch.zeros((1 + width, len(noise))).to(noise) if posterior.trend is None else posterior.trend.double()
         parameters = posterior.parameters.clone()
         weights, biases = posterior.network.split(parameters)[-1]
-        weights.copy_(weights.double() @ back)
-        biases.copy_((biases.double() + trend[0]) @ back + units.output_mean)
-        slopes, noise = (v.to(parameters) for v in (trend[1:] @ back, noise @ back))
+        weights.copy_(weights.double() @ to_raw)
+        biases.copy_((biases.double() + trend[0]) @ to_raw + units.output_mean)
+        slopes, noise = (v.to(parameters) for v in (trend[1:] @ to_raw, noise @ to_raw))
         return cls(posterior, parameters, slopes, noise, posterior.noise_scales)
 
     def __call__(self, inputs: Tensor, generator: torch.Generator) -> Tensor:

@@ -48,7 +48,7 @@ ROUNDS = 3
 """Of finding covariance, parameters, outliers and the turn of the outputs. Of the first two thirds of train_1 of the
 ETH car and its last: 800 rows -21.1 without a turn, -24.24 with two rounds, -24.61 with three; 200 rows -20.3, -23.7
 and -23.9."""
-LEAST_NOISE = 0.01
+LEAST_OF_EXPECTED = 0.01
 """Of the expected noise, what is left at least."""
 ROWS_FOR_TAILS = 40
 """Rows from which on outliers are told from noise."""
@@ -260,7 +260,7 @@ class _Case:
                 scale = typical_scale(white**2, freedom)
                 if again:
                     # An output that never changes tells of no noise at all.
-                    expected_noise = torch.maximum(wide * noise, LEAST_NOISE * self.noise)
+                    expected_noise = torch.maximum(wide * noise, LEAST_OF_EXPECTED * self.noise)
                     normaliser = normaliser.turned(turn_of(correlation, wide * doubt.median(dim=0).values.sqrt()))
                     y = normaliser.outputs(self.outputs).double()
                     left, known, seen = self._left(x, y, parameters, normaliser)
@@ -271,7 +271,7 @@ class _Case:
             sound = _sound(there)
             parameters, every = parameters[sound], y - there[sound]
         white = torch.linalg.solve_triangular(factor, every.permute(2, 1, 0), upper=False)
-        noise_std = torch.maximum(scale * noise, LEAST_NOISE * self.noise).float()
+        noise_std = torch.maximum(scale * noise, LEAST_OF_EXPECTED * self.noise).float()
         return FunctionPosterior(
             normaliser, noise_std, freedom, correlation.float(), model, parameters, gap, seen, factor, white
         )

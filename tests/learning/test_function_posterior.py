@@ -3,66 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 import torch
+from linear_simulator import EMPTY, NOISE, UNITS, Linear, features, rows, tensors, truth
 from scipy.stats import norm
 from scipy.stats import t as student
-from torch import Tensor
 
-from carlab.core.errors import DataError
 from learning import function_posterior
-from learning.domain_models import uniform
 from learning.function_posterior import DRAWS, infer
 from learning.gap import EXPECTED_GAP, MIDDLE_LENGTH, TINY
-from learning.normaliser import Normaliser
-
-UNITS = Normaliser(
-    torch.tensor([0.5, -1.0]), torch.tensor([2.0, 0.5]), torch.tensor([1.0, -2.0]), torch.tensor([2.0, 0.5])
-)
-NOISE = torch.tensor([0.2, 0.1])
-EMPTY = torch.zeros(0, 2)
-
-
-def features(x):
-    """Of two outputs, in numpy (O, N, 3)."""
-    a, b = np.asarray(x, dtype=float).T
-    return np.stack([np.stack([a, b, np.ones_like(a)], axis=1), np.stack([0 * a, 0.3 * a, np.sin(b)], axis=1)])
-
-
-@dataclass(frozen=True)
-class Linear:
-    """Two outputs, linear in three standard normal parameters: a Gaussian process."""
-
-    size: int = 3
-
-    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        return uniform(((-3.0, 4.0), (-2.0, 0.0)), count, generator)
-
-    def parameters(self, normal: Tensor) -> Tensor:
-        return normal
-
-    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        return torch.einsum("onk,pk->pno", torch.tensor(features(inputs)).to(parameters), parameters)
-
-
-def rows(count, seed=0, noise=NOISE):
-    """Inputs and outputs, which the linear simulator cannot wholly explain."""
-    rng = np.random.default_rng(seed)
-    x = np.stack([rng.uniform(-3, 4, count), rng.uniform(-2, 0, count)], axis=1)
-    return tensors(x, truth(x) + noise.numpy() * rng.normal(size=(count, 2)))
-
-
-def truth(x):
-    x = np.asarray(x, dtype=float)
-    wave = np.stack([0.5 * np.sin(2 * x[:, 0]), 0.2 * np.cos(3 * x[:, 1])], axis=1)
-    return (features(x) @ np.array([0.8, -1.1, 0.4])).T + wave
-
-
-def tensors(*arrays):
-    return [torch.tensor(a, dtype=torch.float32) for a in arrays]
 
 
 def said(parameters, x):
@@ -366,74 +317,6 @@ class TestFewRows:
             off = (y.double().numpy() - mean) / std
             gained.append((student(found.freedom).logpdf(off) - norm.logpdf(off)).mean())
         assert np.mean(gained) > 0.02
-
-
-@dataclass(frozen=True)
-class BreaksDown(Linear):
-    """The same, with no number for a share of its parameters."""
-
-    below: float = -2.0
-
-    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        broken = torch.where(parameters[:, 0] < self.below, torch.nan, 0.0)
-        return super().__call__(inputs, parameters) + broken[:, None, None]
-
-
-@pytest.mark.parametrize("count", [0, 12, 60])
-def test_draws_for_which_the_simulator_breaks_down_have_no_say(count):
-    x, y = (v[:count] for v in rows(60))
-    at, _ = rows(5, seed=1)
-    found = infer(BreaksDown(), x, y, UNITS, NOISE)
-    assert found.parameters[:, 0].min() >= -2.0
-    mean, std = found.predict(at)
-    theirs, wide = infer(Linear(), x, y, UNITS, NOISE).predict(at)
-    assert np.allclose(mean, theirs, atol=0.4 * float(wide.max()))
-    assert np.allclose(std, wide, rtol=0.35)
-    with pytest.raises(DataError, match="narrow the ranges"):
-        infer(BreaksDown(below=50.0), x, y, UNITS, NOISE)
-
-
-def test_a_simulator_without_parameters_is_conditioned_as_it_is():
-    @dataclass(frozen=True)
-    class Fixed(Linear):
-        size: int = 0
-
-        def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-            return super().__call__(inputs, torch.tensor([[0.8, -1.1, 0.4]]).expand(len(parameters), 3).to(inputs))
-
-    x, y = rows(30)
-    found = infer(Fixed(), x, y, UNITS, NOISE)
-    at, wanted = rows(50, seed=1, noise=torch.zeros(2))
-    assert float(((found.predict(at)[0] - wanted) / UNITS.output_std).abs().max()) < 0.5
-
-
-def test_an_output_that_never_changes_keeps_a_share_of_the_expected_noise():
-    x, y = rows(60)
-    y[:, 1] = UNITS.output_mean[1]
-    found = infer(None, x, y, UNITS, NOISE)
-    noise = found.noise_std * UNITS.output_std / NOISE
-    assert float(noise[1]) >= 0.01
-    assert 0.5 < float(noise[0]) < 2.0
-
-
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"outputs": torch.zeros(5, 2)}, "10 rows of inputs and 5 of outputs"),
-        ({"noise_std": torch.tensor([0.1, 0.0])}, "is zero"),
-        ({"normaliser": replace(UNITS, input_std=torch.tensor([1.0, 0.0]))}, "is zero"),
-        ({"inputs": torch.full((10, 2), torch.nan)}, "missing or infinite"),
-    ],
-)
-def test_what_cannot_be_conditioned_on_is_said(changed, said):
-    x, y = rows(10)
-    with pytest.raises(DataError, match=said):
-        infer(**{"model": None, "inputs": x, "outputs": y, "normaliser": UNITS, "noise_std": NOISE} | changed)
-
-
-def test_at_no_inputs_there_is_no_prediction(found):
-    mean, std = found.predict(EMPTY)
-    assert mean.shape == std.shape == (0, 2)
 
 
 def test_the_same_seed_gives_the_same_numbers():
