@@ -103,7 +103,7 @@ class Learn:
     def run(self) -> int:
         """Learn and say how it went."""
         from carlab.core.task import ParkingTask
-        from carlab.experiment.campaign import Campaign, check_same_car, taken_up
+        from carlab.experiment.campaign import Campaign, CampaignHooks, check_same_car, taken_up
         from carlab.experiment.interrupts import Interrupts
         from learning.devices import available
 
@@ -122,6 +122,9 @@ class Learn:
             else:
                 run = stack.enter_context(existing_run(self.resume, choice))
                 check_same_car(run, choice, self.which_car.typed())
+                campaign = taken_up(run, choice, CampaignHooks(), self.device)
+                available(campaign.plan.device)
+                self._check_as_before(campaign, choice)
             stack.enter_context(choice.car)
             bar = stack.enter_context(progress(speed_estimate_period_s=STEPS_PERIOD_S))
             interrupts = stack.enter_context(Interrupts())
@@ -133,9 +136,7 @@ class Learn:
                 )  # fmt: skip
                 campaign.write_plan()
             else:
-                campaign = taken_up(run, choice, hooks, self.device)
-                available(campaign.plan.device)
-                self._check_as_before(campaign, choice)
+                campaign.hooks = hooks
                 if self.episodes is not None and self.episodes != campaign.episodes:
                     campaign.episodes = self.episodes
                     campaign.write_plan()
