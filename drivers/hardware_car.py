@@ -17,6 +17,8 @@ from drivers.config import HardwareConfig
 
 POSES_KEPT = 4096
 PLACE_TIMEOUT_S = 1.0
+ARM_WAIT_S = 0.5
+"""How long arming waits for poses that are fresh, and enough to know a speed from, before it gives up."""
 CAPTURE_STAMP_ERROR_S = 0.005
 """How far a capture stamp, carried over from the camera's clock, may be ahead of the host's."""
 
@@ -109,10 +111,13 @@ class HardwareCar(Car):
         )
 
     def arm(self) -> None:
-        """Arm the actuator if it, motion capture and the standstill of the car allow it."""
+        """Arm the actuator if it, motion capture and the standstill of the car allow it.
+
+        Poses that are late for a moment, as on a host that is busy, are waited for (half a second at most).
+        """
         self._require_open()
         self.actuator.require_no_fault()
-        self._take_poses()
+        self._await_poses()
         reasons = [*self.actuator.problems(), *self._pose_problems()]
         estimate = self.estimator.estimate()
         if estimate is not None and not self.estimator.velocity_valid:
@@ -176,6 +181,16 @@ class HardwareCar(Car):
             self.actuator.close()
         finally:
             self.pose_source.close()
+
+    def _await_poses(self) -> None:
+        """Take poses until they say whether the car stands, or none comes any more."""
+        until_s = self.clock.now_s() + ARM_WAIT_S
+        self._take_poses()
+        while self._pose_problems() or not self.estimator.velocity_valid:
+            left_s = until_s - self.clock.now_s()
+            if left_s <= 0.0 or self.pose_source.wait_for(self._sequence, left_s) is None:
+                break
+            self._take_poses()
 
     def _take_poses(self) -> None:
         """Feed the estimator with what has arrived; a source that counts anew is followed."""

@@ -36,6 +36,7 @@ class HandPoses:
     def __init__(self) -> None:
         self.samples: list[PoseSample] = []
         self.failure: NotReadyError | None = None
+        self.on_their_way = 0
         self.closes = 0
 
     def show(self, x_m: float = 0.0, *, age_s: float = 0.0, tracked: bool = True, sequence: int | None = None) -> None:
@@ -59,6 +60,9 @@ class HandPoses:
         return tuple(s for s in self.samples if s.sequence > sequence)
 
     def wait_for(self, sequence: int, timeout_s: float) -> PoseSample | None:
+        if self.on_their_way:
+            self.on_their_way -= 1
+            self.show()
         newest = self.latest()
         return newest if newest is not None and newest.sequence > sequence else None
 
@@ -158,6 +162,14 @@ def test_arming_needs_a_fresh_tracked_pose_at_rest(
         poses.show(x_m, age_s=age_s, tracked=tracked)
     with pytest.raises(NotReadyError, match=reason):
         car.arm()
+
+
+def test_poses_that_are_late_for_a_moment_are_waited_for(car: HardwareCar, poses: HandPoses) -> None:
+    poses.show(age_s=5.0)  # alone too old, and too few
+    poses.on_their_way = 4
+    car.arm()
+    assert poses.on_their_way == 1, "three poses make a speed"
+    assert car.command(Action(0.1, 0.2)).throttle == pytest.approx(0.2)
 
 
 def test_a_car_whose_motor_does_not_say_how_fast_it_turns_is_not_armed(
