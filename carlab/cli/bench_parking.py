@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 from typing import TYPE_CHECKING, get_args
@@ -19,21 +20,26 @@ def run_parking(options: Bench) -> int:
     from carlab.cli.learn import Learn
     from carlab.cli.options import CarOptions
     from carlab.experiment.campaign import CAMPAIGN_FILE
-    from carlab.experiment.parking_study import as_json, draw, read_curve, run_folder, run_name, summarised
+    from carlab.experiment.parking_study import as_json, check_run, draw, read_curve, run_folder, run_name, summarised
     from learning.car_fit import Method
 
     methods: tuple[Method, ...] = tuple(m for m in get_args(Method) if m in options.methods or not options.methods)
     if unknown := [m for m in options.methods if m not in get_args(Method)]:
         raise ConfigError(f"There is no method '{unknown[0]}'; choose among {', '.join(get_args(Method))}.")
+    begun = {}
+    for seed, method in itertools.product(range(options.seeds), methods):
+        done = run_folder(options.runs, method, seed)
+        if done is not None and (done / CAMPAIGN_FILE).is_file():
+            check_run(done, {"updates": ("--updates", options.updates), "model_steps": ("--steps", options.steps)})
+            begun[(seed, method)] = done
     folders = []
     for seed in range(options.seeds):
         for method in methods:
-            done = run_folder(options.runs, method, seed)
             console.print(f"{method}, seed {seed}")
             code = Learn(
                 CarOptions("sim"), episodes=options.episodes, updates=options.updates, method=method,
                 model_steps=options.steps, seed=seed, device=options.device,
-                resume=done if done is not None and (done / CAMPAIGN_FILE).is_file() else None, out=options.runs,
+                resume=begun.get((seed, method)), out=options.runs,
                 name=run_name(method, seed), rerun=False,
             ).run()  # fmt: skip
             if code != 0:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.experiment.campaign import CAMPAIGN_FILE
 from carlab.experiment.campaign_figures import EpisodeFigures
 from carlab.experiment.campaign_report import CURVE_FILE
@@ -83,10 +83,33 @@ def run_name(method: str, seed: int) -> str:
     return f"{method}-seed{seed}"
 
 
+def check_run(folder: Path, options: Mapping[str, tuple[str, int | None]]) -> None:
+    """Raise ConfigError where a run was started with other numbers than are asked for now.
+
+    Args:
+        folder: of the run.
+        options: by name in the plan, the option and what it says; None where it is not given.
+    """
+    plan = _plan(folder)
+    for name, (option, wanted) in options.items():
+        was = plan.get(name)
+        if was != wanted:
+            started = f"without {option}" if was is None else f"with {option} {was}"
+            raise ConfigError(f"{folder} was started {started}; start this study so too, or give it another --runs.")
+
+
+def _plan(folder: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]
+        return found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{folder} is no run of carlab learn ({error}); remove it.") from error
+
+
 def read_curve(folder: Path) -> Curve:
     """A run's figures. Raises DataError where the folder is no run of learning."""
+    plan = _plan(folder)
     try:
-        plan = json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]
         rows = json.loads((folder / CURVE_FILE).read_text(encoding="utf-8"))["episodes"]
         episodes = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
         return Curve(plan["method"], int(plan["seed"]), int(plan["updates"]), tuple(episodes))
@@ -186,4 +209,15 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
     pyplot.close(figure)
 
 
-__all__ = ["LAST", "Curve", "MethodFigures", "as_json", "draw", "read_curve", "run_folder", "run_name", "summarised"]
+__all__ = [
+    "LAST",
+    "Curve",
+    "MethodFigures",
+    "as_json",
+    "check_run",
+    "draw",
+    "read_curve",
+    "run_folder",
+    "run_name",
+    "summarised",
+]

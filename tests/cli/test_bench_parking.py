@@ -30,6 +30,13 @@ def test_two_methods_are_driven_taken_up_and_compared(tmp_path: Path, capsys: py
     again = {p.name: (p / "models" / "0001" / "dynamics.pt").stat().st_mtime_ns for p in runs.iterdir()}
     assert again == first
     assert "never" in capsys.readouterr().out, "forty gradient steps park nothing"
+    before = out.read_bytes()
+    others = ["bench", "parking", *SMALL[:3], "--seeds", "1", "--runs", str(runs), "--out", str(out)]
+    assert run([*others, "--updates", "40", "--steps", "60"]) == 2
+    assert "was started with --steps 50" in " ".join(capsys.readouterr().err.split())
+    assert run([*others, "--steps", "50"]) == 2
+    assert "was started with --updates 40" in " ".join(capsys.readouterr().err.split())
+    assert out.read_bytes() == before
 
 
 def test_an_unknown_method_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,6 +72,7 @@ def turned_and_mirrored(table: Table) -> Table:
 
 
 CANDIDATES = ("aerodynamic_drag", "rolling_resistance", "motor_saturation", "steering_offset", "road_slope")
+NEAREST = ("lateral_bias", "marker_offset", "road_slope", "steering_asymmetry", "steering_offset", "yaw_damping")
 
 
 @pytest.mark.parametrize("change", [dict, turned_and_mirrored])
@@ -115,10 +116,13 @@ def test_nothing_is_named_where_only_base_parameters_are_off(tmp_path: Path) -> 
     assert found.held_out["refit"].score < 0.5 * found.held_out["nominal"].score
 
 
-def test_what_has_no_name_is_described_and_not_forced(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "among", [pytest.param(NEAREST, id="nearest"), pytest.param(None, id="catalogue", marks=pytest.mark.slow)]
+)
+def test_what_has_no_name_is_described_and_not_forced(tmp_path: Path, among: tuple[str, ...] | None) -> None:
     """A cable that pulls the car's tail towards a point: no effect of the catalogue is like it."""
     case = make_case("outside", 41, effects=("cable_pull",), excess=4.0, fit_s=60, hold_s=30)
-    found = outcome(write(tmp_path, case)).diagnosis
+    found = outcome(write(tmp_path, case), effects=among).diagnosis
     assert found.verdict == "unexplained"
     assert found.effects == ()
     assert found.unexplained is not None

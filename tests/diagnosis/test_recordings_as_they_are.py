@@ -68,7 +68,9 @@ def plain(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="module")
 def shaking(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     """A bent wheel of 60 mm radius."""
-    return drive(tmp_path_factory.mktemp("shaking"), make_case("outside", 64, effects=("wheel_imbalance",)))
+    return drive(
+        tmp_path_factory.mktemp("shaking"), make_case("outside", 64, effects=("wheel_imbalance",), fit_s=60, hold_s=30)
+    )
 
 
 def test_noise_is_what_was_added(plain: Drive) -> None:
@@ -152,9 +154,12 @@ def test_a_wheel_is_not_blamed_for_a_frequency_of_its_own(plain: Drive, of_time:
         assert found.periods_per_m == pytest.approx(4.0, abs=0.05)
 
 
-def test_vibration_is_said_and_named_nothing_else(shaking: Drive) -> None:
+@pytest.mark.parametrize(
+    "effects", [("aerodynamic_drag", "velocity_filter_lag", "yaw_damping"), pytest.param(None, marks=pytest.mark.slow)]
+)
+def test_vibration_is_said_and_named_nothing_else(shaking: Drive, effects: tuple[str, ...] | None) -> None:
     fit, hold = (list(import_csv(shaking.folder / name).episodes) for name in ("fit.csv", "hold.csv"))
-    told = diagnose(fit, hold, shaking.nominal, TEXTS).diagnosis
+    told = diagnose(fit, hold, shaking.nominal, TEXTS, effects=effects).diagnosis
     assert told.verdict == "unexplained"
     assert told.unexplained is not None
     assert told.unexplained.kind.startswith("vibration")
