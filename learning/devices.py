@@ -6,6 +6,8 @@ CPU, and what drives a car runs there.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal
 
 import torch
@@ -37,4 +39,19 @@ def settle(device: torch.device | str) -> None:
         torch.cuda.synchronize()
 
 
-__all__ = ["DeviceName", "available", "described", "settle"]
+@contextmanager
+def denormals_flushed() -> Iterator[None]:
+    """Numbers below the smallest normal one (1.2e-38 in float32) count as zero in here, as they do on CUDA.
+
+    The moments of units that are never active fade to such numbers and stay there, and the CPU takes six times as long
+    for an optimiser's step on them.
+    """
+    was = not bool(torch.full((1,), 1e-39) * 1.0)
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(was)
+
+
+__all__ = ["DeviceName", "available", "denormals_flushed", "described", "settle"]

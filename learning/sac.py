@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from carlab.core.errors import ConfigError
 from learning.adam import Adam
+from learning.devices import denormals_flushed
 from learning.particles import Layers, Network, Pullback
 
 _SQUASH = 1e-6
@@ -38,6 +39,7 @@ class _Batch(NamedTuple):
         kept: discount of what is afterwards, 0 at an end (N, 1).
         reward: (N, 1).
         noise: of the actions at both views (2 N, A).
+        unlikely: negative logarithm of its density (2 N,).
     """
 
     views: Tensor
@@ -45,6 +47,7 @@ class _Batch(NamedTuple):
     kept: Tensor
     reward: Tensor
     noise: Tensor
+    unlikely: Tensor
 
 
 @dataclass
@@ -87,16 +90,18 @@ class FastSac(SAC):
         self._temperature.numbers = self.log_ent_coef.detach()  # Loading an agent puts another tensor there.
         rate = float(self.lr_schedule(self._current_progress_remaining))
         self.logger.record("train/learning_rate", rate)
-        with torch.no_grad():
+        with torch.no_grad(), denormals_flushed():
             rows = self.replay_buffer.sample(gradient_steps * batch_size, env=self._vec_normalize_env)
             noise = torch.randn((gradient_steps, 2 * batch_size, rows.actions.shape[1])).to(self.device)
+            unlikely = 0.5 * noise.square().sum(dim=2) + noise.shape[2] * _HALF_LOG_TWO_PI
             discounts = self.gamma if rows.discounts is None else rows.discounts
             kept = (1.0 - rows.dones) * discounts
             seen, after = (v.view(gradient_steps, batch_size, -1) for v in (rows.observations, rows.next_observations))
             taken = torch.cat([rows.observations, rows.actions], dim=1)
             fields = (torch.split(f, batch_size) for f in (taken, kept, rows.rewards))
             found: dict[str, Tensor] = {}
-            for step, batch in enumerate(zip(torch.cat([seen, after], dim=1), *fields, noise, strict=True)):
+            views = torch.cat([seen, after], dim=1)
+            for step, batch in enumerate(zip(views, *fields, noise, unlikely, strict=True)):
                 told = self._gradient_step(_Batch(*batch), rate, last=step + 1 == gradient_steps)
                 found = told or found
                 if step % self.target_update_interval == 0:
@@ -147,8 +152,7 @@ class FastSac(SAC):
         swing = log_std.exp() * batch.noise
         action = torch.tanh(mean + swing)
         slope = 1.0 - action * action
-        log_density = -(0.5 * batch.noise * batch.noise + log_std + torch.log(slope + _SQUASH)).sum(dim=1)
-        log_density -= width * _HALF_LOG_TWO_PI
+        log_density = -(log_std + torch.log(slope + _SQUASH)).sum(dim=1) - batch.unlikely
 
         temperature = self._temperature.numbers.exp()
         self._temperature.step(-(log_density[:count].mean() + float(self.target_entropy)).view(1), rate)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +64,9 @@ class CarState:
 
     def to_array(self) -> FloatArray:
         """Return ``[x, y, yaw, vx, vy, yaw_rate]``, shape (6,)."""
-        return np.array(astuple(self), dtype=np.float64)
+        return np.array(
+            [self.x_m, self.y_m, self.yaw_rad, self.vx_mps, self.vy_mps, self.yaw_rate_radps], dtype=np.float64
+        )
 
     @classmethod
     def from_array(cls, values: NDArray[np.floating]) -> CarState:
