@@ -188,7 +188,7 @@ def learn_gap(
         of_noise = _noise_variance(logs[6], trust[rows])
         covariance.diagonal(dim1=1, dim2=2).add_(of_noise + TINY)
         if known is not None:
-            covariance += known[:, rows][:, :, rows]
+            covariance += _among(known, rows)
 
         def pullback(gradient: Tensor) -> list[Tensor]:
             parts = of_parts(gradient)
@@ -209,10 +209,11 @@ def learn_noise(residual: Tensor, known: Tensor | None, noise_std: Tensor, trust
         of_noise = _noise_variance(logs[0], trust[rows])
         covariance = torch.diag_embed(of_noise + TINY)
         if known is not None:
-            covariance += known[:, rows][:, :, rows]
+            covariance += _among(known, rows)
         return covariance, lambda gradient: [_by_noise(gradient, of_noise)]
 
-    return _most_probable([noise_std.double().log()], (WIDTH_NOISE,), residual.double(), evaluated, seed)[0].exp()
+    middles = [noise_std.double().log()]
+    return _most_probable(middles, (WIDTH_NOISE,), residual.double(), evaluated, seed)[0].exp()
 
 
 def _most_probable(
@@ -237,6 +238,11 @@ def _most_probable(
         for optimiser, gradient, back in zip(optimisers, gradients, held, strict=True):
             optimiser.step(gradient + back, rate)
     return logs
+
+
+def _among(known: Tensor, rows: Tensor) -> Tensor:
+    """Covariances (O, m, m) of some of the rows, of those (O, n, n) of all."""
+    return known if len(rows) == known.shape[1] else known[:, rows][:, :, rows]
 
 
 def _noise_variance(log_noise: Tensor, trust: Tensor) -> Tensor:
@@ -267,7 +273,8 @@ def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
     factor = torch.linalg.cholesky(covariance)
     solved = torch.cholesky_solve(residual.T[:, :, None], factor)
     gradient: Tensor = torch.cholesky_inverse(factor)
-    return gradient.baddbmm_(solved, solved.transpose(1, 2), beta=0.5, alpha=-0.5)
+    # It is symmetric, and turned over it lies in memory as other matrices do.
+    return gradient.baddbmm_(solved, solved.transpose(1, 2), beta=0.5, alpha=-0.5).mT
 
 
 __all__ = ["GapCovariance", "evidence_gradient", "learn_gap", "learn_noise"]
