@@ -281,11 +281,15 @@ class TestCorrelatedErrors:
         told, blind = (float(f.prediction(at).log_density(seen).mean()) for f in (found, apart))
         return told - blind, found.prediction(at)
 
-    def test_other_rows_are_likelier_by_the_information_that_the_outputs_share(self, monkeypatch):
-        """Mutual information of two Gaussians, ``-log(1 - r^2) / 2``, less what the function's own doubt hides."""
+    @pytest.mark.parametrize("count", [300, 600])
+    def test_other_rows_are_likelier_by_the_information_that_the_outputs_share(self, monkeypatch, count):
+        """Mutual information of two Gaussians, ``-log(1 - r^2) / 2``, less what the function's own doubt hides.
+
+        Of as many rows as a step of the search sees, and of twice as many.
+        """
         tied = 0.98
         shared = -0.5 * math.log(1.0 - tied**2)
-        gained, prediction = self.gained(monkeypatch, Linear(), tied)
+        gained, prediction = self.gained(monkeypatch, Linear(), tied, count)
         assert 0.7 * shared < gained < 1.1 * shared
         back = np.linalg.inv(prediction.turn.double().numpy())
         scale = prediction.stds[0].median(dim=0).values.double().numpy()
