@@ -24,11 +24,13 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Tests that only compute run side by side, one to a core; the others wait for the clock most of the time, two at once.
-COMPUTING := tests/concealment tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py
+# Tests that only compute run side by side, one to a core; the others drive against the clock, two at once.
+COMPUTING := tests/concealment tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py \
+	$(addprefix tests/experiment/,test_prior_study.py test_reality_check.py test_learning_on_a_device.py)
+test: export OMP_NUM_THREADS := 1
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
+	$(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
 	$(BIN)/pytest --numprocesses 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))
 
 clean:

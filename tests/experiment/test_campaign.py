@@ -21,6 +21,7 @@ from carlab.cars import CarChoice, choose_car
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Tick
 from carlab.core.errors import DataError
+from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
@@ -31,10 +32,11 @@ from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator,
 from carlab.experiment.campaign_figures import EpisodeFigures
 from carlab.experiment.campaign_report import learning_curve, write_report
 from carlab.experiment.session import EpisodeResult, Session, SessionHooks
-from carlab.experiment.training import TrainingPlan, recorded_features, train, train_beside
+from carlab.experiment.training import PARKED_BONUS, TrainingPlan, recorded_features, train, train_beside
 from carlab.recording.mcap_source import read_documents, read_episode
 from carlab.recording.run_directory import RunDirectory
 from drivers.emulators.command_log import read_log
+from learning import model_env
 from learning.car_fit import load_car
 from learning.evaluation import negative_log_likelihood
 from learning.sac_agent import SacPolicy
@@ -324,6 +326,36 @@ def test_from_an_episode_that_is_too_short_nothing_is_learned_but_the_prior(tmp_
     assert "last_episode_nll" not in figures
     assert json.loads((run.models / "0002" / "training.json").read_text()) == figures
     assert list(dict.fromkeys(told)) == ["reading the recordings", "learning the car", "learning to drive"]
+
+
+def test_the_learned_car_keeps_more_room_and_is_paid_for_standing_in_its_spot(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 2 m/s the gate asks for 0.97 m; a policy that lives on just that is stopped as soon as the car slides more."""
+    made: list[model_env.ModelEnv] = []
+
+    class Kept(model_env.ModelEnv):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            made.append(self)
+
+    monkeypatch.setattr(model_env, "ModelEnv", Kept)
+    (tmp_path / "models").mkdir()
+    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
+    train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
+    edge_m = max(x for x, _ in ENVELOPE.arena_m)
+    history = np.zeros((HISTORY, 2))
+    for world in made:
+        for left_m, stopped in ((1.1, True), (1.4, False)):
+            rushing = CarState(edge_m - left_m, 0.0, 0.0, 2.0, 0.0, 0.0)
+            assert can_stop_inside(ENVELOPE.arena_m, rushing, ENVELOPE.reaction_s, ENVELOPE.deceleration_mps2)
+            row = torch.from_numpy(encode(rushing.to_array()[None], history[None])).float()
+            assert world._stopped(row).tolist() == [stopped]
+    trained, judged = made
+    there = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
+    assert trained._bonus is not None
+    assert trained._bonus(there).tolist() == pytest.approx([PARKED_BONUS, 0.0])
+    assert judged._bonus is None, "what is foretold is the task's reward alone"
 
 
 def test_an_episode_that_ended_before_its_first_tick_is_no_obstacle(tmp_path: Path) -> None:
