@@ -150,9 +150,10 @@ class SenderLoop:
         command = self.logic.tick(now_s)
         try:
             if command is not None and self._is_link_open:
+                began_s = time.monotonic()  # Afterwards might be after the firmware had it, where the host is busy.
                 self.device.send(command)
                 if self.logic.sent_number != before:
-                    self._t_written_s = time.monotonic()
+                    self._t_written_s = began_s
             self._poll(now_s)
         except ActuatorFaultError as error:
             self._link_failed(str(error))

@@ -18,8 +18,8 @@ class SenderStatus:
     """A snapshot of the sender. Times are on the host's monotonic clock; NaN where there is nothing to tell.
 
     ``epoch`` is the last wish obeyed; ``refusal`` says why it could not be. ``sent_number``, ``t_issued_s`` and
-    ``t_written_s`` belong to the newest command written. ``is_sending`` is False where the link or the firmware is
-    not there to be sent to. ``late_*`` is how late the sender woke for its deadlines.
+    ``t_written_s`` (when its writing began) belong to the newest command written. ``is_sending`` is False where the
+    link or the firmware is not there to be sent to. ``late_*`` is how late the sender woke for its deadlines.
     """
 
     t_published_s: float = 0.0

@@ -79,9 +79,8 @@ def test_same_policy_same_end(emulated: EmulatedCar, latency: LatencyParts) -> N
 @pytest.mark.realtime
 def test_latency_by_part_adds_up(latency: LatencyParts) -> None:
     assert set(latency.parts) == {COMMAND_TO_WIRE, WIRE_TO_FIRMWARE, EXPOSURE_TO_ARRIVAL, ARRIVAL_TO_LOOP}
-    # A host that looks elsewhere between writing a command and taking the time makes single samples too small.
-    for samples in latency.parts.values():
-        assert np.quantile(samples, 0.1) > 0
+    for name, samples in latency.parts.items():
+        assert (samples > 0).all(), (name, samples)
     # A servo frame of 8 bytes and one of 10 at 115200 baud take 1.56 ms on the wire; the servo's comes at its end.
     assert np.median(latency.parts[WIRE_TO_FIRMWARE]) > 0.6e-3
     # The world delivers each exposure as late as the car file says, and never earlier.
