@@ -30,7 +30,7 @@ def _best_s(function: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-class _OneThread:
+class OneThread:
     """One core for torch while it lasts."""
 
     def __enter__(self) -> None:
@@ -68,7 +68,7 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
     """
     config = SimulatorConfig()
     found: dict[str, float] = {}
-    with _OneThread():
+    with OneThread():
         for count in (1, cars):
             start, commands = _drive(count)
             rollout(config, start, commands)
@@ -118,7 +118,7 @@ def gradient_speed(cars: int = 2048, repeats: int = 3, batch: int = 4096) -> dic
     names = [n for n in config.values() if n.split(".")[0] in ("vehicle", "tyre", "motor", "steering")]
     numbers = 6 + 2 * TICKS + len(names)
     found: dict[str, float] = {"numbers": float(numbers), "cars": float(cars)}
-    with _OneThread():
+    with OneThread():
         for label, count in (("", cars), ("one_car_", 1)):
             by_gradient = _best_s(lambda count=count: _gradient(config, names, count), repeats + 1)  # type: ignore[misc]
             size = min(batch, 2 * numbers * count)
