@@ -45,12 +45,14 @@ class CarFitSettings:
         steps: of the particles' optimiser.
         particles: how many.
         seed: of everything that is drawn.
+        learning_rate: of the particles; that of ``ParticleSettings`` unless given.
     """
 
     method: Method = "sim-fsvgd"
     steps: int = 2500
     particles: int = 20
     seed: int = 0
+    learning_rate: float = ParticleSettings().learning_rate
 
 
 def car_units(model: CarModel, generator: torch.Generator) -> Normaliser:
@@ -108,7 +110,9 @@ def fit_car(
         seed=settings.seed,
     )  # fmt: skip
     points = measurement_points(model, inputs, units, generator)
-    particles = ParticleSettings(particles=settings.particles, steps=settings.steps, seed=settings.seed)
+    particles = ParticleSettings(
+        particles=settings.particles, steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
+    )
     start = None if before is None else before.posterior.to(device).parameters_for(target.normaliser)
     return CarDynamics(fit_particles(target, points, particles, progress, start), model.history)
 

@@ -18,7 +18,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, DivergedError
 from learning.evaluation import Mixture, negative_log_likelihood
 from learning.function_prior import JITTER, Marginal, RbfCovariance, gaussian_process, simulator_marginal
 from learning.normaliser import Normaliser
@@ -281,7 +281,7 @@ def fit(
                 break
     found = state.posterior(network, normaliser, reach) if kept.posterior is None else kept.posterior
     if not torch.isfinite(found.parameters).all():
-        raise DataError("The fit diverged; fit again with a smaller learning rate.")
+        raise DivergedError("The fit diverged; fit again with a smaller learning rate.")
     return found
 
 

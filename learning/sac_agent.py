@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, DivergedError
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action
 from learning.model_env import ModelEnv, policy_view
@@ -95,7 +95,8 @@ class SacAgent:
             Figures of the last gradient step.
 
         Raises:
-            DataError: the policy diverged; the one before is kept.
+            DivergedError: the policy diverged; the one before is kept.
+            DataError: the earlier policy has another shape.
         """
         s = self._settings
         again = self._sac
@@ -118,29 +119,34 @@ class SacAgent:
             made.log_ent_coef.data.copy_(again.log_ent_coef.data)
         made.set_logger(Logger(None, []))
         env.seed_anew()
+        temperature_log = made.log_ent_coef
+        assert temperature_log is not None
         best, kept = -np.inf, None
-        assert made.log_ent_coef is not None
+        parts = judged if judge is not None else 1
+
+        def look() -> None:
+            nonlocal best, kept
+            if not all(bool(torch.isfinite(p).all()) for p in made.policy.parameters()):
+                raise DivergedError(DIVERGED)
+            if judge is not None and (value := judge(self)) > best:
+                kept = copy.deepcopy((made.policy.state_dict(), temperature_log.data, made.optimiser_state()))
+                best = value
+
         self._sac = made
         try:
             made.learn(s.warm_up, log_interval=NEVER)
             made.gradient_steps = s.updates
-            for part in range(judged if judge is not None else 1):
-                goal = updates * (part + 1) // (judged if judge is not None else 1)
-                made.learn(NEVER, callback=_UntilUpdates(goal, progress), log_interval=NEVER, reset_num_timesteps=False)
-                if not all(bool(torch.isfinite(p).all()) for p in made.policy.parameters()):
-                    raise DataError(DIVERGED)
-                if judge is not None and (value := judge(self)) > best:
-                    kept = copy.deepcopy((made.policy.state_dict(), made.log_ent_coef.data, made.optimiser_state()))
-                    best = value
+            watch = _Watch([updates * (part + 1) // parts for part in range(parts)], progress, look)
+            made.learn(NEVER, callback=watch, log_interval=NEVER, reset_num_timesteps=False)
         except BaseException as error:
             self._sac = again
             if isinstance(error, ValueError) and "nan" in str(error):  # torch's distributions refuse what is no number.
-                raise DataError(DIVERGED) from error
+                raise DivergedError(DIVERGED) from error
             raise
         if kept is not None:
             networks, temperature, moments = kept
             made.policy.load_state_dict(networks)
-            made.log_ent_coef.data.copy_(temperature)
+            temperature_log.data.copy_(temperature)
             made.load_optimiser_state(moments)
         return {name: float(value) for name, value in made.logger.name_to_value.items()}
 
@@ -194,23 +200,28 @@ class SacPolicy:
         return Action.from_array(action.astype(np.float64))
 
 
-class _UntilUpdates(BaseCallback):
-    """Ends training after so many gradient steps."""
+class _Watch(BaseCallback):
+    """Looks at the policy after so many gradient steps, and ends training after the last look.
 
-    def __init__(self, updates: int, progress: Callable[[int], None]) -> None:
+    It looks between two ticks of the world. stable-baselines3 forgets the tick in which a callback ends it, and a
+    replay that goes on after that would hold two ticks as one.
+    """
+
+    def __init__(self, goals: list[int], progress: Callable[[int], None], look: Callable[[], None]) -> None:
         super().__init__()
-        self._updates, self._progress = updates, progress
+        self._goals, self._progress, self._look = goals, progress, look
 
     def _on_rollout_start(self) -> None:
-        self._progress(self._done())
-
-    def _on_step(self) -> bool:
-        return self._done() < self._updates
-
-    def _done(self) -> int:
         model = self.model
         assert isinstance(model, FastSac)
-        return int(model._n_updates)
+        done = int(model._n_updates)
+        self._progress(done)
+        while self._goals and done >= self._goals[0]:
+            self._goals.pop(0)
+            self._look()
+
+    def _on_step(self) -> bool:
+        return bool(self._goals)
 
 
 __all__ = ["SacAgent", "SacPolicy", "SacSettings"]

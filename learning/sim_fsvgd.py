@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, DivergedError
 from learning.adam import Adam
 from learning.domain_models import DomainModel
 from learning.fsvgd import Posterior, reach_of
@@ -124,7 +124,7 @@ def fit_particles(
             if (step + 1) % TOLD_EVERY == 0:
                 progress(step + 1)
         if not bool(torch.isfinite(numbers).all()):
-            raise DataError("The fit diverged; fit again with a smaller learning rate.")
+            raise DivergedError("The fit diverged; fit again with a smaller learning rate.")
         most = math.inf
         if len(target.inputs) >= ROWS_FOR_NOISE:
             sets = target.data[:, None]

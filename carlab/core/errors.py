@@ -3,6 +3,7 @@
     CarlabError
     ├── ConfigError (ValueError)         a file or option is wrong: names the key and the nearest known one
     ├── DataError (ValueError)           a recording or packet is wrong: names the row, the column or the byte
+    │   ├── DivergedError                numbers of what is learned grew beyond all bounds
     │   └── ProtocolError                bytes that do not follow their protocol
     ├── NotReadyError (ConnectionError)  a car, port or camera system is not there; lists every reason at once
     ├── NotOpenError (RuntimeError)      used before open() or after close()
@@ -34,6 +35,10 @@ class ConfigError(CarlabError, ValueError):
 
 class DataError(CarlabError, ValueError):
     """A recording or a packet cannot be used as it is."""
+
+
+class DivergedError(DataError):
+    """What was being learned is no number any more; with smaller steps or other draws it may go well."""
 
 
 class ProtocolError(DataError):

@@ -18,6 +18,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from carlab.cars import CarChoice
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.outcome import EndReason
@@ -193,7 +195,7 @@ class Campaign:
             self._envelope,
             self.run,
             self.choice.control_period_s,
-            seed=self.plan.seed + number,
+            seed=int(np.random.SeedSequence((self.plan.seed, number)).generate_state(1)[0]),
             max_ticks=self.max_ticks,
             config_toml=self.choice.config_toml,
             metadata={"model": str(number), "method": self.plan.method},

@@ -12,20 +12,22 @@ import multiprocessing
 import os
 import shutil
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from carlab.core.clock import MonotonicClock
-from carlab.core.documents import Transition
+from carlab.core.documents import EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import CarlabError, DataError
+from carlab.core.errors import CarlabError, DataError, DivergedError
 from carlab.core.observation import encode
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
+from carlab.core.state_estimator import StateEstimator
 from carlab.core.task import ParkingTask
+from carlab.recording.episode_builder import VELOCITY_DELAY
 from learning.car_fit import LearnedCar, Method
 from learning.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, has_whole_step, transitions_of
@@ -47,7 +49,10 @@ of four runs came to stand 0.21 m away in their third episode."""
 LATER_S = 0.12
 """How much later the safety gate of the learned car reacts: at 2 m/s a policy keeps a quarter of a metre more from
 the edge than the real gate asks for, which otherwise ends the first episodes where the car slides a little more."""
+SMALLER_STEPS = 0.25
+"""By what steps are multiplied where something diverged."""
 Tell = Callable[[str, int, int], None]
+Learned = TypeVar("Learned")
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,16 +132,18 @@ def train(
     clock = MonotonicClock()
     number = len(recordings) + 1
     tell("reading the recordings", 0, 1)
-    episodes = [read_episode(path) for path in recordings if has_ticks(path)]
+    read = [read_episode(path) if has_ticks(path) else None for path in recordings]
+    episodes, last = [e for e in read if e is not None], read[-1] if read else None
     simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
-    model = CarModel(simulator, plan.history, known_ranges(simulator))
     usable = [e for e in episodes if has_whole_step(e, plan.history)]
+    late_s = velocity_delay_s(usable)
+    model = CarModel(simulator, plan.history, known_ranges(simulator), velocity_delay_s=late_s)
     rows = transitions_of(usable, plan.history) if usable else None
     figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
     earlier = model_folder(models, number - 1)
     before = load_car(earlier / DYNAMICS_FILE, plan.device) if earlier.is_dir() else None
-    if before is not None and usable and usable[-1] is episodes[-1]:
-        nll, off = before.surprise(episodes[-1])
+    if before is not None and usable and usable[-1] is last:
+        nll, off = before.surprise(last)
         figures |= {"last_episode_nll": nll, "last_episode_calibration_error": off}
 
     began_s = clock.now_s()
@@ -147,9 +154,6 @@ def train(
     began_s = clock.now_s()
     updates = plan.updates_before(number)
     sac = SacSettings()
-    agent = SacAgent(sac, plan.seed, plan.device)
-    if before is not None:
-        agent = SacAgent.load(earlier, sac, plan.seed, plan.device)
     recorded = recorded_features(usable, plan.history) if usable else None
     careful = replace(envelope, reaction_s=envelope.reaction_s + LATER_S)
     gate: dict[str, Any] = {"envelope": careful, "period_s": simulator.control_period_s, "device": plan.device}
@@ -166,14 +170,22 @@ def train(
         total, last = judging.rolled_out(candidate.act)
         return float(total.mean() + PARKED_WORTH * task.parked(last).float().mean())
 
-    tell("learning to drive", 0, updates)
-    figures |= agent.train(world, updates, lambda done: tell("learning to drive", done, updates), judge)
-    total, last = judging.rolled_out(agent.act)
+    def trained(slower: float) -> SacAgent:
+        settings = replace(sac, learning_rate=slower * sac.learning_rate)
+        agent = SacAgent(settings, plan.seed, plan.device)
+        if before is not None:
+            agent = SacAgent.load(earlier, settings, plan.seed, plan.device)
+        tell("learning to drive", 0, updates)
+        figures.update(agent.train(world, updates, lambda done: tell("learning to drive", done, updates), judge))
+        return agent
+
+    agent = _with_smaller_steps(trained, "policy")
+    total, ends = judging.rolled_out(agent.act)
     figures |= {
         "policy_seconds": clock.now_s() - began_s,
         "updates": updates,
         "return_in_model": float(total.mean()),
-        "parked_in_model": float(task.parked(last).float().mean()),
+        "parked_in_model": float(task.parked(ends).float().mean()),
     }
 
     def write(folder: Path) -> None:
@@ -209,14 +221,50 @@ def _fitted(
         return fit_authors_fsvgd(episodes, plan.history, steps, seed, at, plan.device)
     settings = CarFitSettings(plan.method, steps, seed=seed)
     earlier = before if isinstance(before, CarDynamics) else None
-    return fit_car(rows, model, settings, before=earlier, progress=at, device=plan.device)
+
+    def fitted(slower: float) -> LearnedCar:
+        own = replace(settings, learning_rate=slower * settings.learning_rate)
+        return fit_car(rows, model, own, before=earlier, progress=at, device=plan.device)
+
+    return _with_smaller_steps(fitted, "model")
+
+
+def _with_smaller_steps(learn: Callable[[float], Learned], what: str) -> Learned:
+    """What is learned with usual steps, or with smaller ones where it diverged by those.
+
+    Raises:
+        DivergedError: by those as well.
+    """
+    try:
+        return learn(1.0)
+    except DivergedError as error:
+        log.warning("The %s diverged (%s); it is learned again with steps of %g.", what, error, SMALLER_STEPS)
+    try:
+        return learn(SMALLER_STEPS)
+    except DivergedError as error:
+        raise DivergedError(
+            f"The {what} diverged, with smaller steps as well; what was recorded is kept: if the last recording shows "
+            "what no car does (carlab replay), take it out of the run's folder, or start a run with another --prior."
+        ) from error
+
+
+def velocity_delay_s(episodes: Sequence[EpisodeData]) -> float:
+    """By how much measured velocities lag behind poses, as recordings say it; without any, as the estimator has it."""
+    import numpy as np
+
+    told = [np.asarray(e.extra[VELOCITY_DELAY], dtype=np.float64) for e in episodes if VELOCITY_DELAY in e.extra]
+    known = np.concatenate([t[np.isfinite(t)] for t in told]) if told else np.zeros(0)
+    return float(np.median(known)) if len(known) else 0.5 * StateEstimator().window_s
 
 
 def has_ticks(recording: Path) -> bool:
-    """Whether anything was driven: the gate may end an episode before its first tick."""
+    """Whether anything was driven and seen: the gate may end an episode before its first tick, or a hang in it."""
     from carlab.recording.mcap_source import read_documents
 
-    return any(isinstance(document, Transition) for document in read_documents(recording))
+    documents = read_documents(recording)
+    steps = [document.step for document in documents if isinstance(document, Tick)]
+    seen = [d.steps for d in documents if isinstance(d, EpisodeEnded) and d.last is not None]
+    return len(steps) > 1 or bool(steps and seen and seen[0] > steps[-1])
 
 
 def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:

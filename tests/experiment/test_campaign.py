@@ -20,7 +20,7 @@ import torch
 from carlab.cars import CarChoice, choose_car
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Tick
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, DivergedError
 from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
@@ -28,6 +28,7 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
+from carlab.experiment import training
 from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator, taken_up
 from carlab.experiment.campaign_figures import EpisodeFigures
 from carlab.experiment.campaign_report import learning_curve, write_report
@@ -36,10 +37,11 @@ from carlab.experiment.training import PARKED_BONUS, TrainingPlan, recorded_feat
 from carlab.recording.mcap_source import read_documents, read_episode
 from carlab.recording.run_directory import RunDirectory
 from drivers.emulators.command_log import read_log
-from learning import model_env
+from learning import car_fit, model_env
 from learning.car_fit import load_car
 from learning.evaluation import negative_log_likelihood
-from learning.sac_agent import SacPolicy
+from learning.sac_agent import SacAgent, SacPolicy
+from learning.simulator_model import CarModel
 from learning.transitions import transitions_of
 
 HISTORY = 2
@@ -277,6 +279,63 @@ def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_somethi
     heard = [e for e in currents if second.min() < e.t_s < second.max()]
     assert len(heard) > 3
     assert all(e.value == 0.0 for e in heard), "neutral, again and again"
+
+
+def test_the_model_is_told_by_how_much_recorded_velocities_are_late(
+    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A line through the poses of 50 ms, 100 of them a second, has its slope 25 ms ago."""
+    told: list[float] = []
+
+    def fitted(plan: TrainingPlan, model: CarModel, *rest: Any) -> None:
+        told.append(model.velocity_delay_s)
+        raise DataError("seen enough")
+
+    monkeypatch.setattr(training, "_fitted", fitted)
+    with pytest.raises(DataError, match="seen enough"):
+        train(story.plan, tmp_path / "none", [], ENVELOPE, lambda *what: None)
+    with pytest.raises(DataError, match="seen enough"):
+        train(story.plan, tmp_path / "some", story.run.recordings(), ENVELOPE, lambda *what: None)
+    episodes = [read_episode(path) for path in story.run.recordings()]
+    assert told == pytest.approx([0.025, 0.025], abs=1e-3)
+    late = replace(episodes[0], extra={"velocity_delay_s": np.array([0.01, 0.02, np.nan, 0.04])})
+    assert training.velocity_delay_s([late]) == 0.02
+    assert training.velocity_delay_s([replace(late, extra={})]) == 0.025, "of recordings that do not say"
+
+
+def test_what_diverged_is_learned_again_with_smaller_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rates: dict[str, list[float]] = {"model": [], "policy": []}
+    fit, teach = car_fit.fit_car, SacAgent.train
+    broken = {"model", "policy"}
+
+    def fit_car(rows: Any, model: Any, settings: Any, **others: Any) -> Any:
+        rates["model"].append(settings.learning_rate)
+        if len(rates["model"]) == 1:
+            raise DivergedError("The fit diverged.")
+        return fit(rows, model, settings, **others)
+
+    def taught(self: SacAgent, *arguments: Any) -> dict[str, float]:
+        rates["policy"].append(self._settings.learning_rate)
+        if len(rates["policy"]) == 1 or "always" in broken:
+            raise DivergedError("The policy diverged.")
+        return teach(self, *arguments)
+
+    monkeypatch.setattr(car_fit, "fit_car", fit_car)
+    monkeypatch.setattr(SacAgent, "train", taught)
+    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
+    (tmp_path / "models").mkdir()
+    train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
+    assert all(second == 0.25 * first for first, second in rates.values())
+    assert "The model diverged" in caplog.text
+    assert "The policy diverged" in caplog.text
+    broken.add("always")
+    (tmp_path / "other").mkdir()
+    with pytest.raises(DivergedError, match="with smaller steps as well") as error:
+        train(plan, tmp_path / "other", [], ENVELOPE, lambda *what: None)
+    assert "\n" not in str(error.value)
+    assert list((tmp_path / "other").iterdir()) == []
 
 
 def drive(folder: Path, ticks: int, start: CarState | None = None) -> RunDirectory:

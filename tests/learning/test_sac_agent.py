@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from carlab.core.errors import DataError
+from carlab.core.errors import DataError, DivergedError
 from carlab.core.policy import Policy, PolicyInput
 from carlab.core.quantities import CarState, Observation
 from carlab.core.task import ParkingTask
@@ -136,6 +136,20 @@ def test_the_best_judged_policy_is_kept_whole(values: tuple[float, ...], kept: i
     assert torch.equal(found, then)
 
 
+def test_where_the_policy_was_judged_no_tick_of_the_world_is_lost() -> None:
+    """A car that gains as much in each tick has gained as much in each row of the replay."""
+    agent = SacAgent(SMALL, 0)
+    agent.train(world(16, change=0.01), 256, judge=lambda agent: 0.0, judged=4)
+    assert agent._sac is not None
+    replay = agent._sac.replay_buffer
+    assert replay is not None
+    rows, speed = replay.pos, 4
+    assert rows > 30
+    gained = replay.next_observations[:rows, :, speed] - replay.observations[:rows, :, speed]
+    np.testing.assert_allclose(gained, gained[0, 0], atol=1e-5)
+    assert gained[0, 0] > 1e-3
+
+
 @pytest.mark.parametrize("how", ["a rate far too large", "a world that is no number"])
 def test_a_policy_that_diverges_is_told_and_the_earlier_one_kept(how: str) -> None:
     agent = SacAgent(SMALL, 0)
@@ -144,7 +158,7 @@ def test_a_policy_that_diverges_is_told_and_the_earlier_one_kept(how: str) -> No
     env = world(16, change=float("nan") if how == "a world that is no number" else 0.0)
     if how == "a rate far too large":
         agent._settings = replace(SMALL, learning_rate=1e20)
-    with pytest.raises(DataError, match="diverged") as error:
+    with pytest.raises(DivergedError, match="diverged") as error:
         agent.train(env, 256)
     assert "\n" not in str(error.value)
     np.testing.assert_array_equal(answers(agent), before)
