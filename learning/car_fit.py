@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -118,7 +119,7 @@ def fit_car(
 
 
 def save_car(dynamics: LearnedCar, path: Path) -> None:
-    """Write a learned car into a file, from wherever it is."""
+    """Write a learned car into a file, from wherever it is. Raises OSError where the disk is full."""
     posterior = dynamics.posterior.to("cpu")
     units = posterior.normaliser
     content: dict[str, Any] = {
@@ -136,7 +137,9 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
         "correlation": posterior.correlation,
         "reach": posterior.reach,
     }
-    torch.save(content, path)
+    whole = io.BytesIO()  # torch tells of a full disk by an error of its own
+    torch.save(content, whole)
+    path.write_bytes(whole.getvalue())
 
 
 def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:

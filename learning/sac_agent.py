@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -162,10 +163,13 @@ class SacAgent:
         return found
 
     def save(self, folder: Path) -> None:
-        """Write the agent and its optimisers into a folder."""
+        """Write the agent and its optimisers into a folder. Raises OSError where the disk is full."""
         assert self._sac is not None
-        self._sac.save(folder / AGENT_FILE, exclude=["env", "replay_buffer"])
-        torch.save(self._sac.optimiser_state(), folder / MOMENTS_FILE)
+        agent, moments = io.BytesIO(), io.BytesIO()
+        self._sac.save(agent, exclude=["env", "replay_buffer"])
+        torch.save(self._sac.optimiser_state(), moments)
+        (folder / AGENT_FILE).write_bytes(agent.getvalue())
+        (folder / MOMENTS_FILE).write_bytes(moments.getvalue())
 
     @classmethod
     def load(cls, folder: Path, settings: SacSettings, seed: int, device: torch.device | str = "cpu") -> SacAgent:

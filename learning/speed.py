@@ -1,7 +1,11 @@
-"""How fast learning is: training and prediction of particles, gradient steps of SAC, each beside a yardstick."""
+"""How fast learning is: training and prediction of particles, gradient steps of SAC, each beside a yardstick.
+
+And what a user waits for: a car that is learned from its rows, predictions in its units, steps of the learned car.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -10,14 +14,22 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
+from torch import Tensor
 
 from carlab.core.clock import MonotonicClock
+from learning.car_dynamics import CarDynamics
+from learning.car_fit import NOISE_STD, CarFitSettings, fit_car
 from learning.devices import settle
+from learning.domain_models import draw_parameters
+from learning.fsvgd import EDGE, Posterior
 from learning.function_posterior import infer
 from learning.normaliser import Normaliser
 from learning.particles import Network
 from learning.sac import FastSac
 from learning.sim_fsvgd import ParticleSettings, fit_particles
+from learning.simulator_model import CarModel
+from learning.transitions import Transitions
+from sim_backends.car_parameters import SimulatorConfig
 
 AUTHORS_STEPS_PER_S = 10.0
 """Training steps per second of the authors' code on two cores (7 to 10)."""
@@ -26,11 +38,15 @@ SIZES = {
     "online RL: 10 particles, 48 points, 15 inputs": (10, 12, 15),
     "regression: 20 particles, 40 points": (20, 10, 9),
 }
+CAR_FIT = CarFitSettings()
+FITTED_ROWS, FITTED_HISTORY = 100, 3
+KINEMATIC = ("motor.drive_gain", "motor.damping", "steering.max_angle")
+"""Numbers that a prior whose wheels do not slip is uncertain of."""
 SAC_SIZES = {"64 x 64, batch 64": ([64, 64], 64), "64 x 64, batch 256": ([64, 64], 256)}
 
 
 def training_speed(device: str = "cpu") -> dict[str, Any]:
-    """Steps of the particles' optimiser per second at the sizes of the paper, and of a whole fit of 100 rows."""
+    """Steps of the particles' optimiser per second at the sizes of the paper, and seconds of a whole fit of a car."""
     found: dict[str, Any] = {}
     for name, (particles, sets, width) in SIZES.items():
         generator = torch.Generator().manual_seed(0)
@@ -59,11 +75,35 @@ def training_speed(device: str = "cpu") -> dict[str, Any]:
             "inference_s": inferred_s - began_s,
             "40000_steps_s": 40_000 / rate,
         }
+    found["a car from 100 rows, as carlab learn"] = {"whole_fit_s": _whole_fit_s(device)}
     return found
 
 
+def _whole_fit_s(device: str) -> float:
+    """Time in which a car is learned: units, inference under a simulator whose wheels do not slip, and particles."""
+    car = SimulatorConfig.from_preset()
+    truth = CarModel(car, FITTED_HISTORY, {})
+    prior = CarModel(replace(car, kind="kinematic"), FITTED_HISTORY, {name: car.priors[name] for name in KINEMATIC})
+    generator = torch.Generator().manual_seed(0)
+    inputs = truth.inputs(FITTED_ROWS, generator)
+    outputs = truth(inputs, draw_parameters(truth, 1, generator))[0]
+    seen = outputs + 0.5 * torch.tensor(NOISE_STD) * torch.randn(outputs.shape, generator=generator)
+    number = np.arange(FITTED_ROWS)
+    rows = Transitions(inputs.double().numpy(), seen.double().numpy(), 0 * number, number, FITTED_HISTORY)
+    clock = MonotonicClock()
+    began_s = clock.now_s()
+    fit_car(rows, prior, CAR_FIT, device=device)
+    settle(device)
+    return clock.now_s() - began_s
+
+
 def prediction_speed(device: str = "cpu") -> dict[str, Any]:
-    """A batch of 256 one-step predictions of 20 particles against one matrix product of as many operations."""
+    """A batch of 256 one-step predictions of 20 particles against one matrix product of as many operations.
+
+    ``batch_ms`` is of their networks alone. ``posterior_ms`` is of a whole prediction: from raw inputs, clamped, to raw
+    outputs turned back, with the line that all particles share and the noise. ``learned_car_ms`` is of 256 draws of it
+    as a learned car is stepped, each row by one particle.
+    """
     network = Network(15, 6, activation=ParticleSettings().activation)
     generator = torch.Generator().manual_seed(0)
     numbers = network.initial(20, generator, device)
@@ -71,14 +111,35 @@ def prediction_speed(device: str = "cpu") -> dict[str, Any]:
     operations = 20 * 256 * sum(a * b for a, b in network.layers)
     side = 256
     left, right = torch.randn((operations // side**2, side)).to(device), torch.randn((side, side)).to(device)
+    posterior = _posterior(network, numbers)
+    car = CarDynamics(posterior, history=5)
     with torch.no_grad():
         ours_s = _seconds(lambda: network(numbers, inputs), device)
         product_s = _seconds(lambda: left @ right, device)
+    whole_s = _seconds(lambda: posterior.predict(inputs), device)
+    drawn_s = _seconds(lambda: car.sample(inputs, generator), device)
     return {
         "batch_ms": 1e3 * ours_s,
         "matrix_product_ms": 1e3 * product_s,
         "share_of_its_speed": product_s / ours_s,
+        "posterior_ms": 1e3 * whole_s,
+        "posterior_share_of_its_speed": product_s / whole_s,
+        "learned_car_ms": 1e3 * drawn_s,
     }
+
+
+def _posterior(network: Network, numbers: Tensor) -> Posterior:
+    """Particles with all that a fit gives them beside networks: a turn, a trend, Student's noise that is joint."""
+    generator = torch.Generator().manual_seed(1)
+    width, outputs = network.inputs, network.outputs
+    eye = torch.eye(outputs)
+    units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(outputs), torch.ones(outputs))
+    turn = eye + 0.1 * torch.randn((outputs, outputs), generator=generator)
+    trend = 0.1 * torch.randn((1 + width, outputs), generator=generator)
+    return Posterior(
+        network, numbers.cpu(), torch.full((outputs,), 0.1), units.turned(turn), freedom=5.0, trend=trend,
+        correlation=0.9 * eye + 0.1, reach=torch.full((width,), EDGE),
+    ).to(numbers.device)  # fmt: skip
 
 
 def sac_speed(device: str = "cpu") -> dict[str, Any]:

@@ -103,7 +103,8 @@ class Learn:
     def run(self) -> int:
         """Learn and say how it went."""
         from carlab.core.task import ParkingTask
-        from carlab.experiment.campaign import Campaign, CampaignHooks, check_same_car, taken_up
+        from carlab.experiment.campaign import Campaign, CampaignHooks, check_same_car, seed_of, taken_up
+        from carlab.experiment.campaign_report import restore_rows
         from carlab.experiment.interrupts import Interrupts
         from learning.devices import available
 
@@ -113,7 +114,8 @@ class Learn:
         if (ticks := self.ticks or ParkingTask().max_ticks) <= self.history:
             raise ConfigError(f"--ticks {ticks}: nothing is learned from fewer than --history and one more.")
         available(self.device or "cpu")
-        choice = self.which_car.choose(seed=self.seed)
+        started = None if self.resume is None else seed_of(self.resume)
+        choice = self.which_car.choose(seed=self.seed if started is None else started)
         figures: list[EpisodeFigures] = []
         with contextlib.ExitStack() as stack:
             if self.resume is None:
@@ -125,6 +127,8 @@ class Learn:
                 campaign = taken_up(run, choice, CampaignHooks(), self.device)
                 available(campaign.plan.device)
                 self._check_as_before(campaign, choice)
+                campaign.set_stopped_aside()
+                restore_rows(run, campaign.plan.task)
             stack.enter_context(choice.car)
             bar = stack.enter_context(progress(speed_estimate_period_s=STEPS_PERIOD_S))
             interrupts = stack.enter_context(Interrupts())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 import signal
@@ -61,8 +62,16 @@ def _logged(run: RunDirectory, choice: CarChoice) -> Iterator[None]:
 
 
 def write_result(run: RunDirectory, results: list[EpisodeResult]) -> None:
-    """Write result.json: each episode's end and figures."""
-    episodes = [
+    """Write result.json: each episode's end and figures, after those of a run that was taken up again."""
+    from carlab.recording.run_directory import RESULT_FILE
+
+    path = run.path / RESULT_FILE
+    try:
+        before = list(json.loads(path.read_text(encoding="utf-8"))["episodes"])
+    except (OSError, ValueError, KeyError, TypeError):
+        before = []
+    now = {result.episode for result in results}
+    episodes = [e for e in before if e.get("episode") not in now] + [
         {
             "episode": result.episode,
             "ticks": result.data.ticks,

@@ -16,11 +16,13 @@ import json
 import tomllib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from carlab.cars import CarChoice
+from carlab.core.documents import EpisodeEnded
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
@@ -36,6 +38,7 @@ from carlab.experiment.training import (
     plan_as_json,
     train_beside,
 )
+from carlab.recording.mcap_source import read_documents
 from carlab.recording.run_directory import RunDirectory
 from learning.sac_agent import SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
@@ -43,6 +46,8 @@ from sim_backends.car_parameters import SimulatorConfig
 CAMPAIGN_FILE = "campaign.json"
 GOES_ON = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOFENCE, EndReason.OVERSPEED})
 """Ends of an episode after which the next may follow: a policy that has not learned yet leaves the arena."""
+STOPPED = frozenset({EndReason.STOP_REQUESTED, EndReason.LOOP_HUNG})
+"""Ends of an episode after which it is driven again: they say nothing of the policy."""
 SPREAD = 0.3
 """How far from its value a number of the car file may lie, where the file gives no range."""
 DRY_RUN = "--dry-run"
@@ -136,6 +141,7 @@ class Campaign:
         Raises:
             DataError: what training says.
         """
+        self.set_stopped_aside()
         self._check()
         while (done := len(self.run.recordings())) < self.episodes:
             folder = model_folder(self.run.models, done + 1)
@@ -153,7 +159,8 @@ class Campaign:
             if self.hooks.stop():
                 return
             result = self._drive(done + 1)
-            if result is None:
+            if result is None or result.reason in STOPPED:
+                self.set_stopped_aside()
                 return
             goes_on = self._may_go_on(result.reason)
             if goes_on and result.reason.is_safety_stop:
@@ -163,6 +170,15 @@ class Campaign:
             yield result
             if not goes_on:
                 return
+
+    def set_stopped_aside(self) -> None:
+        """Have the last episode driven again where a person ended it or the loop hung; its recording is kept."""
+        recordings = self.run.recordings()
+        if not recordings or model_folder(self.run.models, len(recordings) + 1).is_dir():
+            return
+        ends = [d.reason for d in read_documents(recordings[-1]) if isinstance(d, EpisodeEnded)]
+        if STOPPED & set(ends):
+            self.run.set_aside(recordings[-1])
 
     def _check(self) -> None:
         """Check the recordings against the simulator where that was not done after the last of them."""
@@ -244,6 +260,14 @@ def check_same_car(run: RunDirectory, choice: CarChoice, typed: str) -> None:
     )
 
 
+def seed_of(folder: Path) -> int | None:
+    """The seed that a run was started with; None where the folder is no campaign: ``taken_up`` says so."""
+    try:
+        return int(json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]["seed"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def taken_up(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device: str | None = None) -> Campaign:
     """A run that goes on as it was started, or on another device. Raises DataError where it is no campaign."""
     path = run.path / CAMPAIGN_FILE
@@ -272,5 +296,6 @@ __all__ = [
     "check_period",
     "check_same_car",
     "prior_simulator",
+    "seed_of",
     "taken_up",
 ]

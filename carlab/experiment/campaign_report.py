@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import json
+import logging
 from dataclasses import fields
 
 import numpy as np
 
 from carlab.core.errors import DataError
-from carlab.experiment.campaign_figures import EpisodeFigures, foretell
+from carlab.core.task import ParkingTask
+from carlab.experiment.campaign_figures import EpisodeFigures, figures_of, foretell
 from carlab.experiment.campaign_picture import draw
 from carlab.experiment.reality_check import RealityCheck
-from carlab.experiment.training import DYNAMICS_FILE, TrainingPlan, has_ticks, model_folder
+from carlab.experiment.session import result_of
+from carlab.experiment.training import DYNAMICS_FILE, FIGURES_FILE, TrainingPlan, has_ticks, model_folder
 from carlab.recording.learning_curve import write_learning_curve
 from carlab.recording.mcap_source import read_episode
 from carlab.recording.run_directory import RunDirectory
 from learning.car_fit import LearnedCar, load_car
+
+log = logging.getLogger(__name__)
 
 CURVE_FILE = "learn.json"
 
@@ -36,6 +41,19 @@ def keep_row(run: RunDirectory, row: EpisodeFigures) -> list[EpisodeFigures]:
     rows = sorted([r for r in learning_curve(run) if r.episode != row.episode] + [row], key=lambda r: r.episode)
     run.write_json(CURVE_FILE, {"schema": "carlab.learn/1", "episodes": [r.to_dict() for r in rows]})
     return rows
+
+
+def restore_rows(run: RunDirectory, task: ParkingTask) -> None:
+    """Make the rows of episodes that have none: the program was ended between their last tick and their row."""
+    known = {row.episode for row in learning_curve(run)}
+    for number, path in enumerate(run.recordings(), start=1):
+        if number in known or not has_ticks(path):
+            continue
+        try:
+            training = json.loads((model_folder(run.models, number) / FIGURES_FILE).read_text(encoding="utf-8"))
+            keep_row(run, figures_of(result_of(number, read_episode(path), task, path), training))
+        except (OSError, ValueError, KeyError) as error:
+            log.warning("Episode %d stays without a row in %s: %s", number, CURVE_FILE, error)
 
 
 def keep_check(run: RunDirectory, told: RealityCheck) -> None:
@@ -77,4 +95,4 @@ def _learned(run: RunDirectory, episode: int) -> LearnedCar | None:
         return None
 
 
-__all__ = ["CURVE_FILE", "keep_check", "keep_row", "learning_curve", "write_report"]
+__all__ = ["CURVE_FILE", "keep_check", "keep_row", "learning_curve", "restore_rows", "write_report"]

@@ -65,6 +65,9 @@ class Interrupts:
     def __exit__(self, *exc_info: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+            outer = getattr(handler, "__self__", None)
+            if self.requested.is_set() and isinstance(outer, Interrupts):
+                outer.requested.set()  # Who asked in here did not ask in there, and means the whole program.
         self._previous.clear()
 
     def reason(self) -> EndReason | None:

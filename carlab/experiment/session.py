@@ -53,6 +53,12 @@ class EpisodeResult:
         return float(np.sum(self.data.rewards))
 
 
+def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
+    """The line of an episode as it was recorded."""
+    final = CarState.from_array(data.states[-1])
+    return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], task.summary(final), path)
+
+
 @dataclass(slots=True)
 class SessionHooks:
     """What a session asks of the person in front of it.
@@ -177,8 +183,7 @@ class Session:
             watch.rest()
         if recorder.failed is not None:
             log.error("Episode %d: %s", number, recorder.failed)
-        final = CarState.from_array(data.states[-1])
-        return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], self.task.summary(final), path)
+        return result_of(number, data, self.task, path)
 
 
 @contextlib.contextmanager

@@ -280,6 +280,8 @@ def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
 
 
 def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None]) -> None:
+    from carlab.recording.sink import describe_os_error
+
     unfinished = folder.with_name(f"{folder.name}.partial")
     try:
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -288,7 +290,7 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
         (unfinished / FIGURES_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
         os.replace(unfinished, folder)
     except OSError as error:
-        raise DataError(f"{folder}: {error.strerror or error}; check the disk, then take the run up again.") from error
+        raise DataError(describe_os_error(error, folder)) from error
 
 
 def train_beside(

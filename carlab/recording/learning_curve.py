@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
+from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
-from carlab.recording.sink import partial_path
+from carlab.recording.drained_file import DrainedFile
+from carlab.recording.sink import describe_os_error, partial_path
 
 APPLICATION = "carlab"
 
@@ -30,12 +33,18 @@ def write_learning_curve(
         driven: x, y [m] of each episode (T, 2).
         foretold: mean and standard deviation of x, y [m] of stretches of each episode (S, T, 2).
         diagnoses: what is said of the simulator after each episode, empty where nothing is; none at all unless given.
+
+    Raises:
+        DataError: it cannot be written; what was there stays.
     """
     unfinished = partial_path(path)
-    unfinished.unlink(missing_ok=True)
-    stream = rr.RecordingStream(APPLICATION, recording_id=path.parent.name)
+    file = DrainedFile(unfinished)
+    stream: rr.RecordingStream | None = None
     try:
-        stream.save(unfinished)
+        unfinished.unlink(missing_ok=True)
+        file.open()
+        stream = rr.RecordingStream(APPLICATION, recording_id=path.parent.name)
+        stream.save(file.start())
         texts = diagnoses or [""] * len(rows)
         for row, line, (mean, std), text in zip(rows, driven, foretold, texts, strict=True):
             stream.set_time("episode", sequence=int(row["episode"]))
@@ -47,9 +56,20 @@ def write_learning_curve(
             stream.log("plan/driven", rr.LineStrips2D([line], colors=[(0, 0, 0)]))
             stream.log("plan/foretold", rr.LineStrips2D(list(mean), colors=[(230, 130, 0)]))
             stream.log("plan/foretold/doubt", rr.Boxes2D(centers=mean[:, -1], half_sizes=2.0 * std[:, -1]))
-    finally:
         stream.disconnect()
-    os.replace(unfinished, path)
+        stream = None
+        file.close()
+        file.check()
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise DataError(describe_os_error(error, path)) from error
+    finally:
+        if stream is not None:
+            with suppress(Exception):
+                stream.disconnect()
+        file.close()
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
 
 
 __all__ = ["write_learning_curve"]

@@ -4,6 +4,7 @@ runs/2026-11-21_134500_<name>/
     config.toml          the resolved configuration
     environment.json     program, git, packages, host, start
     episodes/0001.mcap   one recording an episode, with 0001.rrd beside it
+    episodes/stopped/    those of a learning run that a person ended; they are driven again
     models/  policy/     what was learned
     log.jsonl            the program's log, one JSON object a line
     result.json          how the run ended
@@ -34,6 +35,7 @@ _PACKAGES = (
     *("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "rerun-sdk", "mcap", "protobuf", "pyarrow"),
     *("python-can", "pyserial", "cantools"),
 )
+RESULT_FILE = "result.json"
 _EPISODE_FILE = re.compile(r"(\d+)\.(?:mcap|rrd)(?:\.partial)?")
 
 
@@ -98,6 +100,11 @@ class RunDirectory:
         return self.path / "episodes"
 
     @property
+    def stopped(self) -> Path:
+        """Folder of recordings that are no episodes of the run, because a person ended them; it may be absent."""
+        return self.episodes / "stopped"
+
+    @property
     def models(self) -> Path:
         """Folder of the dynamics models."""
         return self.path / "models"
@@ -114,12 +121,23 @@ class RunDirectory:
 
     def next_episode(self) -> int:
         """The number after the highest that any file has, finished or not; numbers start at 1."""
-        names = (_EPISODE_FILE.fullmatch(entry.name) for entry in self.episodes.iterdir())
+        folders = (folder for folder in (self.episodes, self.stopped) if folder.is_dir())
+        names = (_EPISODE_FILE.fullmatch(entry.name) for folder in folders for entry in folder.iterdir())
         return 1 + max((int(match[1]) for match in names if match), default=0)
 
     def episode_path(self, number: int, suffix: str = ".mcap") -> Path:
         """Where a file of an episode lies: ``episodes/0001.mcap``."""
         return self.episodes / f"{number:04d}{suffix}"
+
+    def set_aside(self, recording: Path) -> None:
+        """Move an episode's files into ``stopped``. Raises DataError where that fails."""
+        try:
+            self.stopped.mkdir(exist_ok=True)
+            for file in (recording.with_suffix(".rrd"), recording):
+                if file.is_file():
+                    os.replace(file, self.stopped / file.name)
+        except OSError as error:
+            raise DataError(describe_os_error(error, self.stopped)) from error
 
     def recordings(self, *, partial: bool = False) -> list[Path]:
         """The finished MCAP recordings in order; with ``partial`` the unfinished ones too."""
@@ -138,17 +156,18 @@ class RunDirectory:
 
     def write_result(self, result: Mapping[str, Any]) -> None:
         """Write result.json: how the run ended. Raises DataError where that fails."""
-        try:
-            self.write_json("result.json", result)
-        except OSError as error:
-            raise DataError(describe_os_error(error, self.path / "result.json")) from error
+        self.write_json(RESULT_FILE, result)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a JSON file whole or not at all."""
+        """Write a JSON file whole or not at all. Raises DataError where that fails."""
         path = self.path / name
         unfinished = path.with_name(f"{name}.partial")
-        unfinished.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
-        os.replace(unfinished, path)
+        try:
+            unfinished.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
+            os.replace(unfinished, path)
+        except OSError as error:
+            unfinished.unlink(missing_ok=True)
+            raise DataError(describe_os_error(error, path)) from error
 
 
 def _made(path: Path) -> bool:

@@ -223,6 +223,29 @@ def test_options_of_the_run_hold_when_it_is_taken_up(longer: tuple[int, str, Pat
     assert not list(folder.glob("episodes/*.rrd"))
 
 
+def test_a_run_that_is_taken_up_has_the_noise_of_its_own_seed_and_all_its_results(
+    carlab: Carlab, longer: tuple[int, str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = longer[2]
+    assert [e["episode"] for e in json.loads((folder / "result.json").read_text())["episodes"]] == [1, 2, 3]
+    seeds: list[int] = []
+    choose = CarOptions.choose
+
+    def chosen(self: CarOptions, **others: Any) -> Any:
+        seeds.append(others["seed"])
+        return choose(self, **others)
+
+    monkeypatch.setattr(CarOptions, "choose", chosen)
+    wanted = json.loads((folder / "campaign.json").read_text())
+    other = {**wanted, "plan": {**wanted["plan"], "seed": 7}}
+    (folder / "campaign.json").write_text(json.dumps(other))
+    try:
+        assert carlab("learn", "--resume", folder)[0] == 0
+    finally:
+        (folder / "campaign.json").write_text(json.dumps(wanted))
+    assert seeds == [7]
+
+
 def interrupted(plan: Any, models: Path, recordings: list[Path], *others: Any) -> dict[str, Any] | None:
     """A training during which somebody presses ^C."""
     signal.raise_signal(signal.SIGINT)

@@ -19,7 +19,7 @@ import torch
 
 from carlab.cars import CarChoice, choose_car
 from carlab.core.clock import MonotonicClock
-from carlab.core.documents import Tick
+from carlab.core.documents import EpisodeEnded, Tick
 from carlab.core.errors import DataError, DivergedError
 from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
@@ -31,16 +31,20 @@ from carlab.core.task import ParkingTask
 from carlab.experiment import training
 from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator, taken_up
 from carlab.experiment.campaign_figures import EpisodeFigures
-from carlab.experiment.campaign_report import learning_curve, write_report
+from carlab.experiment.campaign_report import keep_row, learning_curve, restore_rows, write_report
 from carlab.experiment.session import EpisodeResult, Session, SessionHooks
 from carlab.experiment.training import PARKED_BONUS, TrainingPlan, recorded_features, train, train_beside
+from carlab.recording.drained_file import DrainedFile
+from carlab.recording.learning_curve import write_learning_curve
+from carlab.recording.mcap_sink import McapSink
 from carlab.recording.mcap_source import read_documents, read_episode
+from carlab.recording.recorder import Recorder
 from carlab.recording.run_directory import RunDirectory
 from drivers.emulators.command_log import read_log
 from learning import car_fit, model_env
 from learning.car_fit import load_car
 from learning.evaluation import negative_log_likelihood
-from learning.sac_agent import SacAgent, SacPolicy
+from learning.sac_agent import SacAgent, SacPolicy, SacSettings
 from learning.simulator_model import CarModel
 from learning.transitions import transitions_of
 
@@ -279,6 +283,106 @@ def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_somethi
     heard = [e for e in currents if second.min() < e.t_s < second.max()]
     assert len(heard) > 3
     assert all(e.value == 0.0 for e in heard), "neutral, again and again"
+
+
+def test_an_episode_that_somebody_ended_is_driven_again(story: Story, tmp_path: Path) -> None:
+    """What was recorded is kept, and the run comes to as many whole episodes as were wanted."""
+    run = RunDirectory.create(tmp_path, "stopped")
+    shutil.copytree(story.run.models / "0001", run.models / "0001")
+    heard: list[int] = []
+
+    def on_tick(tick: Tick) -> None:
+        heard.append(tick.step)
+        if len(heard) == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    choice = choose_car("sim", seed=0)
+    figures: list[EpisodeFigures] = []
+    hooks = CampaignHooks(SessionHooks(on_tick=on_tick), on_figures=figures.append)
+    campaign = Campaign(choice, story.plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False)
+    with choice.car:
+        assert list(campaign.go_on()) == []
+        assert (run.recordings(), figures) == ([], [])
+        cut = read_episode(run.stopped / "0001.mcap")
+        assert (cut.ticks, cut.metadata["end_reason"]) == (5, "STOP_REQUESTED")
+        (result,) = campaign.go_on()
+    assert [p.name for p in run.recordings()] == ["0002.mcap"], "its number is not given twice"
+    assert (result.data.ticks, result.reason, figures[0].episode) == (TICKS, EndReason.COMPLETED, 1)
+
+
+def test_where_the_program_was_killed_by_a_second_signal_the_episode_is_driven_again(
+    story: Story, tmp_path: Path
+) -> None:
+    run = RunDirectory.create(tmp_path, "killed")
+    for model in ("0001", "0002"):
+        shutil.copytree(story.run.models / model, run.models / model)
+    for recording in story.run.recordings():
+        shutil.copy(recording, run.episodes)
+    hung = run.recordings()[-1]
+    documents = read_documents(hung)
+    with Recorder([McapSink(run.episode_path(3))]) as recorder:
+        for document in documents:
+            ended = isinstance(document, EpisodeEnded)
+            recorder.emit(replace(document, reason=EndReason.LOOP_HUNG) if ended else document)
+    campaign = Campaign(choose_car("sim"), story.plan, 3, run)
+    shutil.copytree(story.run.models / "0002", run.models / "0004")
+    campaign.set_stopped_aside()
+    assert len(run.recordings()) == 3, "something was learned from it"
+    shutil.rmtree(run.models / "0004")
+    campaign.set_stopped_aside()
+    campaign.set_stopped_aside()
+    assert [p.name for p in run.recordings()] == ["0001.mcap", "0002.mcap"]
+    assert (run.stopped / "0003.mcap").is_file()
+    assert run.next_episode() == 4
+
+
+def test_a_row_that_was_not_written_is_made_up_from_the_recording(story: Story, tmp_path: Path) -> None:
+    run = RunDirectory.create(tmp_path, "rows")
+    for recording in story.run.recordings():
+        shutil.copy(recording, run.episodes)
+    for model in story.run.models.iterdir():
+        shutil.copytree(model, run.models / model.name)
+    whole = json.loads((story.run.path / "learn.json").read_text())
+    (run.path / "learn.json").write_text(json.dumps({**whole, "episodes": whole["episodes"][:1]}))
+    restore_rows(run, story.plan.task)
+    wanted = [replace(f, reality="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in story.figures]
+    assert str(learning_curve(run)[1]) == str(wanted[1])
+    before = (run.path / "learn.json").read_bytes()
+    restore_rows(run, story.plan.task)
+    assert (run.path / "learn.json").read_bytes() == before
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learned, agent = load_car(story.run.models / "0002" / "dynamics.pt"), story.run.models / "0002"
+    taught = SacAgent.load(agent, SacSettings(), 0)
+    for name, write in (
+        ("dynamics.pt", lambda folder: car_fit.save_car(learned, folder / "dynamics.pt")),
+        ("agent.zip", taught.save),
+        ("moments.pt", taught.save),
+    ):
+
+        def full(folder: Path, name: str = name, write: Any = write) -> None:
+            (folder / name).symlink_to("/dev/full")
+            write(folder)
+
+        with pytest.raises(DataError, match="the disk is full; free some space") as error:
+            training._publish(tmp_path / "0001", {}, full)
+        assert "\n" not in str(error.value)
+        assert not (tmp_path / "0001").exists()
+
+    def opened(self: DrainedFile) -> None:
+        self._file = Path("/dev/full").open("wb", buffering=0)  # noqa: SIM115
+
+    curve = tmp_path / "learn.rrd"
+    curve.write_bytes(b"what was there")
+    monkeypatch.setattr(DrainedFile, "open", opened)
+    with pytest.raises(DataError, match="the disk is full; free some space"):
+        write_learning_curve(curve, [{"episode": 1.0}], [np.zeros((3, 2))], [(np.zeros((1, 2, 2)),) * 2])
+    assert curve.read_bytes() == b"what was there"
+    (story.run.path / "learn.json.partial").symlink_to("/dev/full")
+    with pytest.raises(DataError, match="the disk is full; free some space"):
+        keep_row(story.run, story.figures[0])
 
 
 def test_the_model_is_told_by_how_much_recorded_velocities_are_late(

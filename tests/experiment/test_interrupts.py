@@ -28,6 +28,17 @@ def test_a_signal_asks_and_a_second_one_urges(number: signal.Signals) -> None:
     assert signal.getsignal(number) is before
 
 
+def test_who_is_interrupted_while_driving_is_interrupted_after_it() -> None:
+    with Interrupts() as whole:
+        with Interrupts():
+            pass
+        assert whole.reason() is None
+        with Interrupts():
+            signal.raise_signal(signal.SIGINT)
+        assert whole.reason() is EndReason.STOP_REQUESTED
+        assert not whole.urgent.is_set()
+
+
 def test_a_storm_of_signals_does_not_stop_the_program_in_its_handler() -> None:
     """One signal's handler interrupts another's at any instruction: with a lock in them they would wait for ever."""
     stormy = threading.Event()
