@@ -17,6 +17,7 @@ from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
 from carlab.core.clock import MonotonicClock
+from carlab.core.state_estimator import StateEstimator
 from learning.car_dynamics import CarDynamics
 from learning.car_fit import NOISE_STD, CarFitSettings, fit_car
 from learning.devices import settle
@@ -42,6 +43,8 @@ CAR_FIT = CarFitSettings()
 FITTED_ROWS, FITTED_HISTORY = 100, 3
 KINEMATIC = ("motor.drive_gain", "motor.damping", "steering.max_angle")
 """Numbers that a prior whose wheels do not slip is uncertain of."""
+LATE_S = 0.5 * StateEstimator().window_s
+"""By how much velocities lag that are differences of poses."""
 SAC_SIZES = {"64 x 64, batch 64": ([64, 64], 64), "64 x 64, batch 256": ([64, 64], 256)}
 
 
@@ -82,8 +85,9 @@ def training_speed(device: str = "cpu") -> dict[str, Any]:
 def _whole_fit_s(device: str) -> float:
     """Time in which a car is learned: units, inference under a simulator whose wheels do not slip, and particles."""
     car = SimulatorConfig.from_preset()
-    truth = CarModel(car, FITTED_HISTORY, {})
-    prior = CarModel(replace(car, kind="kinematic"), FITTED_HISTORY, {name: car.priors[name] for name in KINEMATIC})
+    ranges = {name: car.priors[name] for name in KINEMATIC}
+    truth = CarModel(car, FITTED_HISTORY, {}, velocity_delay_s=LATE_S)
+    prior = CarModel(replace(car, kind="kinematic"), FITTED_HISTORY, ranges, velocity_delay_s=LATE_S)
     generator = torch.Generator().manual_seed(0)
     inputs = truth.inputs(FITTED_ROWS, generator)
     outputs = truth(inputs, draw_parameters(truth, 1, generator))[0]

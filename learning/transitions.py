@@ -20,6 +20,8 @@ OUTPUTS = ("ahead_m", "left_m", "yaw_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
 """Changes over one step: of place and velocities along the body axes of the step's start, of yaw, of the yaw rate."""
 GAP = 1.5
 """A step longer than this many periods is no step."""
+STALE = 0.75
+"""Share of a period by which a step from pose to pose may be shorter or longer than the others."""
 
 LEAST_LATE_S = 0.002
 """Velocities that lag by less are on time."""
@@ -57,7 +59,9 @@ class Transitions:
 def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions:
     """Every whole step of some episodes with ``history`` commands before the one at its start.
 
-    Steps across a gap in time, with numbers missing, or whose history is cut off are left out.
+    Steps across a gap in time, with numbers missing, or whose history is cut off are left out. So are those across a
+    jump of the poses (``segment`` of an imported recording changes there), and to or from a pose that was not renewed
+    in time (``pose_age_s``): from pose to pose such a step is no period long.
 
     Raises:
         DataError: nothing is left, or ``history`` is negative.
@@ -85,7 +89,7 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
             wrap(change[:, 2]),
             *change[:, 3:].T,
         ], axis=1)  # fmt: skip
-        good &= np.isfinite(given).all(axis=1) & np.isfinite(moved).all(axis=1)
+        good &= np.isfinite(given).all(axis=1) & np.isfinite(moved).all(axis=1) & _as_seen(episode)[rows]
         inputs.append(given[good])
         targets.append(moved[good])
         origin.append(np.full(int(good.sum()), number))
@@ -98,6 +102,18 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
     return Transitions(
         np.concatenate(inputs), np.concatenate(targets), np.concatenate(origin), np.concatenate(ticks), history
     )
+
+
+def _as_seen(episode: EpisodeData) -> np.ndarray:
+    """Which steps (T,) lead from a pose to the next one as motion capture saw it go there."""
+    seen = np.ones(episode.ticks, dtype=bool)
+    if "segment" in episode.extra:
+        seen &= np.diff(episode.extra["segment"]) == 0
+    if "pose_age_s" in episode.extra:
+        between = np.diff(episode.times_s - episode.extra["pose_age_s"])
+        usual = np.nanmedian(between) if np.isfinite(between).any() else np.nan
+        seen &= ~(np.abs(between - usual) > STALE * usual)  # Where no age is known nothing is held against a step.
+    return seen
 
 
 def has_whole_step(episode: EpisodeData, history: int) -> bool:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from tyro.conf import Positional
 
-from carlab.cli.console import console, progress, table
+from carlab.cli.bench_options import check_options
+from carlab.cli.bench_output import write_figures
+from carlab.cli.console import console, table
 from carlab.cli.options import above_zero, json_file
-from carlab.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from carlab.experiment.regression_recordings import RecordedCase
 
 
 @dataclass
@@ -30,8 +26,8 @@ class Bench:
     runs that are in --runs already are taken up."""
 
     out: Path | None = None
-    """Write the figures as JSON into FILE.json; all but speed draw a picture of the same name beside it, and priors
-    keeps its recordings and the diagnosis in a folder of that name."""
+    """Write the figures as JSON into FILE.json (regression and priors after each fit); all but speed draw a picture of
+    the same name beside it, and priors keeps its recordings and the diagnosis in a folder of that name."""
 
     seconds: float = 10.0
     """speed: length of each condition of the sender's measurement [s]."""
@@ -56,11 +52,12 @@ class Bench:
     """regression: how particles are fitted, as carlab does, or with the update and the sizes of the authors' code."""
 
     data: Path | None = None
-    """Folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it. realcar and
-    priors: folder with recordings, the last one held out."""
+    """regression: folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it.
+    realcar and priors: folder with recordings, the last one held out."""
 
     car: Path = Path("eth_rc_car")
-    """realcar: the car file whose simulator is the prior. priors: the nominal one, that is diagnosed."""
+    """realcar: the car file whose simulator is the prior, with its ranges and the doubts of a diagnosis. priors with
+    --data: the nominal one, that is diagnosed."""
 
     history: int | None = None
     """realcar and priors: past commands; found from the recordings unless given (the paper has 3)."""
@@ -100,11 +97,8 @@ class Bench:
         available(self.device)
         if self.out is not None:
             json_file(self.out, "--out")
+        check_options(self)
         if self.what == "speed":
-            usual = Bench()
-            for name in ("case", "rows", "seeds", "methods", "data", "history", "steps", "way"):
-                if getattr(self, name) != getattr(usual, name):
-                    raise ConfigError(f"--{name} is no option of 'bench speed'; say which: carlab bench regression ...")
             return self._speed()
         above_zero(
             seeds=self.seeds, steps=self.steps, episodes=self.episodes, updates=self.updates,
@@ -118,7 +112,9 @@ class Bench:
             from carlab.cli.bench_parking import run_parking
 
             return run_parking(self)
-        return self._regression()
+        from carlab.cli.bench_regression import run_regression
+
+        return run_regression(self)
 
     def _speed(self) -> int:
         from carlab.experiment.speed import measure_speed
@@ -128,56 +124,9 @@ class Bench:
         rows = [[part, name, f"{value:.4g}"] for part, values in figures.items() for name, value in _flat(values)]
         table("Speed", ["part", "figure", "value"], rows)
         if self.out is not None:
-            self.out.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+            write_figures(self.out, figures)
             console.print(f"{self.out}")
         return 0
-
-    def _regression(self) -> int:
-        from carlab.cli import EXIT_INTERRUPTED
-        from carlab.cli.bench_priors import print_rows
-        from carlab.experiment.interrupts import Interrupts
-        from carlab.experiment.regression_picture import draw
-        from carlab.experiment.regression_study import Score, as_json, run_study, summarised
-
-        case = self._recorded() if self.case == "realcar" else self.case
-        scores: list[Score] = []
-        with Interrupts() as interrupts, progress(speed_estimate_period_s=MINUTES_S) as bar:
-            task = bar.add_task(self.case, total=None, note="")
-            study = run_study(
-                case, rows=self.rows, seeds=self.seeds, methods=self.methods, way=self.way, data=self.data,
-                steps=self.steps, device=self.device,
-                progress=lambda what, done, total: bar.update(task, completed=done, total=total, note=what),
-            )  # fmt: skip
-            for score in study:
-                scores.append(score)
-                if interrupts.requested.is_set():
-                    break
-        found = summarised(scores)
-        stopped = interrupts.requested.is_set()
-        title = f"{self.case}, {self.seeds} seeds, {self.way}{', interrupted' if stopped else ''}"
-        print_rows(title, "method", found)
-        if self.out is not None:
-            command = " ".join(["carlab", *sys.argv[1:]])
-            self.out.write_text(json.dumps(as_json(scores, command, self.device), indent=2) + "\n", encoding="utf-8")
-            picture = self.out.with_suffix(".png")
-            draw(found, picture)
-            console.print(f"{self.out}, {picture}")
-        return EXIT_INTERRUPTED if stopped else 0
-
-    def _recorded(self) -> RecordedCase:
-        from carlab.cli.recordings import load_episodes
-        from carlab.experiment.regression_recordings import recorded_case
-
-        if self.data is None or not self.data.is_dir():
-            given = "" if self.data is None else f" ('{self.data}' is none)"
-            raise ConfigError(f"--case realcar needs --data FOLDER{given}, with two recordings (MCAP or CSV) at least.")
-        files = sorted(p for p in self.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
-        case = recorded_case([load_episodes(path) for path in files], self.car, self.history)
-        console.print(f"{case.told} Held out: {files[-1].name}.", soft_wrap=True)
-        return case
-
-
-MINUTES_S = 600.0
 
 
 def _flat(values: object, prefix: str = "") -> list[tuple[str, float]]:

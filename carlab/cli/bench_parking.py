@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-import json
-import sys
 from typing import TYPE_CHECKING, get_args
 
+from carlab.cli.bench_output import command, write_figures
 from carlab.cli.console import console, table
 from carlab.core.errors import ConfigError
 
@@ -61,8 +60,7 @@ def run_parking(options: Bench) -> int:
         [_row(row) for row in summarised(curves)],
     )
     if options.out is not None:
-        command = " ".join(["carlab", *sys.argv[1:]])
-        options.out.write_text(json.dumps(as_json(curves, command), indent=2) + "\n", encoding="utf-8")
+        write_figures(options.out, as_json(curves, command()))
         picture = options.out.with_suffix(".png")
         draw(curves, picture)
         console.print(f"{options.out}, {picture}, {options.runs}")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cli.console import console, progress, table
+from carlab.cli.bench_output import followed, told
+from carlab.cli.console import console, progress
 from carlab.cli.options import required_file
 from carlab.core.errors import ConfigError, DataError
 
@@ -18,20 +18,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from carlab.cli.bench import Bench
-    from carlab.experiment.regression_study import Row, Score
-
-MINUTES_S = 600.0
 
 
 def run_priors(options: Bench) -> int:
     """Record or read, diagnose what is not held out, learn under each prior, and print."""
     from carlab.cars import load_car_file
-    from carlab.cli import EXIT_INTERRUPTED
     from carlab.cli.recordings import load_episodes
-    from carlab.experiment.interrupts import Interrupts
-    from carlab.experiment.prior_study import check_periods, prior_models, run_prior_study
+    from carlab.experiment.prior_study import prior_models, run_prior_study
     from carlab.experiment.regression_recordings import recorded_case
-    from carlab.experiment.regression_study import summarised
 
     with ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -45,50 +39,18 @@ def run_priors(options: Bench) -> int:
             check_unseen(model, files[-1])
         diagnosed = load_car_file(model).simulator
         simulator = load_car_file(car).simulator
-        recordings = [load_episodes(path) for path in files]
-        check_periods(recordings, simulator)
-        case = recorded_case(recordings, car, options.history)
+        case = recorded_case([load_episodes(path) for path in files], car, options.history)
         console.print(f"{case.told} Held out: {files[-1].name}.", soft_wrap=True)
         priors = prior_models(case, simulator, diagnosed)
-        scores: list[Score] = []
-        interrupts = stack.enter_context(Interrupts())
-        bar = stack.enter_context(progress(speed_estimate_period_s=MINUTES_S))
-        task = bar.add_task("priors", total=None, note="")
-        study = run_prior_study(
-            case, priors, rows=options.rows, seeds=options.seeds, steps=options.steps,
-            device=options.device,
-            progress=lambda note, done, total: bar.update(task, completed=done, total=total, note=note),
+        scores, stopped = followed(
+            lambda progress: run_prior_study(
+                case, priors, rows=options.rows, seeds=options.seeds, steps=options.steps, device=options.device,
+                progress=progress,
+            ),
+            options,
+            "priors",
         )  # fmt: skip
-        for score in study:
-            scores.append(score)
-            if options.out is not None:
-                _write(options.out, scores, options.device)
-            if interrupts.requested.is_set():
-                break
-    found = summarised(scores)
-    print_rows(f"{what}, {options.seeds} seeds", "prior", found)
-    if options.out is not None:
-        from carlab.experiment.regression_picture import draw
-
-        picture = options.out.with_suffix(".png")
-        draw(found, picture)
-        console.print(f"{options.out}, {picture}, {work}")
-    return EXIT_INTERRUPTED if interrupts.requested.is_set() else 0
-
-
-def print_rows(title: str, first: str, rows: Sequence[Row]) -> None:
-    """Scores as a table; ``first`` says what is compared."""
-    columns = ["rows", first, "NLL [nat]", "+-", "RMSE", "calibration error", "seconds"]
-    cells = [
-        [f"{r.rows}", r.method, f"{r.nll:.2f}", f"{r.nll_standard_error:.2f}", f"{r.rmse:.3g}",
-         f"{r.calibration:.3f}", f"{r.seconds:.1f}"]
-        for r in rows
-    ]  # fmt: skip
-    if any(r.nll_in_world is not None for r in rows):
-        columns.append("NLL, seven outputs\nin the world")
-        for cell, r in zip(cells, rows, strict=True):
-            cell.append("" if r.nll_in_world is None else f"{r.nll_in_world:.2f}")
-    table(title, columns, cells)
+        return told(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
 
 
 def check_unseen(model: Path, held_out: Path) -> None:
@@ -138,10 +100,3 @@ def _diagnosed(files: Sequence[Path], car: Path, folder: Path) -> Path:
     if Diagnose(tuple(files), car=str(car), out=folder).run() != 0:
         console.print("Nothing could be diagnosed: the diagnosed prior is the car's file.")
     return folder / "model.toml"
-
-
-def _write(out: Path, scores: Sequence[Score], device: str) -> None:
-    from carlab.experiment.regression_study import as_json
-
-    command = " ".join(["carlab", *sys.argv[1:]])
-    out.write_text(json.dumps(as_json(scores, command, device), indent=2) + "\n", encoding="utf-8")

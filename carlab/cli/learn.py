@@ -63,8 +63,10 @@ class Learn:
     method: Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"] = "sim-fsvgd"
     """sim-fsvgd; fsvgd without a simulator; or that as the authors of Sim-FSVGD set it, to be compared with."""
 
-    history: int = 3
-    """Past commands that model and policy see."""
+    history: int | None = None
+    """Past commands that model and policy see. Unless given as many as delay, motion capture and the window of the
+    velocities need (4 for the simulated car; fsvgd-authors has the paper's 3); after three episodes it is said how many
+    the recordings ask for."""
 
     model_steps: int | None = None
     """Steps of the model's optimiser before each episode: 2500 unless given (fsvgd-authors: 40 000 at most)."""
@@ -102,17 +104,14 @@ class Learn:
 
     def run(self) -> int:
         """Learn and say how it went."""
-        from carlab.core.task import ParkingTask
         from carlab.experiment.campaign import Campaign, CampaignHooks, check_same_car, seed_of, taken_up
         from carlab.experiment.campaign_report import restore_rows
         from carlab.experiment.interrupts import Interrupts
         from learning.devices import available
 
         above_zero(episodes=self.episodes, updates=self.updates, ticks=self.ticks, **{"model-steps": self.model_steps})
-        if self.history < 0 or self.seed < 0:
+        if (self.history or 0) < 0 or self.seed < 0:
             raise ConfigError("--history and --seed: 0 or more.")
-        if (ticks := self.ticks or ParkingTask().max_ticks) <= self.history:
-            raise ConfigError(f"--ticks {ticks}: nothing is learned from fewer than --history and one more.")
         available(self.device or "cpu")
         started = None if self.resume is None else seed_of(self.resume)
         choice = self.which_car.choose(seed=self.seed if started is None else started)
@@ -151,8 +150,17 @@ class Learn:
         import tomli_w
 
         from carlab.cars import is_preset, load_car_file
-        from carlab.experiment.campaign import check_period, prior_simulator
+        from carlab.core.task import ParkingTask
+        from carlab.experiment.campaign import PAPERS_HISTORY, check_period, needed_history, prior_simulator
         from carlab.experiment.training import TrainingPlan
+
+        history = self.history
+        if history is None:
+            history = PAPERS_HISTORY if self.method == "fsvgd-authors" else needed_history(choice.simulator)
+        if (ticks := self.ticks or ParkingTask().max_ticks) <= history:
+            raise ConfigError(
+                f"--ticks {ticks}: nothing is learned from fewer than --history ({history}) and one more."
+            )
 
         if self.prior in ("kinematic", "nominal"):
             kind: Literal["kinematic", "nominal"] = "kinematic" if self.prior == "kinematic" else "nominal"
@@ -165,7 +173,7 @@ class Learn:
             check_period(simulator, choice.control_period_s, f"car '{self.which_car.car}'")
         text = tomli_w.dumps(simulator.to_tables())
         return TrainingPlan(
-            text, self.history, self.method, self.model_steps, self.updates, self.ticks, self.seed,
+            text, history, self.method, self.model_steps, self.updates, self.ticks, self.seed,
             device=self.device or "cpu",
         )  # fmt: skip
 

@@ -27,6 +27,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
+from carlab.core.state_estimator import StateEstimator
 from carlab.experiment.campaign_figures import EpisodeFigures, figures_of
 from carlab.experiment.reality_check import RealityCheck, check_beside, check_path
 from carlab.experiment.session import EpisodeResult, Session, SessionHooks
@@ -46,6 +47,7 @@ from sim_backends.car_parameters import SimulatorConfig
 CAMPAIGN_FILE = "campaign.json"
 GOES_ON = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOFENCE, EndReason.OVERSPEED})
 """Ends of an episode after which the next may follow: a policy that has not learned yet leaves the arena."""
+PAPERS_HISTORY, LONGEST_HISTORY = 3, 8
 STOPPED = frozenset({EndReason.STOP_REQUESTED, EndReason.LOOP_HUNG})
 """Ends of an episode after which it is driven again: they say nothing of the policy."""
 SPREAD = 0.3
@@ -78,6 +80,16 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
         return car
     names = KINEMATIC_UNCERTAIN if car.kind == "kinematic" else UNCERTAIN
     return replace(car, priors={n: _about(values[n]) for n in names})
+
+
+def needed_history(car: SimulatorConfig) -> int:
+    """Past commands that still have a say in the next step, as a car's file has it: three to eight.
+
+    They act after the delay, motion capture sees that later, and a velocity is that of a window before.
+    """
+    values = car.values()
+    span_s = values["timing.command_delay"] + values["mocap.latency"] + StateEstimator().window_s
+    return min(max(round(span_s / car.control_period_s), PAPERS_HISTORY), LONGEST_HISTORY)
 
 
 def _about(value: float) -> tuple[float, float]:
@@ -295,6 +307,7 @@ __all__ = [
     "CampaignHooks",
     "check_period",
     "check_same_car",
+    "needed_history",
     "prior_simulator",
     "seed_of",
     "taken_up",

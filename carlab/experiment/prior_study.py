@@ -12,14 +12,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.experiment.campaign import check_period, prior_simulator
-from carlab.experiment.regression_recordings import DELAY_S, RecordedCase
+from carlab.experiment.regression_recordings import DELAY_S, RecordedCase, check_periods
 from carlab.experiment.regression_study import Progress, Score, scored
 from learning.domain_models import DomainModel
 from learning.simulator_model import DELAY, CarModel, known_ranges
@@ -88,12 +86,6 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     return found
 
 
-def check_periods(recordings: Sequence[Sequence[EpisodeData]], car: SimulatorConfig) -> None:
-    """Raise ConfigError where recordings were not made with the control period of the car's file."""
-    for episode in itertools.chain.from_iterable(recordings):
-        check_period(car, float(np.median(np.diff(episode.times_s))), "a recording")
-
-
 def run_prior_study(
     case: RecordedCase,
     priors: Mapping[str, DomainModel | None],
@@ -105,6 +97,8 @@ def run_prior_study(
     progress: Progress = lambda what, done, total: None,
 ) -> Iterator[Score]:
     """Fit under every prior to every number of rows with every seed; scores as they come, with the prior as method.
+
+    A fit that fails is a score that says why, and the others go on.
 
     Args:
         case: the recordings.

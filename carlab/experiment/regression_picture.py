@@ -1,4 +1,4 @@
-"""The regression study as a picture: likelihood, error and calibration against the number of rows."""
+"""The regression study as a picture: likelihood, error, calibration and seconds against the number of rows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.experiment.regression_study import METHODS, Row
+import numpy as np
+
+from carlab.experiment.regression_study import FIGURES, METHODS, Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,11 +19,15 @@ SHOWN_NAT = 12.0
 SHOWN_CALIBRATION = 0.25
 LINEAR_NAT = 10.0
 """Likelihoods that reach farther up are shown by their logarithm from there on."""
-_FIGURES = (
-    ("nll", "negative log-likelihood [nat]"),
-    ("rmse", "root mean square error"),
-    ("calibration", "calibration error"),
-)
+LABELS = {
+    "nll": "negative log-likelihood [nat]",
+    "rmse": "root mean square error",
+    "calibration": "calibration error",
+    "seconds": "seconds a fit",
+}
+MANY = 100.0
+"""A logarithmic axis of more than this has ticks at powers of ten alone."""
+SIZE_INCHES = (11.0, 8.0)
 _SAME_COLOUR = {"Sim-FSVGD without gap": "Sim-FSVGD"}
 """A method without one of its parts is the same colour, dashed."""
 
@@ -30,7 +36,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     """Write a PNG.
 
     Args:
-        rows: of one case.
+        rows: of one case, with a fit that did not fail.
         path: to write to.
     """
     from matplotlib import pyplot
@@ -41,36 +47,40 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """One panel a figure, one line a method, a band of one standard error about the likelihood.
+    """One panel a figure, one line a method, a band of one standard error about each.
 
-    A method has the same colour in every picture. Values far above the others are arrows at the upper edge with their
-    number beside them, so that what is close can be told apart.
+    Fits that failed are left out; one at least must not have. A method has the same colour in every picture. Values
+    far above the others are arrows at the upper edge with their number beside them, so that what is close can be told
+    apart.
     """
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
+    rows = [row for row in rows if row.seeds]
     methods = list(dict.fromkeys(row.method for row in rows))
     counts = sorted({row.rows for row in rows})
-    figure, axes = pyplot.subplots(1, len(_FIGURES), figsize=(13, 4.4), layout="constrained")
-    for axis, (name, label) in zip(axes, _FIGURES, strict=True):
+    figure, axes = pyplot.subplots(2, 2, figsize=SIZE_INCHES, layout="constrained")
+    for axis, name in zip(axes.flat, FIGURES, strict=True):
         highest = _highest(rows, name)
         for method in methods:
             own = sorted((r for r in rows if r.method == method), key=lambda r: r.rows)
-            values = [float(getattr(r, name)) for r in own]
+            values, errors = (np.array([getattr(r, n) for r in own]) for n in (name, f"{name}_standard_error"))
             look = _look(method)
             axis.plot([r.rows for r in own], values, marker="o", markersize=4, label=method, **look)
-            if name == "nll" and own[0].seeds > 1:
-                low, high = ([r.nll + sign * r.nll_standard_error for r in own] for sign in (-1, 1))
-                axis.fill_between([r.rows for r in own], low, high, alpha=0.15, color=look["color"], linewidth=0)
-        axis.set(xscale="log", xlabel="rows", ylabel=label)
+            if np.isfinite(errors).any():
+                axis.fill_between(
+                    [r.rows for r in own], values - errors, values + errors, alpha=0.15, color=look["color"],
+                    linewidth=0,
+                )  # fmt: skip
+        axis.set(xscale="log", xlabel="rows", ylabel=LABELS[name])
         axis.set_xticks(counts, [str(c) for c in counts])
         axis.minorticks_off()
         axis.margins(x=0.08)
         _scale(axis, rows, name, highest)
         axis.grid(alpha=0.3)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(methods), fontsize=9)
+    figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(methods), fontsize=9)
     return figure
 
 
@@ -121,9 +131,9 @@ def _scale(axis: Axes, rows: Sequence[Row], name: str, highest: float | None) ->
                 )  # fmt: skip
     elif name == "nll" and high - low > SHOWN_NAT and high > LINEAR_NAT:
         axis.set_yscale("symlog", linthresh=LINEAR_NAT)
-    elif name == "rmse" and high > 3.0 * low > 0.0:
+    elif name in ("rmse", "seconds") and high > 3.0 * low > 0.0:
         axis.set_yscale("log")
-        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < MANY * low else (1.0,)))
         axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.minorticks_off()
 

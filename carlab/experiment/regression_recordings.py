@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,13 @@ import torch
 from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
+from carlab.experiment.campaign import check_period, prior_simulator
 from carlab.experiment.regression_cases import Case, Data
 from learning.car_fit import NOISE_STD
 from learning.history import find_history
-from learning.simulator_model import CarModel
+from learning.simulator_model import DELAY, CarModel, known_ranges
 from learning.transitions import Transitions, transitions_of, velocity_delay_s
+from sim_backends.car_parameters import SimulatorConfig
 
 FASTEST_TURN_RADPS = 10.0
 """Rows that turn faster are spikes of a differentiated angle."""
@@ -60,14 +63,17 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
 
     Args:
         recordings: episodes of each; the last recording is held out.
-        car: file or name of the car whose simulator is the prior, with its ranges.
+        car: file or name of the car whose simulator is the prior, with its ranges and standard deviations.
         history: past commands; found from the recordings that are not held out unless given.
 
     Raises:
+        ConfigError: the recordings were made with another control period than the car's file has.
         DataError: fewer than two recordings, or too short to tell the history.
     """
     if len(recordings) < 2:
         raise DataError("The real car's study needs two recordings at least; the last one is held out.")
+    simulator = load_car_file(car).simulator
+    check_periods(recordings, simulator)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
     told = f"{history} past commands, as asked for."
     if history is None:
@@ -77,15 +83,19 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
         history, told = choice.history, choice.words()
     rows, held_out = (_ordinary(transitions_of(episodes, history)) for episodes in (fitted, recordings[-1]))
     yaw = np.array([recordings[-1][e].states[t, 2] for e, t in zip(held_out.episode, held_out.tick, strict=True)])
-    simulator = load_car_file(car).simulator
-    late_s = velocity_delay_s(rows, simulator.control_period_s)
-    ranges = {"timing.command_delay": DELAY_S, **simulator.priors}
+    own = prior_simulator(simulator, "nominal")
+    period_s = own.control_period_s
+    # Numbers of a diagnosis have no range but a deviation, and effects that drift act as in the middle of the rows.
+    prior = CarModel(
+        own, history, {DELAY: DELAY_S, **known_ranges(own)}, at_s=float(rows.tick.mean()) * period_s,
+        velocity_delay_s=velocity_delay_s(rows, period_s),
+    )  # fmt: skip
     input_std, output_std = (
         tuple(float(v) for v in np.maximum(of.std(axis=0), LEAST_UNIT)) for of in (rows.inputs, rows.targets)
     )
     return RecordedCase(
         name=NAME,
-        prior=CarModel(simulator, history, ranges, velocity_delay_s=late_s),
+        prior=prior,
         process=None,
         truth=None,
         counts=COUNTS,
@@ -104,8 +114,14 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
     )
 
 
+def check_periods(recordings: Sequence[Sequence[EpisodeData]], car: SimulatorConfig) -> None:
+    """Raise ConfigError where recordings were not made with the control period of the car's file."""
+    for episode in itertools.chain.from_iterable(recordings):
+        check_period(car, episode.period_s, "a recording")
+
+
 def _ordinary(rows: Transitions) -> Transitions:
     return rows.take(np.abs(rows.inputs[:, 2]) < FASTEST_TURN_RADPS)
 
 
-__all__ = ["FASTEST_TURN_RADPS", "NAME", "RecordedCase", "recorded_case"]
+__all__ = ["DELAY_S", "FASTEST_TURN_RADPS", "NAME", "RecordedCase", "check_periods", "recorded_case"]

@@ -9,6 +9,7 @@ and the Gaussian process of FSVGD with its full weight).
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.clock import MonotonicClock
-from carlab.core.errors import ConfigError
+from carlab.core.errors import ConfigError, DataError
 from carlab.experiment.regression_cases import CASES, Case, Data
 from learning.devices import described
 from learning.domain_models import DomainModel, draw_parameters
@@ -46,6 +47,8 @@ POOL = 1024
 DRAWS = 2048
 LEAST_RIDGE = 3
 NOISE_ROWS = 2.0
+_LINEAR_ALGEBRA = ("linalg", "lapack", "cusolver", "magma")
+"""Named in the RuntimeErrors of torch's linear algebra and of the libraries below it."""
 
 
 class Model(Protocol):
@@ -67,6 +70,7 @@ class Score:
         calibration: mean absolute difference of coverage.
         seconds: that the fit took.
         nll_in_world: of the seven outputs that the authors score, for a real car.
+        failed: why there is no model; its figures are NaN then.
     """
 
     case: str
@@ -78,6 +82,7 @@ class Score:
     calibration: float
     seconds: float
     nll_in_world: float | None = None
+    failed: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,6 +247,8 @@ def run_study(
 ) -> Iterator[Score]:
     """Fit every method to every number of rows with every seed, and score it as soon as it is fitted.
 
+    A fit that fails is a score that says why, and the others go on.
+
     Args:
         case: of ``CASES``, or one that was made.
         rows: numbers of rows; those of the case unless given.
@@ -283,20 +290,38 @@ def run_study(
 def scored(
     case: Case, data: Data, count: int, seed: int, method: str, *, way: Way = "ours", steps: int | None = None
 ) -> Score:
-    """Fit one method of ``METHODS`` to rows of a case, and score it on the others."""
+    """Fit one method of ``METHODS`` to rows of a case, and score it on the others; or say why it cannot be fitted."""
     clock = MonotonicClock()
     began_s = clock.now_s()
-    model = METHODS[method](_Task(case, data, seed, way, steps))
-    seconds = clock.now_s() - began_s
-    prediction = model.predict(data.test_inputs)
-    return Score(
-        case.name, method, count, seed,
-        negative_log_likelihood(prediction, data.test_outputs),
-        root_mean_square_error(prediction, data.test_outputs),
-        calibration_error(prediction, data.test_outputs),
-        seconds,
-        _nll_in_world(prediction, data),
-    )  # fmt: skip
+    try:
+        model = METHODS[method](_Task(case, data, seed, way, steps))
+        seconds = clock.now_s() - began_s
+        prediction = model.predict(data.test_inputs)
+        found = (
+            negative_log_likelihood(prediction, data.test_outputs),
+            root_mean_square_error(prediction, data.test_outputs),
+            calibration_error(prediction, data.test_outputs),
+        )
+        in_world = _nll_in_world(prediction, data)
+    except (DataError, RuntimeError, np.linalg.LinAlgError) as error:
+        if (why := _broken_down(error)) is None:
+            raise
+        return _failed(case, method, count, seed, why)
+    if not all(map(math.isfinite, found)):
+        return _failed(case, method, count, seed, "What it predicts is not finite.")
+    return Score(case.name, method, count, seed, *found, seconds, in_world)
+
+
+def _failed(case: Case, method: str, count: int, seed: int, why: str) -> Score:
+    return Score(case.name, method, count, seed, *(math.nan,) * 4, failed=why)
+
+
+def _broken_down(error: Exception) -> str | None:
+    """Why a fit failed; None for an error of the program, after which nothing else may be believed either."""
+    why = next(iter(str(error).splitlines()), "") or type(error).__name__
+    if isinstance(error, (DataError, np.linalg.LinAlgError)):
+        return why
+    return why if any(name in str(error).lower() for name in _LINEAR_ALGEBRA) else None
 
 
 def _nll_in_world(prediction: Mixture, data: Data) -> float | None:
@@ -308,7 +333,10 @@ def _nll_in_world(prediction: Mixture, data: Data) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """Scores of one method at one number of rows over the seeds: means, and the standard error of the likelihood."""
+    """One method at one number of rows over the seeds: means of its scores, and the standard errors of those means.
+
+    Means are of the ``seeds`` fits that did not fail, NaN where there is none; standard errors need two.
+    """
 
     method: str
     rows: int
@@ -319,6 +347,10 @@ class Row:
     calibration: float
     seconds: float
     nll_in_world: float | None = None
+    rmse_standard_error: float = math.nan
+    calibration_standard_error: float = math.nan
+    seconds_standard_error: float = math.nan
+    failed: int = 0
 
 
 def summarised(scores: Sequence[Score]) -> list[Row]:
@@ -327,30 +359,39 @@ def summarised(scores: Sequence[Score]) -> list[Row]:
     for score in scores:
         groups.setdefault((score.rows, score.method), []).append(score)
     found = []
-    for (count, method), own in groups.items():
-        nll, rmse, off, seconds = (np.array([getattr(s, k) for s in own]) for k in _FIGURES)
+    for (count, method), tried in groups.items():
+        own = [s for s in tried if s.failed is None]
+        mean, error = {}, {}
+        for name in FIGURES:
+            values = np.array([getattr(s, name) for s in own])
+            mean[name] = float(values.mean()) if own else math.nan
+            error[f"{name}_standard_error"] = (
+                float(values.std(ddof=1) / np.sqrt(len(own))) if len(own) > 1 else math.nan
+            )
         worlds = [s.nll_in_world for s in own if s.nll_in_world is not None]
-        spread = float(nll.std(ddof=1) / np.sqrt(len(own))) if len(own) > 1 else float("nan")
-        found.append(
-            Row(method, count, len(own), float(nll.mean()), spread, float(rmse.mean()), float(off.mean()),
-                float(seconds.mean()), float(np.mean(worlds)) if worlds else None)
-        )  # fmt: skip
+        in_world = float(np.mean(worlds)) if worlds else None
+        failed = len(tried) - len(own)
+        found.append(Row(method, count, len(own), nll_in_world=in_world, failed=failed, **mean, **error))
     return found
 
 
-_FIGURES = ("nll", "rmse", "calibration", "seconds")
+FIGURES = ("nll", "rmse", "calibration", "seconds")
 
 
 def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[str, object]:
-    """Everything that was measured, and what made it."""
+    """Everything that was measured, and what made it; what is no number is null."""
+
+    def plain(row: Row | Score) -> dict[str, object]:
+        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(row).items()}
+
     return {
         "schema": "carlab.regression/1",
         "command": command,
         "device": described(device),
         "torch_threads": torch.get_num_threads(),
-        "rows": [asdict(row) for row in summarised(scores)],
-        "scores": [asdict(score) for score in scores],
+        "rows": [plain(row) for row in summarised(scores)],
+        "scores": [plain(score) for score in scores],
     }
 
 
-__all__ = ["METHODS", "Row", "Score", "Way", "as_json", "run_study", "scored", "summarised"]
+__all__ = ["FIGURES", "METHODS", "Row", "Score", "Way", "as_json", "run_study", "scored", "summarised"]

@@ -52,9 +52,10 @@ def test_what_is_printed_is_written(tmp_path, capsys, monkeypatch):
         ("FSVGD", 1),
     ]
     for row in told["rows"]:
-        own = [s["nll"] for s in told["scores"] if s["method"] == row["method"]]
-        assert row["nll"] == pytest.approx(np.mean(own))
-        assert row["nll_standard_error"] == pytest.approx(np.std(own, ddof=1) / np.sqrt(2))
+        for name in ("nll", "rmse", "calibration", "seconds"):
+            own = [s[name] for s in told["scores"] if s["method"] == row["method"]]
+            assert row[name] == pytest.approx(np.mean(own))
+            assert row[f"{name}_standard_error"] == pytest.approx(np.std(own, ddof=1) / np.sqrt(2))
         assert f"{row['nll']:.2f}" in printed
     assert out.with_suffix(".png").stat().st_size > 10_000
 
@@ -123,7 +124,7 @@ def test_data_that_is_missing_is_told_before_anything_is_fitted(tmp_path, monkey
         ("regression --out none/x.json", "--out none/x.json: there is no folder none; make it first."),
         ("regression --out x.png", "--out x.png: name a file that ends in .json."),
         ("regression --out folder.json", "--out folder.json: name a file that ends in .json."),
-        ("speed --case pendulum", "--case is no option of 'bench speed'; say which: carlab bench regression"),
+        ("speed --case pendulum", "--case is no option of 'bench speed'; it counts for 'bench regression'."),
     ],
 )
 def test_what_cannot_be_meant_is_refused_before_anything_is_measured(tmp_path, monkeypatch, capsys, options, words):

@@ -1,15 +1,20 @@
 """The picture of a regression study: who is in it, what can be read off, and that the file is what the screen shows."""
 
+import math
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from matplotlib import pyplot
 from matplotlib.image import imread
 
-from carlab.experiment.regression_picture import SHOWN_NAT, draw, picture
-from carlab.experiment.regression_study import METHODS, Row
+from carlab.experiment.regression_picture import SHOWN_NAT, SIZE_INCHES, draw, picture
+from carlab.experiment.regression_study import FIGURES, METHODS, Row
 
 
-def row(method, rows, nll, calibration=0.05):
-    return Row(method, rows, 3, nll, 0.1, 0.2, calibration, 1.0)
+def row(method, rows, nll, calibration=0.05, **others):
+    errors = {"rmse_standard_error": 0.02, "calibration_standard_error": 0.01, "seconds_standard_error": 1.5}
+    return Row(method, rows, 3, nll, 0.1, 0.2, calibration, 1.0, **(errors | others))
 
 
 ROWS = [
@@ -83,5 +88,47 @@ def test_a_method_is_the_same_colour_in_every_picture_and_no_two_share_one():
 def test_the_file_is_a_picture(tmp_path):
     draw(ROWS, tmp_path / "study.png")
     pixels = imread(tmp_path / "study.png")
-    assert pixels.shape[:2] == (round(4.4 * 130), 13 * 130)
+    assert pixels.shape[:2] == (round(130 * SIZE_INCHES[1]), round(130 * SIZE_INCHES[0]))
     assert pixels[..., :3].std() > 0.05
+
+
+def test_every_figure_has_a_panel_with_bands_of_its_standard_error(panels):
+    assert len(panels.axes) == len(FIGURES) == 4
+    for axis, name in zip(panels.axes, FIGURES, strict=True):
+        lines = {line.get_label(): line for line in axis.get_lines()}
+        assert list(lines) == ["Sim-FSVGD", "Sim-FSVGD without gap", "SysID", "ridge"]
+        for (method, line), band in zip(lines.items(), axis.collections, strict=True):
+            assert list(line.get_ydata()) == [getattr(r, name) for r in ROWS if r.method == method]
+            edges = {tuple(corner) for corner in np.round(band.get_paths()[0].vertices, 6)}
+            for r in ROWS:
+                value, error = getattr(r, name), getattr(r, f"{name}_standard_error")
+                if r.method == method:
+                    assert {(r.rows, round(value - error, 6)), (r.rows, round(value + error, 6))} <= edges
+    assert panels.axes[3].get_ylabel() == "seconds a fit"
+
+
+def test_a_single_seed_has_no_band_and_a_fit_that_failed_no_point():
+    none = {f"{name}_standard_error": math.nan for name in FIGURES}
+    nothing = Row("SysID", 50, 0, *(math.nan,) * 5, math.nan, failed=3)
+    figure = picture([*(replace(r, seeds=1, **none) for r in ROWS if (r.method, r.rows) != ("SysID", 50)), nothing])
+    try:
+        for axis in figure.axes:
+            assert not axis.collections
+            assert [len(line.get_ydata()) for line in axis.get_lines()] == [2, 2, 1, 2]
+    finally:
+        pyplot.close(figure)
+
+
+def test_seconds_far_apart_are_all_told(tmp_path):
+    """Ridge is done in milliseconds; a band wider than its mean reaches below zero, which a logarithm has not."""
+    fast = {"seconds": 0.002, "seconds_standard_error": 0.003}
+    slow = {"seconds": 900.0, "seconds_standard_error": 20.0}
+    rows = [replace(r, **(fast if r.method == "ridge" else slow)) for r in ROWS]
+    figure = picture(rows)
+    axis = figure.axes[3]
+    assert axis.get_yscale() == "log"
+    low, high = axis.get_ylim()
+    assert 0.0 < low < 0.002
+    assert high > 900.0
+    pyplot.close(figure)
+    draw(rows, tmp_path / "study.png")

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
 import torch
 from scipy.stats import norm
 
+from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
-from carlab.experiment import regression_recordings
+from carlab.experiment import regression_recordings, regression_study
 from carlab.experiment.campaign import check_period
 from carlab.experiment.concealed_recordings import record_pair
 from carlab.experiment.prior_study import (
@@ -25,12 +27,13 @@ from carlab.experiment.prior_study import (
     prior_models,
     run_prior_study,
 )
-from carlab.experiment.regression_recordings import RecordedCase, recorded_case
+from carlab.experiment.regression_recordings import DELAY_S, RecordedCase, recorded_case
 from carlab.experiment.regression_study import run_study
+from learning.domain_models import draw_parameters
 from learning.function_posterior import infer
 from learning.history import HistoryChoice
 from learning.ridge import Ridge
-from learning.simulator_model import CarModel
+from learning.simulator_model import DELAY, CarModel, known_ranges
 from sim_backends.batch_rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -138,6 +141,53 @@ def test_priors_are_those_of_their_car_files() -> None:
     assert nominal.at_s == pytest.approx(case.rows.tick.mean() * TRUTH.control_period_s)  # type: ignore[union-attr]
 
 
+def test_a_diagnosed_car_is_a_real_cars_prior_with_its_doubts(tmp_path: Path) -> None:
+    """The same prior as in the study of priors: nothing that a diagnosis is unsure of is held exact."""
+    path = tmp_path / "model.toml"
+    path.write_text(tomli_w.dumps(KNOWN.to_tables()))
+    case = recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
+    simulator = load_car_file(path).simulator
+    assert isinstance(case.prior, CarModel)
+    assert set(KNOWN.doubts) == set(simulator.doubts) <= set(case.prior.ranges)
+    assert repr(case.prior) == repr(prior_models(case, simulator, simulator)[NOMINAL])
+    drawn = draw_parameters(case.prior, 400, torch.Generator().manual_seed(0))
+    lags = drawn[:, case.prior.names.index("effects.motor_lag.time_constant")]
+    assert 0.002 < float((lags - 0.09).abs().median()) < 0.02
+
+
+def test_a_nominal_cars_prior_is_uncertain_of_its_ranges_alone() -> None:
+    """As it was when the tables of the README were made: the file has neither deviations nor effects."""
+    car = load_car_file(Path("eth_rc_car")).simulator
+    case = recorded_case([[drive(1)], [drive(2)]], Path("eth_rc_car"), HISTORY)
+    assert isinstance(case.prior, CarModel)
+    assert not car.doubts
+    assert not car.effects
+    assert case.prior.config == car
+    assert list(case.prior.ranges.items()) == [(DELAY, DELAY_S), *car.priors.items()]
+    assert DELAY not in car.priors
+    draws = draw_parameters(case.prior, 3, torch.Generator().manual_seed(0))
+    inputs = case.recorded(Path(), 20, 0).inputs
+    before = replace(case.prior, at_s=0.0)
+    assert torch.equal(case.prior(inputs, draws), before(inputs, draws))
+
+
+def test_a_car_file_without_ranges_is_uncertain_of_what_is_rarely_known(tmp_path: Path) -> None:
+    bare = replace(SimulatorConfig.from_preset(), priors={})
+    path = tmp_path / "bare.toml"
+    path.write_text(tomli_w.dumps(bare.to_tables()))
+    case = recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
+    assert isinstance(case.prior, CarModel)
+    assert case.prior.ranges["motor.drive_gain"] == pytest.approx((0.7 * 8.2, 1.3 * 8.2))
+    assert dict(case.prior.ranges) == {DELAY: DELAY_S, **known_ranges(case.prior.config)}
+
+
+def test_a_real_car_recorded_at_another_rate_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "slow.toml"
+    path.write_text(tomli_w.dumps(replace(SimulatorConfig.from_preset(), control_period_s=0.05).to_tables()))
+    with pytest.raises(ConfigError, match=r"control_period of 0\.05 s, a recording one of 0\.03333 s"):
+        recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
+
+
 def test_the_study_has_a_score_for_every_prior() -> None:
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
@@ -146,6 +196,18 @@ def test_the_study_has_a_score_for_every_prior() -> None:
         (name, 20, 0) for name in (NONE, KINEMATIC, NOMINAL, DIAGNOSED)
     ]
     assert len({s.nll for s in scores}) == 4
+
+
+def test_a_prior_that_cannot_be_fitted_keeps_no_other_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(task: object) -> object:
+        raise DataError("The fit diverged; fit again with a smaller learning rate.")
+
+    case = case_of(drive(2))
+    models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
+    monkeypatch.setitem(regression_study.METHODS, "FSVGD", broken)
+    scores = list(run_prior_study(case, {n: models[n] for n in (NONE, NOMINAL)}, rows=(20,), seeds=1, steps=20))
+    assert [(s.method, s.failed is None) for s in scores] == [(NONE, False), (NOMINAL, True)]
+    assert "The fit diverged" in str(scores[0].failed)
 
 
 def test_knowing_the_effects_helps_where_there_is_little_data() -> None:

@@ -364,6 +364,10 @@ def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(speed, "STEPS", 400)
     monkeypatch.setattr(speed, "SIZES", {"small": (4, 2, 9)})
+    monkeypatch.setattr(speed, "CAR_FIT", CarFitSettings(steps=20))
     settle(device)
-    assert speed.training_speed(device)["small"]["steps_per_s"] > 0.0
-    assert speed.prediction_speed(device)["batch_ms"] > 0.0
+    training = speed.training_speed(device)
+    assert training["small"]["steps_per_s"] > 0.0
+    assert training["a car from 100 rows, as carlab learn"]["whole_fit_s"] > 0.0
+    prediction = speed.prediction_speed(device)
+    assert min(prediction[name] for name in ("batch_ms", "posterior_ms", "learned_car_ms")) > 0.0

@@ -65,6 +65,21 @@ def test_steps_across_gaps_and_rows_with_missing_numbers_are_left_out():
     assert set(range(3, 30)) - set(whole.tick) == {10, 11, 12, 13, 19, 20}
 
 
+def test_steps_across_a_jump_of_the_poses_and_from_poses_that_stood_still_are_left_out():
+    base = episode()
+    segment = np.where(np.arange(31) < 16, 0.0, 1.0)
+    jumped = transitions_of([dataclasses.replace(base, extra={"segment": segment})], 2)
+    assert jumped.tick.tolist() == [t for t in range(2, 30) if t != 15]
+    # Motion capture loses the body for tick 10: it shows the pose of tick 9 again, and one two periods on at tick 11.
+    age = np.full(31, 0.012)
+    age[1::2] += 0.010  # cameras at 100 Hz, a control period of 33 ms: their frames come early and late
+    age[10] = age[9] + base.period_s
+    lost = transitions_of([dataclasses.replace(base, extra={"pose_age_s": age})], 2)
+    assert lost.tick.tolist() == [t for t in range(2, 30) if t not in (9, 10)]
+    untold = transitions_of([dataclasses.replace(base, extra={"pose_age_s": np.full(31, np.nan)})], 2)
+    assert len(untold) == 28
+
+
 def test_episodes_do_not_flow_into_each_other():
     whole = transitions_of([episode(10), episode(12, seed=1)], 4)
     assert [(whole.episode == k).sum() for k in (0, 1)] == [6, 8]

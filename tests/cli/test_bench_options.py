@@ -1,0 +1,91 @@
+"""Options of ``carlab bench`` that would not be heard are refused; those that count are not."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import tyro
+
+from carlab.cli import _verbs, run
+from carlab.cli.bench import Bench
+from carlab.cli.bench_options import EVERYWHERE, PLACES, check_options
+from carlab.core.errors import ConfigError
+
+README = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
+GIVEN = {
+    "seconds": 1.0, "case": "car", "rows": (5,), "seeds": 1, "methods": ("ridge",), "way": "authors",
+    "data": Path("folder"), "car": Path("mine.toml"), "history": 0, "diagnosed": Path("model.toml"), "pair": 2,
+    "recorded_s": (40.0, 20.0), "runs": Path("others"), "episodes": 3, "updates": 50, "steps": 70,
+}  # fmt: skip
+HEARD = {
+    ("speed", ()): {"seconds"},
+    ("regression", ()): {"case", "rows", "seeds", "methods", "way", "data", "steps"},
+    ("regression", (("case", "realcar"),)): {
+        "case", "rows", "seeds", "methods", "way", "data", "steps", "car", "history",
+    },
+    ("priors", ()): {"rows", "seeds", "data", "history", "diagnosed", "pair", "recorded_s", "steps"},
+    ("priors", (("data", Path("folder")),)): {"rows", "seeds", "data", "car", "history", "diagnosed", "steps"},
+    ("parking", ()): {"seeds", "methods", "runs", "episodes", "updates", "steps"},
+}  # fmt: skip
+
+
+def test_every_option_has_its_place() -> None:
+    names = {option.name for option in fields(Bench)}
+    assert names == EVERYWHERE | set(PLACES)
+    assert not EVERYWHERE & set(PLACES)
+    usual = Bench()
+    for name, value in GIVEN.items():
+        assert value != getattr(usual, name), name
+
+
+@pytest.mark.parametrize(("what", "others"), HEARD)
+@pytest.mark.parametrize("name", GIVEN)
+def test_an_option_is_heard_or_refused(what: str, others: tuple[tuple[str, object], ...], name: str) -> None:
+    given = Bench(what, **({name: GIVEN[name]} | dict(others)))  # type: ignore[arg-type]
+    if name in HEARD[what, others]:
+        check_options(given)
+    else:
+        option = f"--{name.replace('_', '-')} is no option of 'bench {what}"
+        with pytest.raises(ConfigError, match=rf"^{option}.*'; it counts for 'bench .*'.*\.$"):
+            check_options(given)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ("speed --case pendulum", "--case is no option of 'bench speed'; it counts for 'bench regression'."),
+        ("speed --runs elsewhere", "--runs is no option of 'bench speed'; it counts for 'bench parking'."),
+        ("priors --methods ridge", "'bench priors'; it counts for 'bench regression' and 'bench parking'."),
+        (
+            "regression --car mine.toml",
+            "--car is no option of 'bench regression --case 1d'; it counts for 'bench regression --case realcar' and "
+            "'bench priors --data FOLDER'.",
+        ),
+        (
+            "priors --data here --recorded-s 40 20",
+            "--recorded-s is no option of 'bench priors --data here'; it counts for 'bench priors' without --data.",
+        ),
+        ("parking --way authors", "--way is no option of 'bench parking'; it counts for 'bench regression'."),
+    ],
+)
+def test_it_is_told_where_the_option_counts(
+    options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run(["bench", *options.split()]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [found[0] or found[1] for found in re.findall(r"^\$ (carlab bench .*)$|`(carlab bench [^`]*)`", README, re.M)],
+)
+def test_what_the_readme_types_is_heard(command: str) -> None:
+    made = tyro.extras.subcommand_cli_from_dict(_verbs(), args=shlex.split(command)[1:], prog="carlab")
+    assert isinstance(made, Bench)
+    check_options(made)
