@@ -15,7 +15,7 @@ from torch import Tensor
 from carlab.core.errors import DataError
 from learning.authors_fsvgd import WorldDynamics
 from learning.car_dynamics import CarDynamics
-from learning.domain_models import draw_parameters
+from learning.domain_models import ABSURD, BROKEN_DOWN, draw_parameters
 from learning.fsvgd import Posterior
 from learning.function_posterior import infer
 from learning.normaliser import Normaliser
@@ -57,10 +57,18 @@ class CarFitSettings:
 
 
 def car_units(model: CarModel, generator: torch.Generator) -> Normaliser:
-    """Units of inputs and outputs by random drives of the simulator; they do not change with the data."""
+    """Units of inputs and outputs by random drives of the simulator; they do not change with the data.
+
+    Raises:
+        DataError: the simulator breaks down in most of them.
+    """
     inputs = model.inputs(_UNITS_FROM, generator)
     with torch.no_grad():
         outputs = model(inputs, draw_parameters(model, 16, generator)).flatten(0, 1)
+    sound = (outputs.abs() < ABSURD).all(dim=1)
+    if 2 * int(sound.sum()) < len(outputs):
+        raise DataError(BROKEN_DOWN)
+    outputs = outputs[sound]
     width = inputs.std(dim=0).clamp_min(0.1)
     return Normaliser(inputs.mean(dim=0), width, torch.zeros(len(OUTPUTS)), outputs.std(dim=0).clamp_min(1e-3))
 

@@ -15,6 +15,11 @@ import torch
 from torch import Tensor
 
 Range = tuple[float, float]
+ABSURD = 1e6
+"""In units of what is usual, or in SI units of a car: from here on a simulator has broken down."""
+BROKEN_DOWN = (
+    "The simulator gives no finite numbers for this data; narrow the ranges of its parameters, or name another."
+)
 
 
 class DomainModel(Protocol):

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.domain_models import DomainModel, draw_parameters
+from learning.domain_models import ABSURD, BROKEN_DOWN, DomainModel, draw_parameters
 from learning.evaluation import Mixture
 from learning.gap import EXPECTED_GAP, TINY, GapCovariance, learn_gap, learn_noise
 from learning.normaliser import Normaliser
@@ -30,7 +30,7 @@ from learning.outliers import (
     turn_of,
     typical_scale,
 )
-from learning.parameter_posterior import BROKEN_DOWN, posterior_parameters
+from learning.parameter_posterior import posterior_parameters
 
 DRAWS = 128
 PRIOR_DRAWS = 1024
@@ -298,12 +298,12 @@ def _simulated(model: DomainModel, inputs: Tensor, parameters: Tensor, normalise
 
 
 def _sound(simulated: Tensor) -> Tensor:
-    """Which draws (P,) a simulator gives finite outputs (P, N, O) for: it may break down for some.
+    """Which draws (P,) a simulator gives possible outputs (P, N, O) for: it may break down for some.
 
     Raises:
         DataError: for none.
     """
-    found = torch.isfinite(simulated).flatten(1).all(dim=1)
+    found = (simulated.abs() < ABSURD).flatten(1).all(dim=1)
     if not bool(found.any()):
         raise DataError(BROKEN_DOWN)
     return found

@@ -11,12 +11,9 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.domain_models import DomainModel
+from learning.domain_models import BROKEN_DOWN, DomainModel
 from learning.normaliser import Normaliser
 
-BROKEN_DOWN = (
-    "The simulator gives no finite numbers for this data; narrow the ranges of its parameters, or name another."
-)
 MOVES = 4
 KEPT = 0.5
 """Effective share of the draws that a colder likelihood leaves."""
@@ -115,4 +112,4 @@ def _resampled(weight: Tensor, generator: torch.Generator) -> Tensor:
     return torch.searchsorted(weight.cumsum(dim=0), (points / count).to(weight.device)).clamp_max(count - 1)
 
 
-__all__ = ["BROKEN_DOWN", "posterior_parameters"]
+__all__ = ["posterior_parameters"]

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from carlab.core.errors import ConfigError
-from learning.domain_models import draw_parameters, within
+from carlab.core.errors import ConfigError, DataError
+from learning.domain_models import ABSURD, BROKEN_DOWN, draw_parameters, within
 from learning.measured_states import LATENCY_EFFECT, Measured
 from sim_backends.batch_rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
@@ -110,7 +110,13 @@ class CarModel:
         return (value + scale * torch.tan(first + (last - first) * shares.double())).clamp(low, high).to(shares)
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Inputs (N, 3 + 2 (H + 1)) of random drives: commands held for a while, cars drawn from the ranges."""
+        """Inputs (N, 3 + 2 (H + 1)) of random drives: commands held for a while, cars drawn from the ranges.
+
+        Where the simulator breaks down in some of them, others stand twice.
+
+        Raises:
+            DataError: it breaks down in most.
+        """
         cars = -(-count // ROWS_A_DRIVE)
         ticks = self.history + 1 + TICKS_APART * ROWS_A_DRIVE
         fresh = 2.0 * torch.rand((cars, ticks, 2), generator=generator) - 1.0
@@ -124,7 +130,11 @@ class CarModel:
         rows = self.history + 1 + TICKS_APART * torch.arange(ROWS_A_DRIVE)
         past = rows[:, None] + torch.arange(-self.history, 1)
         found = torch.cat([states[:, rows, 3:], commands[:, past].flatten(2)], dim=2).flatten(0, 1)
-        return found[torch.randperm(len(found), generator=generator)[:count]]
+        found = found[torch.randperm(len(found), generator=generator)]
+        sound = found[(found.abs() < ABSURD).all(dim=1)]
+        if 2 * len(sound) < len(found):
+            raise DataError(BROKEN_DOWN)
+        return sound[torch.arange(count) % len(sound)] if len(sound) < count else sound[:count]
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
         """Changes (P, N, 6) over one step for inputs (N, D) and parameters (P, K)."""

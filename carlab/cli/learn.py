@@ -8,7 +8,7 @@ import os
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
@@ -226,6 +226,10 @@ class Learn:
             fail(f"{reason.value} {detail} The recording is in {run.path}.")
             os._exit(EXIT_SAFETY_STOP)
 
+        def on_learned(told: dict[str, Any]) -> None:
+            if "history_asked" in told:
+                bar.console.print(f"  {told['history_words']}", soft_wrap=True, highlight=False)
+
         def on_figures(row: EpisodeFigures) -> None:
             figures.append(row)
             keep_row(run, row)
@@ -248,7 +252,7 @@ class Learn:
             on_abandon=on_abandon,
         )  # fmt: skip
         checking = functools.partial(at, "asking whether the simulator still explains it", 0, 1)
-        return CampaignHooks(session, at, on_figures, checking, on_check, interrupts.requested.is_set)
+        return CampaignHooks(session, at, on_learned, on_figures, checking, on_check, interrupts.requested.is_set)
 
     def _watched(self, campaign: Campaign, figures: list[EpisodeFigures]) -> list[EpisodeResult]:
         from carlab.experiment.campaign_report import write_report

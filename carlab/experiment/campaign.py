@@ -112,6 +112,7 @@ class CampaignHooks:
 
     session: SessionHooks = field(default_factory=SessionHooks)
     on_training: Tell = lambda what, done, total: None
+    on_learned: Callable[[dict[str, Any]], None] = lambda figures: None
     on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
     on_checking: Callable[[], None] = lambda: None
     on_check: Callable[[RealityCheck], None] = lambda told: None
@@ -168,6 +169,7 @@ class Campaign:
                 )
                 if told is None:
                     return
+                self.hooks.on_learned(told)
             if self.hooks.stop():
                 return
             result = self._drive(done + 1)

@@ -117,6 +117,12 @@ def read_curve(folder: Path) -> Curve:
         raise DataError(f"{folder} is no run of carlab learn with figures ({error}); remove it.") from error
 
 
+def _by_number(curve: Curve, name: str, count: int) -> list[float]:
+    """A figure of episodes 1 to ``count``; NaN for an episode without a row."""
+    rows = {e.episode: float(getattr(e, name)) for e in curve.episodes}
+    return [rows.get(number, float("nan")) for number in range(1, count + 1)]
+
+
 def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
     """One row a method, in the order in which they come."""
     found = []
@@ -124,9 +130,10 @@ def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
         own = [c for c in curves if c.method == method and c.episodes]
         if not own:
             continue
-        count = min(len(c.episodes) for c in own)
-        returns = np.array([[e.total_reward for e in c.episodes[:count]] for c in own])
-        spread = returns.std(axis=0, ddof=1) / np.sqrt(len(own)) if len(own) > 1 else np.full(count, np.nan)
+        count = min(c.episodes[-1].episode for c in own)
+        returns = np.array([_by_number(c, "total_reward", count) for c in own])
+        known = np.isfinite(returns).sum(axis=0)
+        spread = np.nanstd(returns, axis=0, ddof=1) / np.sqrt(known) if known.min() > 1 else np.full(count, np.nan)
         first = tuple(c.first_parked for c in own)
         parked = [[e.parked for e in c.episodes[-LAST:]] for c in own]
         seconds = [[e.model_seconds + e.policy_seconds for e in c.episodes] for c in own]
@@ -135,7 +142,7 @@ def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
                 method, len(own), count, first,
                 float(np.median([np.inf if f is None else f for f in first])),
                 float(np.mean([np.mean(p) for p in parked])),
-                tuple(returns.mean(axis=0).tolist()), tuple(spread.tolist()),
+                tuple(np.nanmean(returns, axis=0).tolist()), tuple(spread.tolist()),
                 float(np.mean([np.mean(s) for s in seconds])), float(np.mean([np.sum(s) for s in seconds])) / 60.0,
             )
         )  # fmt: skip
@@ -187,9 +194,10 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
         (line,) = reward.plot(numbers, mean, marker="o", markersize=3, label=f"{row.method}, {row.seeds} seeds")
         colour = line.get_color()
         reward.fill_between(numbers, mean - error, mean + error, alpha=0.25, color=colour, linewidth=0)
-        metres = np.array([[e.distance_m for e in c.episodes[: row.episodes]] for c in own])
-        distance.plot(numbers, np.median(metres, axis=0), color=colour, marker="o", markersize=3)
-        distance.fill_between(numbers, metres.min(axis=0), metres.max(axis=0), alpha=0.15, color=colour, linewidth=0)
+        metres = np.array([_by_number(c, "distance_m", row.episodes) for c in own])
+        distance.plot(numbers, np.nanmedian(metres, axis=0), color=colour, marker="o", markersize=3)
+        least, most = np.nanmin(metres, axis=0), np.nanmax(metres, axis=0)
+        distance.fill_between(numbers, least, most, alpha=0.15, color=colour, linewidth=0)
         for curve in own:
             height = -len(ticks)
             ticks.append(height)

@@ -67,7 +67,7 @@ def picture(rows: Sequence[Row]) -> Figure:
         for method in methods:
             own = sorted((r for r in rows if r.method == method), key=lambda r: r.rows)
             values, errors = (np.array([getattr(r, n) for r in own]) for n in (name, f"{name}_standard_error"))
-            look = _look(method)
+            look = _look(method, methods)
             axis.plot([r.rows for r in own], values, marker="o", markersize=4, label=method, **look)
             if np.isfinite(errors).any():
                 axis.fill_between(
@@ -84,17 +84,20 @@ def picture(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _look(method: str) -> dict[str, object]:
-    """Colour and line of a method."""
+def _look(method: str, methods: Sequence[str]) -> dict[str, object]:
+    """Colour and line of a method; those of other studies come in the order in which they are drawn, the last bold."""
     names = [name for name in METHODS if name not in _SAME_COLOUR]
+    others = [name for name in methods if name not in METHODS]
     parent = _SAME_COLOUR.get(method, method)
-    number = names.index(parent) if parent in names else len(names)
+    known = parent in names
+    number = names.index(parent) if known else others.index(method) + (len(names) if len(others) < len(methods) else 0)
+    bold = number == 0 if known else method == others[-1]
     return {
         "color": f"C{number}",
         "linestyle": "--" if method in _SAME_COLOUR else "-",
         "markerfacecolor": "white" if method in _SAME_COLOUR else f"C{number}",
-        "linewidth": 2.2 if number == 0 else 1.3,
-        "zorder": 3.0 if number == 0 else 2.0,
+        "linewidth": 2.2 if bold else 1.3,
+        "zorder": 3.0 if bold else 2.0,
     }
 
 
@@ -114,6 +117,7 @@ def _scale(axis: Axes, rows: Sequence[Row], name: str, highest: float | None) ->
 
     values = [float(getattr(row, name)) for row in rows]
     low, high = min(values), max(values)
+    methods = list(dict.fromkeys(row.method for row in rows))
     if highest is not None:
         room = 0.06 * (highest - low)
         axis.set_ylim(low - room, highest + room)
@@ -123,7 +127,8 @@ def _scale(axis: Axes, rows: Sequence[Row], name: str, highest: float | None) ->
             if value > highest:
                 place = beyond.setdefault(row.rows, 0)
                 beyond[row.rows] += 1
-                colour, number = _look(row.method)["color"], f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
+                colour = _look(row.method, methods)["color"]
+                number = f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
                 axis.annotate(
                     f"↑ {number}", (row.rows, highest + room), (0, -3 - 11 * place), textcoords="offset points",
                     ha="center", va="top", fontsize=8, color=str(colour), zorder=4.0,

@@ -29,6 +29,7 @@ from carlab.core.state_estimator import StateEstimator
 from carlab.core.task import ParkingTask
 from carlab.recording.episode_builder import VELOCITY_DELAY
 from learning.car_fit import LearnedCar, Method
+from learning.history import find_history
 from learning.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, has_whole_step, transitions_of
 from sim_backends.car_parameters import SimulatorConfig
@@ -49,6 +50,8 @@ of four runs came to stand 0.21 m away in their third episode."""
 LATER_S = 0.12
 """How much later the safety gate of the learned car reacts: at 2 m/s a policy keeps a quarter of a metre more from
 the edge than the real gate asks for, which otherwise ends the first episodes where the car slides a little more."""
+EPISODES_TO_TELL_HISTORY = 3
+"""After so many episodes it is found from them how many past commands count."""
 SMALLER_STEPS = 0.25
 """By what steps are multiplied where something diverged."""
 Tell = Callable[[str, int, int], None]
@@ -146,6 +149,10 @@ def train(
         nll, off = before.surprise(last)
         figures |= {"last_episode_nll": nll, "last_episode_calibration_error": off}
 
+    if len(recordings) == EPISODES_TO_TELL_HISTORY:
+        tell("how many past commands count", 0, 1)
+        asked = find_history(usable)
+        figures |= {} if asked is None else {"history_asked": asked.history, "history_words": asked.words()}
     began_s = clock.now_s()
     seed = plan.seed + 1000 * number
     dynamics = _fitted(plan, model, usable, rows, before, seed, tell)

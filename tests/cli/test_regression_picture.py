@@ -47,6 +47,19 @@ def test_each_method_has_a_line_and_the_one_without_gap_is_told_from_the_one_wit
     assert whole.get_linestyle() != part.get_linestyle()
 
 
+@pytest.mark.parametrize("known", [(), ("Sim-FSVGD", "SysID")])
+def test_lines_of_another_study_are_told_from_each_other(known):
+    priors = ("none (FSVGD)", "kinematic", "nominal", "diagnosed")
+    figure = picture([row(name, n, -6.0 - k) for k, name in enumerate(known + priors) for n in (20, 50)])
+    try:
+        lines = figure.axes[0].get_lines()
+        assert len({line.get_color() for line in lines}) == len(known + priors) == len(lines)
+        widths = {line.get_label(): line.get_linewidth() for line in lines}
+        assert widths["diagnosed"] > widths["kinematic"]
+    finally:
+        pyplot.close(figure)
+
+
 def test_a_value_far_off_is_a_number_at_the_edge_and_squeezes_no_other(panels):
     for axis, text, name in ((panels.axes[0], "↑ 315", "nll"), (panels.axes[2], "↑ 0.49", "calibration")):
         assert [t.get_text() for t in axis.texts] == [text]

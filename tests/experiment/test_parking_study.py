@@ -56,6 +56,20 @@ def test_figures_are_those_by_hand(runs: list[Path]) -> None:
     assert theirs.minutes == pytest.approx(3.0)
 
 
+def test_an_episode_without_a_row_shifts_no_other(tmp_path: Path) -> None:
+    folder = made(tmp_path, "sim-fsvgd", 0, [10.0, 20.0, 30.0], {3})
+    whole = json.loads((folder / "learn.json").read_text())
+    left = [row for row in whole["episodes"] if row["episode"] != 2]
+    (folder / "learn.json").write_text(json.dumps({**whole, "episodes": left}))
+    other = made(tmp_path, "sim-fsvgd", 1, [14.0, 22.0, 34.0], {3})
+    curves = [read_curve(r) for r in (folder, other)]
+    (found,) = summarised(curves)
+    assert found.episodes == 3
+    assert np.allclose(found.mean_return, [12.0, 22.0, 32.0])
+    assert math.isnan(found.return_standard_error[0]), "of one run there is none in episode 2"
+    draw(curves, tmp_path / "parking.png")
+
+
 def test_the_file_is_plain_json_and_the_picture_is_drawn(runs: list[Path], tmp_path: Path) -> None:
     curves = [read_curve(r) for r in runs]
     text = json.dumps(as_json(curves, "carlab bench parking"), allow_nan=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -23,6 +23,7 @@ from carlab.core.task import ParkingTask
 from carlab.experiment.episode import EpisodeHooks, run_episode
 from learning.car_dynamics import CarDynamics, inputs_of, moved
 from learning.car_fit import FILE_VERSION, CarFitSettings, fit_car, load_car, save_car
+from learning.evaluation import negative_log_likelihood
 from learning.fsvgd import EDGE, Posterior
 from learning.normaliser import Normaliser
 from learning.particles import Network
@@ -215,10 +216,48 @@ def some_car(freedom: float = math.inf) -> CarDynamics:
     return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, freedom), HISTORY)
 
 
-@pytest.mark.parametrize("freedom", [math.inf, 2.5])
-def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float) -> None:
-    car = some_car(freedom)
-    if math.isfinite(freedom):
+def whole_car() -> CarDynamics:
+    """With all that a car has which was learned from many rows: a trend, turned and correlated errors, a reach."""
+    generator = torch.Generator().manual_seed(8)
+    car = turned(some_car())
+    root = torch.eye(6) + 0.3 * torch.randn((6, 6), generator=generator)
+    shape = root @ root.T
+    scale = shape.diagonal().rsqrt()
+    trend = 0.5 * torch.randn((1 + INPUTS, 6), generator=generator)
+    reach = 0.5 + torch.rand(INPUTS, generator=generator)
+    posterior = replace(car.posterior, trend=trend, correlation=scale[:, None] * shape * scale, reach=reach)
+    return replace(car, posterior=posterior)
+
+
+def test_draws_of_a_whole_car_have_the_moments_of_its_parts() -> None:
+    car = whole_car()
+    posterior, units = car.posterior, car.posterior.normaliser
+    assert posterior.trend is not None
+    assert posterior.correlation is not None
+    assert posterior.reach is not None
+    row = 3.0 * torch.randn((1, INPUTS), generator=torch.Generator().manual_seed(1))
+    seen = (row - units.input_mean) / units.input_std
+    assert bool((seen.abs() > posterior.reach).any()), "some of it is beyond the reach"
+    seen = seen.clamp(-posterior.reach, posterior.reach)
+    network = posterior.network(posterior.parameters, seen)[:, 0].double()
+    line = (posterior.trend[0] + seen[0] @ posterior.trend[1:]).double()
+    back = units.output_std.double()[:, None] * torch.linalg.inv(TURN.double())
+    centres = units.output_mean.double() + (network + line) @ back.T
+    noise = posterior.noise_std.double()
+    own = back @ (noise[:, None] * posterior.correlation.double() * noise) @ back.T
+    covariance = own + torch.cov(centres.T, correction=0)
+    drawn = car.sample(row.expand(60_000, -1), torch.Generator().manual_seed(2)).double()
+    spread = covariance.diagonal().sqrt()
+    assert torch.allclose(drawn.mean(dim=0), centres.mean(dim=0), atol=0.02 * float(spread.max()))
+    assert torch.allclose(torch.cov(drawn.T), covariance, atol=0.03 * float((spread[:, None] * spread).max()))
+    predicted = car.predict(row)
+    assert torch.allclose(predicted.mean[0].double(), centres.mean(dim=0), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("freedom", [math.inf, 2.5, None])
+def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float | None) -> None:
+    car = whole_car() if freedom is None else some_car(freedom)
+    if freedom == 2.5:
         car = turned(car)
     save_car(car, tmp_path / "car.pt")
     again = load_car(tmp_path / "car.pt")
@@ -227,8 +266,10 @@ def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float) -> N
     ours, theirs = car.predict(inputs), again.predict(inputs)
     assert torch.equal(ours.means, theirs.means)
     assert torch.equal(ours.stds, theirs.stds)
-    assert (ours.turn is None) == (theirs.turn is None) == math.isinf(freedom)
-    assert ours.freedom == theirs.freedom == freedom
+    assert (ours.turn is None) == (theirs.turn is None) == (freedom == math.inf)
+    assert ours.freedom == theirs.freedom == (math.inf if freedom is None else freedom)
+    densities = [negative_log_likelihood(told, torch.zeros(50, 6)) for told in (ours, theirs)]
+    assert densities[0] == densities[1]
     first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, again))
     assert torch.equal(first, second)
 
@@ -306,3 +347,47 @@ def test_rows_with_another_history_are_refused(drive: tuple[EpisodeData, list[Tr
     model = CarModel(SimulatorConfig(), 2, {"motor.drive_gain": (5.0, 12.0)})
     with pytest.raises(DataError, match="3 past commands, the model 2"):
         fit_car(transitions_of([drive[0]], HISTORY), model, CarFitSettings(steps=1))
+
+
+class Breaking(CarModel):
+    """A simulator that runs away for strong motors: to where no car has been, or to no number."""
+
+    too_strong: ClassVar[float] = 11.0
+
+    def _roll(
+        self, start: Tensor, commands: Tensor, past: Tensor | None, parameters: Tensor, each: int
+    ) -> torch.Tensor:
+        states = CarModel._roll(self, start, commands, past, parameters, each)
+        strong = parameters[:, 0].repeat_interleave(each)
+        states[strong > self.too_strong] *= 1e30
+        states[strong > self.too_strong + 0.5] = math.nan
+        return states
+
+
+class Broken(Breaking):
+    too_strong: ClassVar[float] = 5.0
+
+
+def kinematic(kind: type[CarModel]) -> CarModel:
+    config = choose_car("sim").simulator
+    ranges = {"motor.drive_gain": (4.0, 12.0), "steering.max_angle": (0.2, 0.6)}
+    return kind(replace(config, kind="kinematic", priors={}), HISTORY, ranges)
+
+
+def test_a_prior_that_breaks_down_for_some_draws_is_learned_from_the_others() -> None:
+    settings = CarFitSettings(steps=40, particles=6)
+    whole, partly = (fit_car(None, kinematic(kind), settings) for kind in (CarModel, Breaking))
+    ours, theirs = whole.posterior.normaliser, partly.posterior.normaliser
+    assert torch.allclose(ours.output_std, theirs.output_std, rtol=0.2)
+    assert torch.allclose(ours.input_std, theirs.input_std, rtol=0.2)
+    inputs = kinematic(Breaking).inputs(500, torch.Generator().manual_seed(0))
+    assert len(inputs) == 500
+    assert float(inputs.abs().max()) < 100.0
+    said = partly.predict(inputs)
+    assert bool(torch.isfinite(said.means).all())
+
+
+def test_a_prior_that_cannot_be_integrated_is_said() -> None:
+    with pytest.raises(DataError, match="simulator gives no finite numbers") as error:
+        fit_car(None, kinematic(Broken), CarFitSettings(steps=5))
+    assert "\n" not in str(error.value)

@@ -32,7 +32,8 @@ class Room(gym.Env[np.ndarray, np.ndarray]):
         return np.full(WIDTH, action.sum(), np.float32), float(action[0]), False, False, {}
 
 
-def batches(count: int) -> list[ReplayBufferSamples]:
+def batches(count: int, *, several: bool = False) -> list[ReplayBufferSamples]:
+    """Batches; where several rewards are summed before a critic is asked, each row has a discount of its own."""
     generator = torch.Generator().manual_seed(3)
     found = []
     for _ in range(count):
@@ -40,7 +41,8 @@ def batches(count: int) -> list[ReplayBufferSamples]:
         action = torch.rand((BATCH, 2), generator=generator) * 2.0 - 1.0
         done = (torch.rand((BATCH, 1), generator=generator) < 0.2).float()
         reward = torch.randn((BATCH, 1), generator=generator)
-        found.append(ReplayBufferSamples(seen, action, after, done, reward))
+        discounts = 0.9 ** torch.randint(1, 6, (BATCH, 1), generator=generator) if several else None
+        found.append(ReplayBufferSamples(seen, action, after, done, reward, discounts))
     return found
 
 
@@ -57,7 +59,8 @@ def deal(learner: SAC, material: list[ReplayBufferSamples]) -> None:
 
     def sample(batch_size: int, env: object = None) -> ReplayBufferSamples:
         parts = [next(rows) for _ in range(batch_size // BATCH)]
-        return ReplayBufferSamples(*(torch.cat([p[k] for p in parts]) for k in range(5)))
+        fields = (None if parts[0][k] is None else torch.cat([p[k] for p in parts]) for k in range(6))
+        return ReplayBufferSamples(*fields)
 
     learner.replay_buffer.sample = sample
 
@@ -79,9 +82,10 @@ def _quiet() -> object:
     return Logger(None, [])
 
 
+@pytest.mark.parametrize("several", [False, True])
 @pytest.mark.parametrize("steps", [1, 40])
-def test_steps_are_those_of_stable_baselines(steps: int) -> None:
-    stock, fast = (trained(kind, batches(steps)) for kind in (SAC, FastSac))
+def test_steps_are_those_of_stable_baselines(steps: int, several: bool) -> None:
+    stock, fast = (trained(kind, batches(steps, several=several)) for kind in (SAC, FastSac))
     fresh = agent(SAC).policy.state_dict()
     for name, wanted in stock.policy.state_dict().items():
         found = fast.policy.state_dict()[name]
