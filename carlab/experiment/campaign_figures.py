@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from carlab.core.episode_data import EpisodeData
-from carlab.core.observation import encode
+from carlab.core.observation import decode_state, encode
 from carlab.core.quantities import FloatArray
 from carlab.experiment.reality_check import RealityCheck
 from carlab.experiment.session import EpisodeResult
@@ -105,7 +105,7 @@ class Foretold:
 
     Attributes:
         ticks: of the recording, the first of each stretch being where it starts (S, T).
-        mean, std: of x, y [m] and yaw [rad] at those ticks (S, T, 3).
+        mean, std: of x, y [m], yaw [rad], vx, vy [m/s] and yaw rate [rad/s] at those ticks (S, T, 6).
     """
 
     ticks: np.ndarray
@@ -119,20 +119,19 @@ def foretell(dynamics: OneStep, episode: EpisodeData, seed: int = 0) -> Foretold
     length = max(round(AHEAD_S / episode.period_s), 1)
     starts = np.arange(history, episode.ticks - length + 1, length)
     if not len(starts):
-        none = np.zeros((0, length + 1, 3))
+        none = np.zeros((0, length + 1, 6))
         return Foretold(np.zeros((0, length + 1), dtype=np.int64), none, none)
     generator = torch.Generator().manual_seed(seed)
     past = episode.sent[starts[:, None] - np.arange(history, 0, -1)]
     first = encode(episode.states[starts], past)
     features = torch.from_numpy(first).float().repeat_interleave(SAMPLES, dim=0)
-    poses = []
+    states = []
     for k in range(length + 1):
-        x, y, sin, cos = features[:, :4].T
-        poses.append(torch.stack([x, y, torch.atan2(sin, cos)], dim=1).view(len(starts), SAMPLES, 3))
+        states.append(decode_state(features).view(len(starts), SAMPLES, 6))
         if k < length:
             command = torch.from_numpy(episode.sent[starts + k]).float().repeat_interleave(SAMPLES, dim=0)
             features = dynamics.step(features, command, generator)
-    every = torch.stack(poses, dim=1).double().numpy()  # (S, T, samples, 3)
+    every = torch.stack(states, dim=1).double().numpy()  # (S, T, samples, 6)
     every[..., 2] = np.unwrap(every[..., 2], axis=1)
     return Foretold(starts[:, None] + np.arange(length + 1), every.mean(axis=2), every.std(axis=2))
 

@@ -10,20 +10,23 @@ from typing import Any
 import numpy as np
 
 from carlab.core.episode_data import EpisodeData
+from carlab.core.quantities import STATE_NAMES
 from carlab.core.task import ParkingTask
 from carlab.experiment.campaign_figures import EpisodeFigures, Foretold
 
 CAR_M = (0.3, 0.16)
+UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 
 
 def draw(
-    rows: Sequence[EpisodeFigures], episode: EpisodeData, foretold: Foretold, task: ParkingTask, path: Path
+    rows: Sequence[EpisodeFigures], number: int, episode: EpisodeData, foretold: Foretold, task: ParkingTask, path: Path
 ) -> None:
     """Write a PNG.
 
     Args:
         rows: one an episode.
-        episode: the last one.
+        number: of the episode that is shown.
+        episode: that episode.
         foretold: of it, by the model it was driven with.
         task: goal and arena.
         path: to write to.
@@ -32,8 +35,11 @@ def draw(
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+    from matplotlib.ticker import MaxNLocator
 
-    figure, (curve, surprise, plan) = pyplot.subplots(1, 3, figsize=(15, 4.6), layout="constrained")
+    figure = pyplot.figure(figsize=(15, 7.6), layout="constrained")
+    grid = figure.add_gridspec(2, 6, height_ratios=(3, 2))
+    curve, surprise, plan = (figure.add_subplot(grid[0, k : k + 2]) for k in (0, 2, 4))
     numbers = [r.episode for r in rows]
     curve.plot(numbers, [r.total_reward for r in rows], marker="o", label="on the car")
     curve.plot(numbers, [r.foretold for r in rows], marker=".", linestyle="--", label="in the learned car")
@@ -48,11 +54,13 @@ def draw(
     other.set_ylabel("distance from the goal at the end [m]", color="tab:gray")
     for axis in (curve, surprise):
         axis.grid(alpha=0.3)
-        axis.xaxis.get_major_locator().set_params(integer=True)
+        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     if rows[-1].reality:
         figure.suptitle(textwrap.shorten(rows[-1].diagnosis, 300, placeholder=" …"), fontsize=8, wrap=True)
     _plan(plan, episode, foretold, task)
-    plan.set_title(f"episode {numbers[-1]}: driven, and foretold a second ahead", fontsize=9)
+    plan.set_title(f"episode {number}: driven, and foretold a second ahead", fontsize=9)
+    for k in range(len(STATE_NAMES)):
+        _state(figure.add_subplot(grid[1, k]), k, episode, foretold)
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
 
@@ -73,6 +81,24 @@ def _plan(axis: Any, episode: EpisodeData, foretold: Foretold, task: ParkingTask
     axis.plot(*corners.T, color="tab:red", linewidth=0.8, alpha=0.5)
     axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axis.legend(fontsize=8)
+
+
+def _state(axis: Any, which: int, episode: EpisodeData, foretold: Foretold) -> None:
+    """What was measured of one state, and what was foretold of it with twice its standard deviation."""
+    measured = episode.states[:, which]
+    measured = np.unwrap(measured) if STATE_NAMES[which] == "yaw" else measured
+    times_s = episode.times_s - episode.times_s[0]
+    axis.plot(times_s, measured, color="black", linewidth=1.2)
+    for ticks, means, stds in zip(foretold.ticks, foretold.mean[..., which], foretold.std[..., which], strict=True):
+        mean, at_s = means.copy(), times_s[ticks]
+        if STATE_NAMES[which] == "yaw":
+            mean += 2.0 * np.pi * np.round((measured[ticks[0]] - mean[0]) / (2.0 * np.pi))
+        axis.plot(at_s, mean, color="tab:orange", linewidth=1.2)
+        axis.fill_between(at_s, mean - 2.0 * stds, mean + 2.0 * stds, color="tab:orange", alpha=0.25, linewidth=0)
+    axis.set_title(f"{STATE_NAMES[which].replace('_', ' ')} [{UNITS[which]}]", fontsize=9)
+    axis.set_xlabel("t [s]", fontsize=8)
+    axis.tick_params(labelsize=7)
+    axis.grid(alpha=0.3)
 
 
 def _outline(pose: Sequence[float]) -> np.ndarray:

@@ -78,10 +78,10 @@ def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> 
         episode, model = read_episode(recordings[r.episode - 1]), models[r.episode]
         assert model is not None
         foretold = foretell(model, episode)
-        driven.append(episode.states[:, :2])
-        told.append((foretold.mean[..., :2], foretold.std[..., :2]))
+        driven.append(episode.states)
+        told.append((foretold.ticks, foretold.mean, foretold.std))
         if r is shown[-1]:
-            draw(rows, episode, foretold, plan.task, run.path / "learn.png")
+            draw(rows, r.episode, episode, foretold, plan.task, run.path / "learn.png")
     numbers = [f.name for f in fields(EpisodeFigures) if f.type != "str"]
     figures = [{n: float(np.float64(getattr(r, n))) for n in numbers} for r in shown]
     write_learning_curve(run.path / "learn.rrd", figures, driven, told, [r.diagnosis for r in shown])

@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 
 from carlab.core.errors import DataError
-from carlab.core.quantities import FloatArray
+from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.recording.drained_file import DrainedFile
 from carlab.recording.sink import describe_os_error, partial_path
 
@@ -22,16 +22,17 @@ def write_learning_curve(
     path: Path,
     rows: Sequence[Mapping[str, float]],
     driven: Sequence[FloatArray],
-    foretold: Sequence[tuple[FloatArray, FloatArray]],
+    foretold: Sequence[tuple[np.ndarray, FloatArray, FloatArray]],
     diagnoses: Sequence[str] = (),
 ) -> None:
-    """Write a recording whose timeline is the episode: every figure as a curve, paths in the plan view.
+    """Write a recording: every figure as a curve over the episodes, paths in the plan view, states over the ticks.
 
     Args:
         path: of the .rrd file; replaced whole.
         rows: figures by name, one mapping an episode, ``episode`` among them.
-        driven: x, y [m] of each episode (T, 2).
-        foretold: mean and standard deviation of x, y [m] of stretches of each episode (S, T, 2).
+        driven: states of each episode (T + 1, 6).
+        foretold: of stretches of each episode the ticks (S, N), and mean and standard deviation of the states there
+            (S, N, 6).
         diagnoses: what is said of the simulator after each episode, empty where nothing is; none at all unless given.
 
     Raises:
@@ -46,16 +47,25 @@ def write_learning_curve(
         stream = rr.RecordingStream(APPLICATION, recording_id=path.parent.name)
         stream.save(file.start())
         texts = diagnoses or [""] * len(rows)
-        for row, line, (mean, std), text in zip(rows, driven, foretold, texts, strict=True):
+        before = 0
+        for row, states, (ticks, mean, std), text in zip(rows, driven, foretold, texts, strict=True):
             stream.set_time("episode", sequence=int(row["episode"]))
             for name, value in row.items():
                 if name != "episode" and np.isfinite(value):
                     stream.log(f"learning/{name}", rr.Scalars(float(value)))
             if text:
                 stream.log("diagnosis", rr.TextLog(text, level=rr.TextLogLevel.INFO))
-            stream.log("plan/driven", rr.LineStrips2D([line], colors=[(0, 0, 0)]))
-            stream.log("plan/foretold", rr.LineStrips2D(list(mean), colors=[(230, 130, 0)]))
-            stream.log("plan/foretold/doubt", rr.Boxes2D(centers=mean[:, -1], half_sizes=2.0 * std[:, -1]))
+            stream.log("plan/driven", rr.LineStrips2D([states[:, :2]], colors=[(0, 0, 0)]))
+            stream.log("plan/foretold", rr.LineStrips2D(list(mean[..., :2]), colors=[(230, 130, 0)]))
+            places, doubts = mean[..., :2].reshape(-1, 2), 2.0 * std[..., :2].reshape(-1, 2)
+            stream.log("plan/foretold/doubt", rr.Ellipses2D(centers=places, half_sizes=doubts))
+            for k, name in enumerate(STATE_NAMES):
+                _series(stream, f"states/{name}/measured", before + np.arange(len(states)), states[:, k : k + 1])
+                if len(ticks):
+                    middle, width = mean[:, 1:, k].ravel(), 2.0 * std[:, 1:, k].ravel()
+                    band = np.stack([middle, middle - width, middle + width], axis=1)
+                    _series(stream, f"states/{name}/foretold", before + ticks[:, 1:].ravel(), band)
+            before += len(states)
         stream.disconnect()
         stream = None
         file.close()
@@ -70,6 +80,13 @@ def write_learning_curve(
         file.close()
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def _series(stream: rr.RecordingStream, entity: str, ticks: np.ndarray, values: FloatArray) -> None:
+    """Curves (n, curves) over the ticks of all episodes, one after the other."""
+    each = np.full(len(values), values.shape[1])
+    columns = rr.Scalars.columns(scalars=values.ravel()).partition(each)
+    stream.send_columns(entity, indexes=[rr.TimeColumn("tick", sequence=ticks)], columns=columns)
 
 
 __all__ = ["write_learning_curve"]

@@ -20,6 +20,7 @@ import torch
 from carlab.cars import CarChoice, choose_car
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import EpisodeEnded, Tick
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError, DivergedError
 from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
@@ -44,6 +45,7 @@ from drivers.emulators.command_log import read_log
 from learning import car_fit, model_env
 from learning.car_fit import load_car
 from learning.evaluation import negative_log_likelihood
+from learning.history import HistoryChoice
 from learning.sac_agent import SacAgent, SacPolicy, SacSettings
 from learning.simulator_model import CarModel
 from learning.transitions import transitions_of
@@ -279,10 +281,17 @@ def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_somethi
     learning = np.array(learning_s)
     second = learning[learning > ticks_s[0]]
     assert len(second) > 3, "it learned a second time, after the first episode"
-    currents = [e for e in read_log(run.path / "firmware.jsonl") if e.name == "current"]
+    entries = [e for e in read_log(run.path / "firmware.jsonl") if ticks_s[0] < e.t_s < ticks_s[-1]]
+    currents = [e for e in entries if e.name == "current"]
     heard = [e for e in currents if second.min() < e.t_s < second.max()]
     assert len(heard) > 3
     assert all(e.value == 0.0 for e in heard), "neutral, again and again"
+    assert not [e for e in entries if e.name == "motor_timeout"], "the firmware missed no command in all that time"
+    meanwhile = np.diff([e.t_s for e in heard])
+    driving = np.diff([e.t_s for e in currents if e.t_s < ticks_s[0] + 0.5 * TICKS * choice.control_period_s])
+    assert np.median(meanwhile) == pytest.approx(np.median(driving), rel=0.5)
+    late_s = np.concatenate([read_episode(path).extra["late_s"][:-1] for path in run.recordings()])
+    assert np.median(late_s) < 0.005
 
 
 def test_an_episode_that_somebody_ended_is_driven_again(story: Story, tmp_path: Path) -> None:
@@ -378,7 +387,9 @@ def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.
     curve.write_bytes(b"what was there")
     monkeypatch.setattr(DrainedFile, "open", opened)
     with pytest.raises(DataError, match="the disk is full; free some space"):
-        write_learning_curve(curve, [{"episode": 1.0}], [np.zeros((3, 2))], [(np.zeros((1, 2, 2)),) * 2])
+        write_learning_curve(
+            curve, [{"episode": 1.0}], [np.zeros((3, 6))], [(np.zeros((0, 2)), *[np.zeros((0, 2, 6))] * 2)]
+        )
     assert curve.read_bytes() == b"what was there"
     (story.run.path / "learn.json.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match="the disk is full; free some space"):
@@ -405,6 +416,24 @@ def test_the_model_is_told_by_how_much_recorded_velocities_are_late(
     late = replace(episodes[0], extra={"velocity_delay_s": np.array([0.01, 0.02, np.nan, 0.04])})
     assert training.velocity_delay_s([late]) == 0.02
     assert training.velocity_delay_s([replace(late, extra={})]) == 0.025, "of recordings that do not say"
+
+
+def test_after_three_episodes_it_is_found_how_many_commands_count(
+    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+
+    def find(episodes: list[EpisodeData]) -> HistoryChoice:
+        asked.append(len(episodes))
+        return HistoryChoice(6, {3: -1.0, 6: -2.0})
+
+    monkeypatch.setattr(training, "find_history", find)
+    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
+    recordings = [*story.run.recordings(), story.run.recordings()[0]]
+    found = [train(plan, tmp_path / str(n), recordings[:n], ENVELOPE, lambda *what: None) for n in (2, 3)]
+    assert asked == [3]
+    assert [f.get("history_asked") for f in found] == [None, 6]
+    assert "asks for 6 past commands" in found[1]["history_words"]
 
 
 def test_what_diverged_is_learned_again_with_smaller_steps(

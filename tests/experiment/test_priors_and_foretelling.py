@@ -71,7 +71,7 @@ def test_foretold_is_where_the_model_goes_by_the_recorded_commands(history: int)
     driven = recording_of(100)
     found = foretell(car, driven)
     assert found.ticks[:, 0].tolist() == [history, history + 30, history + 60]
-    assert found.mean.shape == found.std.shape == (3, 31, 3)
+    assert found.mean.shape == found.std.shape == (3, 31, 6)
     for (start, *_), path in zip(found.ticks, found.mean, strict=True):
         x, y, yaw = driven.states[start, :3]
         headings = yaw + 0.05 * np.arange(31)
@@ -79,5 +79,6 @@ def test_foretold_is_where_the_model_goes_by_the_recorded_commands(history: int)
         np.testing.assert_allclose(path[1:, 0], x + np.cumsum(ahead * np.cos(headings[:-1])), atol=1e-4)
         np.testing.assert_allclose(path[1:, 1], y + np.cumsum(ahead * np.sin(headings[:-1])), atol=1e-4)
         np.testing.assert_allclose(np.exp(1j * path[:, 2]), np.exp(1j * headings), atol=1e-4)
+        np.testing.assert_allclose(path[:, 3:], np.tile(driven.states[start, 3:], (31, 1)), atol=1e-4)
     assert found.std.max() < 1e-4
-    assert foretell(car, recording_of(20)).mean.shape == (0, 31, 3)
+    assert foretell(car, recording_of(20)).mean.shape == (0, 31, 6)
