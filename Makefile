@@ -26,7 +26,7 @@ lint: $(VENV)/.installed
 
 # Tests that only compute run side by side, one to a core; the others drive against the clock, two at once.
 COMPUTING := tests/concealment tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py \
-	$(addprefix tests/experiment/,test_prior_study.py test_reality_check.py test_learning_on_a_device.py)
+	$(addprefix tests/experiment/,test_prior_study.py test_reality_check.py test_learning_on_a_device.py test_targets.py)
 test: export OMP_NUM_THREADS := 1
 
 test: lint

@@ -1,0 +1,68 @@
+"""What learning must reach: likelihood on rows that were not seen, calibration, and a place ahead of its baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.experiment.regression_recordings import recorded_case
+from carlab.experiment.regression_study import Score, run_study
+from carlab.recording.foreign_csv import import_csv
+
+OURS = "Sim-FSVGD"
+BASELINES = ("FSVGD", "SysID", "GreyBox")
+
+
+def means(scores: Iterable[Score], figure: str = "nll") -> dict[tuple[str, int], float]:
+    """Over the seeds, by method and number of rows."""
+    found: dict[tuple[str, int], list[float]] = {}
+    for score in scores:
+        assert score.failed is None, score.failed
+        found.setdefault((score.method, score.rows), []).append(float(getattr(score, figure)))
+    return {key: float(np.mean(values)) for key, values in found.items()}
+
+
+def test_with_ten_rows_of_a_pendulum_it_is_far_ahead_of_its_baselines() -> None:
+    """Drag, friction and the motor's lag are hidden from the prior; a few steps are enough to tell."""
+    told = means(run_study("pendulum_motor", rows=(10,), seeds=1, methods=(OURS, *BASELINES), steps=1000))
+    assert told[OURS, 10] < -6.0
+    assert all(told[OURS, 10] < told[name, 10] - 1.0 for name in BASELINES), told
+
+
+@pytest.mark.slow
+def test_as_the_paper_tells_it_it_is_ahead_at_every_number_of_rows() -> None:
+    told = means(run_study("pendulum_motor", seeds=3, methods=(OURS, *BASELINES, "ridge")))
+    for count in (5, 10, 20, 50):
+        others = {name: told[name, count] for name in (*BASELINES, "ridge") if (name, count) in told}
+        assert told[OURS, count] < min(others.values()), (count, told[OURS, count], others)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("case", "limits"),
+    [
+        ("1d", {2: 0.55}),
+        ("pendulum", {5: -6.0, 50: -6.7}),
+        ("racecar", {20: -9.5, 100: -10.5, 400: -12.0}),
+    ],
+)
+def test_on_the_authors_arrays(shared: Path, case: str, limits: dict[int, float]) -> None:
+    folder = shared / "data" / "regression"
+    told = means(run_study(case, rows=tuple(limits), seeds=3, methods=(OURS,), data=folder))
+    assert all(told[OURS, count] <= limit for count, limit in limits.items()), told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("count", "limit"), [(50, -15.5), (200, -17.3), (800, -18.2)])
+def test_on_a_real_car(shared: Path, count: int, limit: float) -> None:
+    folder = shared / "data" / "eth_rc_car"
+    recordings = [import_csv(folder / f"train_{k}.csv.gz").episodes for k in (1, 2)]
+    case = recorded_case(recordings, Path("eth_rc_car"), history=6)
+    scores = list(run_study(case, rows=(count,), seeds=3, methods=(OURS, "ridge"), steps=4000))
+    told = means(scores)
+    assert told[OURS, count] <= limit
+    assert told[OURS, count] <= told["ridge", count] - 0.5
+    assert means(scores, "calibration")[OURS, count] <= 0.05
