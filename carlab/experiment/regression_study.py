@@ -103,8 +103,8 @@ class _Task:
         """Expected noise (O,), where the data is."""
         return torch.tensor(self.case.expected_noise_std).to(self.data.inputs.device)
 
-    def settings(self) -> FsvgdSettings:
-        """How particles are fitted in the authors' way, and the networks of an ensemble."""
+    def settings(self, *, own: bool = False) -> FsvgdSettings:
+        """How particles are fitted the authors' way (``own``: under a simulator), and the networks of an ensemble."""
         case, rows = self.case, len(self.data.inputs)
         if self.way == "ours":
             noise = tuple(s / o for s, o in zip(case.expected_noise_std, case.output_std, strict=True))
@@ -116,12 +116,13 @@ class _Task:
         steps = self.steps or min(60 * rows // 8 + 5000, 100_000) // 1000 * 1000
         if case.name == "1d":
             return FsvgdSettings(
-                steps=self.steps or 20_000, batch=4, measurement_points=8, bandwidth=1.0, natural=False,
-                falling_rate=False, noise_std=noise, learn_noise=False, seed=self.seed,
+                steps=self.steps or (20_000 if own else 10_000), batch=4, measurement_points=8,
+                bandwidth=1.0 if own else 0.5, natural=False, falling_rate=False, noise_std=noise, learn_noise=False,
+                seed=self.seed,
             )  # fmt: skip
         return FsvgdSettings(
-            steps=steps, batch=8, measurement_points=32, bandwidth=2.0, natural=False, falling_rate=False,
-            noise_std=noise, noise_rate=1.0, seed=self.seed,
+            steps=steps, batch=8, measurement_points=32, bandwidth=10.0 if case.name == "realcar" else 2.0,
+            natural=False, falling_rate=False, noise_std=noise, noise_rate=1.0, seed=self.seed,
         )  # fmt: skip
 
     def pool(self) -> Tensor:
@@ -166,7 +167,7 @@ class _Task:
             drawn = draw_parameters(case.prior, DRAWS, generator).to(everything)
             bank = normaliser.outputs(case.prior(everything, drawn))
         prior = SimulatorPrior(bank, everything, case.gap() if gap else None)
-        return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings())
+        return fit(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.settings(own=True))
 
     def fsvgd(self) -> Model:
         """Particles under a Gaussian process, properly weighted."""

@@ -81,6 +81,23 @@ def test_the_authors_way_is_that_of_their_public_code(monkeypatch, rows, steps):
     assert np.allclose(told.noise_std, np.array([0.05, 0.05, 0.5]) / np.array([0.158, 0.150, 0.951]))
 
 
+def test_the_authors_way_in_one_dimension_is_another_for_each_method(monkeypatch):
+    """lasgroup/simulation_transfer at 547fa14, 1d_visualization_run_training.py."""
+    asked = []
+
+    def instead(inputs, outputs, pool, prior, normaliser, settings):
+        asked.append(settings)
+        return fit(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
+
+    monkeypatch.setattr(regression_study, "fit", instead)
+    list(run_study("1d", seeds=1, methods=("Sim-FSVGD", "FSVGD"), way="authors"))
+    ours, theirs = asked
+    assert (ours.steps, ours.bandwidth) == (20_000, 1.0)
+    assert (theirs.steps, theirs.bandwidth) == (10_000, 0.5)
+    assert {(t.batch, t.measurement_points, t.learn_noise) for t in asked} == {(4, 8, False)}
+    assert all(np.allclose(t.noise_std, 0.05) for t in asked)
+
+
 def test_a_study_is_the_same_again():
     first, second = (list(run_study("1d", seeds=1, methods=("Sim-FSVGD",), steps=30)) for _ in range(2))
     assert (first[0].nll, first[0].rmse) == (second[0].nll, second[0].rmse)
