@@ -61,7 +61,7 @@ def test_on_a_real_car(shared: Path, count: int, limit: float) -> None:
     folder = shared / "data" / "eth_rc_car"
     recordings = [import_csv(folder / f"train_{k}.csv.gz").episodes for k in (1, 2)]
     case = recorded_case(recordings, Path("eth_rc_car"), history=6)
-    scores = list(run_study(case, rows=(count,), seeds=3, methods=(OURS, "ridge"), steps=4000))
+    scores = list(run_study(case, rows=(count,), seeds=3, methods=(OURS, "ridge"), data=folder, steps=4000))
     told = means(scores)
     assert told[OURS, count] <= limit
     assert told[OURS, count] <= told["ridge", count] - 0.5
