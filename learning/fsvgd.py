@@ -228,6 +228,7 @@ def fit(
     settings: FsvgdSettings,
     progress: Callable[[int], None] = lambda step: None,
     held_out: tuple[Tensor, Tensor] | None = None,
+    seen_by: Tensor | None = None,
 ) -> Posterior:
     """Fit particles to data and prior.
 
@@ -240,6 +241,7 @@ def fit(
         settings: how.
         progress: told the number of steps done, from time to time.
         held_out: raw inputs and outputs of rows that choose the step whose particles are kept.
+        seen_by: whether each particle sees each row (L, n); all see all unless given.
 
     Raises:
         DataError: there is nothing to fit, or numbers are missing or infinite; says what to do.
@@ -272,7 +274,7 @@ def fit(
             group["lr"] = rate * group.get("faster", 1.0)
         rows = _rows(count, settings.batch, generator)
         others = count + torch.randint(len(pool), (points,), generator=generator)
-        _step(network, state, everything, targets, rows.to(device), others.to(device), prior, settings)
+        _step(network, state, everything, targets, rows.to(device), others.to(device), prior, settings, seen_by)
         if (step + 1) % CHECKED_EVERY == 0:
             progress(step + 1)
         if held_out is not None and (step + 1) % settings.checked_every == 0:
@@ -320,6 +322,7 @@ def _step(
     others: Tensor,
     prior: FunctionPrior | None,
     settings: FsvgdSettings,
+    seen_by: Tensor | None,
 ) -> None:
     """One step of the optimiser at the measurement set of data ``rows`` and of ``others`` in ``everything``."""
     chosen = torch.cat([rows, others])
@@ -329,7 +332,10 @@ def _step(
     known = torch.zeros(values.shape[2], values.shape[1], dtype=values.dtype, device=values.device)
     if len(rows):
         noise = state.log_noise.exp().clamp_min(LEAST_NOISE)
-        off = targets[rows] - values[:, : len(rows)]
+        off, told = targets[rows] - values[:, : len(rows)], float(len(rows))
+        if seen_by is not None:
+            seen = seen_by[:, rows].to(off)
+            off, told = off * seen[..., None], float(seen.sum()) / len(off)
         weight = settings.likelihood_exponent * len(targets) / len(rows)
         score[:, : len(rows)] += weight * off / noise**2
         known[:, : len(rows)] = weight / noise[:, None] ** 2
@@ -337,7 +343,7 @@ def _step(
             # Gradient by the logarithm of the noise: the particles' mean negative log-likelihood, and the prior's.
             square = (off * off).mean(dim=0).sum(dim=0) / noise**2
             expected = settings.noise_rows * (1.0 - (state.expected_noise / noise) ** 2)
-            state.log_noise.grad = weight * (len(rows) - square) + expected
+            state.log_noise.grad = weight * (told - square) + expected
     if not settings.together:
         state.networks.grad = -pullback(score)
         state.optimiser.step()

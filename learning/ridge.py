@@ -19,13 +19,18 @@ class Ridge:
     Attributes:
         weights: (D + 1, O) with the constant last.
         mean, scale: of the inputs (D,).
-        std: of the errors (O,), by leaving each row out in turn.
+        errors: of each row (n, O), when it is left out.
     """
 
     weights: FloatArray
     mean: FloatArray
     scale: FloatArray
-    std: FloatArray
+    errors: FloatArray
+
+    @property
+    def std(self) -> FloatArray:
+        """Root of the mean square of the errors of rows left out (O,)."""
+        return np.asarray(np.sqrt(np.maximum((self.errors**2).mean(axis=0), 1e-18)))
 
     @classmethod
     def fit(cls, inputs: FloatArray, targets: FloatArray) -> Ridge:
@@ -47,7 +52,7 @@ class Ridge:
         left, singular, right = np.linalg.svd(design, full_matrices=False)
         turned = left.T @ (targets - middle)
         best = np.full(targets.shape[1], np.inf)
-        weights = np.zeros((inputs.shape[1] + 1, targets.shape[1]))
+        weights, errors = np.zeros((inputs.shape[1] + 1, targets.shape[1])), np.zeros(targets.shape)
         for penalty in PENALTIES:
             shrink = singular**2 / (singular**2 + penalty)
             fitted = left @ (shrink[:, None] * turned)
@@ -58,9 +63,9 @@ class Ridge:
             better = square < best
             best = np.where(better, square, best)
             slopes = right.T @ ((singular / (singular**2 + penalty))[:, None] * turned)
-            weights[:-1, better] = slopes[:, better]
+            weights[:-1, better], errors[:, better] = slopes[:, better], error[:, better]
         weights[-1] = middle
-        return cls(weights, mean, scale, np.sqrt(np.maximum(best, 1e-18)))
+        return cls(weights, mean, scale, errors)
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Mean (n, O) at inputs (n, D)."""

@@ -30,6 +30,7 @@ from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, Simul
 from learning.function_posterior import infer
 from learning.function_prior import RbfCovariance
 from learning.normaliser import Normaliser
+from learning.residuals import residuals
 from learning.ridge import Ridge
 from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_points
 from learning.system_identification import GreyBox, Identified, grey_box, identify
@@ -109,7 +110,7 @@ class _Task:
         if self.way == "ours":
             noise = tuple(s / o for s, o in zip(case.expected_noise_std, case.output_std, strict=True))
             return FsvgdSettings(
-                steps=self.steps or 3000, noise_std=noise, learn_noise=case.learn_noise, noise_rows=NOISE_ROWS,
+                steps=self.steps or STEPS, noise_std=noise, learn_noise=case.learn_noise, noise_rows=NOISE_ROWS,
                 seed=self.seed,
             )  # fmt: skip
         noise = tuple(s / o for s, o in zip(case.likelihood_std, case.output_std, strict=True))
@@ -218,9 +219,8 @@ class _Linear:
     ridge: Ridge
 
     def predict(self, inputs: Tensor) -> Mixture:
-        mean, std = self.ridge(inputs.cpu().double().numpy()), self.ridge.std
-        means, stds = (torch.from_numpy(v).to(inputs.device) for v in (mean[None], std[None, None]))
-        return Mixture(means, stds)
+        mean = torch.from_numpy(self.ridge(inputs.cpu().double().numpy()))
+        return residuals(torch.from_numpy(self.ridge.errors)).about(mean[None].to(inputs.device))
 
 
 METHODS: dict[str, Callable[[_Task], Model]] = {

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.stats import norm
+from scipy.stats import multivariate_t
 
 from carlab.cli import run
 from carlab.core.errors import ConfigError, DataError
@@ -15,6 +15,7 @@ from carlab.experiment.regression_cases import CASES
 from carlab.experiment.regression_study import run_study, summarised
 from learning.domain_models import draw_parameters
 from learning.fsvgd import fit
+from learning.residuals import residuals
 from learning.ridge import Ridge
 
 
@@ -23,7 +24,9 @@ def test_ridge_in_the_study_is_scipys_likelihood_of_the_same_rows():
     data = CASES["car"].data(50, 0)
     model = Ridge.fit(data.inputs.double().numpy(), data.outputs.double().numpy())
     mean, truth = model(data.test_inputs.double().numpy()), data.test_outputs.double().numpy()
-    assert score.nll == pytest.approx(-norm.logpdf(truth, mean, model.std).sum(axis=1).mean(), rel=1e-6)
+    left = residuals(torch.from_numpy(model.errors))
+    theirs = multivariate_t(np.zeros(6), (left.factor @ left.factor.T).numpy(), df=left.freedom)
+    assert score.nll == pytest.approx(-theirs.logpdf(truth - mean).mean(), rel=1e-6)
     assert score.rmse == pytest.approx(np.sqrt(((truth - mean) ** 2).sum(axis=1).mean()), rel=1e-6)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +10,13 @@ import numpy as np
 import pytest
 import tomli_w
 import torch
+from scipy.special import logsumexp
 from scipy.stats import norm
 
 from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.quantities import FloatArray
 from carlab.experiment import regression_recordings, regression_study
 from carlab.experiment.campaign import check_period
 from carlab.experiment.concealed_recordings import record_pair
@@ -32,6 +35,8 @@ from carlab.experiment.regression_study import run_study
 from learning.domain_models import draw_parameters
 from learning.function_posterior import infer
 from learning.history import HistoryChoice
+from learning.outliers import tail_scales
+from learning.residuals import residuals
 from learning.ridge import Ridge
 from learning.simulator_model import DELAY, CarModel, known_ranges
 from sim_backends.batch_rollout import rollout
@@ -61,7 +66,7 @@ def case_of(held_out: EpisodeData, history: int | None = HISTORY) -> RecordedCas
 
 
 def test_seven_outputs_in_the_world_are_scored_at_the_states_that_were_measured() -> None:
-    """Ridge's Gaussians as draws, turned by the recorded headings, against the recorded states of the world."""
+    """Draws of what a ridge foretells, turned by the recorded headings, against the recorded states of the world."""
     held_out = drive(2)
     case = case_of(held_out)
     (score,) = run_study(case, rows=(100,), seeds=1, methods=("ridge",), data=Path())
@@ -71,19 +76,28 @@ def test_seven_outputs_in_the_world_are_scored_at_the_states_that_were_measured(
     rows = np.arange(HISTORY, held_out.ticks)
     assert len(mean) == len(rows)  # No row was left out: each is a tick.
     before, after = held_out.states[rows], held_out.states[rows + 1]
-    drawn = mean[:, None] + model.std * np.random.default_rng(0).normal(size=(len(mean), 20_000, 6))
-    yaw = before[:, 2:3]
-    ahead, left = drawn[..., 0], drawn[..., 1]
-    moved = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
-    turned, vx, vy = yaw + drawn[..., 2], before[:, 3:4] + drawn[..., 3], before[:, 4:5] + drawn[..., 4]
-    velocity = np.cos(turned) * vx - np.sin(turned) * vy, np.sin(turned) * vx + np.cos(turned) * vy
-    seven = np.stack([*moved, np.sin(turned), np.cos(turned), *velocity, drawn[..., 5]], axis=-1)
+    left_over = residuals(torch.from_numpy(model.errors))
+    rng, yaw = np.random.default_rng(0), before[:, 2:3]
+
+    def seven_drawn(std: FloatArray) -> FloatArray:
+        drawn = mean[:, None] + std * rng.normal(size=(len(mean), 20_000, 6))
+        ahead, left = drawn[..., 0], drawn[..., 1]
+        moved = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
+        turned, vx, vy = yaw + drawn[..., 2], before[:, 3:4] + drawn[..., 3], before[:, 4:5] + drawn[..., 4]
+        velocity = np.cos(turned) * vx - np.sin(turned) * vy, np.sin(turned) * vx + np.cos(turned) * vy
+        return np.stack([*moved, np.sin(turned), np.cos(turned), *velocity, drawn[..., 5]], axis=-1)
+
     sin, cos = np.sin(after[:, 2]), np.cos(after[:, 2])
     truth = np.column_stack([
         *(after[:, :2] - before[:, :2]).T, sin, cos,
         cos * after[:, 3] - sin * after[:, 4], sin * after[:, 3] + cos * after[:, 4], after[:, 5] - before[:, 5],
     ])  # fmt: skip
-    theirs = -norm.logpdf(truth, seven.mean(axis=1), seven.std(axis=1)).sum(axis=1).mean()
+    # Student's distribution as twenty Gaussians.
+    each = []
+    for scale in tail_scales(left_over.freedom, 20).numpy():
+        seven = seven_drawn(scale * left_over.scale.numpy())
+        each.append(norm.logpdf(truth, seven.mean(axis=1), seven.std(axis=1)).sum(axis=1))
+    theirs = math.log(20.0) - logsumexp(each, axis=0).mean()
     assert score.nll_in_world == pytest.approx(theirs, abs=0.05)
 
 

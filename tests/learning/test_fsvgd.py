@@ -7,7 +7,7 @@ import torch
 
 from carlab.core.errors import DataError
 from learning.ensemble import deep_ensemble
-from learning.evaluation import negative_log_likelihood
+from learning.evaluation import calibration_error, negative_log_likelihood
 from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit
 from learning.function_prior import RbfCovariance
 from learning.normaliser import Normaliser
@@ -87,7 +87,7 @@ def test_expected_noise_counts_for_its_rows():
     """Three rows met exactly: the most probable variance is the expected one times its rows over all rows."""
     x = torch.tensor([[-1.0], [0.0], [1.0]])
     settings = FsvgdSettings(steps=3000, hidden=(32,), noise_std=0.1, noise_rows=2.0, particles=3, weight_decay=0.0)
-    found = deep_ensemble(x, torch.sin(3 * x), UNIT, settings)
+    found = deep_ensemble(x, torch.sin(3 * x), UNIT, settings).networks
     assert float(found.noise_std) == pytest.approx(0.1 * math.sqrt(2.0 / 5.0), rel=0.05)
 
 
@@ -96,8 +96,8 @@ def test_members_of_an_ensemble_do_not_feel_each_other():
     x = torch.linspace(-1, 1, 20)[:, None]
     y = torch.sin(3 * x)
     settings = FsvgdSettings(particles=3, steps=300, hidden=(8,), learn_noise=False)
-    three = deep_ensemble(x, y, UNIT, settings).parameters
-    network = deep_ensemble(x, y, UNIT, settings).network
+    found = deep_ensemble(x, y, UNIT, settings).networks  # Three are too few to leave rows out.
+    three, network = found.parameters, found.network
     start = network.initial(3, generator(), "cpu")
     alone = start[:1].clone().requires_grad_()
     optimiser = torch.optim.AdamW([alone], lr=settings.learning_rate, weight_decay=settings.weight_decay)
@@ -108,6 +108,39 @@ def test_members_of_an_ensemble_do_not_feel_each_other():
         optimiser.step()
     assert torch.allclose(three[:1], alone.detach(), atol=1e-3)
     assert not torch.allclose(three[0], three[1], atol=1e-2)
+
+
+def test_each_member_of_an_ensemble_leaves_out_another_fifth():
+    """A row that is changed changes all members but a fifth, and these by nothing."""
+    x = torch.linspace(-1, 1, 20)[:, None]
+    y = torch.sin(3 * x)
+    settings = FsvgdSettings(particles=10, steps=30, hidden=(8,), learn_noise=False)
+    before = deep_ensemble(x, y, UNIT, settings).networks.parameters
+    blind = torch.zeros(10)
+    for row in range(20):
+        spoilt = y.clone()
+        spoilt[row] += 5.0
+        after = deep_ensemble(x, spoilt, UNIT, settings).networks.parameters
+        same = (after == before).all(dim=1)
+        assert int(same.sum()) == 2
+        blind += same
+    assert blind.tolist() == [4.0] * 10
+
+
+def test_noise_of_an_ensemble_is_that_of_rows_that_were_not_seen():
+    """Networks wide enough to follow every row: in the sample they leave next to nothing."""
+    x = torch.linspace(-1, 1, 40)[:, None]
+    clean = torch.sin(3 * x)
+    y = clean + 0.2 * torch.randn(x.shape, generator=generator(3))
+    settings = FsvgdSettings(particles=10, steps=4000, hidden=(64, 64), weight_decay=0.0, noise_std=0.05)
+    found = deep_ensemble(x, y, UNIT, settings)
+    seen = float((found.networks.predict(x).mean - y).std())
+    assert seen < 0.15
+    new = clean + 0.2 * torch.randn(x.shape, generator=generator(4))
+    assert calibration_error(found.predict(x), new) < 0.1
+    assert (
+        negative_log_likelihood(found.predict(x), new) < negative_log_likelihood(found.networks.predict(x), new) - 0.3
+    )
 
 
 def test_the_same_seed_gives_the_same_model():
