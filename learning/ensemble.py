@@ -1,7 +1,8 @@
 """A deep ensemble: networks that differ by their start (Lakshminarayanan et al. 2017), the plainest baseline.
 
-Each also leaves out another fifth of the rows, so that there are errors of rows that were not seen. They tell the noise
-and how much the networks' disagreement counts; what networks that may follow every row leave of these says nothing.
+Each also leaves out another fifth of the rows (more where there are fewer than ten networks), so that there are errors
+of rows that were not seen. They tell the noise and how much the networks' disagreement counts; what networks that may
+follow every row leave of these says nothing.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from learning.evaluation import Mixture
-from learning.fsvgd import FsvgdSettings, Posterior, fit
+from learning.fsvgd import FsvgdSettings, Posterior, check_rows, fit
 from learning.normaliser import Normaliser
 from learning.outliers import output_correlation, turn_of
 from learning.residuals import Residuals, residuals
@@ -21,7 +22,7 @@ from learning.ridge import Ridge
 
 FOLDS = 5
 LEAST_ROWS = 5
-"""Fewer rows are seen by all networks, and noise is that which the networks learned."""
+"""Fewer rows, or those of fewer than four networks, are seen by all, and noise is that which the networks learned."""
 SHARES = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Of the networks' variance, what may count as doubt: their mean is nearer to the truth than each of them is."""
 ROUNDS = 40
@@ -36,8 +37,8 @@ class Ensemble:
     Attributes:
         networks: fitted one by one, in outputs that are turned so that errors are nearly independent.
         noise: standard deviation of these (O,), and
-        share: of the networks' variance, beside which it stands; none where rows were too few to leave any out.
-        left: distribution of errors in units of both.
+        share: of the networks' variance, beside which it stands.
+        left: distribution of errors in units of both; it and the noise are none where no rows were left out.
     """
 
     networks: Posterior
@@ -46,7 +47,7 @@ class Ensemble:
     left: Residuals | None = None
 
     def predict(self, inputs: Tensor) -> Mixture:
-        """Prediction at inputs (N, D)."""
+        """Prediction at raw inputs (N, D), in raw units."""
         found = self.networks.predict(inputs)
         if self.noise is None or self.left is None:
             return found.smoothed()
@@ -68,7 +69,12 @@ def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, setti
         outputs: (n, O).
         normaliser: of both.
         settings: of the fit; kernel and preconditioning are left out.
+
+    Raises:
+        DataError: there is no data, rows of inputs and outputs differ in number, or numbers are missing or infinite.
+        DivergedError: the networks diverged.
     """
+    check_rows(inputs, outputs)
     alone, count = replace(settings, together=False), len(inputs)
     folds = min(FOLDS, settings.particles // 2)
     if count < LEAST_ROWS or folds < 2:

@@ -193,6 +193,18 @@ class Posterior:
         return Posterior(self.network, *own, self.freedom, *rest)
 
 
+def check_rows(inputs: Tensor, outputs: Tensor, *others: Tensor) -> None:
+    """Refuse rows of inputs (n, D) and outputs (n, O), and other inputs, that nothing can be fitted to.
+
+    Raises:
+        DataError: rows of inputs and outputs differ in number, or numbers are missing or infinite.
+    """
+    if len(outputs) != len(inputs):
+        raise DataError(f"There are {len(inputs)} rows of inputs and {len(outputs)} of outputs; each row needs both.")
+    if not all(bool(torch.isfinite(given).all()) for given in (inputs, outputs, *others)):
+        raise DataError("The data holds numbers that are missing or infinite; leave those rows out and fit again.")
+
+
 def reach_of(seen: Tensor) -> Tensor:
     """How far out each input counts (D,) where normalised inputs (..., D) were learned from."""
     return seen.abs().flatten(0, -2).amax(dim=0).clamp_min(EDGE)
@@ -241,7 +253,8 @@ def fit(
         settings: how.
         progress: told the number of steps done, from time to time.
         held_out: raw inputs and outputs of rows that choose the step whose particles are kept.
-        seen_by: whether each particle sees each row (L, n); all see all unless given.
+        seen_by: whether each particle sees each row (L, n), of particles that do not feel each other; all see all
+            unless given.
 
     Raises:
         DataError: there is nothing to fit, or numbers are missing or infinite; says what to do.
@@ -249,10 +262,7 @@ def fit(
     count = len(inputs)
     if count == 0 and prior is None:
         raise DataError("There is neither data nor a prior to fit; record an episode, or name a car file as the prior.")
-    if len(outputs) != count:
-        raise DataError(f"There are {count} rows of inputs and {len(outputs)} of outputs; each row needs both.")
-    if not (torch.isfinite(inputs).all() and torch.isfinite(outputs).all() and torch.isfinite(pool).all()):
-        raise DataError("The data holds numbers that are missing or infinite; leave those rows out and fit again.")
+    check_rows(inputs, outputs, pool)
     device = pool.device
     generator = torch.Generator().manual_seed(settings.seed)
     width = len(normaliser.output_mean)
@@ -358,4 +368,13 @@ def _step(
     state.optimiser.step()
 
 
-__all__ = ["FsvgdSettings", "FunctionPrior", "GaussianProcessPrior", "Posterior", "SimulatorPrior", "fit", "reach_of"]
+__all__ = [
+    "FsvgdSettings",
+    "FunctionPrior",
+    "GaussianProcessPrior",
+    "Posterior",
+    "SimulatorPrior",
+    "check_rows",
+    "fit",
+    "reach_of",
+]

@@ -125,7 +125,7 @@ def turn_of(correlation: Tensor, size: Tensor) -> Tensor:
 
 
 def student_weights(surprise: Tensor, outputs: int) -> tuple[float, Tensor]:
-    """The fewest degrees of freedom that none larger beats by a nat in likelihood, and the weight of each row.
+    """Degrees of freedom, and the weight of each row; lighter tails are believed if they beat heavier ones by a nat.
 
     Args:
         surprise: squared, summed over outputs (n,).

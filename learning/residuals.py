@@ -20,8 +20,10 @@ from learning.outliers import FREEDOMS, joint_surprise, log_student, output_corr
 ROUNDS = 60
 """Of expectation maximisation of one scale."""
 LEAST_FREEDOM = FREEDOMS[0]
+LEAST_SCALE, LEAST_SHARE = 1e-9, 1e-3
+"""Of an output's errors, in its units and of their mean size: it may be constant in the rows."""
 MARGIN = 1.0
-"""In nats, by which heavier tails are beaten by lighter ones before these are believed."""
+"""In nats of all rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +76,14 @@ def residuals(
     """The Student distribution that errors are most likely of.
 
     Correlations and the outputs' scales against each other are those of ``outliers.output_correlation``; one scale for
-    all and the degrees of freedom are those of the greatest likelihood, the fewest that none larger beats by
-    ``MARGIN``. Few rows tell a scale poorly: there are never more degrees of freedom than rows that are not spent (of
-    a normal distribution with unknown variance, the prediction is Student's; Gelman et al., "Bayesian Data Analysis",
-    3rd edition, section 3.2).
+    all and the degrees of freedom are those of the greatest likelihood, where lighter tails are believed if they beat
+    by ``MARGIN`` what was believed before. Few rows tell a scale poorly: there are no more degrees of freedom than rows
+    that are not spent, expected ones among them, but two and a half at least (of a normal distribution with unknown
+    variance, the prediction is Student's; Gelman et al., "Bayesian Data Analysis", 3rd edition, section 3.2).
 
     Args:
         errors: (n, O).
-        expected_std: standard deviation that is expected (O,); nothing unless given.
+        expected_std: standard deviation that is expected (O,), positive; nothing unless given.
         expected_rows: rows for which it counts.
         spent: rows that the fit of the mean has used up, such as its parameters divided by the outputs.
 
@@ -93,10 +95,11 @@ def residuals(
         raise DataError("What a model leaves must be finite and of one row at least; check its inputs.")
     errors = errors.double()
     believed = 0.0 if expected_std is None else expected_rows
-    unit = errors.square().mean(dim=0).sqrt().clamp_min(1e-12) if expected_std is None else expected_std.double()
+    unit = errors.square().mean(dim=0).sqrt() if expected_std is None else expected_std.double()
+    unit = unit.clamp_min(LEAST_SCALE)
     correlation, width = output_correlation(errors / unit)
     # What is expected keeps the scales of a few rows from nothing.
-    width = unit * ((count * width**2 + believed) / (count + believed)).sqrt()
+    width = unit * ((count * width**2 + believed) / (count + believed)).sqrt().clamp_min(LEAST_SHARE)
     square = joint_surprise(errors / width, correlation)
     of_expected = 0.0 if expected_std is None else float((unit / width).square().sum())
     left = max(count - spent, 0.0)
@@ -120,7 +123,7 @@ def _scale(square: Tensor, outputs: int, freedom: float, believed: float, of_exp
     for _ in range(ROUNDS):
         weight = 1.0 if math.isinf(freedom) else (freedom + outputs) / (freedom + square / scale_square)
         told = float((weight * square).sum()) + believed * of_expected
-        scale_square = max(told / (rows * outputs), 1e-18)
+        scale_square = max(told / (rows * outputs), LEAST_SHARE**2)
     return math.sqrt(scale_square)
 
 

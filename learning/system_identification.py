@@ -116,8 +116,8 @@ def identify(model: DomainModel, inputs: Tensor, outputs: Tensor, noise_std: Ten
     starts = torch.where(free, (drawn - middle) / width.clamp_min(1e-9), 0.0)
     with torch.no_grad():
         first = torch.nan_to_num(apart(starts), nan=torch.inf)
-    offsets = _descended(apart, starts[first.argsort()[:STARTS]], free, STEPS, LEARNING_RATE)
-    best = _best(apart, offsets)
+    starts = starts[first.argsort()[:STARTS]]
+    best = _best(apart, starts, _descended(apart, starts, free, STEPS, LEARNING_RATE))
     # Each output pays for its share of the fitted parameters.
     spent = float(free.sum()) / outputs.shape[1]
 
@@ -133,7 +133,7 @@ def identify(model: DomainModel, inputs: Tensor, outputs: Tensor, noise_std: Ten
             square = left.surprise(off(offsets))
             return unlikely(offsets) - log_student(square, outputs.shape[1], left.freedom).sum(dim=1)
 
-        best = _best(together, _descended(together, best[None], free, ROUND_STEPS, ROUND_RATE))
+        best = _best(together, best[None], _descended(together, best[None], free, ROUND_STEPS, ROUND_RATE))
         left = left_at(best)
     return Identified(model, (middle + width * best).detach(), left.to(outputs))
 
@@ -153,8 +153,9 @@ def _descended(
     return offsets.detach()
 
 
-def _best(losses: Callable[[Tensor], Tensor], offsets: Tensor) -> Tensor:
-    """The one (K,) of the least loss."""
+def _best(losses: Callable[[Tensor], Tensor], starts: Tensor, ends: Tensor) -> Tensor:
+    """The one (K,) of the least loss; where a way down ends in what cannot be computed, its start may be."""
+    offsets = torch.cat([starts, ends])
     with torch.no_grad():
         last = torch.nan_to_num(losses(offsets), nan=torch.inf)
     if not torch.isfinite(last).any():

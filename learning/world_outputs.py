@@ -17,11 +17,13 @@ LEAST_STD = 1e-6
 
 
 def seven_outputs(prediction: Mixture, velocity_mps: Tensor, yaw_rad: Tensor) -> Mixture:
-    """The same components with the exact mean and variance of each of the seven outputs, as independent Gaussians.
+    """The same components with the mean and variance of each of the seven outputs, as independent Gaussians.
+
+    Both are exact where the six outputs err independently; what two outputs err alike is left out.
 
     Args:
-        prediction: changes of the six ``transitions.OUTPUTS`` over a step, of components (L, N, 6) independent in each;
-            of Student's distributions several Gaussians each.
+        prediction: changes of the six ``transitions.OUTPUTS`` over a step, of components (L, N, 6); of Student's
+            distributions several Gaussians each.
         velocity_mps: vx, vy along the body at the step's start (N, 2).
         yaw_rad: there (N,).
 

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from carlab.core.quantities import FloatArray
 
@@ -23,3 +24,16 @@ def difference(a_rad: Any, b_rad: Any) -> Any:
 def circular_mean(angles_rad: FloatArray) -> float:
     """Direction of the mean unit vector of NumPy angles, shape (n,)."""
     return float(np.arctan2(np.mean(np.sin(angles_rad)), np.mean(np.cos(angles_rad))))
+
+
+def on_one_branch(measured_rad: FloatArray, starts: ArrayLike, foretold_rad: FloatArray) -> tuple[FloatArray, ...]:
+    """A measured angle (n,) without jumps, and predictions of it (B, N) on the branch where each begins.
+
+    Args:
+        measured_rad: over the ticks (n,).
+        starts: tick of the first angle of each prediction (B,).
+        foretold_rad: without jumps (B, N).
+    """
+    whole = np.unwrap(measured_rad)
+    turns = np.round((whole[np.asarray(starts, dtype=int)] - foretold_rad[:, 0]) / (2.0 * np.pi))
+    return whole, foretold_rad + 2.0 * np.pi * turns[:, None]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from carlab.core.angles import on_one_branch
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import STATE_NAMES
 from carlab.core.task import ParkingTask
@@ -85,14 +86,13 @@ def _plan(axis: Any, episode: EpisodeData, foretold: Foretold, task: ParkingTask
 
 def _state(axis: Any, which: int, episode: EpisodeData, foretold: Foretold) -> None:
     """What was measured of one state, and what was foretold of it with twice its standard deviation."""
-    measured = episode.states[:, which]
-    measured = np.unwrap(measured) if STATE_NAMES[which] == "yaw" else measured
+    measured, told = episode.states[:, which], foretold.mean[..., which]
+    if STATE_NAMES[which] == "yaw" and len(told):
+        measured, told = on_one_branch(measured, foretold.ticks[:, 0], told)
     times_s = episode.times_s - episode.times_s[0]
     axis.plot(times_s, measured, color="black", linewidth=1.2)
-    for ticks, means, stds in zip(foretold.ticks, foretold.mean[..., which], foretold.std[..., which], strict=True):
-        mean, at_s = means.copy(), times_s[ticks]
-        if STATE_NAMES[which] == "yaw":
-            mean += 2.0 * np.pi * np.round((measured[ticks[0]] - mean[0]) / (2.0 * np.pi))
+    for ticks, mean, stds in zip(foretold.ticks, told, foretold.std[..., which], strict=True):
+        at_s = times_s[ticks]
         axis.plot(at_s, mean, color="tab:orange", linewidth=1.2)
         axis.fill_between(at_s, mean - 2.0 * stds, mean + 2.0 * stds, color="tab:orange", alpha=0.25, linewidth=0)
     axis.set_title(f"{STATE_NAMES[which].replace('_', ' ')} [{UNITS[which]}]", fontsize=9)

@@ -133,7 +133,10 @@ def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
         count = min(c.episodes[-1].episode for c in own)
         returns = np.array([_by_number(c, "total_reward", count) for c in own])
         known = np.isfinite(returns).sum(axis=0)
-        spread = np.nanstd(returns, axis=0, ddof=1) / np.sqrt(known) if known.min() > 1 else np.full(count, np.nan)
+        several, spread = known > 1, np.full(count, np.nan)
+        spread[several] = np.nanstd(returns[:, several], axis=0, ddof=1) / np.sqrt(known[several])
+        middle = np.full(count, np.nan)
+        middle[known > 0] = np.nanmean(returns[:, known > 0], axis=0)
         first = tuple(c.first_parked for c in own)
         parked = [[e.parked for e in c.episodes[-LAST:]] for c in own]
         seconds = [[e.model_seconds + e.policy_seconds for e in c.episodes] for c in own]
@@ -142,7 +145,7 @@ def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
                 method, len(own), count, first,
                 float(np.median([np.inf if f is None else f for f in first])),
                 float(np.mean([np.mean(p) for p in parked])),
-                tuple(np.nanmean(returns, axis=0).tolist()), tuple(spread.tolist()),
+                tuple(middle.tolist()), tuple(spread.tolist()),
                 float(np.mean([np.mean(s) for s in seconds])), float(np.mean([np.sum(s) for s in seconds])) / 60.0,
             )
         )  # fmt: skip
@@ -195,9 +198,11 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
         colour = line.get_color()
         reward.fill_between(numbers, mean - error, mean + error, alpha=0.25, color=colour, linewidth=0)
         metres = np.array([_by_number(c, "distance_m", row.episodes) for c in own])
-        distance.plot(numbers, np.nanmedian(metres, axis=0), color=colour, marker="o", markersize=3)
+        known = np.isfinite(metres).any(axis=0)
+        metres, driven = metres[:, known], numbers[known]
+        distance.plot(driven, np.nanmedian(metres, axis=0), color=colour, marker="o", markersize=3)
         least, most = np.nanmin(metres, axis=0), np.nanmax(metres, axis=0)
-        distance.fill_between(numbers, least, most, alpha=0.15, color=colour, linewidth=0)
+        distance.fill_between(driven, least, most, alpha=0.15, color=colour, linewidth=0)
         for curve in own:
             height = -len(ticks)
             ticks.append(height)

@@ -195,7 +195,7 @@ class _Task:
         )  # fmt: skip
 
     def ensemble(self) -> Model:
-        """Networks that differ by their start."""
+        """Networks that differ by their start and by the rows that they leave out."""
         return deep_ensemble(self.data.inputs, self.data.outputs, self.normaliser, self.settings())
 
     def ridge(self) -> Model:

@@ -149,11 +149,11 @@ def train(
         nll, off = before.surprise(last)
         figures |= {"last_episode_nll": nll, "last_episode_calibration_error": off}
 
+    began_s = clock.now_s()
     if len(recordings) == EPISODES_TO_TELL_HISTORY:
         tell("how many past commands count", 0, 1)
         asked = find_history(usable)
         figures |= {} if asked is None else {"history_asked": asked.history, "history_words": asked.words()}
-    began_s = clock.now_s()
     seed = plan.seed + 1000 * number
     dynamics = _fitted(plan, model, usable, rows, before, seed, tell)
     figures["model_seconds"] = clock.now_s() - began_s

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
+from carlab.core.angles import on_one_branch
 from carlab.core.errors import DataError
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.recording.drained_file import DrainedFile
@@ -60,9 +61,12 @@ def write_learning_curve(
             places, doubts = mean[..., :2].reshape(-1, 2), 2.0 * std[..., :2].reshape(-1, 2)
             stream.log("plan/foretold/doubt", rr.Ellipses2D(centers=places, half_sizes=doubts))
             for k, name in enumerate(STATE_NAMES):
-                _series(stream, f"states/{name}/measured", before + np.arange(len(states)), states[:, k : k + 1])
+                measured, told = states[:, k], mean[..., k]
+                if name == "yaw" and len(ticks):
+                    measured, told = on_one_branch(measured, ticks[:, 0], told)
+                _series(stream, f"states/{name}/measured", before + np.arange(len(states)), measured[:, None])
                 if len(ticks):
-                    middle, width = mean[:, 1:, k].ravel(), 2.0 * std[:, 1:, k].ravel()
+                    middle, width = told[:, 1:].ravel(), 2.0 * std[:, 1:, k].ravel()
                     band = np.stack([middle, middle - width, middle + width], axis=1)
                     _series(stream, f"states/{name}/foretold", before + ticks[:, 1:].ravel(), band)
             before += len(states)

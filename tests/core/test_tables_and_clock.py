@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import circmean
 
-from carlab.core.angles import circular_mean, difference, wrap
+from carlab.core.angles import circular_mean, difference, on_one_branch, wrap
 from carlab.core.clock import MonotonicClock, Pacer, SimulatedClock
 from carlab.core.errors import ConfigError
 from carlab.core.tables import from_table
@@ -99,3 +99,12 @@ def test_difference_goes_the_short_way() -> None:
 def test_circular_mean_agrees_with_scipy(rng: np.random.Generator) -> None:
     angles = rng.normal(math.pi, 0.4, 500)
     assert circular_mean(angles) == pytest.approx(circmean(angles, high=math.pi, low=-math.pi), abs=1e-9)
+
+
+def test_predictions_of_an_angle_are_laid_on_the_branch_of_what_was_measured():
+    true = np.linspace(2.5, 10.0, 76)
+    starts = [0, 30, 60]
+    foretold = np.stack([wrap(true[k]) + (true[k : k + 10] - true[k]) for k in starts])
+    whole, told = on_one_branch(wrap(true), starts, foretold)
+    assert whole == pytest.approx(true)
+    assert told == pytest.approx(np.stack([true[k : k + 10] for k in starts]))

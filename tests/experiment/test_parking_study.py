@@ -66,7 +66,23 @@ def test_an_episode_without_a_row_shifts_no_other(tmp_path: Path) -> None:
     (found,) = summarised(curves)
     assert found.episodes == 3
     assert np.allclose(found.mean_return, [12.0, 22.0, 32.0])
-    assert math.isnan(found.return_standard_error[0]), "of one run there is none in episode 2"
+    assert math.isnan(found.return_standard_error[1]), "of one run there is none in episode 2"
+    # Of 10 and 14, and of 30 and 34: a standard deviation of the square root of 8, of two runs.
+    assert np.allclose([found.return_standard_error[k] for k in (0, 2)], 2.0)
+    draw(curves, tmp_path / "parking.png")
+
+
+def test_an_episode_that_no_run_has_is_left_out(tmp_path: Path) -> None:
+    folders = [made(tmp_path, "sim-fsvgd", seed, [10.0, 20.0, 30.0], {3}) for seed in (0, 1)]
+    for folder in folders:
+        whole = json.loads((folder / "learn.json").read_text())
+        left = [row for row in whole["episodes"] if row["episode"] != 2]
+        (folder / "learn.json").write_text(json.dumps({**whole, "episodes": left}))
+    curves = [read_curve(folder) for folder in folders]
+    (found,) = summarised(curves)
+    assert found.mean_return[0] == 10.0
+    assert found.mean_return[2] == 30.0
+    assert math.isnan(found.mean_return[1])
     draw(curves, tmp_path / "parking.png")
 
 

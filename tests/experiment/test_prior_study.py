@@ -79,8 +79,8 @@ def test_seven_outputs_in_the_world_are_scored_at_the_states_that_were_measured(
     left_over = residuals(torch.from_numpy(model.errors))
     rng, yaw = np.random.default_rng(0), before[:, 2:3]
 
-    def seven_drawn(std: FloatArray) -> FloatArray:
-        drawn = mean[:, None] + std * rng.normal(size=(len(mean), 20_000, 6))
+    def seven_drawn(factor: FloatArray) -> FloatArray:
+        drawn = mean[:, None] + rng.normal(size=(len(mean), 2000, 6)) @ factor.T
         ahead, left = drawn[..., 0], drawn[..., 1]
         moved = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
         turned, vx, vy = yaw + drawn[..., 2], before[:, 3:4] + drawn[..., 3], before[:, 4:5] + drawn[..., 4]
@@ -95,7 +95,7 @@ def test_seven_outputs_in_the_world_are_scored_at_the_states_that_were_measured(
     # Student's distribution as twenty Gaussians.
     each = []
     for scale in tail_scales(left_over.freedom, 20).numpy():
-        seven = seven_drawn(scale * left_over.scale.numpy())
+        seven = seven_drawn(scale * left_over.factor.numpy())
         each.append(norm.logpdf(truth, seven.mean(axis=1), seven.std(axis=1)).sum(axis=1))
     theirs = math.log(20.0) - logsumexp(each, axis=0).mean()
     assert score.nll_in_world == pytest.approx(theirs, abs=0.05)

@@ -44,9 +44,9 @@ def test_as_the_paper_tells_it_it_is_ahead_at_every_number_of_rows() -> None:
 @pytest.mark.parametrize(
     ("case", "limits"),
     [
-        ("1d", {2: 0.55}),
-        ("pendulum", {5: -6.0, 50: -6.7}),
-        ("racecar", {20: -9.5, 100: -10.5, 400: -12.0}),
+        ("1d", {2: 0.0}),
+        ("pendulum", {5: -6.0, 50: -7.0}),
+        ("racecar", {20: -15.0, 100: -24.0, 400: -26.0}),
     ],
 )
 def test_on_the_authors_arrays(shared: Path, case: str, limits: dict[int, float]) -> None:
@@ -56,7 +56,7 @@ def test_on_the_authors_arrays(shared: Path, case: str, limits: dict[int, float]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "limit"), [(50, -15.5), (200, -17.3), (800, -18.2)])
+@pytest.mark.parametrize(("count", "limit"), [(50, -22.0), (200, -24.3), (800, -24.9)])
 def test_on_a_real_car(shared: Path, count: int, limit: float) -> None:
     folder = shared / "data" / "eth_rc_car"
     recordings = [import_csv(folder / f"train_{k}.csv.gz").episodes for k in (1, 2)]
@@ -64,5 +64,5 @@ def test_on_a_real_car(shared: Path, count: int, limit: float) -> None:
     scores = list(run_study(case, rows=(count,), seeds=3, methods=(OURS, "ridge"), data=folder, steps=4000))
     told = means(scores)
     assert told[OURS, count] <= limit
-    assert told[OURS, count] <= told["ridge", count] - 0.5
+    assert told[OURS, count] <= told["ridge", count] - 2.0
     assert means(scores, "calibration")[OURS, count] <= 0.05

@@ -20,6 +20,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import feature_size
 from carlab.core.task import ParkingTask, PathTask
 from carlab.experiment.regression_study import METHODS, Way, run_study
+from learning import system_identification
 from learning.authors_fsvgd import fit_authors_fsvgd
 from learning.car_dynamics import CarDynamics
 from learning.car_fit import CarFitSettings, fit_car, load_car, save_car
@@ -198,7 +199,9 @@ def test_particles_as_the_authors_fit_them(device: str, natural: bool, together:
     close(there.noise_std, here.noise_std)
 
 
-def test_identification(device: str) -> None:
+def test_identification(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("STEPS", "ROUND_STEPS"):
+        monkeypatch.setattr(system_identification, name, 50)
     inputs, outputs = pendulum()
     pool = TRUE.inputs(40, torch.Generator().manual_seed(4))
 
@@ -346,7 +349,9 @@ def test_a_gradient_step_is_that_of_the_cpu(device: str) -> None:
 
 
 @pytest.mark.parametrize("way", ["ours", "authors"])
-def test_a_regression_study(device: str, way: Way) -> None:
+def test_a_regression_study(device: str, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("STEPS", "ROUND_STEPS"):
+        monkeypatch.setattr(system_identification, name, 20)
     there = None
     for there, here in zip(
         *(run_study("pendulum", rows=(5,), seeds=1, way=way, steps=10, device=at) for at in (device, "cpu")),

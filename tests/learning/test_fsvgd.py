@@ -161,3 +161,12 @@ def test_the_same_seed_gives_the_same_model():
 def test_what_cannot_be_fitted_is_said(inputs, outputs, prior, said):
     with pytest.raises(DataError, match=said):
         fit(inputs, outputs, torch.ones(4, 1), prior, UNIT, FsvgdSettings(steps=1))
+
+
+def test_an_ensemble_refuses_rows_that_are_not_whole():
+    x = torch.linspace(-1, 1, 20)[:, None]
+    settings = FsvgdSettings(steps=5, hidden=(8,))
+    with pytest.raises(DataError, match="missing or infinite"):
+        deep_ensemble(x, torch.where(x > 0.9, torch.nan, x), UNIT, settings)
+    with pytest.raises(DataError, match="each row needs both"):
+        deep_ensemble(x, x[:10], UNIT, settings)

@@ -69,3 +69,11 @@ def test_nothing_and_numbers_that_are_missing_are_refused():
     for bad in (torch.zeros((0, 2)), torch.full((4, 2), math.nan)):
         with pytest.raises(DataError, match="finite and of one row"):
             residuals(bad)
+
+
+def test_an_output_that_is_constant_keeps_a_width():
+    errors = torch.cat([drawn(50, 1e9), torch.zeros((50, 1)).double()], dim=1)
+    for found in (residuals(errors), residuals(torch.zeros((5, 2)).double())):
+        assert torch.isfinite(found.turn).all()
+        assert float(found.scale.min()) >= 0.99e-15
+    assert residuals(errors).scale[:3].numpy() == pytest.approx(SIZE, rel=0.4)

@@ -72,6 +72,29 @@ def test_rows_that_something_spoilt_do_not_pull_at_the_parameters():
     assert float(found.left.scale.max()) < 0.03
 
 
+class Edged:
+    """A line through nothing whose simulator breaks down beyond a slope of one."""
+
+    size = 1
+
+    def parameters(self, normal):
+        return 0.5 + 0.3 * normal
+
+    def __call__(self, inputs, parameters):
+        slope = parameters[:, None, :]
+        return torch.where(slope > 1.0, torch.nan, slope * inputs[None])
+
+
+def test_a_way_down_that_ends_where_the_simulator_breaks_down_takes_nothing_away():
+    """Rows that were spoilt hold least squares back from the edge; errors with tails lead over it."""
+    x = torch.linspace(-1, 1, 60)[:, None]
+    y = 1.02 * x + 0.02 * torch.randn(x.shape, generator=generator(2))
+    y[::8] -= 0.8 * x[::8].sign()
+    found = identify(Edged(), x, y, torch.tensor([0.02]))
+    assert 0.8 < float(found.parameters) <= 1.0
+    assert torch.isfinite(found.left.factor).all()
+
+
 def test_errors_that_vary_together_are_found_to():
     """The second output's noise is nine tenths of the first's: what a likelihood gains by it is the closed form's."""
     inputs, outputs, _ = pendulum(800, 0.0)
