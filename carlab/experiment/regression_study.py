@@ -138,7 +138,7 @@ class _Task:
         self,
         simulator: DomainModel | None,
         outputs: Tensor,
-        expected_gap: float | None,
+        expected_gap: float | tuple[float, ...] | None,
         noise_std: tuple[float, ...] | None = None,
     ) -> Particles:
         """Our way: particles led to what data, simulator and gap say together."""
@@ -146,7 +146,7 @@ class _Task:
         noise = self.noise_std if noise_std is None else torch.tensor(noise_std).to(self.noise_std)
         generator = torch.Generator().manual_seed(30_000 + self.seed)
         normaliser = self.normaliser
-        gap = None if expected_gap is None else expected_gap * normaliser.output_std
+        gap = None if expected_gap is None else torch.tensor(expected_gap).to(noise) * normaliser.output_std
         posterior = infer(
             simulator, self.data.inputs, outputs, normaliser, noise, gap_std=gap, with_gap=gap is not None,
             noise_known=noise_std is not None or not case.learn_noise, seed=self.seed,
