@@ -65,8 +65,7 @@ class Case:
         gap_std: of the Gaussian process between simulator and reality (O,), raw; none where the simulator is right.
         gap_lengthscale: of that process on raw inputs.
         function_lengthscale: of the Gaussian-process prior of FSVGD and of a grey box, on normalised inputs.
-        expected_gap: what our way expects the simulator to be wrong by, in units of the outputs, of all or of each
-            (O,); None: it is right.
+        expected_gap: what our way expects the simulator to be wrong by, in units of the outputs; None: it is right.
         ours: the same case as our way sees it, where that is in other coordinates.
         in_body_frame: whether rows are turned and moved into the frame of the step's start.
     """
@@ -84,7 +83,7 @@ class Case:
     gap_std: tuple[float, ...] | None
     gap_lengthscale: float
     function_lengthscale: float
-    expected_gap: float | tuple[float, ...] | None = 0.3
+    expected_gap: float | None = 0.3
     ours: Case | None = None
     in_body_frame: bool = False
 
@@ -92,6 +91,10 @@ class Case:
     def expected_noise_std(self) -> tuple[float, ...]:
         """Twice the noise of the sensor, which is known, and no less than half a per cent of the output's unit."""
         return tuple(max(2.0 * n, LEAST_NOISE * o) for n, o in zip(self.noise_std, self.output_std, strict=True))
+
+    def gap_from(self, count: int) -> float | tuple[float, ...] | None:
+        """Expected size of the gap with so many rows, in units of all outputs or of each (O,); None: there is none."""
+        return self.expected_gap
 
     @property
     def normaliser(self) -> Normaliser:

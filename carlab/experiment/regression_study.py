@@ -161,7 +161,7 @@ class _Task:
         if self.way == "ours":
             if gap and case.process is not None:
                 return self.inferred(case.process, self.data.outputs, None, case.noise_std)
-            return self.inferred(case.prior, self.data.outputs, case.expected_gap if gap else None)
+            return self.inferred(case.prior, self.data.outputs, case.gap_from(len(self.data.inputs)) if gap else None)
         pool, generator = self.pool(), torch.Generator().manual_seed(30_000 + self.seed)
         everything = torch.cat([self.data.inputs, pool])
         with torch.no_grad():
@@ -186,9 +186,10 @@ class _Task:
         """The same and particles for what it leaves."""
         simulator = self.sysid()
         if self.way == "ours":
+            expected = self.case.gap_from(len(self.data.inputs)) or LEAST_GAP
             with torch.no_grad():
                 left = self.data.outputs - simulator.mean(self.data.inputs)
-            return GreyBox(simulator, self.inferred(None, left, self.case.expected_gap or LEAST_GAP))
+            return GreyBox(simulator, self.inferred(None, left, expected))
         return grey_box(
             simulator, self.data.inputs, self.data.outputs, self.pool(), self.function_prior(), self.normaliser,
             self.settings(),

@@ -114,6 +114,22 @@ def test_no_row_that_is_held_out_is_learned_from() -> None:
         }
 
 
+def test_few_rows_expect_little_of_the_gap_and_of_steps_less_than_of_velocities(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case: RecordedCase = recorded_case([[drive(1, 480)], [drive(2)]], Path("rc_car"), HISTORY)
+    asked: list[torch.Tensor] = []
+
+    def spied(*args: object, gap_std: torch.Tensor, **options: object) -> None:
+        asked.append(gap_std / torch.tensor(case.output_std))
+        raise DataError("Enough.")
+
+    monkeypatch.setattr(regression_study, "infer", spied)
+    few, many = 100, 450
+    list(run_study(case, rows=(few, many), seeds=1, methods=("Sim-FSVGD", "GreyBox"), data=Path()))
+    assert [a.tolist() for a in asked] == [pytest.approx([0.03] * 3 + [0.1] * 3)] * 2 + [pytest.approx([0.3] * 6)] * 2
+
+
 def test_nothing_but_the_scores_depends_on_what_is_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """History, units, ranges and delays are those of the other recordings, whatever is held out."""
     asked: list[int] = []
