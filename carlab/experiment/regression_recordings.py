@@ -29,11 +29,12 @@ LEAST_UNIT = 1e-3
 COUNTS = (50, 200, 800)
 DELAY_S = (0.0, 0.2)
 SMALL_GAP, FEW_ROWS = (0.03,) * 3 + (0.1,) * 3, 400
-"""What is expected of the gap with fewer rows than these: of steps, and of the velocities at their ends. A step is a
-velocity's integral over a short time and hardly wrong itself. Against 0.3 for all fifty rows told too little (of
-train_1 of the ETH car two thirds to learn from, the last to judge by: 0.9 nats over six draws of 50 rows, 0.2 over three of
-200). Many rows tell by themselves, and from small gaps the search may take one for noise: of two draws of 800 rows of
-train_1 one lost 0.3 nats on the others."""
+"""What is expected of the gap with fewer rows than these: of steps, and of the velocities at their ends.
+
+A step is a velocity's integral over a short time and hardly wrong itself. Against 0.3 for all, fifty rows told too
+little: of train_1 of the ETH car, two thirds to learn from and the last to judge by, 0.9 nats over six draws of 50 rows
+and 0.2 over three of 200. Many rows tell by themselves, and from small gaps the search may take one for noise: of two
+draws of 800 rows of train_1 one lost 0.3 nats on the others."""
 
 
 @dataclass(frozen=True, slots=True)
