@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.cli.console import console, fail, progress, table
-from carlab.core.errors import DataError
 
 if TYPE_CHECKING:
     from carlab.cli.bench import Bench
@@ -28,19 +25,9 @@ def command() -> str:
 
 def write_figures(path: Path, figures: Mapping[str, Any]) -> None:
     """Write a JSON file whole, or leave the one that is there; DataError where that fails."""
-    from carlab.recording.sink import describe_os_error, partial_path
+    from carlab.recording.whole_files import write_text
 
-    partial = partial_path(path)
-    try:
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(json.dumps(figures, indent=2) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        with suppress(OSError):
-            partial.unlink()
-        raise DataError(describe_os_error(error, path)) from error
+    write_text(path, json.dumps(figures, indent=2) + "\n")
 
 
 def followed(study: Callable[[Progress], Iterator[Score]], options: Bench, name: str) -> tuple[list[Score], bool]:

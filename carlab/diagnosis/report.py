@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,8 @@ import tomli_w
 from carlab.core.errors import DataError
 from carlab.diagnosis import report_text as text
 from carlab.diagnosis.findings import Diagnosis, Exhibits
-from carlab.recording.sink import describe_os_error, make_folder, partial_path
+from carlab.recording.sink import describe_os_error, make_folder
+from carlab.recording.whole_files import write_text
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.registry import REGISTRY
 
@@ -61,7 +60,7 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
     if exhibits.ladder:
         draw_picture(told, exhibits, folder / PICTURE_NAME)
     for name, content in texts.items():
-        _write_whole(folder / name, content)
+        write_text(folder / name, content)
 
 
 def completed(diagnosis: Diagnosis) -> Diagnosis:
@@ -122,17 +121,3 @@ def _rows(line: str) -> list[str]:
         else:
             rows.append(f"  {word}")
     return rows
-
-
-def _write_whole(path: Path, content: str) -> None:
-    partial = partial_path(path)
-    try:
-        with partial.open("w", encoding="utf-8", newline="\n") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        with suppress(OSError):
-            partial.unlink()
-        raise DataError(describe_os_error(error, path)) from error

@@ -14,25 +14,20 @@ Each held-out recording has entities of its own under ``/NAME`` and a tab of its
 from __future__ import annotations
 
 import math
-import os
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
 from carlab.diagnosis.report_figures import LABELS, MODELS, residual, restarts
 from carlab.diagnosis.report_text import number, verdict_sentence
 from carlab.recording import rerun_blueprint as look
-from carlab.recording.drained_file import DrainedFile
 from carlab.recording.rerun_columns import Columns, entity_part
-from carlab.recording.sink import describe_os_error, partial_path
+from carlab.recording.whole_files import rerun_file
 
-APPLICATION = "carlab"
 VERDICT = "verdict"
 COLORS = {"recorded": look.GREY, "nominal": look.ORANGE, "refit": look.VERMILION, "with_effects": look.SKY}
 CHANNELS = {"vx": 3, "vy": 4, "yaw_rate": 5}
@@ -45,33 +40,12 @@ def write_rrd(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
     Raises:
         DataError: it cannot be written.
     """
-    partial = partial_path(path)
-    file = DrainedFile(partial)
-    stream: rr.RecordingStream | None = None
-    try:
-        partial.unlink(missing_ok=True)
-        file.open()
-        parts = entity_names(exhibits)
-        stream = rr.RecordingStream(APPLICATION)
-        stream.save(file.start(), default_blueprint=_blueprint(parts, exhibits))
+    parts = entity_names(exhibits)
+    with rerun_file(path, blueprint=_blueprint(parts, exhibits)) as stream:
         stream.send_recording_name("Diagnosis")
         stream.log(VERDICT, rr.TextDocument(_verdict(diagnosis), media_type=rr.MediaType.MARKDOWN), static=True)
         for part, trace in zip(parts, exhibits.traces, strict=True):
             _send_trace(stream, part, trace, diagnosis)
-        stream.disconnect()
-        stream = None
-        file.close()
-        file.check()
-        os.replace(partial, path)
-    except OSError as error:
-        raise DataError(describe_os_error(error, path)) from error
-    finally:
-        if stream is not None:
-            with suppress(Exception):
-                stream.disconnect()
-        file.close()
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def entity_names(exhibits: Exhibits) -> list[str]:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
 from carlab.core.angles import on_one_branch
-from carlab.core.errors import DataError
 from carlab.core.quantities import STATE_NAMES, FloatArray
-from carlab.recording.drained_file import DrainedFile
-from carlab.recording.sink import describe_os_error, partial_path
-
-APPLICATION = "carlab"
+from carlab.recording.whole_files import rerun_file
 
 
 def write_learning_curve(
@@ -39,14 +33,7 @@ def write_learning_curve(
     Raises:
         DataError: it cannot be written; what was there stays.
     """
-    unfinished = partial_path(path)
-    file = DrainedFile(unfinished)
-    stream: rr.RecordingStream | None = None
-    try:
-        unfinished.unlink(missing_ok=True)
-        file.open()
-        stream = rr.RecordingStream(APPLICATION, recording_id=path.parent.name)
-        stream.save(file.start())
+    with rerun_file(path, recording_id=path.parent.name) as stream:
         texts = diagnoses or [""] * len(rows)
         before = 0
         for row, states, (ticks, mean, std), text in zip(rows, driven, foretold, texts, strict=True):
@@ -70,20 +57,6 @@ def write_learning_curve(
                     band = np.stack([middle, middle - width, middle + width], axis=1)
                     _series(stream, f"states/{name}/foretold", before + ticks[:, 1:].ravel(), band)
             before += len(states)
-        stream.disconnect()
-        stream = None
-        file.close()
-        file.check()
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise DataError(describe_os_error(error, path)) from error
-    finally:
-        if stream is not None:
-            with suppress(Exception):
-                stream.disconnect()
-        file.close()
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
 
 
 def _series(stream: rr.RecordingStream, entity: str, ticks: np.ndarray, values: FloatArray) -> None:
