@@ -55,11 +55,6 @@ class Residuals:
         white: Tensor = errors @ self.turn.to(errors).T
         return white.square().sum(dim=-1)
 
-    def widened(self, by: float | Tensor) -> Residuals:
-        """With every scale, or that of each output (O,), multiplied."""
-        factor = self.factor * (by[:, None] if isinstance(by, Tensor) else by)
-        return Residuals(factor, self.freedom)
-
     def about(self, means: Tensor) -> Mixture:
         """The same about each of the means (L, N, O) of a mixture."""
         one = torch.ones((1, 1, means.shape[2]), dtype=means.dtype, device=means.device)

@@ -14,27 +14,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tomli_w
 import torch
+from learning_runs import HISTORY, TICKS, drive, names, tiny_plan
 
 from carlab.cars import CarChoice, choose_car
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import EpisodeEnded, Tick
-from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import DataError, DivergedError
-from carlab.core.geofence import can_stop_inside
+from carlab.core.errors import DataError
 from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Reality
-from carlab.core.safety import SafetyEnvelope
-from carlab.core.task import ParkingTask
 from carlab.experiment import training
-from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator, taken_up
+from carlab.experiment.campaign import Campaign, CampaignHooks, taken_up
 from carlab.experiment.campaign_figures import EpisodeFigures
 from carlab.experiment.campaign_report import keep_row, learning_curve, restore_rows, write_report
-from carlab.experiment.session import EpisodeResult, Session, SessionHooks
-from carlab.experiment.training import PARKED_BONUS, TrainingPlan, recorded_features, train, train_beside
+from carlab.experiment.session import EpisodeResult, SessionHooks
+from carlab.experiment.training import TrainingPlan, recorded_features
 from carlab.recording.drained_file import DrainedFile
 from carlab.recording.learning_curve import write_learning_curve
 from carlab.recording.mcap_sink import McapSink
@@ -42,22 +38,11 @@ from carlab.recording.mcap_source import read_documents, read_episode
 from carlab.recording.recorder import Recorder
 from carlab.recording.run_directory import RunDirectory
 from drivers.emulators.command_log import read_log
-from learning import car_fit, model_env
+from learning import car_fit
 from learning.car_fit import load_car
 from learning.evaluation import negative_log_likelihood
-from learning.history import HistoryChoice
 from learning.sac_agent import SacAgent, SacPolicy, SacSettings
-from learning.simulator_model import CarModel
 from learning.transitions import transitions_of
-
-HISTORY = 2
-TICKS = 25
-ENVELOPE = SafetyEnvelope(arena_m=ParkingTask().arena_m)
-
-
-def tiny_plan(choice: CarChoice, **changes: Any) -> TrainingPlan:
-    text = tomli_w.dumps(prior_simulator(choice.simulator, "kinematic").to_tables())
-    return replace(TrainingPlan(text, HISTORY, model_steps=60, updates=32, threads=1), **changes)
 
 
 def listened_to(choice: CarChoice) -> list[Action]:
@@ -86,10 +71,6 @@ class Story:
     after_the_kill: list[str] = field(default_factory=list)
     said: str = ""
     first_model: bytes = b""
-
-
-def names(run: RunDirectory) -> list[str]:
-    return sorted(str(p.relative_to(run.path)) for f in (run.models, run.episodes) for p in f.iterdir())
 
 
 @pytest.fixture(scope="module")
@@ -396,104 +377,6 @@ def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.
         keep_row(story.run, story.figures[0])
 
 
-def test_the_model_is_told_by_how_much_recorded_velocities_are_late(
-    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A line through the poses of 50 ms, 100 of them a second, has its slope 25 ms ago."""
-    told: list[float] = []
-
-    def fitted(plan: TrainingPlan, model: CarModel, *rest: Any) -> None:
-        told.append(model.velocity_delay_s)
-        raise DataError("seen enough")
-
-    monkeypatch.setattr(training, "_fitted", fitted)
-    with pytest.raises(DataError, match="seen enough"):
-        train(story.plan, tmp_path / "none", [], ENVELOPE, lambda *what: None)
-    with pytest.raises(DataError, match="seen enough"):
-        train(story.plan, tmp_path / "some", story.run.recordings(), ENVELOPE, lambda *what: None)
-    episodes = [read_episode(path) for path in story.run.recordings()]
-    assert told == pytest.approx([0.025, 0.025], abs=1e-3)
-    late = replace(episodes[0], extra={"velocity_delay_s": np.array([0.01, 0.02, np.nan, 0.04])})
-    assert training.velocity_delay_s([late]) == 0.02
-    assert training.velocity_delay_s([replace(late, extra={})]) == 0.025, "of recordings that do not say"
-
-
-def test_after_three_episodes_it_is_found_how_many_commands_count(
-    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[int] = []
-
-    def find(episodes: list[EpisodeData]) -> HistoryChoice:
-        asked.append(len(episodes))
-        return HistoryChoice(6, {3: -1.0, 6: -2.0})
-
-    monkeypatch.setattr(training, "find_history", find)
-    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    recordings = [*story.run.recordings(), story.run.recordings()[0]]
-    found = [train(plan, tmp_path / str(n), recordings[:n], ENVELOPE, lambda *what: None) for n in (2, 3)]
-    assert asked == [3]
-    assert [f.get("history_asked") for f in found] == [None, 6]
-    assert "asks for 6 past commands" in found[1]["history_words"]
-
-
-def test_what_diverged_is_learned_again_with_smaller_steps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    rates: dict[str, list[float]] = {"model": [], "policy": []}
-    fit, teach = car_fit.fit_car, SacAgent.train
-    broken = {"model", "policy"}
-
-    def fit_car(rows: Any, model: Any, settings: Any, **others: Any) -> Any:
-        rates["model"].append(settings.learning_rate)
-        if len(rates["model"]) == 1:
-            raise DivergedError("The fit diverged.")
-        return fit(rows, model, settings, **others)
-
-    def taught(self: SacAgent, *arguments: Any) -> dict[str, float]:
-        rates["policy"].append(self._settings.learning_rate)
-        if len(rates["policy"]) == 1 or "always" in broken:
-            raise DivergedError("The policy diverged.")
-        return teach(self, *arguments)
-
-    monkeypatch.setattr(car_fit, "fit_car", fit_car)
-    monkeypatch.setattr(SacAgent, "train", taught)
-    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    (tmp_path / "models").mkdir()
-    train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
-    assert all(second == 0.25 * first for first, second in rates.values())
-    assert "The model diverged" in caplog.text
-    assert "The policy diverged" in caplog.text
-    broken.add("always")
-    (tmp_path / "other").mkdir()
-    with pytest.raises(DivergedError, match="with smaller steps as well") as error:
-        train(plan, tmp_path / "other", [], ENVELOPE, lambda *what: None)
-    assert "\n" not in str(error.value)
-    assert list((tmp_path / "other").iterdir()) == []
-
-
-def drive(folder: Path, ticks: int, start: CarState | None = None) -> RunDirectory:
-    """A run with one recording of so many ticks, of a car that somebody may have put somewhere."""
-
-    class Forward:
-        name = "forward"
-
-        def reset(self) -> None: ...
-
-        def act(self, view: PolicyInput) -> Action:
-            return Action(0.0, 0.3)
-
-    choice = choose_car("sim", seed=0)
-    run = RunDirectory.create(folder, "short")
-    with choice.car as car:
-        car.place(CarState() if start is None else start)
-        task = ParkingTask(history_length=HISTORY)
-        Session(
-            car, Forward(), task, ENVELOPE, run, choice.control_period_s, max_ticks=ticks, place=False,
-            record_rerun=False,
-        ).drive(1)  # fmt: skip
-    return run
-
-
 @pytest.mark.parametrize(("reality", "driven"), [(Reality.SIMULATED, 2), (Reality.REAL, 1)])
 def test_a_real_car_that_nobody_puts_at_its_start_drives_no_more_after_a_safety_stop(
     story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reality: Reality, driven: int
@@ -509,76 +392,9 @@ def test_a_real_car_that_nobody_puts_at_its_start_drives_no_more_after_a_safety_
     assert [r.reason.name for r in results] == ["GEOFENCE"] * driven
 
 
-def test_from_an_episode_that_is_too_short_nothing_is_learned_but_the_prior(tmp_path: Path) -> None:
-    run = drive(tmp_path, HISTORY)
-    told: list[str] = []
-    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    figures = train(plan, run.models, run.recordings(), ENVELOPE, lambda what, done, total: told.append(what))
-    assert figures["rows"] == 0
-    assert "last_episode_nll" not in figures
-    assert json.loads((run.models / "0002" / "training.json").read_text()) == figures
-    assert list(dict.fromkeys(told)) == ["reading the recordings", "learning the car", "learning to drive"]
-
-
-def test_the_learned_car_keeps_more_room_and_is_paid_for_standing_in_its_spot(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At 2 m/s the gate asks for 0.97 m; a policy that lives on just that is stopped as soon as the car slides more."""
-    made: list[model_env.ModelEnv] = []
-
-    class Kept(model_env.ModelEnv):
-        def __init__(self, *arguments: Any, **options: Any) -> None:
-            super().__init__(*arguments, **options)
-            made.append(self)
-
-    monkeypatch.setattr(model_env, "ModelEnv", Kept)
-    (tmp_path / "models").mkdir()
-    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
-    edge_m = max(x for x, _ in ENVELOPE.arena_m)
-    history = np.zeros((HISTORY, 2))
-    for world in made:
-        for left_m, stopped in ((1.1, True), (1.4, False)):
-            rushing = CarState(edge_m - left_m, 0.0, 0.0, 2.0, 0.0, 0.0)
-            assert can_stop_inside(ENVELOPE.arena_m, rushing, ENVELOPE.reaction_s, ENVELOPE.deceleration_mps2)
-            row = torch.from_numpy(encode(rushing.to_array()[None], history[None])).float()
-            assert world._stopped(row).tolist() == [stopped]
-    trained, judged = made
-    there = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
-    assert trained._bonus is not None
-    assert trained._bonus(there).tolist() == pytest.approx([PARKED_BONUS, 0.0])
-    assert judged._bonus is None, "what is foretold is the task's reward alone"
-
-
-def test_an_episode_that_ended_before_its_first_tick_is_no_obstacle(tmp_path: Path) -> None:
-    """Somebody put the car down outside the arena: the gate ends the episode at once, and the next may follow."""
-    run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
-    assert len(run.recordings()) == 1
-    plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    assert train(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)["rows"] == 0
-
-
 def test_the_report_is_written_beside_an_episode_without_a_tick(story: Story, tmp_path: Path) -> None:
     run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
     shutil.copytree(story.run.models / "0001", run.models / "0001")
     row = replace(story.figures[0], end="GEOFENCE", total_reward=0.0)
     write_report(run, story.plan, row)
     assert [str(r) for r in learning_curve(run)] == [str(row)]
-
-
-@pytest.mark.parametrize(
-    ("recording", "changes", "said"),
-    [(b"rubbish", {}, "not an MCAP file"), (None, {"threads": 0}, "Training failed: RuntimeError")],
-)
-def test_what_goes_wrong_in_the_other_process_is_said_in_a_sentence(
-    tmp_path: Path, recording: bytes | None, changes: dict[str, Any], said: str
-) -> None:
-    run = RunDirectory.create(tmp_path, "wrong")
-    if recording is not None:
-        run.episode_path(1).write_bytes(recording)
-    plan = tiny_plan(choose_car("sim"), model_steps=1, **changes)
-    with pytest.raises(DataError, match=said) as error:
-        train_beside(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)
-    assert "\n" not in str(error.value)
-    assert names(run) == ([] if recording is None else ["episodes/0001.mcap"])
-    assert multiprocessing.active_children() == []

@@ -1,0 +1,57 @@
+"""Small runs of learning and driving for tests: a plan of seconds, and recordings of a car that goes straight on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from carlab.cars import CarChoice, choose_car
+from carlab.core.policy import PolicyInput
+from carlab.core.quantities import Action, CarState
+from carlab.core.safety import SafetyEnvelope
+from carlab.core.task import ParkingTask
+from carlab.experiment.campaign import prior_simulator
+from carlab.experiment.session import Session
+from carlab.experiment.training import TrainingPlan
+from carlab.recording.run_directory import RunDirectory
+
+HISTORY = 2
+TICKS = 25
+ENVELOPE = SafetyEnvelope(arena_m=ParkingTask().arena_m)
+
+
+def tiny_plan(choice: CarChoice, **changes: Any) -> TrainingPlan:
+    """To learn from the car with wheels that do not slip, in a few steps and with the threads of one."""
+    text = tomli_w.dumps(prior_simulator(choice.simulator, "kinematic").to_tables())
+    return replace(TrainingPlan(text, HISTORY, model_steps=60, updates=32, threads=1), **changes)
+
+
+def names(run: RunDirectory) -> list[str]:
+    """Models and recordings of a run."""
+    return sorted(str(p.relative_to(run.path)) for f in (run.models, run.episodes) for p in f.iterdir())
+
+
+def drive(folder: Path, ticks: int, start: CarState | None = None, episodes: int = 1) -> RunDirectory:
+    """A run with recordings of so many ticks, of a car that somebody may have put somewhere."""
+
+    class Forward:
+        name = "forward"
+
+        def reset(self) -> None: ...
+
+        def act(self, view: PolicyInput) -> Action:
+            return Action(0.0, 0.3)
+
+    choice = choose_car("sim", seed=0)
+    run = RunDirectory.create(folder, "short")
+    with choice.car as car:
+        car.place(CarState() if start is None else start)
+        task = ParkingTask(history_length=HISTORY)
+        Session(
+            car, Forward(), task, ENVELOPE, run, choice.control_period_s, max_ticks=ticks, place=False,
+            record_rerun=False,
+        ).drive(episodes)  # fmt: skip
+    return run
