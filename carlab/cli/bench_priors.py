@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
     from carlab.cli.bench import Bench
 
+HOLDOUT_SHARE = 0.1
+"""Of the recordings that are diagnosed. Of train_1 of the ETH car a diagnosis that fits 70 % names four effects, one
+that fits 90 % eight."""
+
 
 def run_priors(options: Bench) -> int:
     """Record or read, diagnose what is not held out, learn under each prior, and print."""
@@ -94,9 +98,12 @@ def _recordings(options: Bench, work: Path) -> tuple[Path, list[Path], str]:
 
 
 def _diagnosed(files: Sequence[Path], car: Path, folder: Path) -> Path:
-    """The car file of a diagnosis of some recordings, which holds out the end of each for itself."""
+    """The car file of a diagnosis of some recordings, which holds out the end of each for itself.
+
+    No more than it needs: the recording that is held out from it is what judges here.
+    """
     from carlab.cli.diagnose import Diagnose
 
-    if Diagnose(tuple(files), car=str(car), out=folder).run() != 0:
+    if Diagnose(tuple(files), car=str(car), out=folder, holdout_share=HOLDOUT_SHARE).run() != 0:
         console.print("Nothing could be diagnosed: the diagnosed prior is the car's file.")
     return folder / "model.toml"

@@ -40,7 +40,10 @@ class Diagnose:
     """Simulator to question: a car file, a car that comes along (eth_rc_car, dart_jetracer ...), or sim."""
 
     holdout: tuple[Path, ...] = ()
-    """Recordings that only judge; without any, the last 30 % of each recording is held out."""
+    """Recordings that only judge; without any, the last part of each recording is held out."""
+
+    holdout_share: float = 0.3
+    """How much of each recording that is, above 0 and at most 0.5."""
 
     out: Path = Path("diagnosis")
     """Folder for the report."""
@@ -69,6 +72,11 @@ class Diagnose:
         for name in self.effects:
             if name not in EFFECTS:
                 raise ConfigError(f"There is no effect '{name}'; there are: {', '.join(EFFECTS)}.")
+        if not 0.0 < self.holdout_share <= 0.5:
+            raise ConfigError(
+                f"--holdout-share {self.holdout_share:g} leaves too little to fit or to judge by; give one above 0 "
+                "and at most 0.5."
+            )
         of_runs = [_of_run(path) for path in self.recordings]
         to_fit = tuple(path for fitted, _ in of_runs for path in fitted)
         to_judge = (*self.holdout, *(path for _, held_out in of_runs for path in held_out))
@@ -90,6 +98,7 @@ class Diagnose:
                     uses=(*uses, *others),
                     data_faults=(*faults, *more),
                     effects=self.effects or None,
+                    hold_out_share=self.holdout_share,
                     seed=self.seed,
                     progress=lambda what, share: bar.update(row, completed=round(100 * share), note=what),
                     stop=interrupts.requested.is_set,

@@ -73,6 +73,7 @@ def diagnose(
     uses: Sequence[RecordingUse] = (),
     data_faults: Sequence[DataFault] = (),
     effects: Sequence[str] | None = None,
+    hold_out_share: float = HOLD_OUT_SHARE,
     seed: int = 0,
     progress: Progress = lambda what, share: None,
     stop: Callable[[], bool] = lambda: False,
@@ -87,6 +88,7 @@ def diagnose(
         uses: which recording is what, for the report.
         data_faults: what was repaired when the files were read; what is found here is added to it.
         effects: the only effects to try; all of the catalogue unless given. Names that were given are not withdrawn.
+        hold_out_share: of each recording, its last part, where no recording is held out; above 0 and at most 0.5.
         seed: written into the report; nothing here draws random numbers that depend on it.
         progress: told what is being done and how far it is, in [0, 1].
         stop: once true, the search ends and what it has found is judged and reported.
@@ -103,7 +105,7 @@ def diagnose(
     data_faults = (*data_faults, *own_faults)
     progress("reading", 0.03)
     try:
-        fit_tracks, held_tracks = _split(fit, held_out)
+        fit_tracks, held_tracks = _split(fit, held_out, hold_out_share)
         _check_excitation(fit_tracks)
         shots = _thinned(_cut(fit_tracks, FIT_SHOT_S, FIT_STRIDE_S))
         held_shots = _thinned(_cut(held_tracks, HORIZON_S, SCORE_STRIDE_S), MAX_SCORED)
@@ -171,7 +173,9 @@ def _share_left(score: Mapping[str, float]) -> float:
     return max(score["with_effects"] ** 2 - 1.0, 0.0) / excess if excess > 0.05 else 0.0
 
 
-def _split(fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData]) -> tuple[list[Track], list[Track]]:
+def _split(
+    fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], share: float
+) -> tuple[list[Track], list[Track]]:
     """Tracks to fit and to judge by; the end of each recording is held out where no recording is."""
     fit_tracks = tracks_of(fit)
     if not fit_tracks:
@@ -184,7 +188,7 @@ def _split(fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData]) -> tuple
         return fit_tracks, held_tracks
     early, late = [], []
     for track in fit_tracks:
-        cut_at = round((1.0 - HOLD_OUT_SHARE) * len(track.t_s))
+        cut_at = round((1.0 - share) * len(track.t_s))
         guard = round((HORIZON_S + 0.5) / period_s)
         early.append(_part(track, slice(0, max(cut_at - guard, 0))))
         late.append(_part(track, slice(cut_at, len(track.t_s))))

@@ -1,6 +1,7 @@
 """The whole diagnosis on drives by an independent generator: a concealed effect is named and sized."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -98,4 +99,30 @@ def test_a_constant_command_is_inconclusive_and_names_the_drive_that_varies_it(
 def test_what_is_fitted_cannot_judge(concealed: tuple[Path, float], tmp_path: Path) -> None:
     same = str(concealed[0] / "fit.csv")
     assert run(["diagnose", same, "--holdout", same, "--out", str(tmp_path / "out")]) == 2
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5])
+def test_the_share_that_judges_is_not_fitted(
+    concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float
+) -> None:
+    """Nor are the second and a half before it, which shots that judge begin with."""
+    rows = [
+        r for r in (concealed[0] / "fit.csv").read_text().splitlines() if r[0] == "t" or float(r.split(",")[0]) < 12
+    ]
+    path = tmp_path / "short.csv"
+    path.write_text("\n".join(rows) + "\n")
+    assert run(["diagnose", str(path), "--holdout-share", str(share), "--out", str(tmp_path / "out")]) == 5
+    found = re.search(r"to fit hold ([\d.]+) s", " ".join(capfd.readouterr().err.split()))
+    assert found is not None
+    assert float(found[1]) == pytest.approx((1.0 - share) * 12.0 - 1.5, abs=0.11)
+
+
+@pytest.mark.parametrize("share", ["0", "0.6", "nan"])
+def test_a_share_that_leaves_too_little_is_refused(
+    concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], share: str
+) -> None:
+    path = str(concealed[0] / "fit.csv")
+    assert run(["diagnose", path, "--holdout-share", share, "--out", str(tmp_path / "out")]) == 2
+    assert "give one above 0 and at most 0.5" in " ".join(capfd.readouterr().err.split())
     assert not (tmp_path / "out").exists()
