@@ -33,6 +33,7 @@ def test_with_ten_rows_of_a_pendulum_it_is_far_ahead_of_its_baselines() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_as_the_paper_tells_it_it_is_ahead_at_every_number_of_rows() -> None:
     told = means(run_study("pendulum_motor", seeds=3, methods=(OURS, *BASELINES, "ridge")))
     for count in (5, 10, 20, 50):
@@ -41,6 +42,7 @@ def test_as_the_paper_tells_it_it_is_ahead_at_every_number_of_rows() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize(
     ("case", "limits"),
     [
@@ -56,6 +58,7 @@ def test_on_the_authors_arrays(shared: Path, case: str, limits: dict[int, float]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize(("count", "limit"), [(50, -22.0), (200, -24.3), (800, -24.9)])
 def test_on_a_real_car(shared: Path, count: int, limit: float) -> None:
     folder = shared / "data" / "eth_rc_car"
