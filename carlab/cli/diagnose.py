@@ -42,8 +42,8 @@ class Diagnose:
     holdout: tuple[Path, ...] = ()
     """Recordings that only judge; without any, the last part of each recording is held out."""
 
-    holdout_share: float = 0.3
-    """How much of each recording that is, above 0 and at most 0.5."""
+    holdout_share: float | None = None
+    """How much of each recording that is, above 0 and at most 0.5; 0.3 unless given."""
 
     out: Path = Path("diagnosis")
     """Folder for the report."""
@@ -60,7 +60,7 @@ class Diagnose:
     def run(self) -> int:
         """Diagnose and print the verdict."""
         from carlab.cars import default_car, load_car_file
-        from carlab.diagnosis.diagnose import Inconclusive, diagnose
+        from carlab.diagnosis.diagnose import HOLDOUT_SHARE, Inconclusive, diagnose
         from carlab.diagnosis.judge import Texts
         from carlab.diagnosis.report import write_report
         from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separating_drive
@@ -72,17 +72,14 @@ class Diagnose:
         for name in self.effects:
             if name not in EFFECTS:
                 raise ConfigError(f"There is no effect '{name}'; there are: {', '.join(EFFECTS)}.")
-        if not 0.0 < self.holdout_share <= 0.5:
-            raise ConfigError(
-                f"--holdout-share {self.holdout_share:g} leaves too little to fit or to judge by; give one above 0 "
-                "and at most 0.5."
-            )
         of_runs = [_of_run(path) for path in self.recordings]
         to_fit = tuple(path for fitted, _ in of_runs for path in fitted)
         to_judge = (*self.holdout, *(path for _, held_out in of_runs for path in held_out))
         same = {p.resolve() for p in to_fit} & {p.resolve() for p in to_judge}
         if same:
             raise ConfigError(f"{min(same).name} is both fitted and held out; a judge must not be a witness.")
+        if self.holdout_share is not None and to_judge:
+            raise ConfigError("--holdout-share counts only where no recording is held out whole; leave it out.")
         car = default_car() if self.car == "sim" else load_car_file(Path(self.car))
         fit, faults, uses = self._load(to_fit, "fit", car.simulator.mocap.latency_s)
         held, more, others = self._load(to_judge, "held out", car.simulator.mocap.latency_s)
@@ -98,7 +95,7 @@ class Diagnose:
                     uses=(*uses, *others),
                     data_faults=(*faults, *more),
                     effects=self.effects or None,
-                    hold_out_share=self.holdout_share,
+                    holdout_share=HOLDOUT_SHARE if self.holdout_share is None else self.holdout_share,
                     seed=self.seed,
                     progress=lambda what, share: bar.update(row, completed=round(100 * share), note=what),
                     stop=interrupts.requested.is_set,

@@ -10,7 +10,7 @@ import numpy as np
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.diagnosis import data_faults as data_faults_of
 from carlab.diagnosis.findings import (
     DataFault,
@@ -39,7 +39,7 @@ SCORE_STRIDE_S = 0.25
 MAX_SHOTS = 600
 MAX_SCORED = 1200
 MIN_SECONDS = 8.0
-HOLD_OUT_SHARE = 0.3
+HOLDOUT_SHARE, LARGEST_HOLDOUT_SHARE = 0.3, 0.5
 MIN_SHARE = 0.1
 SPOILT_SHARE = 0.5
 """Faults that leave less of a recording than this have spoilt it."""
@@ -73,7 +73,7 @@ def diagnose(
     uses: Sequence[RecordingUse] = (),
     data_faults: Sequence[DataFault] = (),
     effects: Sequence[str] | None = None,
-    hold_out_share: float = HOLD_OUT_SHARE,
+    holdout_share: float = HOLDOUT_SHARE,
     seed: int = 0,
     progress: Progress = lambda what, share: None,
     stop: Callable[[], bool] = lambda: False,
@@ -88,15 +88,20 @@ def diagnose(
         uses: which recording is what, for the report.
         data_faults: what was repaired when the files were read; what is found here is added to it.
         effects: the only effects to try; all of the catalogue unless given. Names that were given are not withdrawn.
-        hold_out_share: of each recording, its last part, where no recording is held out; above 0 and at most 0.5.
+        holdout_share: of each recording, its last part, where no recording is held out; above 0 and at most 0.5.
         seed: written into the report; nothing here draws random numbers that depend on it.
         progress: told what is being done and how far it is, in [0, 1].
         stop: once true, the search ends and what it has found is judged and reported.
 
     Raises:
         Inconclusive: the recordings cannot tell; why, and what to record.
-        ConfigError: the simulator cannot integrate.
+        ConfigError: the simulator cannot integrate, or the share leaves too little.
     """
+    if not 0.0 < holdout_share <= LARGEST_HOLDOUT_SHARE:
+        raise ConfigError(
+            f"--holdout-share {holdout_share:g} leaves too little to fit or to judge by; give one above 0 and at most "
+            f"{LARGEST_HOLDOUT_SHARE:g}."
+        )
     clock = MonotonicClock()
     began_s = clock.now_s()
     progress("reading", 0.0)
@@ -105,7 +110,7 @@ def diagnose(
     data_faults = (*data_faults, *own_faults)
     progress("reading", 0.03)
     try:
-        fit_tracks, held_tracks = _split(fit, held_out, hold_out_share)
+        fit_tracks, held_tracks = _split(fit, held_out, holdout_share)
         _check_excitation(fit_tracks)
         shots = _thinned(_cut(fit_tracks, FIT_SHOT_S, FIT_STRIDE_S))
         held_shots = _thinned(_cut(held_tracks, HORIZON_S, SCORE_STRIDE_S), MAX_SCORED)

@@ -126,3 +126,12 @@ def test_a_share_that_leaves_too_little_is_refused(
     assert run(["diagnose", path, "--holdout-share", share, "--out", str(tmp_path / "out")]) == 2
     assert "give one above 0 and at most 0.5" in " ".join(capfd.readouterr().err.split())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_share_beside_a_recording_that_is_held_out_is_refused(
+    concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    paths = [str(concealed[0] / "fit.csv"), "--holdout", str(concealed[0] / "hold.csv")]
+    assert run(["diagnose", *paths, "--holdout-share", "0.1", "--out", str(tmp_path / "out")]) == 2
+    assert "counts only where no recording is held out whole" in " ".join(capfd.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
