@@ -116,7 +116,7 @@ def fit_car(
     gap = (EXPECTED_GAP if own else EXPECTED_FUNCTION) * units.output_std
     target = infer(
         model if own else None, inputs, outputs, units, torch.tensor(NOISE_STD).to(device), gap_std=gap,
-        seed=settings.seed,
+        starts=(1.0,), seed=settings.seed,
     )  # fmt: skip
     points = measurement_points(model, inputs, units, generator)
     particles = ParticleSettings(

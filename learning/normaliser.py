@@ -48,6 +48,11 @@ class Normaliser:
         """What raw errors are multiplied by (O, O) where outputs are turned; those of normalised outputs follow."""
         return None if self.output_turn is None else self.output_turn.to(self.output_std) / self.output_std
 
+    @property
+    def log_volume(self) -> float:
+        """By how much the turn makes volumes larger, as a logarithm: densities in units become others by it."""
+        return 0.0 if self.output_turn is None else float(torch.linalg.slogdet(self.output_turn.double()).logabsdet)
+
     def turned(self, by: Tensor) -> Normaliser:
         """With normalised outputs multiplied by a matrix (O, O) from the left."""
         now = by if self.output_turn is None else by @ self.output_turn

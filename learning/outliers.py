@@ -98,6 +98,20 @@ def output_correlation(white: Tensor) -> tuple[Tensor, Tensor]:
     return (found if least < LEAST_EIGENVALUE else told), width
 
 
+def left_out_density(white: Tensor, doubt: Tensor) -> Tensor:
+    """Log density (n,) of each row by what all others say, with tails, sizes and correlation as the rows tell them.
+
+    Args:
+        white: how far off each row is, in units of its doubt (n, O), and
+        doubt: its variance (n, O), both of ``left_out``.
+    """
+    correlation, width = output_correlation(white)
+    surprise, outputs = joint_surprise(white / width, correlation), white.shape[1]
+    freedom, _ = student_weights(surprise, outputs)
+    size = (0.5 * doubt.log() + width.log()).sum(dim=1) + 0.5 * torch.logdet(correlation)
+    return log_student(surprise, outputs, freedom) - size
+
+
 def joint_surprise(white: Tensor, correlation: Tensor) -> Tensor:
     """Squared surprise (...) of all outputs of errors (..., O) in units of their doubt, that are correlated (O, O)."""
     factor = torch.linalg.cholesky_ex(correlation).L
@@ -178,6 +192,7 @@ __all__ = [
     "first_trust",
     "joint_surprise",
     "left_out",
+    "left_out_density",
     "log_student",
     "output_correlation",
     "student_weights",

@@ -12,6 +12,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from learning import function_posterior
+from learning.evaluation import negative_log_likelihood
 from learning.function_posterior import DRAWS, infer
 from learning.gap import EXPECTED_GAP, MIDDLE_LENGTH, TINY
 
@@ -274,9 +275,9 @@ class TestCorrelatedErrors:
     def gained(self, monkeypatch, model, tied, count=300):
         """Nats a row of others by knowing, and the prediction."""
         x, y = self.both(count, 0, tied)
-        found = infer(model, x, y, UNITS, 2.0 * NOISE)
+        found = infer(model, x, y, UNITS, 2.0 * NOISE, starts=(1.0,))
         monkeypatch.setattr(function_posterior, "output_correlation", lambda w: (torch.eye(2).double(), torch.ones(2)))
-        apart = infer(model, x, y, UNITS, 2.0 * NOISE)
+        apart = infer(model, x, y, UNITS, 2.0 * NOISE, starts=(1.0,))
         at, seen = self.both(500, 1, tied)
         told, blind = (float(f.prediction(at).log_density(seen).mean()) for f in (found, apart))
         return told - blind, found.prediction(at)
@@ -299,6 +300,34 @@ class TestCorrelatedErrors:
     def test_errors_that_are_independent_cost_next_to_nothing(self, monkeypatch):
         gained, _ = self.gained(monkeypatch, None, 0.0)
         assert abs(gained) < 0.03
+
+
+class TestStarts:
+    """The evidence of a gap has several optima, and rows that are left out choose."""
+
+    @pytest.mark.parametrize(
+        ("model", "expected"), [(None, 0.01), (None, EXPECTED_GAP), (Linear(), EXPECTED_GAP)], ids=str
+    )
+    def test_other_rows_are_likelier(self, model, expected):
+        """Over three draws of sixty rows; and in none of them less likely."""
+        gained = []
+        for seed in range(3):
+            at, y = rows(300, 100 + seed)
+            one, several = (
+                infer(model, *rows(60, seed), UNITS, NOISE, gap_std=expected * UNITS.output_std, seed=seed, **starts)
+                for starts in ({"starts": (1.0,)}, {})
+            )
+            before, after = (negative_log_likelihood(found.prediction(at), y) for found in (one, several))
+            gained.append(before - after)
+        assert min(gained) > -0.02
+        assert np.mean(gained) > 0.3
+
+    def test_a_start_from_which_nothing_can_be_computed_is_passed_over(self):
+        x, y = rows(50)
+        at, _ = rows(5, seed=1)
+        first, both = (infer(None, x, y, UNITS, NOISE, starts=s).predict(at) for s in ((1.0,), (1.0, math.nan)))
+        assert torch.equal(first[0], both[0])
+        assert torch.equal(first[1], both[1])
 
 
 class TestFewRows:

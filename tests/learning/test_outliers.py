@@ -13,6 +13,7 @@ from learning.outliers import (
     VARIANCE_OF_MEDIAN,
     WIDTH_DOUBT,
     left_out,
+    left_out_density,
     log_student,
     output_correlation,
     student_weights,
@@ -47,6 +48,23 @@ def test_a_rows_surprise_is_that_of_a_fit_without_it(trusted):
             assert float(doubt[row, k]) == pytest.approx(variance, rel=1e-9)
             off = left[row, k] - gain @ left[others, k]
             assert float(white[row, k]) == pytest.approx(off / np.sqrt(variance))
+
+
+@pytest.mark.parametrize(("freedom", "lost"), [(4.0, 0.02), (math.inf, 0.05)])
+def test_rows_left_out_are_as_likely_as_the_distribution_they_were_drawn_from_says(freedom, lost):
+    """Its correlation, sizes and tails are told from the rows; scipy knows them.
+
+    Sizes that bear outliers are too small for a Gaussian, whose tails then look heavier than they are.
+    """
+    shape = np.array([[1.0, 0.8, 0.0], [0.8, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    size = np.array([0.5, 2.0, 1.0])
+    rng = np.random.default_rng(5)
+    true = multivariate_t(np.zeros(3), size[:, None] * shape * size, df=freedom)
+    drawn, doubt = true.rvs(4000, random_state=rng), rng.uniform(0.1, 10.0, (4000, 3))
+    theirs = true.logpdf(drawn) - 0.5 * np.log(doubt).sum(axis=1)
+    found = left_out_density(torch.tensor(drawn), torch.tensor(doubt)).numpy()
+    assert found.mean() == pytest.approx(theirs.mean(), abs=lost)
+    assert np.corrcoef(found, theirs)[0, 1] > 0.99
 
 
 class TestCorrelation:
