@@ -231,7 +231,7 @@ class _Case:
         for other in others:
             try:
                 found, density = other.explained(parameters)
-            except torch.linalg.LinAlgError:
+            except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
                 continue  # A gap from which nothing can be computed; the first is there.
             ahead = density - own
             gain = float(ahead.mean())
