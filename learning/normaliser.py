@@ -50,7 +50,7 @@ class Normaliser:
 
     @property
     def log_volume(self) -> float:
-        """By how much the turn makes volumes larger, as a logarithm: densities in units become others by it."""
+        """By how much the turn makes volumes larger, as a logarithm: log densities in units are larger by it."""
         return 0.0 if self.output_turn is None else float(torch.linalg.slogdet(self.output_turn.double()).logabsdet)
 
     def turned(self, by: Tensor) -> Normaliser:

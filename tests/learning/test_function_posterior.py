@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from linear_simulator import EMPTY, NOISE, UNITS, Linear, features, rows, tensors, truth
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student
 
 from learning import function_posterior
@@ -275,9 +275,9 @@ class TestCorrelatedErrors:
     def gained(self, monkeypatch, model, tied, count=300):
         """Nats a row of others by knowing, and the prediction."""
         x, y = self.both(count, 0, tied)
-        found = infer(model, x, y, UNITS, 2.0 * NOISE, starts=(1.0,))
+        found = infer(model, x, y, UNITS, 2.0 * NOISE)
         monkeypatch.setattr(function_posterior, "output_correlation", lambda w: (torch.eye(2).double(), torch.ones(2)))
-        apart = infer(model, x, y, UNITS, 2.0 * NOISE, starts=(1.0,))
+        apart = infer(model, x, y, UNITS, 2.0 * NOISE)
         at, seen = self.both(500, 1, tied)
         told, blind = (float(f.prediction(at).log_density(seen).mean()) for f in (found, apart))
         return told - blind, found.prediction(at)
@@ -321,6 +321,18 @@ class TestStarts:
             gained.append(before - after)
         assert min(gained) > -0.02
         assert np.mean(gained) > 0.3
+
+    def test_densities_in_turned_outputs_are_comparable_by_their_volume(self):
+        """Errors of any normal distribution and the same ones turned twice, by scipy."""
+        rng = np.random.default_rng(4)
+        first, second, root = rng.normal(size=(3, 2, 2))
+        units = UNITS.turned(torch.tensor(first)).turned(torch.tensor(second))
+        turn, spread = second @ first, root @ root.T + np.eye(2)
+        alone = rng.normal(size=(5, 2))
+        told = multivariate_normal(cov=spread).logpdf(alone)
+        there = multivariate_normal(cov=turn @ spread @ turn.T).logpdf(alone @ turn.T)
+        assert np.allclose(there + units.log_volume, told)
+        assert UNITS.log_volume == 0.0
 
     def test_a_start_from_which_nothing_can_be_computed_is_passed_over(self):
         x, y = rows(50)
