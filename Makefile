@@ -1,10 +1,11 @@
-# make demo: learn to park in three episodes over the whole emulated hardware path.   make test: linters, types, layers, tests.
+# make demo: learn to park, then diagnose a concealed effect, over the whole emulated hardware path.   make test: linters, types, layers, tests.
+# make docs: the documentation site in build/site.   make pictures: the pictures of the documentation.
 # Each sets up .venv by itself on a fresh machine that has Python >= 3.11 and make.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs pictures clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "carlab needs Python 3.11 or newer; run: make PYTHON=python3.12 ...")'
@@ -16,7 +17,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(VENV)/.installed
-	$(BIN)/carlab learn --car emulated --episodes 3 --name demo
+	$(BIN)/python -u examples/demo.py
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff check .
@@ -25,13 +26,19 @@ lint: $(VENV)/.installed
 	$(BIN)/lint-imports
 
 # Tests that only compute run side by side, one to a core; the others drive against the clock, two at once.
-COMPUTING := tests/concealment tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/test_architecture.py tests/test_readme.py \
-	$(addprefix tests/experiment/,test_prior_study.py test_reality_check.py test_learning_on_a_device.py test_targets.py)
+COMPUTING := tests/benchmark tests/studies tests/prediction tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/api tests/examples tests/test_architecture.py tests/docs \
+	$(addprefix tests/experiment/,test_reality_check.py test_learning_on_a_device.py)
 test: export OMP_NUM_THREADS := 1
 
 test: lint
 	$(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
 	$(BIN)/pytest --numprocesses 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))
+
+docs: $(VENV)/.installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+pictures: $(VENV)/.installed
+	$(BIN)/python docs/pictures.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,19 +1,87 @@
-"""carlab: drive, learn and diagnose small race cars. The contract is re-exported here; everything else by module."""
+"""carlab: drive, learn and diagnose small race cars.
 
-from carlab.core.car import Car
-from carlab.core.errors import CarlabError
-from carlab.core.quantities import NEUTRAL, Action, CarState, Health, Observation, PoseSample, Reality
+    import carlab
+    car = carlab.load_car("eth_rc_car")
+    recording = carlab.load("train_1.csv.gz")
+    report = carlab.diagnose(recording, car)
+    report.model.save("model.toml")
+
+The Python interface and the contract of a car are re-exported here, imported when they are first used; everything else
+is reached by its module.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from carlab.api import (
+        DiagnosisReport,
+        DriveRun,
+        LearnHooks,
+        LearnRun,
+        PredictionErrors,
+        Recording,
+        RunHooks,
+        diagnose,
+        drive,
+        learn,
+        load,
+        load_car,
+        predict,
+    )
+    from carlab.core.car import Car
+    from carlab.core.errors import CarlabError
+    from carlab.core.quantities import NEUTRAL, Action, CarState, Health, Observation, PoseSample, Reality
+
+_MODULES = {
+    "api": (
+        *("DiagnosisReport", "DriveRun", "LearnHooks", "LearnRun", "PredictionErrors", "Recording", "RunHooks"),
+        *("diagnose", "drive", "learn", "load", "load_car", "predict"),
+    ),
+    "core.car": ("Car",),
+    "core.errors": ("CarlabError",),
+    "core.quantities": ("NEUTRAL", "Action", "CarState", "Health", "Observation", "PoseSample", "Reality"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
 __all__ = [
     "NEUTRAL",
     "Action",
     "Car",
     "CarState",
     "CarlabError",
+    "DiagnosisReport",
+    "DriveRun",
     "Health",
+    "LearnHooks",
+    "LearnRun",
     "Observation",
     "PoseSample",
+    "PredictionErrors",
     "Reality",
+    "Recording",
+    "RunHooks",
     "__version__",
+    "diagnose",
+    "drive",
+    "learn",
+    "load",
+    "load_car",
+    "predict",
 ]
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> object:
+        """Import a public name when it is first used."""
+        if name not in _MODULE_OF:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(f"carlab.{_MODULE_OF[name]}"), name)
+        globals()[name] = value
+        return value
+
+    def __dir__() -> list[str]:
+        """Public names, imported or not."""
+        return sorted({*globals(), *__all__})

@@ -14,9 +14,9 @@ from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, NotArm
 from carlab.core.quantities import NEUTRAL, Action, Health
 from drivers.calibration import ActuatorCalibration, DeviceCommand
 from drivers.config import ActuatorConfig
-from drivers.sender_logic import Order, SenderState, Wish
-from drivers.sender_process import Sender, start_sender
-from drivers.sender_status import SenderStatus
+from drivers.sender.logic import Order, SenderState, Wish
+from drivers.sender.process import Sender, start_sender
+from drivers.sender.status import SenderStatus
 
 START_TIMEOUT_S = 15.0
 ANSWER_TIMEOUT_S = 2.0
@@ -55,7 +55,7 @@ class Actuator:
         return self._sender is not None and self._owner_pid == os.getpid()
 
     def open(self) -> None:
-        """Start the sender and wait until the VESC answers; idempotent.
+        """Start the sender and wait until the motor controller answers; idempotent.
 
         Raises NotReadyError where the port is wrong, nothing answers, or the firmware is too old.
         """
@@ -95,7 +95,7 @@ class Actuator:
     def command(self, action: Action) -> Action:
         """Post the newest command and return it as it will be on the wire, clamped and rounded by the calibration.
 
-        That is neutral while the VESC's telemetry is stale: the sender holds everything else back then. Neutral is
+        That is neutral while the telemetry is stale: the sender holds everything else back then. Neutral is
         accepted, and changes nothing, while disarmed. Raises NotOpenError, ActuatorFaultError,
         ActionOutOfRangeError (not a number) and NotArmedError.
         """
@@ -168,7 +168,7 @@ class Actuator:
             found.append(status.fault or self._latched)
         age_s = time.monotonic() - status.t_telemetry_s
         if not age_s <= self.config.telemetry_stale_s and not found:
-            found.append(f"the VESC's telemetry is {age_s:.1f} s old; check the link.")
+            found.append(f"the {self.config.device_kind.name}'s telemetry is {age_s:.1f} s old; check the link.")
         return tuple(found)
 
     def health(self) -> Health:
@@ -177,12 +177,13 @@ class Actuator:
         if not self.is_open or self._sender is None:
             return Health(False, problems)
         status = self._sender.status()
+        device = self.config.device_kind.name.lower()
         readings = {
             "battery_v": status.input_v,
             "motor_erpm": status.erpm,
             "tachometer_steps": status.tachometer_steps,
-            "vesc_fault_code": float(status.fault_code),
-            "vesc_motor_timeout_flag": float(status.status_bits & 1),
+            f"{device}_fault_code": float(status.fault_code),
+            f"{device}_motor_timeout_flag": float(status.is_motor_released),
             "firmware_version": status.firmware_major + status.firmware_minor / 100.0,
             "telemetry_age_s": time.monotonic() - status.t_telemetry_s,
             "command_to_wire_s": status.t_written_s - status.t_issued_s,
@@ -236,14 +237,16 @@ class Actuator:
 
     def _living_status(self, sender: Sender) -> SenderStatus:
         """The status of a sender that lives and reacts; one that hangs is a fault even if it comes back."""
-        status = sender.status()
+        status, name = sender.status(), self.config.device_kind.name
         if not sender.is_alive():
             raise ActuatorFaultError(
                 status.fault
-                or "The sender process has ended; the VESC's own time-out stops the motor. Open the car anew."
+                or f"The sender process has ended; the {name}'s own time-out stops the motor. Open the car anew."
             )
         if _hangs(status):
-            raise self._latch("The sender process hangs; the VESC's own time-out stops the motor. Open the car anew.")
+            raise self._latch(
+                f"The sender process hangs; the {name}'s own time-out stops the motor. Open the car anew."
+            )
         return status
 
     def _unfaulted_status(self, sender: Sender) -> SenderStatus:
@@ -286,11 +289,11 @@ class Actuator:
         return status
 
     def _await_connection(self) -> None:
-        what = f"The VESC at {self.config.address} is not ready"
+        what = f"The {self.config.device_kind.name} at {self.config.address} is not ready"
         status = self._await(lambda s: s.t_published_s > 0.0 or s.is_ended, START_TIMEOUT_S)
         if status.t_published_s == 0.0:
             raise NotReadyError(
-                what, ("the sender process did not start; run 'python -m drivers.sender_process' by hand.",)
+                what, ("the sender process did not start; run 'python -m drivers.sender.process' by hand.",)
             )
         settled = (SenderState.CONNECTED, SenderState.FAULT)
         status = self._await(lambda s: s.is_ended or s.state in settled, self.config.open_timeout_s)
@@ -299,19 +302,13 @@ class Actuator:
         raise NotReadyError(what, (status.fault or self._silence(status),))
 
     def _silence(self, status: SenderStatus) -> str:
+        kind = self.config.device_kind
         if status.firmware_major:
-            return "it says its version but sends no telemetry; restart it and check its app settings in VESC Tool."
+            return "it says its version but sends no telemetry; restart it and check its app settings."
         heard = status.garbage_bytes + status.crc_errors
-        if self.config.kind == "vesc_can":
-            return (
-                "nothing answers there; check power, termination, the bitrate, and that controller_id in "
-                "[hardware.actuator] is the VESC's id and its CAN mode is VESC."
-            )
-        if heard:
-            return (
-                f"what answers is no VESC ({heard} bytes of garbage); check 'port' and 'baud' in [hardware.actuator]."
-            )
-        return "the port opens but nothing answers; switch the VESC on and check that 'port' is the VESC's."
+        if heard and kind.garbage_hint:
+            return f"what answers is no {kind.name} ({heard} bytes of garbage); {kind.garbage_hint}"
+        return kind.silent_hint
 
 
 def _hangs(status: SenderStatus) -> bool:

@@ -9,7 +9,9 @@ from typing import Literal
 
 from carlab.core.errors import ActionOutOfRangeError, ConfigError
 from carlab.core.quantities import Action
-from drivers.vesc_payloads import CURRENT_SCALE, DUTY_SCALE, SERVO_SCALE
+
+CURRENT_SCALE, DUTY_SCALE, SERVO_SCALE = 1e3, 1e5, 1e3
+"""Device steps per ampere, per unit of duty, and over the servo's range."""
 
 
 class MotorKind(enum.IntEnum):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from carlab.core.errors import ConfigError
 from drivers.calibration import ActuatorCalibration
+from drivers.device_kinds import DEVICE_KINDS, DeviceKind
 
 MULTICAST_GROUP = "239.74.163.2"
 
@@ -15,15 +15,16 @@ MULTICAST_GROUP = "239.74.163.2"
 class ActuatorConfig:
     """The actuator, the table ``[hardware.actuator]``.
 
-    ``vesc_serial`` uses ``port`` and ``baud`` (ignored on USB). ``vesc_can`` uses ``interface`` (any of python-can:
-    socketcan, slcan, pcan, ..., ``udp_multicast`` between processes, ``virtual`` within one), ``channel``,
-    ``bitrate``, the VESC's ``controller_id`` and a ``host_id`` that nobody else on the bus has. The sender sends at
-    ``rate_hz``; a command older than ``watchdog_s`` becomes neutral and one older than ``latch_s`` a latched fault.
-    Telemetry is polled at ``telemetry_rate_hz``; older than ``telemetry_stale_s`` means neutral, older than
-    ``telemetry_lost_s`` a latched fault. ``realtime_priority`` asks for SCHED_FIFO and goes on without it.
+    ``kind`` names an entry of ``DEVICE_KINDS``. A serial kind uses ``port`` and ``baud`` (ignored on USB). A bus uses
+    ``interface`` (any of python-can: socketcan, slcan, pcan, ..., ``udp_multicast`` between processes, ``virtual``
+    within one), ``channel``, ``bitrate``, the ``controller_id`` and a ``host_id`` that nobody else has. The sender
+    sends at ``rate_hz``; a command older than ``watchdog_s`` becomes neutral and one older than ``latch_s`` a
+    latched fault. Telemetry is polled at ``telemetry_rate_hz``; older than ``telemetry_stale_s`` means neutral,
+    older than ``telemetry_lost_s`` a latched fault. ``realtime_priority`` asks for SCHED_FIFO and goes on without
+    it.
     """
 
-    kind: Literal["vesc_serial", "vesc_can"] = "vesc_serial"
+    kind: str = "vesc_serial"
     port: str = "/dev/ttyACM0"
     baud: int = 115200
     interface: str = "socketcan"
@@ -41,7 +42,9 @@ class ActuatorConfig:
     realtime_priority: bool = True
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for numbers that could not work together."""
+        """Raise ConfigError for an unknown kind, or for numbers that could not work together."""
+        if self.kind not in DEVICE_KINDS:
+            raise ConfigError(f"kind of the actuator is {self.kind!r}; it must be one of {', '.join(DEVICE_KINDS)}.")
         if not 10.0 <= self.rate_hz <= 500.0:
             raise ConfigError(f"rate_hz is {self.rate_hz:g}; it must lie in [10, 500].")
         if not 1.0 <= self.telemetry_rate_hz <= 200.0:
@@ -61,9 +64,14 @@ class ActuatorConfig:
             raise ConfigError("open_timeout_s, baud and bitrate must be positive.")
 
     @property
+    def device_kind(self) -> DeviceKind:
+        """The protocol and link that ``kind`` names."""
+        return DEVICE_KINDS[self.kind]
+
+    @property
     def address(self) -> str:
         """Where the actuator is, in words for messages."""
-        if self.kind == "vesc_serial":
+        if not self.device_kind.is_bus:
             return self.port
         return f"controller {self.controller_id} on {self.interface} {self.channel}"
 

@@ -108,6 +108,7 @@ class HardwareCar(Car):
             delay_s,
             poses,
             self.estimator.velocity_valid,
+            self._motor_is_turning(),
         )
 
     def arm(self) -> None:
@@ -126,7 +127,7 @@ class HardwareCar(Car):
             reasons.append(f"the car moves at {speed_mps:.2f} m/s; wait until it stands still.")
         erpm = abs(self.actuator.status().erpm)
         if math.isnan(erpm):
-            reasons.append("the VESC has not said how fast the motor turns; check its app settings in VESC Tool.")
+            reasons.append("the motor controller has not said how fast the motor turns; check its app settings.")
         elif erpm > self.config.arm_max_erpm:
             reasons.append(f"the motor turns at {erpm:.0f} eRPM; wait until it stands still.")
         if reasons:
@@ -181,6 +182,11 @@ class HardwareCar(Car):
             self.actuator.close()
         finally:
             self.pose_source.close()
+
+    def _motor_is_turning(self) -> bool | None:
+        """Whether the measured motor speed is above that at which the car may be armed; None if it is not measured."""
+        erpm = self.actuator.status().erpm
+        return None if math.isnan(erpm) else abs(erpm) > self.config.arm_max_erpm
 
     def _await_poses(self) -> None:
         """Take poses until they say whether the car stands, or none comes any more."""

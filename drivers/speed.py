@@ -16,7 +16,7 @@ from carlab.core.quantities import Action
 from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
-from drivers.sender_status import SenderStatus
+from drivers.sender.status import SenderStatus
 
 MAX_LOADED_RATIO = 1.5
 

@@ -1,7 +1,7 @@
-"""Where tensors are: on the CPU, or on a CUDA device where there is one.
+"""Devices of tensors: the CPU, or a CUDA device.
 
-Random numbers are drawn on the CPU and moved, so that a seed means the same draws everywhere; files hold tensors of the
-CPU, and what drives a car runs there.
+Random numbers are drawn on the CPU and moved, so that a seed means the same draws everywhere. Files hold CPU tensors;
+a car is driven from the CPU.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ DeviceName = Literal["cpu", "cuda"]
 
 
 def available(name: str) -> str:
-    """The name, where torch finds such a device. Raises ConfigError otherwise."""
+    """The name of an available device. Raises ConfigError where torch does not find it."""
     if torch.device(name).type == "cuda" and not torch.cuda.is_available():
         built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
         raise ConfigError(
@@ -34,17 +34,16 @@ def described(name: str) -> str:
 
 
 def settle(device: torch.device | str) -> None:
-    """Wait until a device has done what it was given, for taking times."""
+    """Wait until a device has finished, for timing."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize()
 
 
 @contextmanager
 def denormals_flushed() -> Iterator[None]:
-    """Numbers below the smallest normal one (1.2e-38 in float32) count as zero in here, as they do on CUDA.
+    """Flush denormal numbers (below 1.2e-38 in float32) to zero in this context, as CUDA does.
 
-    The moments of units that are never active fade to such numbers and stay there, and the CPU takes six times as long
-    for an optimiser's step on them.
+    Adam's moments of inactive units decay to denormal numbers, on which the CPU is six times slower.
     """
     was = not bool(torch.full((1,), 1e-39) * 1.0)
     torch.set_flush_denormal(True)

@@ -1,6 +1,6 @@
-"""How fast learning is: training and prediction of particles, gradient steps of SAC, each beside a yardstick.
+"""Speed of learning: training and prediction of particles and gradient steps of SAC, each relative to a reference.
 
-And what a user waits for: a car that is learned from its rows, predictions in its units, steps of the learned car.
+Also durations that a user waits for: the fit of a car to its rows, predictions in raw units, steps of the learned car.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from torch import Tensor
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.state_estimator import StateEstimator
-from learning.car_dynamics import CarDynamics
-from learning.car_fit import NOISE_STD, CarFitSettings, fit_car
 from learning.devices import settle
-from learning.domain_models import draw_parameters
-from learning.fsvgd import EDGE, Posterior
-from learning.function_posterior import infer
-from learning.normaliser import Normaliser
-from learning.particles import Network
-from learning.sac import FastSac
-from learning.sim_fsvgd import ParticleSettings, fit_particles
-from learning.simulator_model import CarModel
-from learning.transitions import Transitions
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.policy.sac import FastSac
+from learning.posterior.distillation import DistillationSettings, distil
+from learning.posterior.inference import infer
+from learning.posterior.particle_posterior import MIN_INPUT_CLIP, ParticlePosterior
+from learning.priors.domain_models import draw_parameters
+from learning.priors.simulator_model import CarModel
+from learning.world.car_dynamics import CarDynamics
+from learning.world.car_fit import NOISE_STD, CarFitSettings, fit_car
+from learning.world.transitions import Transitions
 from sim_backends.car_parameters import SimulatorConfig
 
 AUTHORS_STEPS_PER_S = 10.0
@@ -42,9 +42,9 @@ SIZES = {
 CAR_FIT = CarFitSettings()
 FITTED_ROWS, FITTED_HISTORY = 100, 3
 KINEMATIC = ("motor.drive_gain", "motor.damping", "steering.max_angle")
-"""Numbers that a prior whose wheels do not slip is uncertain of."""
-LATE_S = 0.5 * StateEstimator().window_s
-"""By how much velocities lag that are differences of poses."""
+"""Uncertain numbers of the kinematic prior."""
+DIFFERENCE_DELAY_S = 0.5 * StateEstimator().window_s
+"""Delay of velocities that are differences of poses."""
 SAC_SIZES = {"64 x 64, batch 64": ([64, 64], 64), "64 x 64, batch 256": ([64, 64], 256)}
 
 
@@ -64,12 +64,12 @@ def training_speed(device: str = "cpu") -> dict[str, Any]:
         points = torch.randn((4096, width), generator=generator).to(device)
         steps = [0.0, 0.0]
 
-        def told(done: int, at: list[float] = steps, clock: MonotonicClock = clock) -> None:
+        def note_time(done: int, at: list[float] = steps, clock: MonotonicClock = clock) -> None:
             settle(device)
             at[0] = at[0] or clock.now_s()
             at[1] = clock.now_s()
 
-        fit_particles(target, points, ParticleSettings(particles=particles, sets=sets, steps=STEPS), told)
+        distil(target, points, DistillationSettings(particles=particles, sets=sets, steps=STEPS), note_time)
         between = STEPS // 200 * 200 - 200
         rate = between / (steps[1] - steps[0])
         found[name] = {
@@ -83,11 +83,11 @@ def training_speed(device: str = "cpu") -> dict[str, Any]:
 
 
 def _whole_fit_s(device: str) -> float:
-    """Time in which a car is learned: units, inference under a simulator whose wheels do not slip, and particles."""
+    """Duration of learning a car [s]: units, inference with the kinematic prior, and particles."""
     car = SimulatorConfig.from_preset()
     ranges = {name: car.priors[name] for name in KINEMATIC}
-    truth = CarModel(car, FITTED_HISTORY, {}, velocity_delay_s=LATE_S)
-    prior = CarModel(replace(car, kind="kinematic"), FITTED_HISTORY, ranges, velocity_delay_s=LATE_S)
+    truth = CarModel(car, FITTED_HISTORY, {}, velocity_delay_s=DIFFERENCE_DELAY_S)
+    prior = CarModel(replace(car, kind="kinematic"), FITTED_HISTORY, ranges, velocity_delay_s=DIFFERENCE_DELAY_S)
     generator = torch.Generator().manual_seed(0)
     inputs = truth.inputs(FITTED_ROWS, generator)
     outputs = truth(inputs, draw_parameters(truth, 1, generator))[0]
@@ -102,13 +102,12 @@ def _whole_fit_s(device: str) -> float:
 
 
 def prediction_speed(device: str = "cpu") -> dict[str, Any]:
-    """A batch of 256 one-step predictions of 20 particles against one matrix product of as many operations.
+    """Durations of 256 one-step predictions of 20 particles, relative to a matrix product of as many operations.
 
-    ``batch_ms`` is of their networks alone. ``posterior_ms`` is of a whole prediction: from raw inputs, clamped, to raw
-    outputs turned back, with the line that all particles share and the noise. ``learned_car_ms`` is of 256 draws of it
-    as a learned car is stepped, each row by one particle.
+    ``batch_ms``: the networks alone. ``posterior_ms``: a whole prediction with clipping, trend, decorrelation and
+    noise, in raw units. ``learned_car_ms``: 256 samples as a learned car is stepped, each row by one particle.
     """
-    network = Network(15, 6, activation=ParticleSettings().activation)
+    network = Network(15, 6, activation=DistillationSettings().activation)
     generator = torch.Generator().manual_seed(0)
     numbers = network.initial(20, generator, device)
     inputs = torch.randn((256, 15), generator=generator).to(device)
@@ -132,17 +131,17 @@ def prediction_speed(device: str = "cpu") -> dict[str, Any]:
     }
 
 
-def _posterior(network: Network, numbers: Tensor) -> Posterior:
-    """Particles with all that a fit gives them beside networks: a turn, a trend, Student's noise that is joint."""
+def _posterior(network: Network, numbers: Tensor) -> ParticlePosterior:
+    """Particles as a fit returns them: with decorrelation, trend, and correlated Student-t noise."""
     generator = torch.Generator().manual_seed(1)
     width, outputs = network.inputs, network.outputs
     eye = torch.eye(outputs)
     units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(outputs), torch.ones(outputs))
-    turn = eye + 0.1 * torch.randn((outputs, outputs), generator=generator)
+    decorrelation = eye + 0.1 * torch.randn((outputs, outputs), generator=generator)
     trend = 0.1 * torch.randn((1 + width, outputs), generator=generator)
-    return Posterior(
-        network, numbers.cpu(), torch.full((outputs,), 0.1), units.turned(turn), freedom=5.0, trend=trend,
-        correlation=0.9 * eye + 0.1, reach=torch.full((width,), EDGE),
+    return ParticlePosterior(
+        network, numbers.cpu(), torch.full((outputs,), 0.1), units.decorrelated(decorrelation), dof=5.0, trend=trend,
+        correlation=0.9 * eye + 0.1, input_clip=torch.full((width,), MIN_INPUT_CLIP),
     ).to(numbers.device)  # fmt: skip
 
 
@@ -166,7 +165,7 @@ def sac_speed(device: str = "cpu") -> dict[str, Any]:
 
 
 class _Room(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """Spaces of the parking task and numbers without meaning."""
+    """An environment with the parking task's spaces and random observations."""
 
     observation_space = gym.spaces.Box(-5.0, 5.0, (13,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -183,7 +182,7 @@ class _Room(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def _seconds(work: Any, device: str, times: int = 50) -> float:
-    """Median time of a call, the first ones left out."""
+    """Median duration of a call after a warm-up [s]."""
     clock = MonotonicClock()
     for _ in range(max(times // 10, 1)):
         work()

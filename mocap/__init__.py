@@ -1,6 +1,6 @@
 """Motion capture by NatNet: the pose of one rigid body, on the host's clock. Names load on first use.
 
-The emulated server is in ``mocap.emulator``, the codec in ``mocap.natnet_codec``.
+The emulated server is in ``mocap.emulators.natnet_server``, the codec in ``mocap.natnet.codec``.
 """
 
 from __future__ import annotations
@@ -9,19 +9,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mocap.discovery import FoundServer, discover
-    from mocap.mocap_config import MocapConfig
-    from mocap.natnet_client import NatNetClient
+    from mocap.config import MocapConfig
+    from mocap.natnet.client import NatNetClient
+    from mocap.natnet.discovery import FoundServer, discover
     from mocap.rigid_body import RigidBodyPoseSource
     from mocap.time_alignment import ClockAlignment
 
 _HOMES = {
     "ClockAlignment": "time_alignment",
-    "FoundServer": "discovery",
-    "MocapConfig": "mocap_config",
-    "NatNetClient": "natnet_client",
+    "FoundServer": "natnet.discovery",
+    "MocapConfig": "config",
+    "NatNetClient": "natnet.client",
     "RigidBodyPoseSource": "rigid_body",
-    "discover": "discovery",
+    "discover": "natnet.discovery",
 }
 
 __all__ = ["ClockAlignment", "FoundServer", "MocapConfig", "NatNetClient", "RigidBodyPoseSource", "discover"]

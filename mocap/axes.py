@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from mocap.natnet_models import Quaternion, Vector3
+from mocap.natnet.models import Quaternion, Vector3
 
 
 def z_up_vector(v: Vector3) -> Vector3:

@@ -12,9 +12,9 @@ from typing import Self
 from carlab.core.errors import NotReadyError
 from carlab.core.quantities import PoseSample
 from mocap.axes import base_link_pose, tilt_rad, z_up_quaternion, z_up_vector
-from mocap.mocap_config import MocapConfig
-from mocap.natnet_client import NatNetClient
-from mocap.natnet_models import Description, Frame, Quaternion, RigidBody, RigidBodyDescription
+from mocap.config import MocapConfig
+from mocap.natnet.client import NatNetClient
+from mocap.natnet.models import Description, Frame, Quaternion, RigidBody, RigidBodyDescription
 
 SAMPLES_KEPT = 1024
 NORM_TOLERANCE = 0.01

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 
-from mocap.natnet_codec import Frame, MessageId, decode_frame, encode_frame, encode_message, split_message
-from mocap.natnet_models import BitstreamVersion, LabelledMarker, MarkerSet, RigidBody
+from mocap.natnet.codec import Frame, MessageId, decode_frame, encode_frame, encode_message, split_message
+from mocap.natnet.models import BitstreamVersion, LabelledMarker, MarkerSet, RigidBody
 
 
 def example_frame(bodies: int, other_markers: int, labelled_markers: int, marker_sets: int = 0) -> Frame:

@@ -6,11 +6,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sim_backends.batch_rollout import Rollout, rollout
+    from sim_backends.batch.rollout import Rollout, rollout
     from sim_backends.car_parameters import CarParameters, MocapParameters, SimulatorConfig, preset_names
     from sim_backends.effects import EFFECTS
     from sim_backends.plant import Plant
-    from sim_backends.registry import REGISTRY, ParameterInfo
+    from sim_backends.registry import REGISTRY, ParameterInfo, register, registered
     from sim_backends.sensor import MocapSensor
     from sim_backends.simulated_car import SimulatedCar
 
@@ -26,6 +26,8 @@ __all__ = [
     "SimulatedCar",
     "SimulatorConfig",
     "preset_names",
+    "register",
+    "registered",
     "rollout",
 ]
 
@@ -38,8 +40,10 @@ _HOME = {
     "Plant": "plant",
     "REGISTRY": "registry",
     "ParameterInfo": "registry",
-    "Rollout": "batch_rollout",
-    "rollout": "batch_rollout",
+    "register": "registry",
+    "registered": "registry",
+    "Rollout": "batch.rollout",
+    "rollout": "batch.rollout",
     "MocapSensor": "sensor",
     "SimulatedCar": "simulated_car",
 }

@@ -7,17 +7,18 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Any, Self
 
 from carlab.core.errors import ConfigError
-from carlab.core.tables import check_keys
+from carlab.core.tables import check_keys, number
 from sim_backends.effects import EFFECTS, DelayEffect
-from sim_backends.effects.base import GRAVITY_MPS2
+from sim_backends.effects.base import GRAVITY_MPS2, MODEL_KINDS, ModelKind
 from sim_backends.registry import REGISTRY, ParameterInfo, section
 
-ModelKind = Literal["dynamic", "linear_tyre", "kinematic", "blend"]
 TABLES = ("vehicle", "tyre", "motor", "steering", "timing", "model", "mocap", "effects")
 """Tables of a car file that describe the simulator; a real car's ``[hardware]`` is not among them."""
+
+LATENCY = "mocap.latency"
 
 _FIELD_OF = {info.name: info.field for info in REGISTRY.values() if info.field}
 
@@ -64,7 +65,9 @@ class SimulatorConfig:
     ``effects`` maps ids of the catalogue to their parameters (all of them, in SI units; a choice may be given by its
     word and is kept as its position); ``priors`` maps dotted
     names to (low, high) where the car file gives a range, ``doubts`` to a standard deviation where it gives one, as a
-    diagnosis does. Building one checks it: ConfigError says what is wrong.
+    diagnosis does. ``unknown`` names what the car file does not state although every car has its own: the latency of
+    motion capture; its value is a default then, and a diagnosis estimates it. Building one checks it: ConfigError says
+    what is wrong.
     """
 
     parameters: CarParameters = CarParameters()
@@ -75,10 +78,11 @@ class SimulatorConfig:
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     doubts: Mapping[str, float] = field(default_factory=dict)
+    unknown: frozenset[str] = field(default=frozenset(), compare=False)
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(ModelKind):
-            raise ConfigError(f"kind is {self.kind!r} in [model]; it must be one of {', '.join(get_args(ModelKind))}.")
+        if self.kind not in MODEL_KINDS:
+            raise ConfigError(f"kind is {self.kind!r} in [model]; it must be one of {', '.join(MODEL_KINDS)}.")
         check_keys(self.effects, EFFECTS, "[effects]")
         check_keys(self.priors, REGISTRY, "the priors")
         complete = {}
@@ -137,6 +141,7 @@ class SimulatorConfig:
             parameters=replace(self.parameters, **grouped["parameters"]),
             mocap=replace(self.mocap, **grouped["mocap"]),
             effects=effects,
+            unknown=self.unknown - changes.keys(),
             **grouped["timing"],
         )
 
@@ -181,14 +186,17 @@ class SimulatorConfig:
                 {name: value for name, value in values.items() if not name.startswith("effects.")}
             )
             with_effects = replace(plain, effects=effects).with_values(values) if effects else plain
-            return replace(with_effects, priors=priors, doubts=doubts)
+            stated = {*values, *(p.same_as for name in effects for p in EFFECTS[name].parameters)}
+            return replace(with_effects, priors=priors, doubts=doubts, unknown=frozenset({LATENCY}) - stated)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
 
     def to_tables(self) -> dict[str, Any]:
-        """The tables that ``from_tables`` reads back to an equal simulator; ready for TOML."""
+        """The tables that ``from_tables`` reads back to an equal simulator, without what is unknown; ready for TOML."""
         tables: dict[str, Any] = {}
         for name, value in self.values().items():
+            if name in self.unknown:
+                continue
             *path, key = name.split(".")
             table = tables
             for part in path:
@@ -254,9 +262,7 @@ def _number(entry: Any, where: str) -> tuple[float, tuple[float, float] | None, 
                 f"{where}: value {given['value']:g} must lie between low {given['low']:g} and high {given['high']:g}."
             )
         return given["value"], (given["low"], given["high"]) if ranged else None, given.get("std")
-    if isinstance(entry, bool) or not isinstance(entry, (int, float)):
-        raise ConfigError(f"{where} must be a number, not {entry!r}.")
-    return float(entry), None, None
+    return number(entry, where), None, None
 
 
 __all__ = [

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 from carlab.core.angles import wrap
 from carlab.core.quantities import Action, CarState
-from sim_backends.actuators import ActuatorChain, ActuatorState
-from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS, ObservationEffect
-from sim_backends.integrate import MAX_STEP_S, integrate_held, substeps_for
-from sim_backends.single_track import SingleTrack, State
+from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
+from sim_backends.dynamics.array_ops import FLOATS
+from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held, substeps_for
+from sim_backends.dynamics.single_track import SingleTrack, State
+from sim_backends.measurement import MeasurementModel
 
 MEMORY_S = 1.0
 """How far back poses can be asked for [s]."""
@@ -54,8 +54,7 @@ class Plant:
         self._model = SingleTrack(FLOATS, config.kind, values, config.effects)
         self._chain = ActuatorChain(FLOATS, values, config.effects)
         self._delays_s = config.delays_s()
-        observers = (e for e in (EFFECTS[name] for name in config.effects) if isinstance(e, ObservationEffect))
-        self._observers = [(e, config.effects[e.id]) for e in sorted(observers, key=lambda e: (e.order, e.id))]
+        self._measurement = MeasurementModel(FLOATS, values, config.effects)
         self._t_s = self._start_s = 0.0
         self._state: State = (0.0,) * 6
         self._memory: ActuatorState = ()
@@ -132,9 +131,7 @@ class Plant:
 
     def measured_pose(self, t_s: float) -> Pose:
         """Pose of the tracked point at ``t_s`` with the observation effects (marker offset) but no noise or latency."""
-        state = self._true_at(t_s)[:6]
-        for effect, values in self._observers:
-            state = effect.observe(FLOATS, state, values)
+        state = self._measurement.observe(self._true_at(t_s)[:6])
         return Pose(state[0], state[1], wrap(state[2]))
 
     def _apply_due(self) -> None:

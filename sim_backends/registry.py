@@ -6,12 +6,13 @@ identification, the prior over simulators and the diagnosis treat every number a
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from carlab.core.errors import ConfigError
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import CATALOGUE, EFFECTS, Effect
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,22 +81,51 @@ _BASE = (
 )
 
 
-def _effect_parameters() -> Iterator[ParameterInfo]:
-    for effect in EFFECTS.values():
-        for p in effect.parameters:
-            yield ParameterInfo(
-                f"effects.{effect.id}.{p.name}",
-                p.unit,
-                p.identity,
-                p.low,
-                p.high,
-                p.positive,
-                same_as=p.same_as,
-                choices=p.choices,
-            )
+def _numbers_of(effect: Effect) -> dict[str, ParameterInfo]:
+    return {
+        (name := f"effects.{effect.id}.{p.name}"): ParameterInfo(
+            name, p.unit, p.identity, p.low, p.high, p.positive, same_as=p.same_as, choices=p.choices
+        )
+        for p in effect.parameters
+    }
 
 
-REGISTRY: dict[str, ParameterInfo] = {info.name: info for info in (*_BASE, *_effect_parameters())}
+REGISTRY: dict[str, ParameterInfo] = {info.name: info for info in _BASE}
+for _effect in EFFECTS.values():
+    REGISTRY |= _numbers_of(_effect)
+
+
+def register(effect: Effect) -> None:
+    """Make an effect known to car files, all engines, the diagnosis, its reports, and the prior of learning.
+
+    Raises:
+        ConfigError: its id is taken, or it has no parameters.
+    """
+    if effect.id in EFFECTS:
+        raise ConfigError(f"There is an effect '{effect.id}' already; give the new one another id.")
+    if not effect.parameters:
+        raise ConfigError(f"Effect '{effect.id}' has no parameters; give it at least one EffectParameter.")
+    EFFECTS[effect.id] = effect
+    if effect.catalogued:
+        CATALOGUE[effect.id] = effect
+    REGISTRY.update(_numbers_of(effect))
+
+
+@contextlib.contextmanager
+def registered(*effects: Effect) -> Iterator[None]:
+    """Register effects for the time of a ``with`` block."""
+    known: list[Effect] = []
+    try:
+        for effect in effects:
+            register(effect)
+            known.append(effect)
+        yield
+    finally:
+        for effect in known:
+            EFFECTS.pop(effect.id)
+            CATALOGUE.pop(effect.id, None)
+            for name in _numbers_of(effect):
+                REGISTRY.pop(name)
 
 
 def section(prefix: str) -> dict[str, ParameterInfo]:

@@ -11,7 +11,8 @@ import numpy as np
 from carlab.core.angles import wrap
 from carlab.core.quantities import PoseSample
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS, ObservationEffect
+from sim_backends.dynamics.array_ops import FLOATS
+from sim_backends.measurement import MeasurementModel
 from sim_backends.plant import Pose
 
 
@@ -20,16 +21,6 @@ class HasPose(Protocol):
 
     def measured_pose(self, t_s: float) -> Pose:
         """Pose of the tracked point at ``t_s``, without noise."""
-
-
-def mocap_latency_s(config: SimulatorConfig) -> float:
-    """Age of a pose on arrival [s]: the car file's, or that of the effect ``mocap_latency``."""
-    latency_s = config.mocap.latency_s
-    for effect_id, values in config.effects.items():
-        effect = EFFECTS[effect_id]
-        if isinstance(effect, ObservationEffect) and (instead := effect.latency_s(values)) is not None:
-            latency_s = float(instead)
-    return latency_s
 
 
 class MocapSensor:
@@ -46,7 +37,7 @@ class MocapSensor:
 
     def __init__(self, config: SimulatorConfig, seed: int = 0, *, extra_latency_s: float = 0.0) -> None:
         self._mocap = config.mocap
-        self.latency_s = mocap_latency_s(config) + extra_latency_s
+        self.latency_s: float = MeasurementModel(FLOATS, config.values(), config.effects).latency_s + extra_latency_s
         self.lost = 0
         self._rng = np.random.default_rng(seed)
         self._start_s = 0.0

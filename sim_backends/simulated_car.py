@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 
 from carlab.core.angles import wrap
 from carlab.core.car import Car
@@ -11,7 +12,8 @@ from carlab.core.errors import ActuatorFaultError, NotArmedError, NotOpenError, 
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Health, Observation, PoseSample, Reality
 from carlab.core.state_estimator import StateEstimator
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import EFFECTS, ObservationEffect
+from sim_backends.dynamics.array_ops import FLOATS
+from sim_backends.measurement import MeasurementModel, State, filter_step
 from sim_backends.plant import Plant, Pose
 from sim_backends.sensor import MocapSensor
 
@@ -20,7 +22,7 @@ class _Approach:
     """A tracked point that moves at a constant body velocity and is at ``state`` at ``t_s``: what the camera saw."""
 
     def __init__(self, config: SimulatorConfig, state: CarState, t_s: float) -> None:
-        self._plant = Plant(config)
+        self._measurement = MeasurementModel(FLOATS, config.values(), config.effects)
         self._state, self._t_s = state, t_s
 
     def measured_pose(self, t_s: float) -> Pose:
@@ -32,8 +34,8 @@ class _Approach:
         left = dt * (across * s.vx_mps + along * s.vy_mps)
         sin, cos = math.sin(s.yaw_rad), math.cos(s.yaw_rad)
         x, y = s.x_m + cos * forward - sin * left, s.y_m + sin * forward + cos * left
-        self._plant.reset(CarState(x, y, wrap(s.yaw_rad + turn)), t_s)
-        return self._plant.measured_pose(t_s)
+        seen = self._measurement.observe((x, y, wrap(s.yaw_rad + turn), s.vx_mps, s.vy_mps, s.yaw_rate_radps))
+        return Pose(seen[0], seen[1], wrap(seen[2]))
 
 
 class SimulatedCar(Car):
@@ -79,7 +81,7 @@ class SimulatedCar(Car):
         self._plant = Plant(self.config, seed)
         self._sensor = MocapSensor(self.config, seed, extra_latency_s=extra_pose_latency_s)
         self._estimator = StateEstimator(window_s)
-        self._filter = _VelocityFilter(self.config)
+        self._velocities = _MeasuredVelocities(self.config)
         self._open = self._armed = False
         self._fault: str | None = None
         self._fresh_until_s: float | None = None
@@ -102,7 +104,7 @@ class SimulatedCar(Car):
         begin_s = self.clock.now_s()
         arrive_s = begin_s + self._sensor.settling_time_s(self._estimator.window_s)
         self._estimator.reset()
-        self._filter.reset()
+        self._velocities.reset()
         self._sensor.reset(begin_s)
         self._unseen.clear()
         self._fresh_until_s = None
@@ -129,7 +131,7 @@ class SimulatedCar(Car):
             raise PoseLostError("No pose has arrived yet; lower [mocap] dropout or wait a little after open().")
         state, velocity_delay_s = estimate
         return Observation(
-            state=self._filter.state(state),
+            state=self._velocities.state(state),
             t_capture_s=newest.t_capture_s,
             t_receive_s=newest.t_receive_s,
             sequence=newest.sequence,
@@ -218,49 +220,37 @@ class SimulatedCar(Car):
     def _take_in(self, samples: list[PoseSample]) -> None:
         for sample in samples:
             self._estimator.update(sample)
-            self._filter.update(self._estimator)
+            self._velocities.update(self._estimator)
         self._unseen.extend(samples)
 
 
-class _VelocityFilter:
-    """The effect ``velocity_filter_lag``: an exact first-order filter on the estimated velocities."""
+class _MeasuredVelocities:
+    """What the measurement model makes of the estimated velocities: its effects on velocities and its filter."""
 
     def __init__(self, config: SimulatorConfig) -> None:
-        self._time_constant_s = velocity_time_constant_s(config)
+        self._model = MeasurementModel(FLOATS, config.values(), config.effects)
         self._t_s: float | None = None
-        self._input = self._output = (0.0, 0.0, 0.0)
+        self._input: State = (0.0, 0.0, 0.0)
+        self._output: State = (0.0, 0.0, 0.0)
 
     def reset(self) -> None:
         self._t_s = None
 
     def update(self, estimator: StateEstimator) -> None:
-        estimate, newest = estimator.estimate() if self._time_constant_s > 0.0 else None, estimator.newest
+        lag_s = self._model.velocity_time_constant_s
+        estimate, newest = estimator.estimate() if lag_s is not None else None, estimator.newest
         if estimate is None or newest is None or not estimator.velocity_valid:
             return
-        velocity = (estimate[0].vx_mps, estimate[0].vy_mps, estimate[0].yaw_rate_radps)
+        velocity = self._model.observe_velocities(astuple(estimate[0]))[3:]
         if self._t_s is None:
             self._output = velocity
         elif newest.t_capture_s > self._t_s:
-            span = (newest.t_capture_s - self._t_s) / self._time_constant_s
-            decay = math.exp(-span)
-            ramp = 1.0 - (1.0 - decay) / span
-            self._output = tuple(  # type: ignore[assignment]
-                decay * y + (1.0 - decay) * u0 + ramp * (u1 - u0)
-                for y, u0, u1 in zip(self._output, self._input, velocity, strict=True)
-            )
+            step_s = newest.t_capture_s - self._t_s
+            self._output = filter_step(FLOATS, self._output, self._input, velocity, step_s, lag_s)
         self._t_s, self._input = newest.t_capture_s, velocity
 
     def state(self, state: CarState) -> CarState:
+        """The state that a car reports for an estimated one."""
         if self._t_s is None:
-            return state
+            return CarState(*self._model.observe_velocities(astuple(state)))
         return CarState(state.x_m, state.y_m, state.yaw_rad, *self._output)
-
-
-def velocity_time_constant_s(config: SimulatorConfig) -> float:
-    """Time constant of the filter on measured velocities [s]; 0 where there is none."""
-    total_s = 0.0
-    for effect_id, values in config.effects.items():
-        effect = EFFECTS[effect_id]
-        if isinstance(effect, ObservationEffect) and (own := effect.velocity_time_constant_s(values)) is not None:
-            total_s += float(own)
-    return total_s

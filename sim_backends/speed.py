@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from carlab.core.quantities import Action
-from sim_backends.batch_rollout import rollout
+from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled_step import compile_step
-from sim_backends.plain_loop import rollout_one_by_one
+from sim_backends.compiled.step import compile_step
+from sim_backends.dynamics.plain_loop import rollout_one_by_one
 from sim_backends.plant import Plant
 
 TICKS = 30

@@ -20,10 +20,30 @@ def test_layers_point_down() -> None:
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_importing_a_package_imports_nothing_heavy(package: str) -> None:
-    heavy = ("torch", "serial", "can", "rerun", "mcap", "gymnasium", "scipy", "stable_baselines3", "pygame")
+    heavy = (
+        "torch",
+        "serial",
+        "can",
+        "rerun",
+        "mcap",
+        "gymnasium",
+        "scipy",
+        "stable_baselines3",
+        "pygame",
+        "matplotlib",
+    )
     code = f"import sys, {package}; print([m for m in {heavy!r} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_importing_carlab_loads_little_beside_the_standard_library() -> None:
+    """A bound on modules instead of seconds, which depend on what else the machine does; 0.2 s are some 400 modules."""
+    code = "import sys; before = set(sys.modules); import carlab; print(len(set(sys.modules) - before), *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    count, *loaded = done.stdout.split()
+    assert int(count) < 40
+    assert "numpy" not in loaded
 
 
 def test_only_the_command_line_and_processes_of_their_own_print() -> None:

@@ -12,10 +12,10 @@ from typing import Any
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import as_polygon
 from carlab.core.safety import SafetyEnvelope
-from carlab.core.tables import check_keys, from_table
+from carlab.core.tables import check_keys, from_table, number
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig, HardwareConfig
-from mocap.mocap_config import MocapConfig
+from mocap.config import MocapConfig
 from sim_backends.car_parameters import TABLES, SimulatorConfig, preset_names
 
 _ARMING = tuple(f.name for f in fields(HardwareConfig) if f.name.startswith("arm_"))
@@ -39,6 +39,18 @@ class CarFile:
     text: str
     simulator: SimulatorConfig
     real: RealCar | None
+
+    def save(self, path: Path | str) -> Path:
+        """Write the file as TOML, replacing one that is there; returns the path.
+
+        Raises DataError where it cannot be written.
+        """
+        import tomli_w
+
+        from carlab.recording.atomic_files import write_text
+
+        write_text(Path(path), self.text or tomli_w.dumps(self.simulator.to_tables()))
+        return Path(path)
 
 
 def load_car_file(path: Path) -> CarFile:
@@ -104,7 +116,7 @@ def _real_car(tables: Any, path: Path) -> RealCar:
     hardware = HardwareConfig(
         actuator=from_table(ActuatorConfig, table("actuator"), f"[hardware.actuator] of {path}"),
         calibration=from_table(ActuatorCalibration, table("calibration"), f"[hardware.calibration] of {path}"),
-        **{name: _number(tables[name], name, where) for name in _ARMING if name in tables},
+        **{name: number(tables[name], f"'{name}' in {where}") for name in _ARMING if name in tables},
     )
     return RealCar(
         name=str(tables.get("name", path.stem)),
@@ -112,9 +124,3 @@ def _real_car(tables: Any, path: Path) -> RealCar:
         mocap=from_table(MocapConfig, table("mocap"), f"[hardware.mocap] of {path}"),
         envelope=replace(envelope, arena_m=as_polygon(arena["corners_m"], f"corners_m in [hardware.arena] of {path}")),
     )
-
-
-def _number(value: Any, name: str, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ConfigError(f"'{name}' in {where} must be a number, not {value!r}.")
-    return float(value)

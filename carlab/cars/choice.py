@@ -6,17 +6,13 @@ import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from carlab.cars.car_file import CarFile, default_car, is_preset, load_car_file
 from carlab.core.car import Car
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, ActionLimits, Reality
 from carlab.core.safety import SafetyEnvelope
-from sim_backends.car_parameters import preset_names
-
-if TYPE_CHECKING:
-    from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.car_parameters import SimulatorConfig, preset_names
 
 PLUGIN_GROUP = "carlab.cars"
 
@@ -43,15 +39,23 @@ class CarChoice:
 
 
 def choose_car(
-    name: str, *, vehicle: Path | None = None, dry_run: bool = False, seed: int = 0, log_folder: Path | None = None
+    name: str | CarFile,
+    *,
+    vehicle: Path | CarFile | None = None,
+    reality: Path | CarFile | None = None,
+    dry_run: bool = False,
+    seed: int = 0,
+    log_folder: Path | None = None,
 ) -> CarChoice:
     """Build the car that ``--car`` names; nothing is opened.
 
     Args:
         name: sim, emulated, emulated-can, the name of a plug-in (entry point group ``carlab.cars``: a callable that
-            takes a CarFile and a seed and returns a CarChoice), a car that comes with the package (simulated), or
-            the path of a car file.
+            takes a CarFile and a seed and returns a CarChoice), a car that comes with the package (simulated),
+            the path of a car file, or a car file that was read.
         vehicle: car file whose physics sim, emulated and plug-ins use; the default car without it.
+        reality: car file whose physics a simulated or emulated car has in truth, while ``CarChoice.simulator`` and the
+            recordings keep what the other file says; the same file without it.
         dry_run: swallow commands.
         seed: of the sensors' noise.
         log_folder: where an emulated car writes its log.
@@ -59,22 +63,7 @@ def choose_car(
     Raises:
         ConfigError: there is no such car, or its file is wrong.
     """
-    plugins = {point.name: point for point in importlib.metadata.entry_points(group=PLUGIN_GROUP)}
-    if name in BUILT_IN:
-        choice = BUILT_IN[name](default_car() if vehicle is None else load_car_file(vehicle), seed)
-    elif name in plugins:
-        choice = plugins[name].load()(default_car() if vehicle is None else load_car_file(vehicle), seed)
-    else:
-        if vehicle is not None:
-            raise ConfigError(f"--vehicle goes with --car sim or emulated; '{name}' is a car of its own.")
-        path = Path(name)
-        if path.suffix != ".toml" and not path.exists() and not is_preset(path):
-            raise ConfigError(
-                f"There is no car '{name}'; name one of {', '.join([*BUILT_IN, *plugins, *preset_names()])}, "
-                "or a FILE.toml."
-            )
-        file = load_car_file(path)
-        choice = _real(file, seed) if file.real is not None else _simulated(file, seed)
+    choice = _choose(name, vehicle, reality, seed)
     if log_folder is not None:
         choice.log_to(log_folder)
     if dry_run:
@@ -84,29 +73,66 @@ def choose_car(
     return choice
 
 
+def _choose(
+    name: str | CarFile, vehicle: Path | CarFile | None, reality: Path | CarFile | None, seed: int
+) -> CarChoice:
+    truth = None if reality is None else _read(reality).simulator
+    plugins = {point.name: point for point in importlib.metadata.entry_points(group=PLUGIN_GROUP)}
+    if isinstance(name, str) and name in BUILT_IN:
+        return BUILT_IN[name](default_car() if vehicle is None else _read(vehicle), seed, truth)
+    if isinstance(name, str) and name in plugins:
+        if truth is not None:
+            raise ConfigError(f"--reality goes with simulated and emulated cars; '{name}' has physics of its own.")
+        choice: CarChoice = plugins[name].load()(default_car() if vehicle is None else _read(vehicle), seed)
+        return choice
+    if vehicle is not None:
+        raise ConfigError(f"--vehicle goes with --car sim or emulated; '{_name_of(name)}' is a car of its own.")
+    if isinstance(name, str):
+        path = Path(name)
+        if path.suffix != ".toml" and not path.exists() and not is_preset(path):
+            raise ConfigError(
+                f"There is no car '{name}'; name one of {', '.join([*BUILT_IN, *plugins, *preset_names()])}, "
+                "or a FILE.toml."
+            )
+    file = _read(Path(name) if isinstance(name, str) else name)
+    if file.real is None:
+        return _simulated(file, seed, truth)
+    if truth is not None:
+        raise ConfigError(f"--reality goes with simulated and emulated cars; '{_name_of(name)}' is a real one.")
+    return _real(file, seed)
+
+
+def _read(car: Path | CarFile) -> CarFile:
+    return car if isinstance(car, CarFile) else load_car_file(car)
+
+
+def _name_of(car: str | CarFile) -> str:
+    return car.name if isinstance(car, CarFile) else car
+
+
 def _config_toml(file: CarFile, car: str) -> str:
     import tomli_w
 
     return f"# --car {car}\n" + (file.text or tomli_w.dumps(file.simulator.to_tables()))
 
 
-def _simulated(file: CarFile, seed: int) -> CarChoice:
+def _simulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
     from sim_backends.simulated_car import SimulatedCar
 
-    car = SimulatedCar(file.simulator, seed=seed, name=file.name)
+    car = SimulatedCar(truth or file.simulator, seed=seed, name=file.name)
     return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, "sim"))
 
 
-def _emulated(file: CarFile, seed: int, actuator: str = "serial") -> CarChoice:
+def _emulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None, actuator: str = "serial") -> CarChoice:
     from carlab.cars.emulated_car import EmulatedCar
 
-    car = EmulatedCar(file, actuator=actuator, seed=seed)
+    car = EmulatedCar(file, actuator=actuator, seed=seed, reality=truth)
     name = "emulated" if actuator == "serial" else "emulated-can"
     return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, name), car.log_to)
 
 
-def _emulated_can(file: CarFile, seed: int) -> CarChoice:
-    return _emulated(file, seed, "can")
+def _emulated_can(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
+    return _emulated(file, seed, truth, "can")
 
 
 def _real(file: CarFile, seed: int) -> CarChoice:
@@ -140,7 +166,7 @@ def _envelope(file: CarFile) -> SafetyEnvelope:
     return SafetyEnvelope() if file.real is None else file.real.envelope
 
 
-BUILT_IN: dict[str, Callable[[CarFile, int], CarChoice]] = {
+BUILT_IN: dict[str, Callable[[CarFile, int, SimulatorConfig | None], CarChoice]] = {
     "sim": _simulated,
     "emulated": _emulated,
     "emulated-can": _emulated_can,

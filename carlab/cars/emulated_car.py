@@ -26,8 +26,9 @@ from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
 from drivers.config import MULTICAST_GROUP, ActuatorConfig
 from drivers.hardware_car import HardwareCar
-from mocap.mocap_config import MocapConfig
+from mocap.config import MocapConfig
 from mocap.rigid_body import RigidBodyPoseSource
+from sim_backends.car_parameters import SimulatorConfig
 
 START_TIMEOUT_S = 30.0
 ANSWER_TIMEOUT_S = 5.0
@@ -126,6 +127,8 @@ class EmulatedCar(Car):
         file: whose physics and motion capture the world has.
         actuator: ``serial`` or ``can``.
         seed: of the motion capture's noise.
+        reality: physics and motion capture of the world where they differ from the file's; nothing but the bytes on the
+            wire carries them to the driver.
         world: further options of the world (bitstream, multicast ...).
         actuator_options: further options of the actuator (rates, watchdog ...).
     """
@@ -138,6 +141,7 @@ class EmulatedCar(Car):
         *,
         actuator: str = "serial",
         seed: int = 0,
+        reality: SimulatorConfig | None = None,
         world: Mapping[str, Any] | None = None,
         actuator_options: Mapping[str, Any] | None = None,
     ) -> None:
@@ -146,7 +150,8 @@ class EmulatedCar(Car):
         self.clock = MonotonicClock()
         self._actuator = actuator
         self._actuator_options = dict(actuator_options or {})
-        self._config = WorldConfig(simulator=file.simulator.to_tables(), actuator=actuator, seed=seed, **(world or {}))
+        physics = (reality or file.simulator).to_tables()
+        self._config = WorldConfig(simulator=physics, actuator=actuator, seed=seed, **(world or {}))
         self._world: EmulatedWorld | None = None
         self._car: HardwareCar | None = None
 

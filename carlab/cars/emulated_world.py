@@ -30,10 +30,10 @@ from drivers.emulators.can_firmware import CanFirmware
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import RESTING, VescFirmware
-from drivers.vesc_payloads import MotorValues
-from mocap.emulated_scene import EmulatedBody, RigidBodySample
-from mocap.emulator import NatNetServer
-from mocap.emulator_faults import ServerFaults
+from drivers.vesc.payloads import MotorValues
+from mocap.emulators.faults import ServerFaults
+from mocap.emulators.natnet_server import NatNetServer
+from mocap.emulators.scene import EmulatedBody, RigidBodySample
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.plant import Plant
 from sim_backends.sensor import MocapSensor

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-EXIT_INTERRUPTED = 130
+from carlab.cli.exit_codes import EXIT_INTERRUPTED
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -45,6 +45,11 @@ def run(argv: Sequence[str]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
+        from carlab.recording.sink import DISK_FULL, describe_os_error
+
+        if error.errno in DISK_FULL:
+            fail(describe_os_error(error, error.filename or os.getcwd()))
+            return 1
         named = f"{error.filename}: " if error.filename else ""
         what = "the path, its permissions and the disk" if error.filename else "addresses, cables and permissions"
         fail(f"{named}{error.strerror or error}; check {what}.")

@@ -1,4 +1,4 @@
-"""What studies of ``carlab bench`` leave behind: figures kept after every fit, a table, a picture, and an exit code."""
+"""Output of the studies of ``carlab bench``: figures written after every fit, a table, a picture, an exit code."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.cli.console import console, fail, progress, table
+from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 
 if TYPE_CHECKING:
-    from carlab.cli.bench import Bench
-    from carlab.experiment.regression_study import Progress, Row, Score
+    from carlab.cli.bench_options import BenchOptions
+    from carlab.studies.regression.scores import Row, Score
+    from carlab.studies.regression.study import Progress
 
-MINUTES_S = 600.0
-EXIT_FAILED = 1
+SPEED_PERIOD_S = 600.0
+"""Window over which the progress bar estimates its speed."""
 
 
 def command() -> str:
@@ -25,24 +27,29 @@ def command() -> str:
 
 def write_figures(path: Path, figures: Mapping[str, Any]) -> None:
     """Write a JSON file whole, or leave the one that is there; DataError where that fails."""
-    from carlab.recording.whole_files import write_text
+    from carlab.recording.atomic_files import write_text
 
     write_text(path, json.dumps(figures, indent=2) + "\n")
 
 
-def followed(study: Callable[[Progress], Iterator[Score]], options: Bench, name: str) -> tuple[list[Score], bool]:
-    """Scores of a study, each written as soon as it is there, and whether ^C ended it; a fit that failed is told.
+def run_and_write(
+    study: Callable[[Progress], Iterator[Score]], options: BenchOptions, name: str
+) -> tuple[list[Score], bool]:
+    """Run a study, write the figures after each score, and print each failure.
 
     Args:
-        study: begins it, and tells how far it is.
-        options: among them the file that is written.
+        study: starts it with a progress callback.
+        options: with the file to write.
         name: of the progress bar.
+
+    Returns:
+        The scores, and whether ^C ended the study.
     """
-    from carlab.experiment.interrupts import Interrupts
-    from carlab.experiment.regression_study import as_json
+    from carlab.experiment.episodes.interrupts import Interrupts
+    from carlab.studies.regression.scores import as_json
 
     scores: list[Score] = []
-    with Interrupts() as interrupts, progress(speed_estimate_period_s=MINUTES_S) as bar:
+    with Interrupts() as interrupts, progress(speed_estimate_period_s=SPEED_PERIOD_S) as bar:
         task = bar.add_task(name, total=None, note="")
         for score in study(lambda note, done, total: bar.update(task, completed=done, total=total, note=note)):
             scores.append(score)
@@ -55,36 +62,38 @@ def followed(study: Callable[[Progress], Iterator[Score]], options: Bench, name:
         return scores, interrupts.requested.is_set()
 
 
-def told(scores: Sequence[Score], stopped: bool, options: Bench, title: str, first: str, *beside: Path) -> int:
-    """Print and draw a study; the exit code says whether it was ended early or some fit failed.
+def report(scores: Sequence[Score], stopped: bool, options: BenchOptions, title: str, first: str, *others: Path) -> int:
+    """Print and draw a study.
 
     Args:
         scores: of it.
         stopped: whether it was ended early.
-        options: among them the file that was written.
+        options: with the file that was written.
         title: of the table.
-        first: what is compared.
-        beside: what else was written.
-    """
-    from carlab.cli import EXIT_INTERRUPTED
-    from carlab.experiment.regression_picture import draw
-    from carlab.experiment.regression_study import summarised
+        first: head of the column with the compared methods.
+        others: further files that were written.
 
-    found = summarised(scores)
-    print_rows(f"{title}{', interrupted' if stopped else ''}", first, found)
+    Returns:
+        The exit code: whether the study was ended early, or some fit failed.
+    """
+    from carlab.studies.regression.picture import draw
+    from carlab.studies.regression.scores import summarised
+
+    rows = summarised(scores)
+    print_rows(f"{title}{', interrupted' if stopped else ''}", first, rows)
     if options.out is not None:
-        written = [options.out, *beside]
-        if any(row.seeds for row in found):
+        written = [options.out, *others]
+        if any(row.seeds for row in rows):
             written.insert(1, options.out.with_suffix(".png"))
-            draw(found, written[1])
+            draw(rows, written[1])
         console.print(", ".join(map(str, written)))
     if stopped:
         return EXIT_INTERRUPTED
-    return EXIT_FAILED if any(row.failed for row in found) else 0
+    return EXIT_FAILED if any(row.failed for row in rows) else 0
 
 
 def print_rows(title: str, first: str, rows: Sequence[Row]) -> None:
-    """Scores as a table; ``first`` says what is compared."""
+    """Print scores as a table; ``first`` is the head of the column with the compared methods."""
     columns = ["rows", first, "NLL [nat]", "+-", "RMSE", "calibration error", "seconds"]
     cells = [[f"{r.rows}", _named(r), *_figures(r)] for r in rows]
     if any(r.nll_in_world is not None for r in rows):
@@ -110,4 +119,4 @@ def _figures(row: Row) -> list[str]:
     ]
 
 
-__all__ = ["command", "followed", "print_rows", "told", "write_figures"]
+__all__ = ["command", "print_rows", "report", "run_and_write", "write_figures"]

@@ -10,17 +10,17 @@ from carlab.cli.console import console, table
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from carlab.cli.bench import Bench
-    from carlab.experiment.parking_study import MethodFigures
+    from carlab.cli.bench_options import BenchOptions
+    from carlab.studies.parking import MethodFigures
 
 
-def run_parking(options: Bench) -> int:
-    """Drive what is missing of the study's runs, and print what all of them came to."""
+def run_parking(options: BenchOptions) -> int:
+    """Drive the missing runs of the study, and print the figures of all."""
     from carlab.cli.learn import Learn
     from carlab.cli.options import CarOptions
-    from carlab.experiment.campaign import CAMPAIGN_FILE
-    from carlab.experiment.parking_study import as_json, check_run, draw, read_curve, run_folder, run_name, summarised
-    from learning.car_fit import Method
+    from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
+    from carlab.studies.parking import as_json, check_run, draw, read_curve, run_folder, run_name, summarised
+    from learning.world.car_fit import Method
 
     methods: tuple[Method, ...] = tuple(m for m in get_args(Method) if m in options.methods or not options.methods)
     if unknown := [m for m in options.methods if m not in get_args(Method)]:

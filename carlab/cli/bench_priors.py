@@ -9,27 +9,26 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cli.bench_output import followed, told
+from carlab.api.recordings import required_file
+from carlab.cli.bench_output import report, run_and_write
 from carlab.cli.console import console, progress
-from carlab.cli.options import required_file
 from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from carlab.cli.bench import Bench
+    from carlab.cli.bench_options import BenchOptions
 
 HOLDOUT_SHARE = 0.1
-"""Of the recordings that are diagnosed. Of train_1 of the ETH car a diagnosis that fits 70 % names four effects, one
-that fits 90 % eight."""
+"""Share of the diagnosed recordings that the diagnosis holds out for itself (docs/decisions/0014)."""
 
 
-def run_priors(options: Bench) -> int:
-    """Record or read, diagnose what is not held out, learn under each prior, and print."""
+def run_priors(options: BenchOptions) -> int:
+    """Record or read, diagnose the recordings that are not held out, learn under each prior, and print."""
     from carlab.cars import load_car_file
     from carlab.cli.recordings import load_episodes
-    from carlab.experiment.prior_study import prior_models, run_prior_study
-    from carlab.experiment.regression_recordings import recorded_case
+    from carlab.studies.priors import prior_models, run_prior_study
+    from carlab.studies.regression.recordings import recorded_case
 
     with ExitStack() as stack:
         work = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -44,9 +43,9 @@ def run_priors(options: Bench) -> int:
         diagnosed = load_car_file(model).simulator
         simulator = load_car_file(car).simulator
         case = recorded_case([load_episodes(path) for path in files], car, options.history)
-        console.print(f"{case.told} Held out: {files[-1].name}.", soft_wrap=True)
+        console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
         priors = prior_models(case, simulator, diagnosed)
-        scores, stopped = followed(
+        scores, stopped = run_and_write(
             lambda progress: run_prior_study(
                 case, priors, rows=options.rows, seeds=options.seeds, steps=options.steps, device=options.device,
                 progress=progress,
@@ -54,11 +53,16 @@ def run_priors(options: Bench) -> int:
             options,
             "priors",
         )  # fmt: skip
-        return told(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
+        return report(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
 
 
 def check_unseen(model: Path, held_out: Path) -> None:
-    """Raise ConfigError where the report beside a diagnosed car names the recording that is held out."""
+    """Check that the report beside a diagnosed car does not name the held-out recording.
+
+    Raises:
+        ConfigError: it does, or there is no such model.
+        DataError: the report cannot be read.
+    """
     required_file(model, "The diagnosed car")
     report = model.parent / "report.json"
     if not report.is_file():
@@ -74,8 +78,8 @@ def check_unseen(model: Path, held_out: Path) -> None:
         )
 
 
-def _recordings(options: Bench, work: Path) -> tuple[Path, list[Path], str]:
-    """Car file, recordings, the last of which is held out, and what they are."""
+def _recordings(options: BenchOptions, work: Path) -> tuple[Path, list[Path], str]:
+    """Car file, recordings (the last one is held out), and a title."""
     if options.data is not None:
         if not options.data.is_dir():
             raise ConfigError(
@@ -85,7 +89,7 @@ def _recordings(options: Bench, work: Path) -> tuple[Path, list[Path], str]:
         if len(files) < 2:
             raise DataError(f"{options.data} has {len(files)} recordings; the last is held out, so two are needed.")
         return options.car, files, options.data.name
-    from carlab.experiment.concealed_recordings import CAR_NAME, HELD_OUT_NAME, TRAINING_NAME, record_pair
+    from carlab.studies.concealed_recordings import CAR_NAME, HELD_OUT_NAME, TRAINING_NAME, record_pair
 
     folder = work / "recordings"
     with progress() as bar:
@@ -93,15 +97,12 @@ def _recordings(options: Bench, work: Path) -> tuple[Path, list[Path], str]:
         pair = record_pair(options.pair, folder, *options.recorded_s)
         bar.remove_task(task)
     what = " and ".join(name.replace("_", " ") for name in pair.effects)
-    console.print(f"Concealed in the simulated car, told to nobody else: {what} (seed {pair.seed}).", soft_wrap=True)
+    console.print(f"Concealed in the simulated car: {what} (seed {pair.seed}).", soft_wrap=True)
     return folder / CAR_NAME, [folder / TRAINING_NAME, folder / HELD_OUT_NAME], what
 
 
 def _diagnosed(files: Sequence[Path], car: Path, folder: Path) -> Path:
-    """The car file of a diagnosis of some recordings, which holds out the end of each for itself.
-
-    No more than it needs: the recording that is held out from it is what judges here.
-    """
+    """The car file of a diagnosis of some recordings, which holds out the end of each for itself."""
     from carlab.cli.diagnose import Diagnose
 
     if Diagnose(tuple(files), car=str(car), out=folder, holdout_share=HOLDOUT_SHARE).run() != 0:

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from carlab.cli.bench_output import followed, told
+from carlab.cli.bench_output import report, run_and_write
 from carlab.cli.console import console
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from carlab.cli.bench import Bench
-    from carlab.experiment.regression_recordings import RecordedCase
+    from carlab.cli.bench_options import BenchOptions
+    from carlab.studies.regression.recordings import RecordedCase
 
 
-def run_regression(options: Bench) -> int:
-    """Fit every method to few rows, and print; what was measured is kept after each fit."""
-    from carlab.experiment.regression_study import run_study
+def run_regression(options: BenchOptions) -> int:
+    """Fit every method to few rows, and print; the figures are written after each fit."""
+    from carlab.studies.regression.cases import CASES
+    from carlab.studies.regression.study import run_study
 
     case = _recorded(options) if options.case == "realcar" else options.case
-    scores, stopped = followed(
+    scores, stopped = run_and_write(
         lambda progress: run_study(
             case, rows=options.rows, seeds=options.seeds, methods=options.methods, way=options.way, data=options.data,
             steps=options.steps, device=options.device, progress=progress,
@@ -26,17 +27,21 @@ def run_regression(options: Bench) -> int:
         options,
         options.case,
     )  # fmt: skip
-    return told(scores, stopped, options, f"{options.case}, {options.seeds} seeds, {options.way}", "method")
+    code = report(scores, stopped, options, f"{options.case}, {options.seeds} seeds, {options.way}", "method")
+    note = CASES[options.case].comparison_note if options.case in CASES and options.way == "ours" else ""
+    if note:
+        console.print(note, soft_wrap=True)
+    return code
 
 
-def _recorded(options: Bench) -> RecordedCase:
+def _recorded(options: BenchOptions) -> RecordedCase:
     from carlab.cli.recordings import load_episodes
-    from carlab.experiment.regression_recordings import recorded_case
+    from carlab.studies.regression.recordings import recorded_case
 
     if options.data is None or not options.data.is_dir():
         given = "" if options.data is None else f" ('{options.data}' is none)"
         raise ConfigError(f"--case realcar needs --data FOLDER{given}, with two recordings (MCAP or CSV) at least.")
     files = sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
     case = recorded_case([load_episodes(path) for path in files], options.car, options.history)
-    console.print(f"{case.told} Held out: {files[-1].name}.", soft_wrap=True)
+    console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
     return case

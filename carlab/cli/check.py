@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 from tyro.conf import OmitArgPrefixes
 
+from carlab.api.arguments import above_zero
 from carlab.cli.console import banner, console, fail, table
-from carlab.cli.options import CarOptions, above_zero
+from carlab.cli.options import CarOptions
 from carlab.core.errors import NotReadyError
 
 UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM", "count": "", "flag": ""}

@@ -56,7 +56,7 @@ class Emulate:
         """Serve until interrupted."""
         from carlab.cars import default_car, load_car_file
         from carlab.cars.emulated_world import World, WorldConfig
-        from carlab.experiment.interrupts import Interrupts
+        from carlab.experiment.episodes.interrupts import Interrupts
 
         self._refuse_nonsense()
         file = default_car() if self.vehicle is None else load_car_file(self.vehicle)

@@ -27,7 +27,7 @@ class Export:
 
     def run(self) -> int:
         """Read and write."""
-        from carlab.recording.export import write_csv, write_parquet
+        from carlab.recording.csv.export import write_csv, write_parquet
 
         name = self.out.name.lower()
         if not name.endswith((".csv", ".csv.gz", ".parquet")):

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
+from carlab.api.recordings import is_csv, required_file, resolved_mapping
 from carlab.cli.console import console
-from carlab.cli.options import new_file, required_file
-from carlab.cli.recordings import is_csv, print_findings
+from carlab.cli.options import new_file
+from carlab.cli.recordings import print_findings
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from carlab.recording.csv_mapping import ColumnMapping
+    from carlab.recording.csv.mapping import ColumnMapping
 
 Sign = Literal[1, -1]
+NOT_OF_THE_MAPPING = ("recording", "out", "mapping", "report", "verbose")
 
 
 @dataclass
@@ -139,10 +141,10 @@ class Import:
 
     def run(self) -> int:
         """Import, report, write."""
-        from carlab.recording.foreign_csv import import_csv
-        from carlab.recording.mcap_sink import write_episode
+        from carlab.recording.csv.foreign import import_csv
+        from carlab.recording.mcap.sink import write_episode
 
-        required_file(self.recording, "The recording")
+        required_file(self.recording)
         if not is_csv(self.recording):
             raise ConfigError(f"{self.recording} is not a .csv or .csv.gz; carlab import reads those.")
         stem = self.recording.name.removesuffix(".gz").removesuffix(".csv")
@@ -169,34 +171,6 @@ class Import:
         return 0
 
     def _mapping(self) -> ColumnMapping | None:
-        from carlab.recording.csv_mapping import load_mapping, recognise_layout
-        from carlab.recording.csv_table import read_csv
-
-        columns: dict[str, dict[str, Any]] = {}
-        for channel in ("x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle"):
-            for part in ("unit", "sign", "scale"):
-                value = getattr(self, f"{channel}_{part}", None)
-                if value is not None:
-                    columns.setdefault(channel, {})[part] = value
-        options = {
-            "velocity_frame": self.velocity_frame,
-            "velocity_lag_s": self.velocity_lag,
-            "velocities": self.velocities,
-            "yaw_offset_rad": self.yaw_offset,
-            "swap_xy": self.swap_xy,
-            "repair_yaw_rate": self.repair_yaw_rate,
-            "missing": self.missing,
-            "gaps": self.gaps,
-            "stamps": self.stamps,
-            "clock": self.clock,
-            "command_lag_s": self.command_lag,
-            "rate_hz": self.rate,
-        }
-        given = {name: value for name, value in options.items() if value is not None}
-        if self.mapping is None and not given and not columns:
-            return None
-        if self.mapping is not None:
-            mapping = load_mapping(self.mapping)
-        else:
-            mapping = recognise_layout(read_csv(self.recording).header, self.recording.name)
-        return mapping.with_options(columns=columns, **given)
+        own = {f.name: getattr(self, f.name) for f in fields(self)}
+        options = {name: value for name, value in own.items() if name not in NOT_OF_THE_MAPPING}
+        return resolved_mapping(self.recording, self.mapping, options)

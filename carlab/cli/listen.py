@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from carlab.api.arguments import above_zero
 from carlab.cli.console import console, table
-from carlab.cli.options import above_zero
 from carlab.core.errors import ConfigError
 
 
@@ -52,8 +52,8 @@ class Listen:
         """Listen and print four lines a second, then the statistics."""
         from carlab.cars import load_car_file
         from carlab.core.clock import MonotonicClock
-        from carlab.experiment.interrupts import Interrupts
-        from mocap.mocap_config import MocapConfig
+        from carlab.experiment.episodes.interrupts import Interrupts
+        from mocap.config import MocapConfig
         from mocap.rigid_body import RigidBodyPoseSource
 
         above_zero(seconds=self.seconds)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import shlex
-import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from carlab.api.cars import typed_car
 from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -29,23 +27,24 @@ class CarOptions:
     dry_run: bool = False
     """Real inputs, but no command is sent."""
 
+    reality: Path | None = None
+    """Car file whose physics a simulated or emulated car has in truth: what differs from its own file is concealed from
+    everything that learns and diagnoses, and reaches it through recordings alone."""
+
+    def arguments(self) -> dict[str, Any]:
+        """These options as arguments of the calls that drive."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
     def typed(self) -> str:
         """These options as one would type them, each with a space before it; nothing for those that need no word."""
-        words = [] if self.car == CarOptions().car else ["--car", self.car]
-        words += [] if self.vehicle is None else ["--vehicle", str(self.vehicle)]
-        words += ["--dry-run"] if self.dry_run else []
-        return "".join(f" {shlex.quote(word)}" for word in words)
+        return typed_car(**self.arguments())
 
     def choose(self, *, seed: int, log_folder: Path | None = None) -> CarChoice:
         """Build the car; nothing is opened yet."""
         from carlab.cars import choose_car
 
-        return choose_car(self.car, vehicle=self.vehicle, dry_run=self.dry_run, seed=seed, log_folder=log_folder)
-
-
-def has_screen() -> bool:
-    """Whether a window can be opened."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        given = self.arguments()
+        return choose_car(given.pop("car"), **given, seed=seed, log_folder=log_folder)
 
 
 def new_file(path: Path, option: str, suffix: str) -> Path:
@@ -63,20 +62,4 @@ def json_file(path: Path, option: str) -> Path:
         raise ConfigError(f"{option} {path}: name a file that ends in .json.")
     if not path.parent.is_dir():
         raise ConfigError(f"{option} {path}: there is no folder {path.parent}; make it first.")
-    return path
-
-
-def above_zero(**values: float | None) -> None:
-    """Raise ConfigError for an option that is not a finite number above zero; None is none given."""
-    for name, value in values.items():
-        if value is not None and not 0.0 < value < float("inf"):
-            raise ConfigError(f"--{name} {value:g}: a number above zero.")
-
-
-def required_file(path: Path, what: str) -> Path:
-    """The path, where it is a file; ConfigError otherwise."""
-    if not path.exists():
-        raise ConfigError(f"{what} '{path}' does not exist; check the path.")
-    if path.is_dir():
-        raise ConfigError(f"{what} '{path}' is a folder; name a file in it.")
     return path

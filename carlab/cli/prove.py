@@ -15,9 +15,9 @@ from carlab.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from carlab.concealment.proof_set import CaseSpec
-    from carlab.concealment.runner import Proof
-    from carlab.experiment.interrupts import Interrupts
+    from carlab.benchmark.cases.proof_set import CaseSpec
+    from carlab.benchmark.proof.runner import Proof
+    from carlab.experiment.episodes.interrupts import Interrupts
 
 STAGES = {
     "make": "cases made",
@@ -64,20 +64,26 @@ class Prove:
     baselines: bool = True
     """Put the same cases to PySINDy, a Gaussian process, stepwise BIC and cross-correlation."""
 
+    calibrate: bool = False
+    """Run nothing; print the rates of false and missed names over the range of each decision threshold, from the
+    finished diagnoses of the folder. Use it with --set development: never tune on the test set."""
+
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
         """Make, seal, diagnose, open, score."""
-        from carlab.concealment.baselines import require_studies
-        from carlab.concealment.runner import Proof
-        from carlab.experiment.interrupts import Interrupts
+        from carlab.benchmark.baselines.run import require_studies
+        from carlab.benchmark.proof.runner import Proof
+        from carlab.experiment.episodes.interrupts import Interrupts
 
         if self.jobs < 1 or self.timeout <= 0.0:
             raise ConfigError("--jobs and --timeout: numbers above zero.")
         specs = self._specs()
         if self.simulator != "own":
             return self._study()
+        if self.calibrate:
+            return self._calibrate(Proof(self.out, specs))
         if self.baselines:
             require_studies()
         with Interrupts() as interrupts, progress(speed_estimate_period_s=DAY_S) as bar:
@@ -92,10 +98,10 @@ class Prove:
         return self._score(proof)
 
     def _study(self) -> int:
-        from carlab.concealment.public_report import ASKED_RATIO
-        from carlab.concealment.public_simulator import require_public_simulator
-        from carlab.concealment.public_study import study
-        from carlab.experiment.interrupts import Interrupts
+        from carlab.benchmark.public_simulators.commonroad import require_public_simulator
+        from carlab.benchmark.public_simulators.study import study
+        from carlab.benchmark.public_simulators.study_page import ASKED_RATIO
+        from carlab.experiment.episodes.interrupts import Interrupts
 
         require_public_simulator()
         seeds = range(self.seed, self.seed + (self.limit or 1))
@@ -115,6 +121,18 @@ class Prove:
             return 130
         return 0 if all(row["verdict"] for row in rows) else 1
 
+    def _calibrate(self, proof: Proof) -> int:
+        from carlab.benchmark.proof.calibration import COLUMNS, calibrate
+
+        decisions = proof.decisions() if (proof.root / "seal.json").exists() else {}
+        if not decisions:
+            raise ConfigError(
+                f"{self.out} has no finished diagnosis with decisions.json; run the same command without --calibrate."
+            )
+        rates = calibrate(proof.open_seal(), decisions)
+        table(f"{len(decisions)} cases; * marks the present value", list(COLUMNS), [r.row() for r in rates])
+        return 0
+
     def _stages(self, proof: Proof, interrupts: Interrupts) -> bool:
         if proof.make() is None or not proof.diagnose():
             return False
@@ -125,7 +143,7 @@ class Prove:
         return not interrupts.requested.is_set()
 
     def _specs(self) -> list[CaseSpec]:
-        from carlab.concealment.proof_set import drawn, full_set, short_set
+        from carlab.benchmark.cases.proof_set import drawn, full_set, short_set
 
         if self.limit is not None and self.limit < 1:
             raise ConfigError(f"--limit {self.limit}: at least one case.")
@@ -136,18 +154,18 @@ class Prove:
         return specs if self.limit is None else drawn(specs, self.limit, self.seed)
 
     def _score(self, proof: Proof) -> int:
-        from carlab.concealment.baseline_scores import COLUMNS, compare, comparison_rows
-        from carlab.concealment.results_page import results_page
-        from carlab.concealment.scores import draw_confusion, judge_all, summarise, table_rows, write_scores
+        from carlab.benchmark.baselines.scores import COLUMNS, compare, comparison_rows
+        from carlab.benchmark.proof.results_page import results_page
+        from carlab.benchmark.proof.scores import draw_confusion, score_cases, summarise, table_rows, write_scores
 
         answers = proof.open_seal()
         console.print("The seal is whole: the answers are those of the hash.")
         runs = proof.reports()
         with console.status("Scoring"):
-            rows = judge_all(answers, runs, proof.reports(oracle=True) if self.oracle else None, proof.same)
+            rows = score_cases(answers, runs, proof.reports(oracle=True) if self.oracle else None, proof.same)
         summary = summarise(rows.values())
         comparison = compare(rows, proof.baseline_reports()) if self.baselines else []
-        table(f"{len(rows)} cases", ["figure", "value (95 %)", "n", "asked"], table_rows(summary))
+        table(f"{len(rows)} cases", ["figure", "value (95 %)", "n", "target"], table_rows(summary))
         if comparison:
             table("Beside the baselines, names strictly", ["figure", *COLUMNS], comparison_rows(comparison))
         if summary["no_report"]:
@@ -209,6 +227,6 @@ class _Bar:
 
 
 def _diagnose_command() -> tuple[str, ...]:
-    from carlab.concealment.runner import DIAGNOSE
+    from carlab.benchmark.proof.runner import DIAGNOSE
 
     return DIAGNOSE

@@ -1,43 +1,30 @@
-"""Recordings by path, whatever their format."""
+"""Recordings that verbs read, with what was found in them printed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from carlab.api.recordings import load
 from carlab.cli.console import console, table
-from carlab.cli.options import required_file
 from carlab.core.episode_data import EpisodeData
 
 if TYPE_CHECKING:
-    from carlab.recording.audit_report import AuditReport
-    from carlab.recording.csv_mapping import ColumnMapping
-
-CSV_ENDS = (".csv", ".csv.gz")
+    from carlab.diagnosis.findings import FitErrors
+    from carlab.recording.audit.report import AuditReport
 
 
-def is_csv(path: Path) -> bool:
-    """Whether the name says CSV."""
-    return path.name.lower().endswith(CSV_ENDS)
-
-
-def load_episodes(path: Path, mapping: ColumnMapping | None = None) -> Sequence[EpisodeData]:
-    """Read an MCAP recording (one episode) or a CSV (one or several); what was found out about a CSV is printed."""
-    required_file(path, "The recording")
-    if is_csv(path):
-        from carlab.recording.foreign_csv import import_csv
-
-        imported = import_csv(path, mapping=mapping)
-        console.print(imported.announcement)
-        print_findings(imported.report)
-        return imported.episodes
-    from carlab.recording.mcap_source import read_episode
-
-    episode = read_episode(path)
-    if episode.metadata.get("recovered"):
-        console.print(f"[yellow]{path} was never finished; {episode.ticks} complete ticks were recovered.[/yellow]")
-    return [episode]
+def load_episodes(path: Path) -> Sequence[EpisodeData]:
+    """Read an MCAP recording (one episode) or a CSV (one or several), and print what was found in it."""
+    recording = load(path)
+    if recording.audit is not None:
+        console.print(recording.announcement)
+        print_findings(recording.audit)
+    if recording.is_recovered:
+        ticks = recording.episode.ticks
+        console.print(f"[yellow]{path} was never finished; {ticks} complete ticks were recovered.[/yellow]")
+    return recording.episodes
 
 
 def print_findings(report: AuditReport) -> None:
@@ -59,3 +46,14 @@ def print_findings(report: AuditReport) -> None:
             rows,
             numeric=False,
         )
+
+
+def print_errors(title: str, first_column: str, errors: Mapping[str, FitErrors]) -> None:
+    """Print errors after a horizon as a table, one row a model."""
+    figures = ("position_m", "yaw_rad", "vx", "vy", "yaw_rate")
+    rows = [
+        [name.replace("_", " "), *(f"{getattr(e, k):.4f}" for k in figures), f"{e.score:.2f}"]
+        for name, e in errors.items()
+    ]
+    columns = [first_column, "position [m]", "yaw [rad]", "vx [m/s]", "vy [m/s]", "yaw rate [rad/s]", "score"]
+    table(title, columns, rows)

@@ -5,31 +5,34 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from carlab.cli.console import console, fail, progress, table
-from carlab.cli.options import CarOptions, above_zero, new_file
-from carlab.cli.recordings import load_episodes
-from carlab.cli.runs import ask_to_place, new_run, write_result
+from carlab.api.arguments import above_zero
+from carlab.api.runs import RunHooks, new_run, write_result
+from carlab.cli.console import banner, console, fail, progress, table
+from carlab.cli.options import CarOptions, new_file
+from carlab.cli.recordings import load_episodes, print_errors
+from carlab.cli.runs import ask_to_place
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
 
 if TYPE_CHECKING:
+    from carlab.api import PredictionErrors
     from carlab.cars import CarChoice
-    from sim_backends.car_parameters import SimulatorConfig
 
 
 @dataclass
 class Replay:
     """Send recorded actions to any car, real or simulated, and compare.
 
-    On a simulated car: predict --horizon seconds ahead from many starts along the recording and print the errors by
-    channel. On any other car (or with --drive): put it at the recorded start, send the recorded actions at their
-    times, record that, and print how far it strays.
+    On a simulated car: predict --horizon seconds ahead from many initial states along the recording and print the
+    errors beside those of constant velocity, as carlab diagnose does: in the whole recording, and in the last part,
+    which a diagnosis of this recording alone holds out. On any other car (or with --drive): put it at the recorded
+    start, send the recorded actions at their times, record that, and print how far it strays.
     """
 
     recording: Positional[Path]
@@ -37,11 +40,14 @@ class Replay:
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    horizon: float = 1.0
+    horizon_s: Annotated[float, arg(name="horizon")] = 1.0
     """How far to predict [s]."""
 
-    stride: float = 0.25
+    stride_s: Annotated[float, arg(name="stride")] = 0.25
     """From one start to the next [s]."""
+
+    holdout_share: float = 0.3
+    """How much of the recording the last part is, above 0 and at most 0.5."""
 
     save: Path | None = None
     """Write FILE.rrd with the predictions beside the recording."""
@@ -63,51 +69,67 @@ class Replay:
 
     def run(self) -> int:
         """Predict or drive, and print."""
-        above_zero(horizon=self.horizon, stride=self.stride, seconds=self.seconds)
+        above_zero(horizon=self.horizon_s, stride=self.stride_s, seconds=self.seconds)
         if self.seed < 0:
             raise ConfigError(f"--seed {self.seed}: at least 0.")
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
         choice = self.which_car.choose(seed=self.seed)
-        episodes = load_episodes(self.recording)
         if choice.car.reality is Reality.SIMULATED and not self.drive:
-            for index, episode in enumerate(episodes):
-                self._predict(episode, choice.simulator, index if len(episodes) > 1 else None)
+            self._predict()
             return 0
-        return self._drive(max(episodes, key=lambda e: e.ticks), choice)
+        return self._drive(max(load_episodes(self.recording), key=lambda e: e.ticks), choice)
 
-    def _predict(self, episode: EpisodeData, simulator: SimulatorConfig, index: int | None) -> None:
-        from carlab.experiment.prediction_errors import prediction_errors
+    def _predict(self) -> None:
+        from carlab.api import predict
+        from carlab.api.prediction import summary_of
+        from carlab.diagnosis.score_recording import describe_windows
 
-        found = prediction_errors(episode, simulator, self.horizon, self.stride)
-        rows = [
-            [f"{channel} [{unit}]", *(f"{value:.4f}" for value in (rms, median, p90, bias, constant, still))]
-            for channel, unit, rms, median, p90, bias, constant, still in found.rows()
-        ]
-        part = "" if index is None else f", part {index + 1}"
-        title = f"Error after {found.horizon_s:.2f} s, {found.shots} starts{part}"
-        columns = ["channel", "rms", "median", "p90", "bias", "constant velocity: rms", "no change: rms"]
-        table(title, columns, rows)
-        if found.note:
-            console.print(found.note)
-        left_out = [f"{count} {why}" for why, count in found.left_out.items() if count]
-        if left_out:
-            console.print(f"Starts left out: {', '.join(left_out)}.")
+        car = self.which_car
+        if car.vehicle is not None and car.car != "sim":
+            raise ConfigError(f"--vehicle goes with --car sim; '{car.car}' is a car of its own.")
+        found = predict(
+            self.recording,
+            car.vehicle or car.car,
+            horizon_s=self.horizon_s,
+            stride_s=self.stride_s,
+            holdout_share=self.holdout_share,
+        )
+        for note in found.material.notes:
+            console.print(note, markup=False)
+        for fault in (*found.material.faults, *found.score.faults):
+            console.print(f"{fault.channel}: {fault.action}", markup=False)
+        for part in (found.score.whole, found.score.last):
+            if part is None:
+                console.print("The last part is too short to be scored by itself.")
+                continue
+            print_errors(f"Error after {found.horizon_s:.2f} s, {describe_windows(part)}", "model", summary_of(part))
+        self._print_channels(found)
         if self.save is not None:
-            from carlab.recording.rerun_sink import episode_to_rrd
+            for path in found.save(self.save):
+                console.print(f"{path}")
 
-            path = self.save if index is None else self.save.with_name(f"{self.save.stem}-{index + 1}.rrd")
-            episode_to_rrd(episode, path, self.recording.name, overlays={"predicted": found.overlay})
-            console.print(f"{path}")
+    def _print_channels(self, found: PredictionErrors) -> None:
+        from carlab.diagnosis.score_recording import CONSTANT_VELOCITY, MODEL, NO_CHANGE
+
+        model, *baselines = (found.channels(name) for name in (MODEL, CONSTANT_VELOCITY, NO_CHANGE))
+        rows = [
+            [
+                f"{e.channel} [{e.unit}]",
+                *(f"{v:.4f}" for v in (e.rms, e.median, e.p90, e.bias, *(b[k].rms for b in baselines))),
+            ]
+            for k, e in enumerate(model)
+        ]
+        columns = ["channel", "rms", "median", "p90", "bias", "constant velocity: rms", "no change: rms"]
+        table(f"By channel, {found.score.whole.part}", columns, rows)
 
     def _drive(self, episode: EpisodeData, choice: CarChoice) -> int:
-        from carlab.cli import EXIT_INTERRUPTED
-        from carlab.cli.drive import EXIT_SAFETY_STOP
+        from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
         from carlab.core.outcome import EndReason
         from carlab.core.quantities import CarState
         from carlab.core.task import RecordedTask
-        from carlab.experiment.scripted_policies import ReplayPolicy
-        from carlab.experiment.session import Session, SessionHooks
+        from carlab.experiment.episodes.scripted_policies import ReplayPolicy
+        from carlab.experiment.episodes.session import Session, SessionHooks
 
         period_s = choice.control_period_s
         duration_s = float(episode.times_s[-1] - episode.times_s[0])
@@ -120,7 +142,11 @@ class Replay:
 
             envelope = replace(envelope, arena_m=rectangle(x.min() - 20, x.max() + 20, y.min() - 20, y.max() + 20))
         with contextlib.ExitStack() as stack:
-            run = stack.enter_context(new_run(self.out, "replay", choice))
+            run = stack.enter_context(
+                new_run(
+                    self.out, "replay", choice, RunHooks(on_start=lambda folder, car: banner(car.reality, car.name))
+                )
+            )
             car = stack.enter_context(choice.car)
             bar = stack.enter_context(progress())
             row = bar.add_task("replay", total=task.max_ticks, note="")
@@ -138,20 +164,7 @@ class Replay:
             return EXIT_INTERRUPTED
         write_result(run, results)
         driven = results[0].data
-        elapsed_s = driven.times_s - driven.times_s[0]
-        recorded = np.stack(
-            [np.interp(elapsed_s, episode.times_s - episode.times_s[0], c) for c in _unwrapped(episode).T]
-        )
-        error = _unwrapped(driven) - recorded.T
-        rows = [
-            [
-                f"{name} [{unit}]",
-                *(f"{abs(error[_row_at(elapsed_s, t), k]):.4f}" for t in (0.5, 1.0, 2.0)),
-                f"{abs(error[-1, k]):.4f}",
-            ]
-            for k, (name, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True))
-        ]
-        table("Difference to the recording", ["channel", "0.5 s", "1 s", "2 s", f"end ({elapsed_s[-1]:.1f} s)"], rows)
+        _print_difference(driven, episode)
         console.print(f"Recorded in {results[0].path}")
         if results[0].reason.is_safety_stop:
             fail(f"{results[0].reason.value} {driven.metadata['end_detail']}".rstrip())
@@ -159,11 +172,20 @@ class Replay:
         return EXIT_INTERRUPTED if results[0].reason is EndReason.STOP_REQUESTED else 0
 
 
+def _print_difference(driven: EpisodeData, episode: EpisodeData) -> None:
+    """Print how far what was driven strays from the recording."""
+    elapsed_s = driven.times_s - driven.times_s[0]
+    recorded = np.stack([np.interp(elapsed_s, episode.times_s - episode.times_s[0], c) for c in _unwrapped(episode).T])
+    error = np.abs(_unwrapped(driven) - recorded.T)
+    shown = [int(np.argmin(np.abs(elapsed_s - t_s))) for t_s in (0.5, 1.0, 2.0)]
+    rows = [
+        [f"{name} [{unit}]", *(f"{error[row, k]:.4f}" for row in (*shown, -1))]
+        for k, (name, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True))
+    ]
+    table("Difference to the recording", ["channel", "0.5 s", "1 s", "2 s", f"end ({elapsed_s[-1]:.1f} s)"], rows)
+
+
 def _unwrapped(episode: EpisodeData) -> FloatArray:
     states = episode.states.copy()
     states[:, 2] = np.unwrap(states[:, 2])
     return states
-
-
-def _row_at(elapsed_s: FloatArray, t_s: float) -> int:
-    return int(np.argmin(np.abs(elapsed_s - t_s)))

@@ -9,8 +9,10 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from carlab.api.driving import has_screen
+from carlab.api.recordings import required_file
 from carlab.cli.console import console
-from carlab.cli.options import has_screen, new_file, required_file
+from carlab.cli.options import new_file
 from carlab.cli.recordings import load_episodes
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, NotReadyError
@@ -34,7 +36,7 @@ class View:
 
     def run(self) -> int:
         """View or save."""
-        required_file(self.recording, "The recording")
+        required_file(self.recording)
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
         if self.screenshot is not None and self.screenshot.suffix != ".png":
@@ -57,7 +59,7 @@ class View:
         return max(episodes, key=lambda e: e.ticks)
 
     def _rrd(self, ready: Path | None, episode: EpisodeData | None, path: Path) -> Path:
-        from carlab.recording.rerun_sink import episode_to_rrd
+        from carlab.recording.rerun.sink import episode_to_rrd
 
         if episode is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +70,7 @@ class View:
 
     def _picture(self, ready: Path | None, episode: EpisodeData | None, path: Path) -> None:
         from carlab.recording.picture import save_summary
-        from carlab.recording.screenshot import save_screenshot
+        from carlab.recording.rerun.screenshot import save_screenshot
 
         with tempfile.TemporaryDirectory(prefix="carlab-view-") as folder:
             try:
@@ -81,7 +83,7 @@ class View:
         console.print(f"{path}")
 
     def _open(self, ready: Path | None, episode: EpisodeData | None) -> int:
-        from carlab.recording.screenshot import rerun_program
+        from carlab.recording.rerun.screenshot import rerun_program
 
         program = rerun_program()
         if program is None:

@@ -17,7 +17,10 @@ Polygon = Sequence[tuple[float, float]]
 
 def as_polygon(corners_m: Polygon, where: str) -> tuple[tuple[float, float], ...]:
     """Check corners given by a user: at least three, finite, and enclosing an area. Raises ConfigError."""
-    points = np.asarray(corners_m, dtype=np.float64)
+    try:
+        points = np.asarray(corners_m, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        points = np.full((0, 2), np.nan)
     if points.ndim != 2 or points.shape[0] < 3 or points.shape[1] != 2 or not np.isfinite(points).all():
         raise ConfigError(f"{where} must be at least three corners [x, y] in metres.")
     x, y = points.T

@@ -18,6 +18,7 @@ class EndReason(enum.Enum):
     OVERSPEED = "The car was faster than its speed limit; lower the throttle or raise max_speed."
     POSE_STALE = "Motion capture went silent; check the camera software, the network and that the body is visible."
     POSE_JUMP = "The pose jumped further than the car can drive; check that no other body is taken for it in Motive."
+    POSE_FROZEN = "The pose did not change while the motor turned; check that the motion-capture software is live."
     TRACKING_LOST = "Motion capture lost sight of the body; check the markers and the capture volume."
     NOT_READY = "The car could not be armed; nothing was driven."
     ACTUATOR_FAULT = "The actuator link or its firmware failed; check power, cable and the log, then start again."

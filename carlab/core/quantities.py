@@ -105,6 +105,7 @@ class Observation:
     saw the body, so that an unseen body shows as a state that grows old. ``velocity_delay_s`` is the known delay of
     the velocity filter; ``poses`` are the raw samples that arrived since the previous observation, oldest first.
     ``velocity_valid`` is False where too few poses have come for velocities, which are zero then.
+    ``motor_is_turning`` is measured by the motor controller; None where nothing measures it.
     """
 
     state: CarState
@@ -115,6 +116,7 @@ class Observation:
     velocity_delay_s: float = 0.0
     poses: tuple[PoseSample, ...] = ()
     velocity_valid: bool = True
+    motor_is_turning: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,11 @@ from carlab.core.documents import SafetyEvent
 from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, CarlabError, ConfigError, NotArmedError
 from carlab.core.geofence import can_stop_inside
 from carlab.core.outcome import EndReason
-from carlab.core.quantities import NEUTRAL, Action, Observation
+from carlab.core.quantities import NEUTRAL, Action, CarState, Observation
 
+FROZEN_POSITION_M, FROZEN_YAW_RAD = 2e-5, 1e-4
+"""A smaller change of the pose is none: below the noise of motion capture, above the resolution of 32-bit numbers. A
+car that is blocked with turning wheels still moves by the noise, so it does not count as frozen."""
 CLOCK_TOLERANCE_S = 0.01
 """A pose that claims to arrive further ahead than this was stamped by another clock."""
 
@@ -31,7 +34,8 @@ class SafetyEnvelope:
     """Limits of one car in one place. Rates are per second of normalised command; the arena is corners [m] or empty.
 
     Between two observations the pose may move by ``max_speed_mps`` and turn by ``max_yaw_rate_radps`` for the time
-    between them, and by the jump margins on top.
+    between them, and by the jump margins on top. A pose that stays the same for ``frozen_pose_s`` while the motor turns
+    on command ends the episode.
     """
 
     max_steering: float = 1.0
@@ -44,6 +48,7 @@ class SafetyEnvelope:
     jump_margin_rad: float = 0.5
     stale_pose_s: float = 0.1
     lost_pose_s: float = 0.5
+    frozen_pose_s: float = 0.4
     reaction_s: float = 0.15
     deceleration_mps2: float = 3.0
     arena_m: tuple[tuple[float, float], ...] = ()
@@ -129,6 +134,44 @@ def violation(
     return None
 
 
+class FrozenPoseWatch:
+    """Notices a pose that does not change although the motor turns on command.
+
+    Fresh stamps do not prove a fresh pose: paused motion-capture software may repeat the last one.
+    """
+
+    def __init__(self, frozen_pose_s: float) -> None:
+        self.frozen_pose_s = frozen_pose_s
+        self._pose: CarState | None = None
+        self._since_s = 0.0
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._pose = None
+
+    def problem(self, observation: Observation, sent: Action, now_s: float) -> str | None:
+        """Return what is wrong, None while all is well.
+
+        Args:
+            observation: the newest observation.
+            sent: the last command that was sent.
+            now_s: the time of the car's clock [s].
+        """
+        state = observation.state
+        must_move = observation.motor_is_turning is True and sent.throttle != 0.0
+        if self._pose is None or not must_move or _has_moved(state, self._pose):
+            self._pose, self._since_s = state, now_s
+            return None
+        frozen_s = now_s - self._since_s
+        return None if frozen_s <= self.frozen_pose_s else f"It was the same for {frozen_s:.2f} s."
+
+
+def _has_moved(now: CarState, then: CarState) -> bool:
+    moved_m = math.hypot(now.x_m - then.x_m, now.y_m - then.y_m)
+    turned_rad = abs(float(wrap(now.yaw_rad - then.yaw_rad)))
+    return moved_m > FROZEN_POSITION_M or turned_rad > FROZEN_YAW_RAD
+
+
 class SafetyState(enum.Enum):
     """State of the gate."""
 
@@ -167,6 +210,7 @@ class SafeCar:
         self._sent = NEUTRAL
         self._sent_s: float | None = None
         self._seen: Observation | None = None
+        self._frozen = FrozenPoseWatch(envelope.frozen_pose_s)
         self._active: frozenset[str] = frozenset()
 
     def arm(self) -> None:
@@ -174,6 +218,7 @@ class SafeCar:
         self.car.arm()
         self.state = SafetyState.ARMED
         self._sent, self._sent_s, self._seen = NEUTRAL, None, None
+        self._frozen.reset()
 
     def command(self, requested: Action, observation: Observation, period_s: float) -> Action:
         """Pass a command through the gate and return what was sent; raise SafetyStop where the episode must end."""
@@ -185,6 +230,8 @@ class SafeCar:
         found = violation(observation, self._seen, now_s, self.envelope)
         if found is not None:
             self._end(*found, now_s)
+        if (frozen := self._frozen.problem(observation, self._sent, now_s)) is not None:
+            self._end(EndReason.POSE_FROZEN, frozen, now_s)
         self._seen = observation
         age_s = now_s - observation.t_receive_s
         kinds: dict[str, str] = {}

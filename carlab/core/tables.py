@@ -45,40 +45,57 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     return cls(**values)
 
 
+def number(value: Any, where: str) -> float:
+    """Return ``value`` as a float; raises ConfigError for what is no number and for one that no float can hold."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ConfigError(f"{where} must be a number, not {value!r}.")
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise ConfigError(f"{where} is too large; give a number below 1e308.") from error
+
+
 def _convert(hint: Any, value: Any, where: str) -> Any:
     origin = typing.get_origin(hint)
     if origin in (typing.Union, types.UnionType):
         options = [h for h in typing.get_args(hint) if h is not type(None)]
-        if value is None:
-            return None
-        return _convert(options[0], value, where)
+        return None if value is None else _convert(options[0], value, where)
     if origin is typing.Literal:
-        if value not in typing.get_args(hint):
-            raise ConfigError(f"{where} is {value!r}; it must be one of {', '.join(map(repr, typing.get_args(hint)))}.")
-        return value
+        return _choice(typing.get_args(hint), value, where)
     if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{where} must be a list, not {value!r}.")
-        items = typing.get_args(hint)
-        if len(items) == 2 and items[1] is Ellipsis:
-            return tuple(_convert(items[0], v, where) for v in value)
-        if len(value) != len(items):
-            raise ConfigError(f"{where} must have {len(items)} entries, not {len(value)}.")
-        return tuple(_convert(h, v, where) for h, v in zip(items, value, strict=True))
+        return _tuple(typing.get_args(hint), value, where)
     if origin in (dict, Mapping) or hint in (dict, Mapping):
         if not isinstance(value, Mapping):
             raise ConfigError(f"{where} must be a table, not {value!r}.")
         return dict(value)
     if dataclasses.is_dataclass(hint):
         return from_table(typing.cast(type, hint), value, where)
+    return _plain(hint, value, where)
+
+
+def _choice(choices: tuple[Any, ...], value: Any, where: str) -> Any:
+    if not isinstance(value, (str, int, float)) or value not in choices:
+        raise ConfigError(f"{where} is {value!r}; it must be one of {', '.join(map(repr, choices))}.")
+    return value
+
+
+def _tuple(items: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise ConfigError(f"{where} must be a list, not {value!r}.")
+    if len(items) == 2 and items[1] is Ellipsis:
+        return tuple(_convert(items[0], v, where) for v in value)
+    if len(value) != len(items):
+        raise ConfigError(f"{where} must have {len(items)} entries, not {len(value)}.")
+    return tuple(_convert(h, v, where) for h, v in zip(items, value, strict=True))
+
+
+def _plain(hint: Any, value: Any, where: str) -> Any:
     if hint is float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise ConfigError(f"{where} must be a number, not {value!r}.")
+        value = number(value, where)
         if math.isnan(value):
             raise ConfigError(f"{where} is NaN; give a number.")
-        return float(value)
-    if hint is int and (isinstance(value, bool) or not isinstance(value, int)):
+    elif hint is int and (isinstance(value, bool) or not isinstance(value, int)):
         raise ConfigError(f"{where} must be a whole number, not {value!r}.")
-    if hint in (str, bool) and not isinstance(value, hint):
+    elif hint in (str, bool) and not isinstance(value, hint):
         raise ConfigError(f"{where} must be {'text' if hint is str else 'true or false'}, not {value!r}.")
     return value

@@ -1,4 +1,4 @@
-"""What a diagnosis says, as data: the schema ``carlab.diagnosis/1`` to the letter, and what its pictures need."""
+"""Results of a diagnosis as data: the schema ``carlab.diagnosis/1``, and the material of its pictures."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.decisions import Decision
+from carlab.diagnosis.settings import DEFAULT
 
 SCHEMA = "carlab.diagnosis/1"
 Verdict = Literal["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"]
@@ -37,11 +39,12 @@ class Where:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Why an effect is believed.
+    """Why an effect is accepted.
 
-    Relative fall of the held-out score when it is added last; held-out log-likelihood gain over its clustered
-    standard error; the share of it that base parameters cannot absorb; relative rise of each channel's error when it
-    is taken out.
+    held_out_error_reduction   relative fall of the held-out score when it is added last
+    standard_errors            held-out log-likelihood gain over its clustered standard error
+    visibility                 share of its influence that base parameters cannot imitate
+    deletion_fingerprint       relative rise of each channel's error when it is removed
     """
 
     held_out_error_reduction: float
@@ -52,7 +55,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class EffectFinding:
-    """One named effect. ``separating_drive`` names a manoeuvre that would tell its set apart."""
+    """One named effect. ``separating_drive`` names a manoeuvre that would separate its set."""
 
     id: str
     confidence: float
@@ -78,7 +81,7 @@ class FitErrors:
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """What is left when every named effect is in: share of the squared excess, where, and of what class."""
+    """Residual with every named effect: share of the squared excess, where it shows, and its class."""
 
     share: float
     channels: tuple[str, ...]
@@ -108,7 +111,7 @@ class RecordingUse:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The whole answer. ``held_out`` has nominal, refit, with_effects and noise_floor."""
+    """The whole result. ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor."""
 
     verdict: Verdict
     sentence: str
@@ -135,7 +138,7 @@ class Diagnosis:
                 found["where"]["place"] = dict(zip(("x", "y", "radius"), e.where.place, strict=True))
             effects.append(found)
         unexplained = None
-        if self.unexplained is not None and self.unexplained.share >= 0.1:
+        if self.unexplained is not None and self.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
             unexplained = asdict(self.unexplained)
             unexplained["class"] = unexplained.pop("kind")
         made = {
@@ -167,7 +170,7 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """One held-out recording beside its predictions, each restarted every horizon.
+    """One held-out recording and its predictions, each restarted every horizon.
 
     times_s (T + 1,); recorded (T + 1, 6); predicted by name (nominal, refit, with_effects), each (T + 1, 6) with NaN
     where there is none; marked are the stretches (start, end) [s] where the refit is worst.
@@ -188,7 +191,8 @@ class Exhibits:
     regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
     correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
                  and the 99 % bound
-    candidates: every effect tried first: id, gain on unseen blocks in standard errors, loss with it
+    candidates: candidates for the first effect: id, gain on unseen blocks in standard errors, loss with it
+    decisions: about names, with the statistics that were compared with thresholds
     """
 
     traces: tuple[Trace, ...] = ()
@@ -196,3 +200,4 @@ class Exhibits:
     regimes: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
     correlation: Mapping[str, tuple[FloatArray, FloatArray, float]] = field(default_factory=dict)
     candidates: tuple[tuple[str, float, float], ...] = ()
+    decisions: tuple[Decision, ...] = ()

@@ -1,10 +1,9 @@
-"""Recordings that carlab made itself, as a diagnosis expects them: every state ``latency`` old, no velocity older.
+"""Recordings of carlab, converted to what a diagnosis expects: all states of one known age.
 
-A control loop knows the newest pose, whose age changes with the phase of motion capture, and velocities of a line
-through the poses before it, which are older still. Both ages are in the recording, and so are all the poses, those
-that arrived later among them. A local quadratic through them gives the state of the one instant that the simulator
-means: that of the tick less the latency of motion capture in the car file. What a velocity column differs from the
-line through its own poses (a filter behind the estimator) is kept.
+A control loop uses the newest pose, whose age changes with the phase of motion capture, and velocities of a line
+through earlier poses, which are older. Both ages are recorded, and so are all poses, later ones included. A local
+quadratic through the poses gives the state at the tick less the latency of motion capture in the car file. The
+difference between a velocity column and the line through its own poses (a filter behind the estimator) is kept.
 """
 
 from __future__ import annotations
@@ -18,20 +17,23 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
 from carlab.core.state_estimator import MIN_SAMPLES, fit_velocity
 from carlab.recording.episode_builder import POSE_AGE, VELOCITY_DELAY
+from sim_backends.car_parameters import LATENCY, SimulatorConfig
 
 HALF_WINDOW_S = 0.025
 """Half of the quadratic's window: seven poses at 120 Hz; two on either side at least."""
-LEAST_ASIDE = 2
-MOST_POSES = 64
-MATCH_S = 5e-4
-"""The line behind a velocity is known where the mean time of some number of poses matches its stated age so well."""
+MIN_POSES_PER_SIDE = 2
+MAX_LINE_POSES = 64
+MAX_AGE_MISMATCH_S = 5e-4
+"""Poses of the line behind a velocity are known if their mean time matches the recorded age this closely."""
+STATE_AGE = "state_age_s"
+"""Metadata of an episode whose states ``as_captured`` has computed."""
 
 
 def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
     """States of ``latency_s`` before each tick, from all recorded poses.
 
     Args:
-        episode: as read; one that does not tell the ages of its poses and velocities comes back as it is.
+        episode: as read; returned unchanged if it lacks the ages of its poses and velocities.
         latency_s: of motion capture, by the car file.
 
     Returns:
@@ -40,7 +42,7 @@ def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
     """
     poses = episode.poses[np.unique(episode.poses[:, 0], return_index=True)[1]]
     known = POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra
-    if not known or len(poses) < 2 * LEAST_ASIDE + 1:
+    if not known or len(poses) < 2 * MIN_POSES_PER_SIDE + 1:
         return episode
     poses = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
     states = _quadratic(poses, episode.times_s - latency_s)
@@ -59,17 +61,24 @@ def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
         sent=episode.sent[ticks],
         rewards=episode.rewards[ticks],
         extra={name: column[rows] for name, column in episode.extra.items()},
+        metadata={**episode.metadata, STATE_AGE: repr(latency_s)},
     )
 
 
+def with_known_latency(config: SimulatorConfig, episodes: Sequence[EpisodeData]) -> SimulatorConfig:
+    """The simulator; its latency is known where ``as_captured`` gave the states of all episodes that very age."""
+    known = LATENCY in config.unknown and all(STATE_AGE in e.metadata for e in episodes)
+    return replace(config, unknown=config.unknown - {LATENCY}) if known else config
+
+
 def window_variance_s2(episodes: Sequence[EpisodeData]) -> float | None:
-    """Variance [s2] of the window that ``as_captured`` differentiates by; None where it leaves recordings as they are.
+    """Variance [s2] of the window that ``as_captured`` differentiates by; None where recordings are unchanged.
 
     A line through evenly spaced poses at t gives v + s2 / 2 d2v/dt2 with s2 = sum(t^4) / (3 sum(t^2)).
     """
     for episode in episodes:
         gaps = np.diff(np.unique(episode.poses[:, 0]))
-        if POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra and len(gaps) >= 2 * LEAST_ASIDE:
+        if POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra and len(gaps) >= 2 * MIN_POSES_PER_SIDE:
             gap_s = float(np.median(gaps))
             t = gap_s * np.arange(1, _half(gap_s) + 1)
             return float(np.sum(t**4) / (3.0 * np.sum(t**2)))
@@ -77,7 +86,7 @@ def window_variance_s2(episodes: Sequence[EpisodeData]) -> float | None:
 
 
 def _half(gap_s: float) -> int:
-    return max(LEAST_ASIDE, round(HALF_WINDOW_S / gap_s))
+    return max(MIN_POSES_PER_SIDE, round(HALF_WINDOW_S / gap_s))
 
 
 def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
@@ -91,7 +100,7 @@ def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
         nearest = int(np.argmin(np.abs(t_s - moment_s)))
         window = slice(max(nearest - half, 0), nearest + half + 1)
         t = t_s[window] - moment_s
-        if min((t <= 1e-6).sum(), (t >= -1e-6).sum()) < LEAST_ASIDE or t[-1] - t[0] > widest_s:
+        if min((t <= 1e-6).sum(), (t >= -1e-6).sum()) < MIN_POSES_PER_SIDE or t[-1] - t[0] > widest_s:
             continue
         scale = float(np.abs(t).max())
         design = np.stack([np.ones_like(t), t / scale, (t / scale) ** 2], axis=1)
@@ -105,20 +114,20 @@ def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
 
 def _behind_the_line(episode: EpisodeData, poses: FloatArray) -> FloatArray:
     """Velocity columns less those of the lines that they were estimated by (n, 3); zero where that is not known."""
-    left = np.zeros((len(episode.times_s), 3))
+    difference = np.zeros((len(episode.times_s), 3))
     capture_s = episode.times_s - episode.extra[POSE_AGE]
     mean_s = capture_s - episode.extra[VELOCITY_DELAY]
-    for k, (end_s, middle_s) in enumerate(zip(capture_s, mean_s, strict=True)):
+    for k, (end_s, mean_time_s) in enumerate(zip(capture_s, mean_s, strict=True)):
         end = int(np.searchsorted(poses[:, 0], end_s + 1e-6))
-        counts = np.arange(MIN_SAMPLES, min(end, MOST_POSES) + 1)
-        if not np.isfinite(middle_s) or not len(counts):
+        counts = np.arange(MIN_SAMPLES, min(end, MAX_LINE_POSES) + 1)
+        if not np.isfinite(mean_time_s) or not len(counts):
             continue
         sums = np.cumsum(poses[:end, 0][::-1])[counts - 1] / counts
-        best = int(np.argmin(np.abs(sums - middle_s)))
-        if abs(float(sums[best]) - middle_s) < MATCH_S:
+        best = int(np.argmin(np.abs(sums - mean_time_s)))
+        if abs(float(sums[best]) - mean_time_s) < MAX_AGE_MISMATCH_S:
             line = fit_velocity(poses[end - counts[best] : end])
-            left[k] = episode.states[k, 3:] - (line.vx_mps, line.vy_mps, line.yaw_rate_radps)
-    return np.asarray(left)
+            difference[k] = episode.states[k, 3:] - (line.vx_mps, line.vy_mps, line.yaw_rate_radps)
+    return np.asarray(difference)
 
 
-__all__ = ["as_captured", "window_variance_s2"]
+__all__ = ["as_captured", "window_variance_s2", "with_known_latency"]

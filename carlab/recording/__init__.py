@@ -6,33 +6,33 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from carlab.recording.csv.export import write_csv, write_parquet
     from carlab.recording.episode_builder import episode_from_documents
-    from carlab.recording.export import write_csv, write_parquet
-    from carlab.recording.mcap_sink import McapSink, write_episode
-    from carlab.recording.mcap_source import read_documents, read_episode, read_recording
+    from carlab.recording.mcap.sink import McapSink, write_episode
+    from carlab.recording.mcap.source import read_documents, read_episode, read_recording
     from carlab.recording.picture import save_summary
     from carlab.recording.recorder import Recorder
-    from carlab.recording.rerun_sink import RerunSink, episode_to_rrd
-    from carlab.recording.run_directory import RunDirectory
-    from carlab.recording.screenshot import save_screenshot
+    from carlab.recording.rerun.screenshot import save_screenshot
+    from carlab.recording.rerun.sink import RerunSink, episode_to_rrd
+    from carlab.recording.run_folder import RunDirectory
     from carlab.recording.sink import Sink
 
 _HOMES = {
-    "McapSink": "mcap_sink",
+    "McapSink": "mcap.sink",
     "Recorder": "recorder",
-    "RerunSink": "rerun_sink",
-    "RunDirectory": "run_directory",
+    "RerunSink": "rerun.sink",
+    "RunDirectory": "run_folder",
     "Sink": "sink",
     "episode_from_documents": "episode_builder",
-    "episode_to_rrd": "rerun_sink",
-    "read_documents": "mcap_source",
-    "read_episode": "mcap_source",
-    "read_recording": "mcap_source",
-    "save_screenshot": "screenshot",
+    "episode_to_rrd": "rerun.sink",
+    "read_documents": "mcap.source",
+    "read_episode": "mcap.source",
+    "read_recording": "mcap.source",
+    "save_screenshot": "rerun.screenshot",
     "save_summary": "picture",
-    "write_csv": "export",
-    "write_episode": "mcap_sink",
-    "write_parquet": "export",
+    "write_csv": "csv.export",
+    "write_episode": "mcap.sink",
+    "write_parquet": "csv.export",
 }
 __all__ = [
     "McapSink",

@@ -19,6 +19,8 @@ VELOCITY_DELAY = "velocity_delay_s"
 LATE = "late_s"
 POLICY_TIME = "policy_s"
 TRACKED = "tracked"
+Row = tuple[float, int, Observation]
+"""Time [s] of an observation, the step that it begins, and the observation."""
 OWN_COLUMNS = (POSE_AGE, VELOCITY_DELAY, LATE, POLICY_TIME, TRACKED)
 
 
@@ -41,35 +43,12 @@ def episode_from_documents(
     """
     started = next((d for d in documents if isinstance(d, EpisodeStarted)), None)
     ended = next((d for d in documents if isinstance(d, EpisodeEnded)), None)
-    ticks = [d for d in documents if isinstance(d, Tick)]
     transitions = {d.step: d for d in documents if isinstance(d, Transition)}
-    rows = [(tick.t_s, tick.step, tick.observation) for tick in ticks]
-    if ended is not None and ended.last is not None and ticks and ended.steps > ticks[-1].step:
-        arrival = transitions.get(ticks[-1].step)
-        rows.append((ended.t_s if arrival is None else arrival.t_s, ended.steps, ended.last))
-    else:
-        ticks = ticks[:-1]
+    ticks, rows = _observed(documents, transitions, ended)
     if not ticks:
         how = f"it ended as {ended.reason.name}. {ended.detail}".rstrip() if ended else "its writer was stopped"
         raise DataError(f"The recording holds no complete tick ({how}); record it anew.")
     seen = [observation for _, _, observation in rows]
-    poses = [
-        (pose.t_capture_s, pose.x_m, pose.y_m, pose.yaw_rad)
-        for observation in seen
-        for pose in observation.poses
-        if pose.tracked
-    ]
-    columns = {
-        POSE_AGE: [t_s - observation.t_capture_s for t_s, _, observation in rows],
-        VELOCITY_DELAY: [observation.velocity_delay_s for observation in seen],
-        LATE: [*(tick.late_s for tick in ticks), math.nan],
-        POLICY_TIME: [*(tick.policy_s for tick in ticks), math.nan],
-        **_extra_columns(extra or {}, [step for _, step, _ in rows]),
-    }
-    arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
-    kept = {name: values for name, values in arrays.items() if not np.isnan(values).all()}
-    if not all(observation.tracked for observation in seen):
-        kept[TRACKED] = np.array([observation.tracked for observation in seen], dtype=np.float64)
     missing = ticks[-1].step + 1 - ticks[0].step - len(ticks)
     return EpisodeData(
         times_s=np.array([t_s for t_s, _, _ in rows], dtype=np.float64),
@@ -77,14 +56,14 @@ def episode_from_documents(
         requested=np.array([tick.requested.to_array() for tick in ticks]),
         sent=np.array([tick.sent.to_array() for tick in ticks]),
         rewards=np.array([_reward(transitions.get(tick.step)) for tick in ticks], dtype=np.float64),
-        poses=np.array(poses, dtype=np.float64).reshape(-1, 4),
+        poses=_tracked_poses(seen),
         metadata={
             **(run_metadata or {}),
             **(_started_texts(started) if started else {}),
             **_ended_texts(ended),
             **({"missing_ticks": str(missing)} if missing else {}),
         },
-        extra=kept,
+        extra=_extra_columns(ticks, rows, extra or {}),
     )
 
 
@@ -92,9 +71,43 @@ def _reward(transition: Transition | None) -> float:
     return math.nan if transition is None else transition.reward
 
 
-def _extra_columns(extra: Mapping[int, Mapping[str, float]], steps: Sequence[int]) -> dict[str, list[float]]:
+def _observed(
+    documents: Sequence[Document], transitions: Mapping[int, Transition], ended: EpisodeEnded | None
+) -> tuple[list[Tick], list[Row]]:
+    """Ticks with an observation after their command, and the rows of all observations: one more than ticks."""
+    ticks = [d for d in documents if isinstance(d, Tick)]
+    rows = [(tick.t_s, tick.step, tick.observation) for tick in ticks]
+    if ended is None or ended.last is None or not ticks or ended.steps <= ticks[-1].step:
+        return ticks[:-1], rows
+    arrival = transitions.get(ticks[-1].step)
+    return ticks, [*rows, (ended.t_s if arrival is None else arrival.t_s, ended.steps, ended.last)]
+
+
+def _tracked_poses(seen: Sequence[Observation]) -> FloatArray:
+    """Raw poses (P, 4) of all observations, without those of lost tracking."""
+    poses = [pose for observation in seen for pose in observation.poses if pose.tracked]
+    columns = [(pose.t_capture_s, pose.x_m, pose.y_m, pose.yaw_rad) for pose in poses]
+    return np.array(columns, dtype=np.float64).reshape(-1, 4)
+
+
+def _extra_columns(
+    ticks: Sequence[Tick], rows: Sequence[Row], extra: Mapping[int, Mapping[str, float]]
+) -> dict[str, FloatArray]:
+    """Further columns (T + 1,) of the rows; those without any number are left out."""
+    seen = [observation for _, _, observation in rows]
     names = dict.fromkeys(name for values in extra.values() for name in values)
-    return {name: [extra.get(step, {}).get(name, math.nan) for step in steps] for name in names}
+    columns = {
+        POSE_AGE: [t_s - observation.t_capture_s for t_s, _, observation in rows],
+        VELOCITY_DELAY: [observation.velocity_delay_s for observation in seen],
+        LATE: [*(tick.late_s for tick in ticks), math.nan],
+        POLICY_TIME: [*(tick.policy_s for tick in ticks), math.nan],
+        **{name: [extra.get(step, {}).get(name, math.nan) for _, step, _ in rows] for name in names},
+    }
+    arrays = {name: np.array(values, dtype=np.float64) for name, values in columns.items()}
+    kept = {name: values for name, values in arrays.items() if not np.isnan(values).all()}
+    if not all(observation.tracked for observation in seen):
+        kept[TRACKED] = np.array([observation.tracked for observation in seen], dtype=np.float64)
+    return kept
 
 
 def _started_texts(started: EpisodeStarted) -> dict[str, str]:

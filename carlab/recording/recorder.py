@@ -176,7 +176,10 @@ class Recorder:
         name = getattr(sink, "path", type(sink).__name__)
         sentence = describe_os_error(error, name) if isinstance(error, OSError) else f"{name}: {error}"
         self._remember(sentence)
-        logger.error("Recording failed: %s", sentence, exc_info=None if isinstance(error, OSError) else error)
+        if isinstance(error, OSError):  # Whoever drives tells it once, from ``failed``.
+            logger.info("Recording failed: %s", sentence)
+        else:
+            logger.error("Recording failed: %s", sentence, exc_info=error)
         try:
             if not isinstance(error, OSError):
                 sink.close(EndReason.RECORDER_ERROR, sentence)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import shutil
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
 
 PARTIAL_SUFFIX = ".partial"
+DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 MIN_FREE_BYTES = 20_000_000
 """A recording is not begun on a disk with less room than this."""
 
@@ -58,8 +60,9 @@ def make_folder(folder: Path) -> None:
 
 def describe_os_error(error: OSError, path: Path | str) -> str:
     """One sentence with the next step for a file that could not be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"{path} could not be written because the disk is full; free some space and start again."
+    if error.errno in DISK_FULL:
+        space = f"free some space{_disk_of(Path(path))}"
+        return f"{path} could not be written because the disk is full; {space} and start again."
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{path} may not be written; check the permissions of its folder or choose another one."
     if isinstance(error, FileExistsError):
@@ -67,6 +70,17 @@ def describe_os_error(error: OSError, path: Path | str) -> str:
     if isinstance(error, NotADirectoryError):
         return f"{path} cannot be made because a file stands where its folder belongs; choose another folder."
     return f"{path} could not be written: {error.strerror or error}; check the disk, then start again."
+
+
+def _disk_of(path: Path) -> str:
+    """The disk that holds a path and its free space; empty where that is not known."""
+    folder = path.absolute()
+    while not os.path.ismount(folder) and folder != folder.parent:
+        folder = folder.parent
+    try:
+        return f" on the disk of {folder} ({shutil.disk_usage(folder).free / 1e6:.1f} MB free)"
+    except OSError:
+        return ""
 
 
 class Sink(ABC):

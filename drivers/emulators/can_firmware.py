@@ -16,13 +16,14 @@ from typing import Self
 
 import can
 
-from drivers import vesc_can_codec
-from drivers.can_link import open_bus
 from drivers.config import MULTICAST_GROUP
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
-from drivers.vesc_can_codec import CanFrame, CanReassembler, Packet, Send
+from drivers.links.can_link import open_bus
+from drivers.links.link import CanFrame
+from drivers.vesc import can_codec as vesc_can_codec
+from drivers.vesc.can_codec import CanReassembler, Packet, Send
 
 POLL_S = 0.005
 STATUS_PACKETS = (Packet.STATUS_1, Packet.STATUS_4, Packet.STATUS_5)
@@ -113,13 +114,13 @@ class CanFirmware:
 
     def _hear(self, bus: can.BusABC, frame: CanFrame, now_s: float) -> None:
         own_id = self.firmware.controller_id
-        if frame.controller_id not in (own_id, vesc_can_codec.BROADCAST_ID):
+        if vesc_can_codec.controller_of(frame) not in (own_id, vesc_can_codec.BROADCAST_ID):
             return
-        if frame.packet in _SIMPLE and len(frame.data) >= 4:
+        if vesc_can_codec.packet_of(frame) in _SIMPLE and len(frame.data) >= 4:
             self._note_first(frame, now_s)
-            name, scale = _SIMPLE[Packet(frame.packet)]
+            name, scale = _SIMPLE[Packet(vesc_can_codec.packet_of(frame))]
             self.firmware.set_motor(name, struct.unpack_from(">i", frame.data)[0] / scale, now_s)
-        elif frame.packet == Packet.PING and frame.data:
+        elif vesc_can_codec.packet_of(frame) == Packet.PING and frame.data:
             self._note_first(frame, now_s)
             self._send(bus, vesc_can_codec.pong(frame.data[0], own_id))
         elif (packet := self._reassembler.feed(frame)) is not None:
@@ -132,7 +133,7 @@ class CanFirmware:
     def _note_first(self, frame: CanFrame, now_s: float) -> None:
         if not self._has_heard:
             self._has_heard = True
-            self.log.add(now_s, "first_byte", float(frame.packet))
+            self.log.add(now_s, "first_byte", float(vesc_can_codec.packet_of(frame)))
 
     def _send(self, bus: can.BusABC, frame: CanFrame) -> None:
         data = self.faults.pass_on(frame.data)

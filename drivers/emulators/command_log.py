@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import logging
 import threading
 from collections import deque
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TextIO
+
+logger = logging.getLogger(__name__)
 
 ENTRIES_KEPT = 500_000
 MOTOR_NAMES = frozenset({"current", "brake", "duty", "rpm"})
@@ -25,7 +29,10 @@ class LogEntry:
 
 
 class CommandLog:
-    """Entries in memory and, where a path is given, as JSON lines flushed one by one, so that a kill loses none."""
+    """Entries in memory and, where a path is given, as JSON lines flushed one by one, so that a kill loses none.
+
+    The file is for people to read. If it cannot be written, one warning names it, and the firmware goes on without it.
+    """
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
@@ -36,7 +43,10 @@ class CommandLog:
     def open(self) -> None:
         """Open the file, where there is one; entries are appended."""
         if self.path is not None and self._file is None:
-            self._file = self.path.open("a", encoding="utf-8")
+            try:
+                self._file = self.path.open("a", encoding="utf-8")
+            except OSError as error:
+                self._give_up_file(error)
 
     def add(self, t_s: float, name: str, value: float = 0.0) -> None:
         """Append an entry."""
@@ -44,8 +54,11 @@ class CommandLog:
         with self._lock:
             self._entries.append(entry)
             if self._file is not None:
-                self._file.write(json.dumps(asdict(entry)) + "\n")
-                self._file.flush()
+                try:
+                    self._file.write(json.dumps(asdict(entry)) + "\n")
+                    self._file.flush()
+                except OSError as error:
+                    self._give_up_file(error)
             self._lock.notify_all()
 
     def entries(self, *names: str, since_s: float = float("-inf")) -> list[LogEntry]:
@@ -67,8 +80,20 @@ class CommandLog:
         """Close the file; the entries in memory stay."""
         with self._lock:
             if self._file is not None:
-                self._file.close()
+                with contextlib.suppress(OSError):
+                    self._file.close()
                 self._file = None
+
+    def _give_up_file(self, error: OSError) -> None:
+        logger.warning(
+            "The log of the fake firmware cannot be written to %s (%s); free some disk space.",
+            self.path,
+            error.strerror or error,
+        )
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._file = None
 
     def _first(self, name: str, since_s: float) -> LogEntry | None:
         return next((e for e in self._entries if e.name == name and e.t_s >= since_s), None)

@@ -6,8 +6,7 @@ import random
 from dataclasses import dataclass, field
 
 from carlab.core.errors import ActuatorFaultError
-from drivers.link import FrameLink, LinkStatistics
-from drivers.vesc_can_codec import CanFrame
+from drivers.links.link import CanFrame, FrameLink, LinkStatistics
 
 
 @dataclass(slots=True)

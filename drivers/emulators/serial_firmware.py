@@ -21,7 +21,7 @@ from typing import Self
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
-from drivers.vesc_serial_codec import VescFrameDecoder, encode_frame
+from drivers.vesc.serial_codec import VescFrameDecoder, encode_frame
 
 POLL_S = 0.005
 BITS_A_BYTE = 10

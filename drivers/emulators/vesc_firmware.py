@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from carlab.core.errors import ProtocolError
 from drivers.emulators.command_log import CommandLog
-from drivers.vesc_payloads import (
+from drivers.vesc.payloads import (
     CURRENT_SCALE,
     DUTY_SCALE,
     FULL_MASK,

@@ -1,4 +1,7 @@
-"""Physics beyond the base model, by the ids of the catalogue. To add an effect, write its class and list it here.
+"""Physics beyond the base model: each effect is one class that holds all that is known of it.
+
+To add an effect of your own, write its class and call ``sim_backends.registry.register``. To add one to the package,
+list it here.
 
 What acts before what: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity,
 offset) and throttle (dead band, nonlinearity, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake
@@ -11,6 +14,7 @@ from __future__ import annotations
 
 from sim_backends.effects.base import (
     ActuatorEffect,
+    Confusable,
     DelayEffect,
     DynamicsEffect,
     Effect,
@@ -86,16 +90,36 @@ _ALL: tuple[Effect, ...] = (
 CATALOGUE: dict[str, Effect] = {effect.id: effect for effect in _ALL}
 """The effects that a diagnosis names, by id, in the order of the catalogue."""
 EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in UNCATALOGUED}}
-"""Everything that a simulator can have: the catalogue, then physics outside it."""
+"""Everything that a simulator can have: the catalogue, then physics outside it. ``register`` adds to both."""
+
+
+def separation(one: str, other: str) -> Confusable | None:
+    """How two effects are separated, whichever of both lists the pair; None where none does."""
+    for effect_id, confused in ((one, other), (other, one)):
+        for entry in EFFECTS[effect_id].confusable if effect_id in EFFECTS else ():
+            if entry.effect == confused:
+                return entry
+    return None
+
+
+def confusable_effects() -> dict[str, tuple[str, ...]]:
+    """For each effect of the catalogue, those that may be taken for it: pairs both ways, in the catalogue's order."""
+    pairs = {(e.id, entry.effect) for e in CATALOGUE.values() for entry in e.confusable}
+    pairs |= {(b, a) for a, b in pairs}
+    return {name: tuple(other for other in CATALOGUE if (name, other) in pairs) for name in CATALOGUE}
+
 
 __all__ = [
     "CATALOGUE",
     "EFFECTS",
     "ActuatorEffect",
+    "Confusable",
     "DelayEffect",
     "DynamicsEffect",
     "Effect",
     "EffectParameter",
     "Forces",
     "ObservationEffect",
+    "confusable_effects",
+    "separation",
 ]

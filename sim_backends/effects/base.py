@@ -12,11 +12,13 @@ system identification and the prior over simulators treat them like every other 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
-from sim_backends.array_ops import Ops, Value
+from carlab.core.quantities import FloatArray
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.inverse import newton_inverse
 
 GRAVITY_MPS2 = 9.81
 
@@ -24,15 +26,26 @@ Parameters = Mapping[str, Value]
 Triple = tuple[Value, Value, Value]
 """A signal at the start, the middle and the end of an integration step."""
 Kind = Literal["input", "dynamics", "observation"]
+Dependency = Literal["time", "place", "heading"]
+ModelKind = Literal["dynamic", "linear_tyre", "kinematic", "blend"]
+MODEL_KINDS: tuple[ModelKind, ...] = get_args(ModelKind)
 
 
 @dataclass(frozen=True, slots=True)
 class EffectParameter:
     """One number of an effect.
 
-    ``identity`` is the value at which the effect does nothing; None means the number of the car file named by
-    ``same_as``. ``low`` and ``high`` are the physical bounds (``positive``: above ``low``), ``typical`` a size that a
-    small race car may have. A choice among ``choices`` is their position, 0.0 for the first; car files spell it out.
+    Attributes:
+        name: Within the effect.
+        unit: SI; "1" for none.
+        identity: The value at which the effect does nothing; None means the number of the car file ``same_as``.
+        low: Lower physical bound; with ``positive`` the number is above it.
+        high: Upper physical bound.
+        typical: A size that a small race car may have.
+        positive: Whether ``low`` itself is not allowed.
+        same_as: Dotted name of the car file's number that a missing value is taken from.
+        choices: Words of a choice; its number is their position, 0.0 for the first, and car files have the word.
+        reduces: Dotted name of the car file's number that a negative value reduces, at most to 0.
     """
 
     name: str
@@ -44,22 +57,96 @@ class EffectParameter:
     positive: bool = False
     same_as: str = ""
     choices: tuple[str, ...] = ()
+    reduces: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Confusable:
+    """Another effect that may be taken for this one.
+
+    Attributes:
+        effect: Its id.
+        drive: Manoeuvre that separates both; "" where none is known or none can.
+        reason: Why it separates them, a clause; where no drive can, what to do instead, in sentences.
+    """
+
+    effect: str
+    drive: str = ""
+    reason: str = ""
+
+
+class ScreeningProbe(Protocol):
+    """What an effect may ask of the recording when it chooses its screening points."""
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Numbers of the fitted simulator without the effect, by dotted name."""
+
+    @property
+    def path_m(self) -> FloatArray:
+        """Recorded positions (N, 2) [m]."""
+
+    def points(self, rows: Iterable[Mapping[str, float]]) -> FloatArray:
+        """Coordinates (P, n) of P sets of the effect's numbers."""
+
+    def sized(self, directions: Iterable[Mapping[str, float]], held: Sequence[str] = ()) -> list[dict[str, float]]:
+        """Sets of numbers along directions from the identity, at sizes that change the prediction errors noticeably.
+
+        A direction has a step for each number in units of its typical size; numbers in ``held`` have their value there.
+        """
 
 
 class Effect:
-    """Base of all effects; subclasses are stateless and are registered in ``sim_backends.effects.EFFECTS``."""
+    """Base of all effects: equation, parameters, what it depends on, and its texts, in one class.
+
+    Subclasses are stateless. ``sim_backends.registry.register`` makes an effect known to all engines, to the diagnosis
+    and to the prior of learning; nothing else knows an effect by its id.
+    """
 
     id: ClassVar[str]
     kind: ClassVar[Kind]
-    sentence: ClassVar[str]
     parameters: ClassVar[tuple[EffectParameter, ...]]
-    look_alikes: ClassVar[tuple[str, ...]] = ()
-    catalogued: ClassVar[bool] = True
-    """Whether it has an id of the catalogue, by which a diagnosis may name it."""
-    class_statement: ClassVar[str] = ""
-    """What a diagnosis says instead of a name that is not in the catalogue."""
     order: ClassVar[int] = 50
-    """Effects of a kind act in ascending order."""
+    """Effects of a kind act in ascending order, then by id."""
+    depends_on: ClassVar[frozenset[Dependency]] = frozenset()
+    """Beyond the state in the car's own frame: time since the first row, place in the world, heading in the world."""
+    lag_parameter: ClassVar[str] = ""
+    """The parameter that says by how long the effect delays a signal."""
+    command: ClassVar[Literal["steering", "throttle"]] = "steering"
+    """The command that the effect acts on, or whose changes show it most."""
+    disc_parameters: ClassVar[tuple[str, ...]] = ()
+    """The parameters x, y and radius [m] of the disc in which the effect acts."""
+    base_models: ClassVar[tuple[ModelKind, ...]] = MODEL_KINDS
+    """Forms of the base model beside which the effect can be identified."""
+    confusable: ClassVar[tuple[Confusable, ...]] = ()
+    """Effects that may be taken for it; a pair is listed at one of both."""
+
+    name: ClassVar[str] = ""
+    """A noun phrase with its article."""
+    summary: ClassVar[str]
+    """One sentence without numbers."""
+    sentence: ClassVar[str] = ""
+    """Clause with the numbers: a template over the parameters, see ``carlab.diagnosis.report.sentences``."""
+    refuted_if: ClassVar[str] = ""
+    """Observation that would refute the effect, a clause after "if"."""
+    catalogued: ClassVar[bool] = True
+    """Whether a diagnosis may name it; otherwise it is a rival, described by ``class_statement``."""
+    class_statement: ClassVar[str] = ""
+
+    screening_scaled: ClassVar[tuple[str, ...] | None] = None
+    """Parameters that screening scales along the best point's direction; None means all that are added to."""
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray | None:
+        """Coordinates (P, n) at which screening tries the effect; None for the general rule.
+
+        The general rule takes one number both ways from its identity at three sizes of the change that it makes in the
+        prediction, and several numbers on a grid about their typical sizes.
+        """
+        return None
+
+    def numbers(self, values: Mapping[str, Value]) -> dict[str, Value]:
+        """The effect's own numbers by parameter, from numbers by dotted name."""
+        return {p.name: values[f"effects.{self.id}.{p.name}"] for p in self.parameters}
 
 
 class DelayEffect(Effect):
@@ -76,7 +163,6 @@ class ActuatorEffect(Effect):
     """Stands between the delayed command and the wheel angle [rad] or the throttle [1]."""
 
     kind: ClassVar[Kind] = "input"
-    channel: ClassVar[Literal["steering", "throttle"]]
     has_state: ClassVar[bool] = False
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
@@ -106,8 +192,8 @@ class Forces:
     mass, wheel_angle [rad]. ``drive`` is the motor's force, ``axle_force`` the F_x of the driven axle (drive less
     damping), ``demand`` the same before wheel slip, ``force_x`` all longitudinal forces but the tyres' side forces.
     ``front_per_load`` is the steady side force of the front axle for each newton of its load. ``states`` are the extra
-    states of effects by name; an effect puts their time derivatives into ``rates``. ``stiff`` is there within a
-    Runge-Kutta step that treats stiff states.
+    states of effects by name; an effect puts their time derivatives into ``rates``. ``stiff`` has, within a
+    Runge-Kutta step, the ``StiffStep`` of each effect with stiff states, by effect id.
     """
 
     t_s: Value
@@ -139,17 +225,28 @@ class Forces:
     moment: Value = 0.0
     states: dict[str, Value] = field(default_factory=dict)
     rates: dict[str, Value] = field(default_factory=dict)
-    stiff: StiffValues | None = None
+    stiff: Mapping[str, Any] = field(default_factory=dict)
 
 
-class StiffValues(Protocol):
-    """What a Runge-Kutta step with stiff states puts in the place of their differential equations."""
+@dataclass(frozen=True, slots=True)
+class StepStart:
+    """The start of a Runge-Kutta step of length ``step_s`` [s], for effects with stiff states.
 
-    axle_force: Value | None
-    """Mean force of the driven wheels over the step [N]."""
+    ``states`` are the extra states by name; ``forces`` evaluates the model there, with the mean throttle of the step:
+    all forces, and dvx/dt [m/s2]. ``damping`` is the motor's [N s/m].
+    """
 
-    def lagging_sides(self, vx: Value, steady_front: Value, steady_rear: Value) -> tuple[Value, Value]:
-        """Side forces of the axles at a stage [N], from vx and the steady ones of that stage."""
+    states: Mapping[str, Value]
+    step_s: Value
+    damping: Value
+    forces: Callable[[], tuple[Forces, Value]]
+
+
+class StiffStep(Protocol):
+    """One Runge-Kutta step of an effect's stiff states; its effect's hooks find it in ``Forces.stiff``."""
+
+    def finish(self) -> dict[str, Value]:
+        """The stiff states at the end of the step, by name."""
 
 
 class DynamicsEffect(Effect):
@@ -165,8 +262,17 @@ class DynamicsEffect(Effect):
     kind: ClassVar[Kind] = "dynamics"
     states: ClassVar[tuple[str, ...]] = ()
     stiff: ClassVar[bool] = False
-    """Whether its states are stepped by ``stiff_step`` instead of Runge-Kutta."""
-    needs_position: ClassVar[bool] = False
+    """Whether its states are too fast for Runge-Kutta steps and are stepped by ``stiff_step``."""
+
+    def base_model(
+        self, kind: ModelKind, tyre: Mapping[str, Value], values: Parameters
+    ) -> tuple[ModelKind, Mapping[str, Value]]:
+        """Change the form of the base model and its tyre numbers (``front.mu``, ``rear.B`` ...)."""
+        return kind, tyre
+
+    def stiff_step(self, ops: Ops, start: StepStart, values: Parameters) -> StiffStep:
+        """Begin a step of the stiff states."""
+        raise NotImplementedError
 
     def on_load(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Change ``load_front`` and ``load_rear``."""
@@ -198,13 +304,25 @@ class DynamicsEffect(Effect):
 
 
 class ObservationEffect(Effect):
-    """Changes what motion capture and the velocity filter say of the true state."""
+    """Changes what motion capture and the velocity filter say of the true state.
+
+    An effect on poses shows in the velocities too, since they come from the poses; ``observe`` changes both.
+    """
 
     kind: ClassVar[Kind] = "observation"
+    velocities_only: ClassVar[bool] = False
+    """Whether ``observe`` changes the velocity columns alone, so that velocities from measured poses are true."""
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
         """Measured x, y, yaw, vx, vy, yaw rate of a true state."""
         return state
+
+    def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
+        """The true state that is measured as ``measured``: the inverse of ``observe``, by Newton's method.
+
+        Override it where there is a closed form.
+        """
+        return newton_inverse(ops, lambda state: self.observe(ops, state, values), measured)
 
     def latency_s(self, values: Parameters) -> Value | None:
         """Age of what is measured [s], in place of the car file's; None where the effect leaves it alone."""

@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.array_ops import Ops
-from sim_backends.effects.base import GRAVITY_MPS2, DynamicsEffect, EffectParameter, Forces, Parameters
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from sim_backends.dynamics.array_ops import Ops
+from sim_backends.effects.base import (
+    GRAVITY_MPS2,
+    Confusable,
+    DynamicsEffect,
+    EffectParameter,
+    Forces,
+    Parameters,
+    ScreeningProbe,
+)
 
 
 class YawDamping(DynamicsEffect):
     """``M -= coefficient r``."""
 
     id = "yaw_damping"
-    sentence = "A moment against turning that grows with the yaw rate, as of a locked axle."
+    name = "a moment against turning"
+    summary = "A moment against turning that grows with the yaw rate, as of a locked axle."
+    sentence = "a moment of {coefficient} of yaw rate holds the car from turning, as a locked axle does"
+    refuted_if = "tight circles at walking pace are as tight as the steering says"
     parameters = (EffectParameter("coefficient", "N m s/rad", 0.0, 0.0, 10.0, 0.05),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -24,7 +38,10 @@ class TorqueSteer(DynamicsEffect):
     """``M += coefficient u``, u the throttle that acts."""
 
     id = "torque_steer"
-    sentence = "Throttle turns the car: a moment in proportion to it."
+    name = "a throttle that turns the car"
+    summary = "Throttle turns the car: a moment in proportion to it."
+    sentence = "full throttle turns the car to the {coefficient:left|right} with a moment of {coefficient:size}"
+    refuted_if = "the car pulls to that side when it rolls with no throttle, too"
     parameters = (EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.1),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -36,9 +53,14 @@ class LateralBias(DynamicsEffect):
     """``F_y += force``, in the body frame, at the centre of mass."""
 
     id = "lateral_bias"
-    sentence = "A constant side force pulls the car to one side."
+    name = "a side force"
+    summary = "A constant side force pulls the car to one side."
+    sentence = "a constant force of {force:size} pushes the car to the {force:left|right}"
+    refuted_if = (
+        "the path's curvature from it does not fade as speed grows (then the steering is off centre), or it turns "
+        "with the heading (then the floor slopes)"
+    )
     parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
-    look_alikes = ("steering_offset",)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Push to the left."""
@@ -53,12 +75,30 @@ class RoadSlope(DynamicsEffect):
     """
 
     id = "road_slope"
-    sentence = "The floor slopes."
+    name = "a floor that slopes"
+    summary = "The floor slopes."
+    sentence = "the floor slopes by {angle}; straight up is where a heading of {direction} points"
+    refuted_if = "the pull does not change sign when the car drives the other way"
     parameters = (
         EffectParameter("angle", "rad", 0.0, -0.5, 0.5, 0.03),
         EffectParameter("direction", "rad", 0.0, -2.0 * math.pi, 2.0 * math.pi, 1.0),
     )
-    look_alikes = ("lateral_bias",)
+    depends_on = frozenset({"heading"})
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Eight directions of ascent, each with the angles that count in one of them."""
+        headings = np.linspace(-np.pi, np.pi, 8, endpoint=False)
+        sized = probe.sized([{"angle": 1.0, "direction": float(headings[0])}], held=("direction",))
+        angles = sorted({row["angle"] for row in sized})
+        return probe.points({"angle": a, "direction": float(h)} for a in angles for h in headings)
+
+    confusable = (
+        Confusable(
+            "lateral_bias",
+            "figure_eight",
+            "a slope pulls the other way when the heading turns round, a side force of the car turns with it",
+        ),
+    )
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Weight along the floor."""

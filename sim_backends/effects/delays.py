@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from sim_backends.array_ops import Value
-from sim_backends.effects.base import DelayEffect, EffectParameter, Parameters
+from sim_backends.dynamics.array_ops import Value
+from sim_backends.effects.base import Confusable, DelayEffect, EffectParameter, Parameters
 
 
 class CommandDelay(DelayEffect):
     """Both commands act ``extra_delay`` later; may be negative as long as the total delay is not."""
 
     id = "command_delay"
-    sentence = "Both commands act later than the car file says."
-    parameters = (EffectParameter("extra_delay", "s", 0.0, -1.0, 1.0, 0.03),)
-    look_alikes = ("mocap_latency",)
+    name = "a command delay that is not the car file's"
+    summary = "Both commands act later than the car file says."
+    sentence = "both commands act {extra_delay:size} {extra_delay:later|earlier} than the car file says"
+    refuted_if = (
+        "steering and throttle turn out late by different amounts, or a delay measured at the car is the car file's"
+    )
+    lag_parameter = "extra_delay"
+    parameters = (EffectParameter("extra_delay", "s", 0.0, -1.0, 1.0, 0.03, reduces="timing.command_delay"),)
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
         """Same for both."""
@@ -23,9 +28,21 @@ class SteeringDelay(DelayEffect):
     """The steering command acts ``delay`` later."""
 
     id = "steering_delay"
-    sentence = "The steering command acts later than the throttle command."
+    name = "a delay of the steering"
+    summary = "The steering command acts later than the throttle command."
+    sentence = "the steering command acts {delay} later than the throttle command"
+    refuted_if = (
+        "the wheels start to move at once and only arrive late, or fast steering comes out weaker than slow steering"
+    )
+    lag_parameter = "delay"
     parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03),)
-    look_alikes = ("steering_lag",)
+    confusable = (
+        Confusable(
+            "steering_lag",
+            "steering_steps",
+            "a delay shifts every step by the same pause; a lag starts at once and rounds it off",
+        ),
+    )
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
         """Steering alone."""
@@ -36,9 +53,20 @@ class ThrottleDelay(DelayEffect):
     """The throttle command acts ``delay`` later."""
 
     id = "throttle_delay"
-    sentence = "The throttle command acts later than the steering command."
+    command = "throttle"
+    name = "a delay of the throttle"
+    summary = "The throttle command acts later than the steering command."
+    sentence = "the throttle command acts {delay} later than the steering command"
+    refuted_if = "the car starts to gain speed at once after a step of throttle, only more gently"
+    lag_parameter = "delay"
     parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03),)
-    look_alikes = ("motor_lag",)
+    confusable = (
+        Confusable(
+            "motor_lag",
+            "throttle_steps",
+            "a delay shifts every step by the same pause; a lag starts at once and rounds it off",
+        ),
+    )
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
         """Throttle alone."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.array_ops import Ops
-from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, Parameters
+from sim_backends.dynamics.array_ops import Ops
+from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 LARGEST_FORCE_N = 1e9
 LARGEST_SHARE = 1e6
@@ -15,10 +15,23 @@ class BatterySag(DynamicsEffect):
     """``drive_gain (1 - rate t)``, t since the first row of the recording; not below zero."""
 
     id = "battery_sag"
-    sentence = "The drive weakens with time as the battery runs down."
+    command = "throttle"
+    name = "a drive that changes as the battery runs down"
+    summary = "The drive weakens with time as the battery runs down."
+    sentence = "the drive {rate:weakens|strengthens} by {rate:size each minute}"
+    refuted_if = (
+        "cornering changes along with it (then it is grip), or the drive stays weak after the battery is charged"
+    )
     order = 10
+    depends_on = frozenset({"time"})
     parameters = (EffectParameter("rate", "1/s", 0.0, -1.0, 1.0, 0.003),)
-    look_alikes = ("friction_drift",)
+    confusable = (
+        Confusable(
+            "friction_drift",
+            "figure_eight",
+            "driven over and over for some minutes: a weak battery slows the car, lost grip widens its turns",
+        ),
+    )
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Weaken."""
@@ -29,7 +42,11 @@ class BrakeAsymmetry(DynamicsEffect):
     """``drive force * gain_ratio`` where drive force and vx have opposite signs."""
 
     id = "brake_asymmetry"
-    sentence = "The motor brakes with another gain than it drives."
+    command = "throttle"
+    name = "a brake that is not the drive reversed"
+    summary = "The motor brakes with another gain than it drives."
+    sentence = "the motor brakes with {gain_ratio} times the force with which it drives at the same throttle"
+    refuted_if = "braking from several speeds needs several such ratios"
     order = 20
     parameters = (EffectParameter("gain_ratio", "1", 1.0, 0.0, 10.0, 1.5),)
 
@@ -43,10 +60,20 @@ class MotorSaturation(DynamicsEffect):
     """Drive force clipped to ``+-force``, before damping."""
 
     id = "motor_saturation"
-    sentence = "The motor gives no more than a certain force."
+    command = "throttle"
+    name = "a limit of the motor's force"
+    summary = "The motor gives no more than a certain force."
+    sentence = "the motor gives no more than {force} of drive force, whatever the throttle"
+    refuted_if = "the limit moves with the grip of the floor, or with the load on the wheels"
     order = 30
     parameters = (EffectParameter("force", "N", math.inf, 0.0, math.inf, 3.0),)
-    look_alikes = ("throttle_nonlinearity", "traction_limit")
+    confusable = (
+        Confusable(
+            "traction_limit",
+            "throttle_ramp",
+            "the limit of traction sinks as the turn takes grip, the motor's stays",
+        ),
+    )
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Clip."""
@@ -61,13 +88,23 @@ class TractionLimit(DynamicsEffect):
     """
 
     id = "traction_limit"
-    sentence = "The driven wheels pass on no more force than their grip allows."
+    command = "throttle"
+    name = "a limit of traction"
+    summary = "The driven wheels pass on no more force than their grip allows."
+    sentence = "the driven wheels ({axle:choice rear|all}) pass on no more than {share} times the force of full grip"
+    refuted_if = "the same limit is reached on a floor with more grip (then it is the motor's)"
     order = 40
     parameters = (
         EffectParameter("share", "1", math.inf, 0.0, math.inf, 0.7),
         EffectParameter("axle", "1", 0.0, 0.0, 1.0, 0.0, choices=("rear", "all")),
     )
-    look_alikes = ("motor_saturation", "friction_ellipse")
+    confusable = (
+        Confusable(
+            "friction_ellipse",
+            "throttle_ramp",
+            "a limit caps the drive force; shared grip takes side force long before the cap",
+        ),
+    )
 
     def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Clip."""

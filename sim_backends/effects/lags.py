@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import ActuatorEffect, EffectParameter, Parameters, Triple
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters, Triple
 from sim_backends.effects.first_order import lag_weights
 
 
@@ -11,6 +11,7 @@ class FirstOrderLag(ActuatorEffect):
     """``time_constant * dy/dt = command - y``, by its closed form (``first_order``)."""
 
     has_state = True
+    lag_parameter = "time_constant"
     parameters = (EffectParameter("time_constant", "s", 0.0, 0.0, 5.0, 0.08),)
 
     def step(
@@ -33,17 +34,39 @@ class SteeringLag(FirstOrderLag):
     """The wheel angle follows the steering servo's command with a lag."""
 
     id = "steering_lag"
-    sentence = "The steering servo lags behind its command."
-    channel = "steering"
+    name = "a lag of the steering servo"
+    summary = "The steering servo lags behind its command."
+    sentence = "the steering servo lags by {time_constant}"
+    refuted_if = (
+        "the wheels reach their angle after the same pause for a small and for a large step (a delay), or later the "
+        "larger the step is (a limit of their rate)"
+    )
+    command = "steering"
     order = 30
-    look_alikes = ("steering_delay", "steering_rate_limit", "tyre_relaxation")
+    confusable = (
+        Confusable(
+            "steering_rate_limit",
+            "steering_steps",
+            "a lag takes as long for a small as for a large step; a limited rate takes longer for the large one",
+        ),
+        Confusable(
+            "tyre_relaxation",
+            "steering_steps",
+            (
+                "a lag lasts as long at any speed; building up side force takes a distance, so drive it twice, the "
+                "second time with --max-throttle 0.15"
+            ),
+        ),
+    )
 
 
 class MotorLag(FirstOrderLag):
     """The drive force follows the throttle with a lag."""
 
     id = "motor_lag"
-    sentence = "The motor's force lags behind the throttle."
-    channel = "throttle"
+    name = "a lag of the motor"
+    summary = "The motor's force lags behind the throttle."
+    sentence = "the motor's force lags behind the throttle by {time_constant}"
+    refuted_if = "after a step of throttle nothing happens for a while and then everything at once (a delay)"
+    command = "throttle"
     order = 30
-    look_alikes = ("throttle_delay",)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import GRAVITY_MPS2, DynamicsEffect, EffectParameter, Forces, Parameters
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import GRAVITY_MPS2, Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 ROLL_SENSITIVITY = 0.3
 """Share of an axle's side force that is lost when its inner wheels carry nothing, unless the car file gives another."""
@@ -21,7 +21,10 @@ class AerodynamicDownforce(DynamicsEffect):
     """``F_z += coefficient vx^2`` in all, split like the static loads."""
 
     id = "aerodynamic_downforce"
-    sentence = "Aerodynamic downforce: the faster, the more grip."
+    name = "downforce"
+    summary = "Aerodynamic downforce: the faster, the more grip."
+    sentence = "the tyres carry {coefficient} times speed squared more than the car's weight"
+    refuted_if = "the fastest corner of a given radius is no faster than grip without downforce allows"
     order = 10
     parameters = (EffectParameter("coefficient", "N s2/m2", 0.0, -10.0, 10.0, 0.3),)
 
@@ -43,9 +46,11 @@ class LoadTransfer(DynamicsEffect):
     """
 
     id = "load_transfer"
-    sentence = "Speeding up presses the rear wheels to the ground and braking the front wheels."
+    name = "load that moves between the axles"
+    summary = "Speeding up presses the rear wheels to the ground and braking the front wheels."
+    sentence = "speeding up and braking move load between the axles, as of a centre of mass {height} above the floor"
+    refuted_if = "braking and speeding up change the balance in the same direction (then they share the tyres' grip)"
     parameters = (EffectParameter("height", "m", 0.0, 0.0, 1.0, 0.04),)
-    look_alikes = ("friction_ellipse",)
 
     def on_transfer(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Move load."""
@@ -67,15 +72,29 @@ class RollDynamics(DynamicsEffect):
     """
 
     id = "roll_dynamics"
-    sentence = "The body rolls and swings, which shifts grip between the sides later than the side force changes."
+    name = "a body that rolls"
+    summary = "The body rolls and swings, which shifts grip between the sides later than the side force changes."
+    sentence = (
+        "the body rolls at {frequency} with a damping ratio of {damping}, and load that changes sides costs grip, "
+        "with a sensitivity of {sensitivity}"
+    )
+    refuted_if = "fast weaving shows no resonance near that frequency"
     order = 50
     states = ("shift", "shift_rate")
+    base_models = ("dynamic", "kinematic", "blend")
+    """Where tyres do not saturate, the loss of grip by roll would stand for that."""
     parameters = (
         EffectParameter("frequency", "Hz", math.inf, 0.0, math.inf, 2.5, positive=True),
         EffectParameter("damping", "1", 0.5, 0.0, 5.0, 0.3),
         EffectParameter("sensitivity", "1", ROLL_SENSITIVITY, 0.0, 20.0, 0.5),
     )
-    look_alikes = ("load_transfer",)
+    confusable = (
+        Confusable(
+            "load_transfer",
+            "steering_chirp",
+            "a rolling body answers late and most near its own frequency; load moves at once",
+        ),
+    )
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale both side forces and set the rates of the roll."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import EffectParameter, ObservationEffect, Parameters
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import Confusable, EffectParameter, ObservationEffect, Parameters, ScreeningProbe
 
 
 class MarkerOffset(ObservationEffect):
@@ -14,11 +17,22 @@ class MarkerOffset(ObservationEffect):
 
     id = "marker_offset"
     order = 40
-    sentence = "Motion capture tracks a point that is not the centre of mass."
+    name = "a tracked point beside the centre of mass"
+    summary = "Motion capture tracks a point that is not the centre of mass."
+    sentence = (
+        "motion capture tracks a point {ahead:size} {ahead:ahead of|behind} and {left:size} to the {left:left|right} "
+        "of the centre of mass"
+    )
+    refuted_if = "on a slow circle the tracked point shows the side velocity of the centre of mass"
     parameters = (
         EffectParameter("ahead", "m", 0.0, -1.0, 1.0, 0.03),
         EffectParameter("left", "m", 0.0, -1.0, 1.0, 0.01),
     )
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Eight directions around the centre of mass."""
+        angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+        return probe.points(probe.sized({"ahead": float(np.cos(a)), "left": float(np.sin(a))} for a in angles))
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
         """Shift the point."""
@@ -34,6 +48,20 @@ class MarkerOffset(ObservationEffect):
             yaw_rate,
         )
 
+    def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
+        """Shift the point back."""
+        x, y, yaw, vx, vy, yaw_rate = measured
+        ahead, left = values["ahead"], values["left"]
+        sin, cos = ops.sin(yaw), ops.cos(yaw)
+        return (
+            x - (cos * ahead - sin * left),
+            y - (sin * ahead + cos * left),
+            yaw,
+            vx + left * yaw_rate,
+            vy - ahead * yaw_rate,
+            yaw_rate,
+        )
+
 
 class MocapYawMisalignment(ObservationEffect):
     """``yaw_meas = yaw + angle``: the tracked body's axes are turned against the car's.
@@ -43,10 +71,12 @@ class MocapYawMisalignment(ObservationEffect):
     """
 
     id = "mocap_yaw_misalignment"
-    sentence = "Motion capture's forward axis of the car is not the car's."
+    name = "a heading that motion capture measures askew"
+    summary = "Motion capture's forward axis of the car is not the car's."
+    sentence = "motion capture sees the car turned {angle:size} to the {angle:left|right} of where it points"
+    refuted_if = "driving straight with the steering centred, the measured side velocity does not grow with speed"
     order = 60
     parameters = (EffectParameter("angle", "rad", 0.0, -3.2, 3.2, 0.03),)
-    look_alikes = ("steering_offset",)
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
         """Turn the axes."""
@@ -54,14 +84,32 @@ class MocapYawMisalignment(ObservationEffect):
         sin, cos = ops.sin(values["angle"]), ops.cos(values["angle"])
         return x, y, yaw + values["angle"], vx * cos + vy * sin, vy * cos - vx * sin, yaw_rate
 
+    def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
+        """Turn the axes back."""
+        x, y, yaw, vx, vy, yaw_rate = measured
+        sin, cos = ops.sin(values["angle"]), ops.cos(values["angle"])
+        return x, y, yaw - values["angle"], cos * vx - sin * vy, sin * vx + cos * vy, yaw_rate
+
 
 class MocapLatency(ObservationEffect):
     """Every measured channel is ``latency`` old."""
 
     id = "mocap_latency"
-    sentence = "Motion capture is older than the car file says."
+    name = "a motion-capture latency that is not the car file's"
+    summary = "Motion capture is older than the car file says."
+    sentence = "all that motion capture measures is {latency} old"
+    refuted_if = "a latency measured against a known event, such as a tap on the car, equals the car file's"
+    lag_parameter = "latency"
     parameters = (EffectParameter("latency", "s", None, 0.0, 1.0, 0.03, same_as="mocap.latency"),)
-    look_alikes = ("command_delay",)
+    confusable = (
+        Confusable(
+            "command_delay",
+            reason=(
+                "No drive tells a command that acts late from a picture that comes late. Measure the latency of the "
+                "motion capture by itself, against an event at a known time, and write it into the car file."
+            ),
+        ),
+    )
 
     def latency_s(self, values: Parameters) -> Value | None:
         """Instead of the car file's."""
@@ -72,9 +120,24 @@ class VelocityFilterLag(ObservationEffect):
     """``time_constant dv_meas/dt = v - v_meas`` on the velocity columns only."""
 
     id = "velocity_filter_lag"
-    sentence = "The recorded velocities went through a filter with a lag."
+    name = "a filter in the recorded velocities"
+    summary = "The recorded velocities went through a filter with a lag."
+    sentence = "the recorded velocities went through a filter that lags by {time_constant}"
+    refuted_if = "the poses are as late as the velocities (then the car, or the commands, are late)"
+    lag_parameter = "time_constant"
     parameters = (EffectParameter("time_constant", "s", 0.0, 0.0, 5.0, 0.04),)
-    look_alikes = ("motor_lag", "steering_lag")
+    confusable = (
+        Confusable(
+            "motor_lag",
+            "throttle_steps",
+            "compare velocity with the slope of the position: a filter delays the first against the second",
+        ),
+        Confusable(
+            "steering_lag",
+            "steering_steps",
+            "compare yaw rate with the slope of the yaw: a filter delays the first against the second",
+        ),
+    )
 
     def velocity_time_constant_s(self, values: Parameters) -> Value | None:
         """Of the filter."""

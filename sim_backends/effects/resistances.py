@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sim_backends.array_ops import Ops
-from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, Parameters
+from sim_backends.dynamics.array_ops import Ops
+from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 ROLLING_SPEED_MPS = 0.05
 """Speed over which rolling resistance builds up, so that it is smooth at rest [m/s]."""
@@ -13,9 +13,12 @@ class RollingResistance(DynamicsEffect):
     """``F_x -= force tanh(vx / 0.05 m/s)``."""
 
     id = "rolling_resistance"
-    sentence = "Rolling resistance: a force against the motion that does not depend on speed."
+    command = "throttle"
+    name = "rolling resistance"
+    summary = "Rolling resistance: a force against the motion that does not depend on speed."
+    sentence = "a rolling resistance of {force} holds the car back at any speed"
+    refuted_if = "rolling out with no throttle, the car loses less speed each second the slower it gets"
     parameters = (EffectParameter("force", "N", 0.0, 0.0, 50.0, 0.8),)
-    look_alikes = ("throttle_deadband",)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Brake."""
@@ -26,9 +29,19 @@ class AerodynamicDrag(DynamicsEffect):
     """``F_x -= coefficient vx |vx|``."""
 
     id = "aerodynamic_drag"
-    sentence = "Aerodynamic drag: a force against the motion that grows with the square of speed."
+    command = "throttle"
+    name = "a drag that grows with the square of speed"
+    summary = "Aerodynamic drag: a force against the motion that grows with the square of speed."
+    sentence = "a drag of {coefficient} times speed squared holds the car back"
+    refuted_if = "rolling out from high speed with no throttle shows no such drag (then the motor is at its limit)"
     parameters = (EffectParameter("coefficient", "N s2/m2", 0.0, 0.0, 10.0, 0.1),)
-    look_alikes = ("motor_saturation",)
+    confusable = (
+        Confusable(
+            "motor_saturation",
+            "coast_down",
+            "with no throttle the motor's limit has no say, drag still slows the car",
+        ),
+    )
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Brake."""
@@ -39,7 +52,11 @@ class CorneringDrag(DynamicsEffect):
     """``F_x -= coefficient |d| tanh(vx / 0.05 m/s)``."""
 
     id = "cornering_drag"
-    sentence = "Steered wheels slow the car down more than their side force does."
+    command = "throttle"
+    name = "a drag of the steered wheels"
+    summary = "Steered wheels slow the car down more than their side force does."
+    sentence = "steered wheels hold the car back by {coefficient} of wheel angle"
+    refuted_if = "the loss of speed in corners depends on how fast they are driven rather than on the wheel angle"
     parameters = (EffectParameter("coefficient", "N/rad", 0.0, 0.0, 100.0, 3.0),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import ActuatorEffect, EffectParameter, Parameters, Triple
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters, Triple
 
 FASTEST_RADPS = 1e6
 """A rate limit above this is none."""
@@ -21,11 +21,20 @@ class SteeringDeadband(ActuatorEffect):
     """``d = d_cmd - clip(d_cmd, -width/2, width/2)``."""
 
     id = "steering_deadband"
-    sentence = "The steering servo ignores small commands around straight ahead."
-    channel = "steering"
+    name = "a dead band of the steering"
+    summary = "The steering servo ignores small commands around straight ahead."
+    sentence = "the steering ignores small commands around straight ahead, in a band {width} wide"
+    refuted_if = "the wheels also stand still for a moment when the steering turns back far from straight ahead"
+    command = "steering"
     order = 10
     parameters = (EffectParameter("width", "rad", 0.0, 0.0, 1.0, 0.06),)
-    look_alikes = ("steering_backlash",)
+    confusable = (
+        Confusable(
+            "steering_backlash",
+            "steering_chirp",
+            "play opens at each turn back, a dead band only around straight ahead",
+        ),
+    )
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Nothing within the band, shifted towards zero outside."""
@@ -41,12 +50,14 @@ class SteeringRateLimit(ActuatorEffect):
     """
 
     id = "steering_rate_limit"
-    sentence = "The steering servo turns no faster than a certain rate."
-    channel = "steering"
+    name = "a limit of the steering servo's speed"
+    summary = "The steering servo turns no faster than a certain rate."
+    sentence = "the steering servo turns the wheels no faster than {rate}"
+    refuted_if = "small steps of steering are as late as large ones"
+    command = "steering"
     has_state = True
     order = 20
     parameters = (EffectParameter("rate", "rad/s", math.inf, 0.0, math.inf, 3.0, positive=True),)
-    look_alikes = ("steering_lag",)
 
     def step(
         self, ops: Ops, command: Triple, state: Value, duration_s: Value, values: Parameters
@@ -77,12 +88,14 @@ class SteeringBacklash(ActuatorEffect):
     """
 
     id = "steering_backlash"
-    sentence = "The steering linkage has play: the wheels follow only when it is taken up."
-    channel = "steering"
+    name = "play in the steering"
+    summary = "The steering linkage has play: the wheels follow only when it is taken up."
+    sentence = "the steering linkage has {play} of play, which is taken up anew at each turn back"
+    refuted_if = "commands are ignored around straight ahead only, whichever way the wheels moved before"
+    command = "steering"
     has_state = True
     order = 40
     parameters = (EffectParameter("play", "rad", 0.0, 0.0, 1.0, 0.06),)
-    look_alikes = ("steering_deadband",)
 
     def step(
         self, ops: Ops, command: Triple, state: Value, duration_s: Value, values: Parameters
@@ -107,11 +120,23 @@ class SteeringAsymmetry(ActuatorEffect):
     """``d = d_cmd (1 + gain sign(d_cmd))``."""
 
     id = "steering_asymmetry"
-    sentence = "The wheels turn farther to one side than to the other."
-    channel = "steering"
+    name = "a steering that turns farther to one side"
+    summary = "The wheels turn farther to one side than to the other."
+    sentence = (
+        "the wheels turn {gain:size percent} farther to the {gain:left|right} than commanded, and as much less to "
+        "the other side"
+    )
+    refuted_if = "left and right circles at the same command have the same radius"
+    command = "steering"
     order = 50
     parameters = (EffectParameter("gain", "1", 0.0, -1.0, 1.0, 0.1),)
-    look_alikes = ("steering_offset",)
+    confusable = (
+        Confusable(
+            "steering_offset",
+            "figure_eight",
+            "an offset tightens one circle and widens the other alike at any command; an asymmetry grows with it",
+        ),
+    )
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """More to the left for a positive gain."""
@@ -122,11 +147,20 @@ class SteeringNonlinearity(ActuatorEffect):
     """``d = saturation tanh(d_cmd / saturation)``."""
 
     id = "steering_nonlinearity"
-    sentence = "The wheel angle grows less than the command towards full lock."
-    channel = "steering"
+    name = "a steering that yields less towards full lock"
+    summary = "The wheel angle grows less than the command towards full lock."
+    sentence = "the wheel angle grows ever less than its command and would never exceed {saturation}"
+    refuted_if = "a slow circle at full lock, where tyres do not slip, is as tight as the linear steering says"
+    command = "steering"
     order = 60
     parameters = (EffectParameter("saturation", "rad", math.inf, 0.0, math.inf, 0.5, positive=True),)
-    look_alikes = ("tyre_saturation",)
+    confusable = (
+        Confusable(
+            "tyre_saturation",
+            "slow_circle",
+            "at walking pace tyres do not slip, so a wide circle at full lock is the steering's",
+        ),
+    )
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Saturate smoothly."""
@@ -139,11 +173,28 @@ class SteeringOffset(ActuatorEffect):
     """``d = d_cmd + angle``."""
 
     id = "steering_offset"
-    sentence = "The wheels are not straight when the steering command is zero."
-    channel = "steering"
+    name = "a steering that is not centred"
+    summary = "The wheels are not straight when the steering command is zero."
+    sentence = "with a steering command of zero the wheels point {angle:size} to the {angle:left|right}"
+    refuted_if = "the pull to one side fades as speed grows, or the heading is off without the path being curved"
+    command = "steering"
     order = 70
     parameters = (EffectParameter("angle", "rad", 0.0, -1.0, 1.0, 0.05),)
-    look_alikes = ("lateral_bias", "mocap_yaw_misalignment")
+    confusable = (
+        Confusable(
+            "lateral_bias",
+            "throttle_ramp",
+            "the curvature from wheels off centre stays as speed grows; that from a side force fades",
+        ),
+        Confusable(
+            "mocap_yaw_misalignment",
+            "throttle_ramp",
+            (
+                "wheels off centre curve the path; a heading measured askew only shows as side velocity growing with "
+                "speed"
+            ),
+        ),
+    )
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Shift."""

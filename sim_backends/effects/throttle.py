@@ -5,8 +5,8 @@ Acting order: dead band, nonlinearity, lag. Throttle in [-1, 1].
 
 from __future__ import annotations
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import ActuatorEffect, EffectParameter, Parameters
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters
 
 _SMALLEST = 1e-12
 
@@ -15,11 +15,20 @@ class ThrottleDeadband(ActuatorEffect):
     """``u = sign(u_t) max(|u_t| - width, 0) / (1 - width)``."""
 
     id = "throttle_deadband"
-    sentence = "The motor does not answer to small throttle commands."
-    channel = "throttle"
+    name = "a dead band of the throttle"
+    summary = "The motor does not answer to small throttle commands."
+    sentence = "the motor does not answer to throttle commands smaller than {width:percent} of full"
+    refuted_if = "the car slows down just as strongly when it rolls with no throttle at all (a resistance)"
+    command = "throttle"
     order = 10
     parameters = (EffectParameter("width", "1", 0.0, 0.0, 0.99, 0.08),)
-    look_alikes = ("rolling_resistance",)
+    confusable = (
+        Confusable(
+            "rolling_resistance",
+            "coast_down",
+            "with no throttle a dead band has no say, a resistance still slows the car",
+        ),
+    )
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Nothing within the band, stretched outside."""
@@ -32,11 +41,25 @@ class ThrottleNonlinearity(ActuatorEffect):
     """``u = sign(u_t) |u_t|^exponent``."""
 
     id = "throttle_nonlinearity"
-    sentence = "The motor's force is not proportional to the throttle command."
-    channel = "throttle"
+    name = "a curved throttle response"
+    summary = "The motor's force is not proportional to the throttle command."
+    sentence = "the motor's force grows as the throttle to the power of {exponent}, not in proportion to it"
+    refuted_if = "the curve has a sharp corner (a dead band or a limit) rather than a bend over the whole range"
+    command = "throttle"
     order = 20
     parameters = (EffectParameter("exponent", "1", 1.0, 0.0, 5.0, 1.3, positive=True),)
-    look_alikes = ("motor_saturation", "throttle_deadband")
+    confusable = (
+        Confusable(
+            "motor_saturation",
+            "throttle_ramp",
+            "a limit shows as a corner in the force over the throttle, a curve bends all the way",
+        ),
+        Confusable(
+            "throttle_deadband",
+            "throttle_ramp",
+            "a dead band shows as a corner at small throttle, a curve bends all the way",
+        ),
+    )
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Power of the size; at zero, where a power has no derivative, the command itself."""

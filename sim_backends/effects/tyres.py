@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, Parameters
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import (
+    Confusable,
+    DynamicsEffect,
+    EffectParameter,
+    Forces,
+    ModelKind,
+    Parameters,
+    ScreeningProbe,
+    StepStart,
+)
 from sim_backends.effects.first_order import LagWeights, lag_weights
 
 EDGE_M = 0.05
@@ -13,6 +26,12 @@ EDGE_M = 0.05
 RELAXATION_FLOOR_MPS = 0.3
 SHORTEST_M = 1e-9
 """A relaxation length below this is none."""
+SCREENING_GRIPS = (0.4, 0.65, 0.95, 1.4)
+"""Friction coefficients of each axle at which saturating tyres are screened."""
+SCREENING_SHAPE = 1.5
+"""Pacejka's C there."""
+SCREENING_SPACING_M, SCREENING_RADIUS_M = 0.5, 0.8
+"""Spacing and radius of the discs at which a patch is screened [m]."""
 LARGEST_SHARE = 0.98
 """Most of the friction that a longitudinal force may use up in the ellipse."""
 
@@ -25,7 +44,10 @@ class TyreSaturation(DynamicsEffect):
     """
 
     id = "tyre_saturation"
-    sentence = "The tyres' side force saturates: grip is limited."
+    name = "the limit of tyre grip"
+    summary = "The tyres' side force saturates: grip is limited."
+    sentence = "the side force of the tyres saturates, at a friction of {mu_front} in front and {mu_rear} at the rear"
+    refuted_if = "turns tighten less than linearly even at walking pace (then it is the steering)"
     parameters = (
         EffectParameter("mu_front", "1", None, 0.0, 5.0, 0.43, same_as="tyre.front.mu"),
         EffectParameter("B_front", "1", None, 0.0, 100.0, 2.75, positive=True, same_as="tyre.front.B"),
@@ -34,17 +56,45 @@ class TyreSaturation(DynamicsEffect):
         EffectParameter("B_rear", "1", None, 0.0, 100.0, 5.0, positive=True, same_as="tyre.rear.B"),
         EffectParameter("C_rear", "1", None, 0.0, 10.0, 1.3, positive=True, same_as="tyre.rear.C"),
     )
-    look_alikes = ("steering_nonlinearity",)
+    base_models = ("linear_tyre", "kinematic", "blend")
+    screening_scaled = ()
+
+    def base_model(
+        self, kind: ModelKind, tyre: Mapping[str, Value], values: Parameters
+    ) -> tuple[ModelKind, Mapping[str, Value]]:
+        """Pacejka's tyres with these numbers."""
+        if kind not in ("kinematic", "linear_tyre"):
+            return kind, tyre
+        return "dynamic", {f"{axle}.{n}": values[f"{n}_{axle}"] for axle in ("front", "rear") for n in ("mu", "B", "C")}
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Tyres of several grips with the stiffness B C mu that the linear ones have."""
+        stiffness = {a: math.prod(probe.values[f"tyre.{a}.{k}"] for k in ("B", "C", "mu")) for a in ("front", "rear")}
+        return probe.points(
+            {
+                "mu_front": front,
+                "mu_rear": rear,
+                "C_front": SCREENING_SHAPE,
+                "C_rear": SCREENING_SHAPE,
+                "B_front": stiffness["front"] / (SCREENING_SHAPE * front),
+                "B_rear": stiffness["rear"] / (SCREENING_SHAPE * rear),
+            }
+            for front in SCREENING_GRIPS
+            for rear in SCREENING_GRIPS
+        )
 
 
 class FrictionDrift(DynamicsEffect):
     """``mu (1 + rate t)`` of both axles, t since the first row of the recording; not below zero."""
 
     id = "friction_drift"
-    sentence = "Grip changes with time, as tyres warm up or wear."
+    depends_on = frozenset({"time"})
+    name = "a grip that changes with time"
+    summary = "Grip changes with time, as tyres warm up or wear."
+    sentence = "grip {rate:grows|falls} by {rate:size each minute}"
+    refuted_if = "only the drive changes with time and cornering does not (then it is the battery)"
     order = 10
     parameters = (EffectParameter("rate", "1/s", 0.0, -1.0, 1.0, -0.003),)
-    look_alikes = ("battery_sag",)
 
     def on_grip(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale."""
@@ -59,15 +109,25 @@ class LowFrictionPatch(DynamicsEffect):
     """
 
     id = "low_friction_patch"
-    sentence = "There is a place on the floor where grip is low."
+    name = "a slippery place"
+    summary = "There is a place on the floor where grip is low."
+    sentence = "grip falls by {loss:percent} within {radius} of the place x = {x}, y = {y}"
+    refuted_if = "the car slides alike elsewhere at the same speed and turn, or does not slide there on another lap"
     order = 20
-    needs_position = True
+    depends_on = frozenset({"place"})
+    disc_parameters = ("x", "y", "radius")
+    screening_scaled = ("loss",)
     parameters = (
         EffectParameter("x", "m", 0.0, -1e4, 1e4, 1.0),
         EffectParameter("y", "m", 0.0, -1e4, 1e4, 0.5),
         EffectParameter("radius", "m", 0.5, 0.0, 1e4, 0.8),
         EffectParameter("loss", "1", 0.0, 0.0, 1.0, 0.5),
     )
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Discs over the ground that was driven on."""
+        cells = np.unique(np.round(probe.path_m / SCREENING_SPACING_M).astype(np.int64), axis=0) * SCREENING_SPACING_M
+        return probe.points({"x": x, "y": y, "radius": SCREENING_RADIUS_M, "loss": 0.1} for x, y in cells.tolist())
 
     def on_grip(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale inside."""
@@ -85,10 +145,24 @@ class FrictionEllipse(DynamicsEffect):
     """
 
     id = "friction_ellipse"
-    sentence = "Driving and braking take side force from the rear tyres."
+    name = "grip shared between driving and cornering"
+    summary = "Driving and braking take side force from the rear tyres."
+    sentence = (
+        "driving and braking take side force from rear tyres, as a friction circle at {scale} times the drive force"
+    )
+    refuted_if = "driving and braking shift the balance in opposite directions (then load moves between the axles)"
     order = 10
     parameters = (EffectParameter("scale", "1", 0.0, 0.0, 10.0, 0.6),)
-    look_alikes = ("load_transfer",)
+    confusable = (
+        Confusable(
+            "load_transfer",
+            "throttle_steps",
+            (
+                "shared grip is lost both in driving and in braking; moved load helps the rear in one and hurts in "
+                "the other"
+            ),
+        ),
+    )
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale the rear's side force."""
@@ -105,29 +179,35 @@ class TyreRelaxation(DynamicsEffect):
     """
 
     id = "tyre_relaxation"
-    sentence = "The tyres must roll some way before their side force has built up."
+    name = "the rolling distance in which side force builds up"
+    summary = "The tyres must roll some way before their side force has built up."
+    sentence = "the tyres roll {length} before their side force has built up"
+    refuted_if = "the side force is late by the same time, rather than by the same distance, at two speeds"
     order = 90
     states = ("front", "rear")
     stiff = True
     parameters = (EffectParameter("length", "m", 0.0, 0.0, 5.0, 0.15),)
-    look_alikes = ("steering_lag",)
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """The lagging forces instead of the steady ones."""
         front, rear = forces.side_front, forces.side_rear
-        if forces.stiff is not None:
-            forces.side_front, forces.side_rear = forces.stiff.lagging_sides(forces.vx, front, rear)
+        if self.id in forces.stiff:
+            forces.side_front, forces.side_rear = forces.stiff[self.id].at_stage(forces.vx, front, rear)
             return
         rate = ops.floor(ops.abs(forces.vx), RELAXATION_FLOOR_MPS) / ops.floor(values["length"], SHORTEST_M)
         lags = values["length"] >= SHORTEST_M
         for name, steady in (("front", front), ("rear", rear)):
-            force = forces.states[f"tyre_relaxation.{name}"]
-            forces.rates[f"tyre_relaxation.{name}"] = (steady - force) * rate
+            force = forces.states[f"{self.id}.{name}"]
+            forces.rates[f"{self.id}.{name}"] = (steady - force) * rate
             setattr(forces, f"side_{name}", ops.where(lags, force, steady))
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
         """The steady forces."""
-        return {"tyre_relaxation.front": forces.side_front, "tyre_relaxation.rear": forces.side_rear}
+        return {f"{self.id}.front": forces.side_front, f"{self.id}.rear": forces.side_rear}
+
+    def stiff_step(self, ops: Ops, start: StepStart, values: Parameters) -> RelaxedSides:
+        """The lag's closed form at each stage."""
+        return RelaxedSides(ops, self.id, start, values["length"])
 
 
 class RelaxedSides:
@@ -137,8 +217,10 @@ class RelaxedSides:
     and Ostermann 2010, "Exponential integrators"), at the speed of the start and then of the middle of the step.
     """
 
-    def __init__(self, ops: Ops, before: tuple[Value, Value], length: Value, step_s: Value) -> None:
-        self._ops, self._length, self._step_s = ops, length, step_s
+    def __init__(self, ops: Ops, effect_id: str, start: StepStart, length: Value) -> None:
+        self._ops, self._length, self._step_s = ops, length, start.step_s
+        self._names = (f"{effect_id}.front", f"{effect_id}.rear")
+        before = (start.states[self._names[0]], start.states[self._names[1]])
         self._before = self._steady = before
         self._stage = 0
         self._weights: LagWeights | None = None
@@ -164,6 +246,10 @@ class RelaxedSides:
             self.last = _both(lambda k: weights.after_half(central[k], self._steady[k], now[k]))
         self._stage += 1
         return self.last
+
+    def finish(self) -> dict[str, Value]:
+        """The side forces at the end of the step."""
+        return dict(zip(self._names, self.last, strict=True))
 
 
 def _both(of: Callable[[int], Value]) -> tuple[Value, Value]:

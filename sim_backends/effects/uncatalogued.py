@@ -8,8 +8,19 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, ObservationEffect, Parameters
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import (
+    Confusable,
+    DynamicsEffect,
+    EffectParameter,
+    Forces,
+    ObservationEffect,
+    Parameters,
+    ScreeningProbe,
+)
 
 AT_REST_MPS = 0.2
 """Speed over which a force of rolling wheels builds up."""
@@ -17,6 +28,8 @@ SCRUB_FLOOR_MPS = 0.3
 SCRUB_CURVATURE = 1.0
 """Curvature of the path at which the wheels of a locked axle begin to slide [1/m]."""
 STILL_AIR_M2PS2 = 1e-6
+SCREENING_COEFFICIENT = 0.15
+"""Drag coefficient at which a wind is screened [N s2/m2]."""
 COASTING = 0.05
 """Throttle below which a speed controller brakes by itself."""
 
@@ -30,14 +43,24 @@ class Wind(DynamicsEffect):
 
     id = "wind"
     catalogued = False
-    sentence = "A steady wind blows over the floor."
+    summary = "A steady wind blows over the floor."
     class_statement = "depends on the heading, a direction of the world, and grows with speed, as a steady wind's force"
     parameters = (
         EffectParameter("speed", "m/s", 0.0, 0.0, 30.0, 1.0),
         EffectParameter("direction", "rad", 0.0, -2.0 * math.pi, 2.0 * math.pi, 1.0),
         EffectParameter("coefficient", "N s2/m2", 0.1, 0.0, 10.0, 0.15),
     )
-    look_alikes = ("road_slope",)
+    depends_on = frozenset({"heading"})
+    screening_scaled = ("speed",)
+
+    def screening_points(self, probe: ScreeningProbe) -> FloatArray:
+        """Eight directions, each with the speeds that count in one of them."""
+        start = {"speed": 1.0, "direction": 0.0, "coefficient": SCREENING_COEFFICIENT}
+        sized = probe.sized([start], held=("direction", "coefficient"))
+        headings = np.linspace(-np.pi, np.pi, 8, endpoint=False)
+        return probe.points({**row, "direction": float(h)} for row in sized for h in headings)
+
+    confusable = (Confusable("road_slope"),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Blow."""
@@ -56,7 +79,10 @@ class _SideForce(DynamicsEffect):
     catalogued = False
     order = 80
     parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
-    look_alikes = ("steering_offset", "lateral_bias")
+    confusable = (
+        Confusable("steering_offset"),
+        Confusable("lateral_bias"),
+    )
 
     @staticmethod
     def push(ops: Ops, forces: Forces, values: Parameters) -> Value:
@@ -68,7 +94,11 @@ class FrontSideForce(_SideForce):
     """``F_y,front += force tanh(|vx| / 0.2 m/s)`` in the front wheels' frame: toe or camber of the front wheels."""
 
     id = "front_side_force"
-    sentence = "Toe or camber of the front wheels pushes them to one side."
+    confusable = (
+        Confusable("steering_offset"),
+        Confusable("lateral_bias"),
+    )
+    summary = "Toe or camber of the front wheels pushes them to one side."
     class_statement = "constant: a bias of the front wheels' side force, even in steering, as of toe or camber"
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -80,7 +110,11 @@ class RearSideForce(_SideForce):
     """``F_y,rear += force tanh(|vx| / 0.2 m/s)``: toe or camber of the rear wheels."""
 
     id = "rear_side_force"
-    sentence = "Toe or camber of the rear wheels pushes them to one side."
+    confusable = (
+        Confusable("steering_offset"),
+        Confusable("lateral_bias"),
+    )
+    summary = "Toe or camber of the rear wheels pushes them to one side."
     class_statement = "constant: a bias of the rear wheels' side force, even in steering, as of toe or camber"
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -97,10 +131,10 @@ class LockedAxle(DynamicsEffect):
 
     id = "locked_axle"
     catalogued = False
-    sentence = "Two driven wheels that turn as one scrub in turns."
+    summary = "Two driven wheels that turn as one scrub in turns."
     class_statement = "odd in the yaw rate, by the path's curvature whatever the speed, as of a locked differential"
     parameters = (EffectParameter("moment", "N m", 0.0, 0.0, 20.0, 0.1),)
-    look_alikes = ("yaw_damping",)
+    confusable = (Confusable("yaw_damping"),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scrub."""
@@ -114,10 +148,10 @@ class BrakingPull(DynamicsEffect):
 
     id = "braking_pull"
     catalogued = False
-    sentence = "The brakes pull to one side."
+    summary = "The brakes pull to one side."
     class_statement = "follows negative throttle only: braking turns the car to one side"
     parameters = (EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.2),)
-    look_alikes = ("torque_steer",)
+    confusable = (Confusable("torque_steer"),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Pull."""
@@ -129,10 +163,13 @@ class CoastBrake(DynamicsEffect):
 
     id = "coast_brake"
     catalogued = False
-    sentence = "The motor brakes while the throttle is released."
+    summary = "The motor brakes while the throttle is released."
     class_statement = "odd in speed where there is no throttle, as of a motor that brakes while it coasts"
     parameters = (EffectParameter("coefficient", "N s/m", 0.0, 0.0, 50.0, 0.5),)
-    look_alikes = ("rolling_resistance", "throttle_deadband")
+    confusable = (
+        Confusable("rolling_resistance"),
+        Confusable("throttle_deadband"),
+    )
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Brake."""
@@ -146,16 +183,22 @@ class PositionScale(ObservationEffect):
     id = "position_scale"
     catalogued = False
     order = 50
-    sentence = "The metre of motion capture has another length."
+    summary = "The metre of motion capture has another length."
     class_statement = "every length and speed is proportionally too long or too short, as by a scale of motion capture"
     parameters = (EffectParameter("scale", "1", 0.0, -0.5, 0.5, 0.03),)
-    look_alikes = ("marker_offset",)
+    confusable = (Confusable("marker_offset"),)
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
         """Stretch."""
         x, y, yaw, vx, vy, yaw_rate = state
         stretch = 1.0 + values["scale"]
         return x * stretch, y * stretch, yaw, vx * stretch, vy * stretch, yaw_rate
+
+    def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
+        """Shrink."""
+        x, y, yaw, vx, vy, yaw_rate = measured
+        stretch = 1.0 + values["scale"]
+        return x / stretch, y / stretch, yaw, vx / stretch, vy / stretch, yaw_rate
 
 
 UNCATALOGUED = (Wind(), FrontSideForce(), RearSideForce(), LockedAxle(), BrakingPull(), CoastBrake(), PositionScale())

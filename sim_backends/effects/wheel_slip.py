@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, Parameters
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters, StepStart
 
 WHEEL_RADIUS_M = 0.033
 """Radius of a wheel of a 1:10 touring car; the catalogue has no parameter for it. Inertia scales with its square."""
@@ -17,6 +17,7 @@ SUBSTEPS = 4
 _NEWTON_STEPS = 6
 _STIFFEST_N = 1e5
 _LEAST_GRIP_N = 1e-6
+_SLIP_SPEED, _RIM_ACCELERATION = "longitudinal_slip.slip_speed", "longitudinal_slip.rim_acceleration"
 
 
 class LongitudinalSlip(DynamicsEffect):
@@ -33,7 +34,11 @@ class LongitudinalSlip(DynamicsEffect):
     """
 
     id = "longitudinal_slip"
-    sentence = "The driven wheels slip: they spin up before the car does, and pass on no more than their grip."
+    command = "throttle"
+    name = "slipping driven wheels"
+    summary = "The driven wheels slip: they spin up before the car does, and pass on no more than their grip."
+    sentence = "the driven wheels slip: their inertia is {inertia}, the tyres' stiffness along {stiffness}"
+    refuted_if = "the push of the motor is late by the same time at low and at high throttle (then the motor lags)"
     order = 50
     states = ("slip_speed",)
     stiff = True
@@ -41,32 +46,46 @@ class LongitudinalSlip(DynamicsEffect):
         EffectParameter("inertia", "kg m2", 0.0, 0.0, 1.0, 1e-4),
         EffectParameter("stiffness", "N", math.inf, 0.0, math.inf, 40.0, positive=True),
     )
-    look_alikes = ("motor_lag", "traction_limit")
+    confusable = (
+        Confusable(
+            "motor_lag",
+            "throttle_steps",
+            "a lag lasts as long for a small as for a large step; spinning wheels come with the large one",
+        ),
+        Confusable(
+            "traction_limit",
+            "throttle_steps",
+            "wheels that spin need time to spin up and to catch again; a plain limit acts at once",
+        ),
+    )
 
     def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """The tyres' force instead of the motor's."""
         rolls = values["inertia"] >= LEAST_INERTIA_KGM2
-        if forces.stiff is not None and forces.stiff.axle_force is not None:
-            forces.axle_force = ops.where(rolls, forces.stiff.axle_force, forces.axle_force)
+        if self.id in forces.stiff:
+            forces.axle_force = ops.where(rolls, forces.stiff[self.id].axle_force, forces.axle_force)
             return
-        force = _force(ops, forces, values, forces.states["longitudinal_slip.slip_speed"])
+        force = _force(ops, forces, values, forces.states[_SLIP_SPEED])
         per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], LEAST_INERTIA_KGM2)
         rate = per_inertia * (forces.axle_force - force)
-        forces.rates["longitudinal_slip.rim_acceleration"] = rate
+        forces.rates[_RIM_ACCELERATION] = rate
         forces.axle_force = ops.where(rolls, force, forces.axle_force)
 
     def on_motion(self, ops: Ops, forces: Forces, acceleration_mps2: Value, values: Parameters) -> None:
         """Rate of the slip speed."""
-        if forces.stiff is None:
-            rim = forces.rates["longitudinal_slip.rim_acceleration"]
-            forces.rates["longitudinal_slip.slip_speed"] = rim - acceleration_mps2
+        if self.id not in forces.stiff:
+            forces.rates[_SLIP_SPEED] = forces.rates[_RIM_ACCELERATION] - acceleration_mps2
+
+    def stiff_step(self, ops: Ops, start: StepStart, values: Parameters) -> SlipStep:
+        """The implicit Euler rule for slip and forward speed, all other forces held."""
+        return SlipStep(ops, start, values)
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
         """Slip speed at which wheels and car speed up alike; 0.95 of the limit where the wheels would spin up."""
         _, peak = _limits(ops, forces, values)
         wheels = ops.floor(values["inertia"], LEAST_INERTIA_KGM2) / WHEEL_RADIUS_M**2
         share = ops.clip(forces.axle_force * forces.mass / ((forces.mass + wheels) * peak), -0.95, 0.95)
-        return {"longitudinal_slip.slip_speed": _atanh(ops, share) / _per_speed(ops, forces.vx, forces, values)}
+        return {_SLIP_SPEED: _atanh(ops, share) / _per_speed(ops, forces.vx, forces, values)}
 
 
 def _limits(ops: Ops, forces: Forces, values: Parameters) -> tuple[Value, Value]:
@@ -94,6 +113,21 @@ def _atanh(ops: Ops, x: Value) -> Value:
     return y
 
 
+class SlipStep:
+    """One Runge-Kutta step of the wheels: ``axle_force`` is the tyres' mean force over it [N]."""
+
+    def __init__(self, ops: Ops, start: StepStart, values: Parameters) -> None:
+        forces, acceleration_mps2 = start.forces()
+        other = forces.mass * acceleration_mps2 - forces.axle_force
+        self.axle_force, self._slip_mps = step_wheels(
+            ops, forces, values, forces.demand, start.damping, other, start.step_s
+        )
+
+    def finish(self) -> dict[str, Value]:
+        """The slip speed at the end of the step [m/s]."""
+        return {_SLIP_SPEED: self._slip_mps}
+
+
 def step_wheels(
     ops: Ops, forces: Forces, values: Parameters, demand: Value, damping: Value, rest: Value, step_s: Value
 ) -> tuple[Value, Value]:
@@ -113,7 +147,7 @@ def step_wheels(
     per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], LEAST_INERTIA_KGM2)
     both = per_inertia + per_mass
     short_s = step_s * (1.0 / SUBSTEPS)
-    slip, vx = forces.states["longitudinal_slip.slip_speed"], forces.vx
+    slip, vx = forces.states[_SLIP_SPEED], forces.vx
     force = _force(ops, forces, values, slip)
     total = 0.0 * force
     for _ in range(SUBSTEPS):

@@ -22,8 +22,8 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.policy import Policy
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
-from carlab.experiment.episode import run_episode
-from carlab.experiment.scripted_policies import ReverseParkingPolicy
+from carlab.experiment.episodes.episode import run_episode
+from carlab.experiment.episodes.scripted_policies import ReverseParkingPolicy
 from sim_backends.simulated_car import SimulatedCar
 
 SEEDS = range(10)

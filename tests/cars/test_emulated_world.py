@@ -15,8 +15,11 @@ from carlab.cars import default_car
 from carlab.cars import emulated_car as emulated_car_module
 from carlab.cars.emulated_car import EmulatedCar, EmulatedWorld
 from carlab.cars.emulated_world import WorldConfig
+from carlab.core.documents import SafetyEvent
 from carlab.core.errors import NotOpenError, NotReadyError
-from carlab.core.quantities import CarState
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import Action, CarState
+from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyStop
 
 PATIENT_S = 20.0
 
@@ -147,3 +150,27 @@ def marked(marker: str) -> list[int]:
 def assert_gone(pid: int) -> None:
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.realtime
+def test_a_frozen_pose_with_fresh_stamps_ends_the_episode() -> None:
+    """The cameras repeat one pose while the wheels turn: the gate stops the car within about half a second."""
+    events: list[SafetyEvent] = []
+    with EmulatedCar(default_car()) as car:
+        car.place(CarState())
+        safe = SafeCar(car, SafetyEnvelope(), events.append)
+        safe.arm()
+
+        def drive(ticks: int) -> None:
+            for _ in range(ticks):
+                safe.command(Action(0.3, 0.3), car.observe(), 1.0 / 30.0)
+                time.sleep(1.0 / 30.0)
+
+        drive(30)
+        car.world.ask(do="mocap", faults={"frozen": True})
+        frozen_s = time.monotonic()
+        with pytest.raises(SafetyStop) as stop:
+            drive(90)
+        assert time.monotonic() - frozen_s < 2.0
+    assert stop.value.reason == EndReason.POSE_FROZEN
+    assert events[-1].kind == "pose_frozen"

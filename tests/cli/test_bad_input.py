@@ -10,8 +10,8 @@ import pytest
 
 from carlab.cars.emulated_world import World, WorldConfig
 from carlab.core.clock import MonotonicClock
-from mocap.emulator_faults import ServerFaults
-from mocap.natnet_models import BitstreamVersion
+from mocap.emulators.faults import ServerFaults
+from mocap.natnet.models import BitstreamVersion
 from sim_backends.car_parameters import SimulatorConfig
 
 Outcome = tuple[int, str]

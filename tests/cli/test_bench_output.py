@@ -18,8 +18,9 @@ import torch
 from carlab.cli import run
 from carlab.cli.bench_output import write_figures
 from carlab.core.errors import DataError
-from carlab.experiment import regression_study
-from carlab.experiment.regression_study import METHODS, Score, as_json, run_study, summarised
+from carlab.studies.regression.methods import METHODS
+from carlab.studies.regression.scores import FIGURES, Score, as_json, summarised
+from carlab.studies.regression.study import run_study
 from learning.evaluation import Mixture
 
 Carlab = Callable[..., tuple[int, str]]
@@ -41,7 +42,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, instead: Callable[[Any], Any]) -> 
     monkeypatch.setitem(METHODS, "SysID", instead)
 
 
-def test_a_fit_that_fails_is_told_and_the_others_go_on(
+def test_a_failed_fit_is_reported_and_the_study_goes_on(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def sometimes(task: Any) -> Any:
@@ -55,15 +56,15 @@ def test_a_fit_that_fails_is_told_and_the_others_go_on(
     assert code == 1
     assert "SysID, 5 rows, seed 1 failed: The simulator gives no finite outputs for this data" in text
     assert "SysID, 1 of 3 failed" in text
-    told = strict(out)
-    assert [(s["method"], s["seed"], s["failed"] is None) for s in told["scores"]] == [
+    figures = strict(out)
+    assert [(s["method"], s["seed"], s["failed"] is None) for s in figures["scores"]] == [
         ("ridge", 0, True), ("SysID", 0, True), ("ridge", 1, True), ("SysID", 1, False), ("ridge", 2, True),
         ("SysID", 2, True),
     ]  # fmt: skip
-    assert told["scores"][3]["nll"] is None
-    ridge, identified = told["rows"]
+    assert figures["scores"][3]["nll"] is None
+    ridge, identified = figures["rows"]
     assert (ridge["seeds"], ridge["failed"], identified["seeds"], identified["failed"]) == (3, 0, 2, 1)
-    own = [told["scores"][k]["nll"] for k in (1, 5)]
+    own = [figures["scores"][k]["nll"] for k in (1, 5)]
     assert identified["nll"] == pytest.approx(np.mean(own))
     assert identified["nll_standard_error"] == pytest.approx(np.std(own, ddof=1) / math.sqrt(2.0))
     assert out.with_suffix(".png").stat().st_size > 10_000
@@ -169,12 +170,12 @@ def test_a_file_is_written_whole_or_stays_as_it_was(tmp_path: Path, monkeypatch:
 
 
 def test_standard_errors_are_of_every_figure() -> None:
-    figures = np.array([[1.0, 0.5, 0.02, 3.0], [4.0, 0.7, 0.05, 9.0], [5.0, 0.1, 0.01, 1.0]])
-    scores = [Score("1d", "ridge", 5, k, *map(float, figures[k])) for k in range(3)]
+    values = np.array([[1.0, 0.5, 0.02, 3.0], [4.0, 0.7, 0.05, 9.0], [5.0, 0.1, 0.01, 1.0]])
+    scores = [Score("1d", "ridge", 5, k, *map(float, values[k])) for k in range(3)]
     (row,) = summarised(scores)
-    for k, name in enumerate(regression_study.FIGURES):
-        assert getattr(row, name) == pytest.approx(figures[:, k].mean())
-        spread = figures[:, k].std(ddof=1) / math.sqrt(3.0)
+    for k, name in enumerate(FIGURES):
+        assert getattr(row, name) == pytest.approx(values[:, k].mean())
+        spread = values[:, k].std(ddof=1) / math.sqrt(3.0)
         assert getattr(row, f"{name}_standard_error") == pytest.approx(spread)
-    told: Any = as_json(scores[:1], "carlab bench regression")
-    assert told["rows"][0]["rmse_standard_error"] is None, "a single fit has no standard error"
+    figures: Any = as_json(scores[:1], "carlab bench regression")
+    assert figures["rows"][0]["rmse_standard_error"] is None, "a single fit has no standard error"

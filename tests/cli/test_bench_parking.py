@@ -12,7 +12,7 @@ from carlab.cli import run
 SMALL = ["--methods", "sim-fsvgd", "fsvgd-authors", "--updates", "40", "--steps", "50", "--seeds", "1"]
 
 
-def test_two_methods_are_driven_taken_up_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_methods_are_driven_resumed_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, runs = tmp_path / "parking.json", tmp_path / "runs"
     arguments = ["bench", "parking", *SMALL, "--runs", str(runs), "--out", str(out)]
     assert run([*arguments, "--episodes", "1"]) == 0

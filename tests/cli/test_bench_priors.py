@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from carlab.concealment.measurement import COLUMNS, write_csv
+from carlab.benchmark.world.measurement import COLUMNS, write_csv
 from carlab.core.quantities import Action, CarState
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.plant import Plant
@@ -62,10 +62,10 @@ def test_recordings_are_learned_under_four_priors(carlab: Carlab, folder: Path, 
     code, text = carlab("bench", "priors", "--data", folder, "--car", "rc_car", "--diagnosed", model, *arguments)
     assert code == 0, text
     assert "Held out: 2.csv." in text
-    told = json.loads(out.read_text())
+    study = json.loads(out.read_text())
     names = ["none (FSVGD)", "kinematic", "nominal", "diagnosed"]
-    assert [(r["method"], r["rows"], r["seeds"]) for r in told["rows"]] == [(name, 20, 1) for name in names]
-    for row in told["rows"]:
+    assert [(r["method"], r["rows"], r["seeds"]) for r in study["rows"]] == [(name, 20, 1) for name in names]
+    for row in study["rows"]:
         assert f"{row['nll']:.2f}" in text
         assert np.isfinite([row["nll"], row["calibration"]]).all()
     assert out.with_suffix(".png").stat().st_size > 10_000
@@ -77,7 +77,7 @@ def test_two_effects_are_concealed_diagnosed_and_learned_with(carlab: Carlab, tm
     arguments = ("--recorded-s", 40, 20, "--rows", 20, "--seeds", 1, "--history", 4, "--steps", 30, "--out", out)
     code, text = carlab("bench", "priors", *arguments)
     assert code == 0, text
-    assert "told to nobody else: motor lag and mocap yaw misalignment" in text
+    assert "Concealed in the simulated car: motor lag and mocap yaw misalignment" in text
     assert {p.name for p in (tmp_path / "study" / "recordings").iterdir()} == {
         "car.toml", "1_training.csv", "2_held_out.csv",
     }  # fmt: skip

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from carlab.experiment.regression_study import run_study
+from carlab.studies.regression.study import run_study
 
 Carlab = Callable[..., tuple[int, str]]
 
@@ -42,7 +42,7 @@ def test_figures_tell_their_device(
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Imaginary 9000")
-    monkeypatch.setattr("carlab.experiment.regression_study.run_study", here)
+    monkeypatch.setattr("carlab.studies.regression.study.run_study", here)
     out = tmp_path / "study.json"
     few = ("--case", "pendulum", "--rows", 5, "--seeds", 1, "--methods", "ridge")
     code, _ = carlab("bench", "regression", *few, "--out", out, *options)

@@ -1,4 +1,4 @@
-"""``carlab learn`` as it is called: what it refuses, what it prints, and taking a run up again."""
+"""``carlab learn`` as it is called: what it refuses, what it prints, and resuming a run."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ import pytest
 import torch
 import tyro
 
+import carlab.cars as carlab_cars
+from carlab.api import learning
 from carlab.cli import run
-from carlab.cli.learn import Learn
 from carlab.cli.options import CarOptions
-from carlab.recording.mcap_source import read_episode
-from carlab.recording.run_directory import RunDirectory
+from carlab.recording.mcap.source import read_episode
+from carlab.recording.run_folder import RunDirectory
 
 Carlab = Callable[..., tuple[int, str]]
 
@@ -40,9 +41,9 @@ def said_by(*argv: object) -> tuple[int, str]:
 @pytest.fixture(scope="module", autouse=True)
 def one_thread() -> Any:
     """A second thread of torch costs more than it gives where others compute as well."""
-    plan = Learn._plan
+    plan = learning._plan
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Learn, "_plan", lambda self, choice: replace(plan(self, choice), threads=1))
+        patch.setattr(learning, "_plan", lambda request, choice: replace(plan(request, choice), threads=1))
         yield
 
 
@@ -57,7 +58,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Path]:
 
 @pytest.fixture(scope="module")
 def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Path]:
-    """The same where three were wanted: taken up again."""
+    """The same run with three episodes wanted: resumed."""
     folder = tmp_path_factory.mktemp("longer") / learned[2].name
     shutil.copytree(learned[2], folder)
     found = *said_by("learn", "--resume", folder, "--episodes", 3), folder
@@ -69,8 +70,8 @@ def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFact
     ("options", "words"),
     [
         ("--episodes 0", "--episodes 0: a number above zero."),
-        ("--history -1", "--history and --seed: 0 or more."),
-        ("--seed -1", "--history and --seed: 0 or more."),
+        ("--history -1", "--history -1: at least 0."),
+        ("--seed -1", "--seed -1: at least 0."),
         ("--ticks 0", "--ticks 0: a number above zero."),
         ("--history 100", "--ticks 100: nothing is learned from fewer than --history (100) and one more."),
         ("--ticks 3", "--ticks 3: nothing is learned from fewer than --history (4) and one more."),
@@ -156,7 +157,7 @@ def test_the_same_numbers_in_other_words_are_the_same_car(
     assert "has nothing left to do" in text
 
 
-def test_only_a_run_of_learning_is_taken_up_again(carlab: Carlab, tmp_path: Path) -> None:
+def test_only_a_run_of_learning_is_resumed_again(carlab: Carlab, tmp_path: Path) -> None:
     (tmp_path / "some").mkdir()
     code, text = carlab("learn", "--resume", tmp_path / "some")
     assert code == 1
@@ -165,7 +166,7 @@ def test_only_a_run_of_learning_is_taken_up_again(carlab: Carlab, tmp_path: Path
     driven = RunDirectory.create(tmp_path, "driven")
     code, text = carlab("learn", "--resume", driven.path)
     assert code == 1
-    assert "is no run of carlab learn that can be taken up again" in text
+    assert "is no run of carlab learn that can be resumed" in text
 
 
 def test_an_impossible_prior_file_is_named(carlab: Carlab, tmp_path: Path) -> None:
@@ -186,7 +187,7 @@ def test_a_run_learns_drives_and_prints_how_it_went(learned: tuple[int, str, Pat
     for row in curve:
         driven = read_episode(folder / "episodes" / f"{row['episode']:04d}.mcap")
         assert driven.ticks == TICKS
-        line = f"{row['episode']} {driven.rewards.sum():.1f} {row['foretold']:.1f} {row['distance_m']:.2f}"
+        line = f"{row['episode']} {driven.rewards.sum():.1f} {row['predicted_return']:.1f} {row['distance_m']:.2f}"
         assert line in rows
         assert f"episode {row['episode']}: return {driven.rewards.sum():.1f}" in text
     assert f"learned from {TICKS - 1} rows" in text
@@ -209,7 +210,7 @@ def test_a_run_that_is_done_says_so(carlab: Carlab, learned: tuple[int, str, Pat
     assert text.rpartition("╯")[2].strip()
 
 
-def test_a_run_that_wants_more_is_taken_up(longer: tuple[int, str, Path]) -> None:
+def test_a_run_that_wants_more_is_resumed(longer: tuple[int, str, Path]) -> None:
     code, text, folder = longer
     assert code == 0
     assert "episode 3: return" in text
@@ -217,25 +218,25 @@ def test_a_run_that_wants_more_is_taken_up(longer: tuple[int, str, Path]) -> Non
     assert sorted(p.name for p in folder.glob("episodes/*.mcap")) == ["0001.mcap", "0002.mcap", "0003.mcap"]
 
 
-def test_options_of_the_run_hold_when_it_is_taken_up(longer: tuple[int, str, Path]) -> None:
+def test_options_of_the_run_hold_when_it_is_resumed(longer: tuple[int, str, Path]) -> None:
     folder = longer[2]
     assert read_episode(folder / "episodes" / "0003.mcap").ticks == TICKS
     assert not list(folder.glob("episodes/*.rrd"))
 
 
-def test_a_run_that_is_taken_up_has_the_noise_of_its_own_seed_and_all_its_results(
+def test_a_run_that_is_resumed_has_the_noise_of_its_own_seed_and_all_its_results(
     carlab: Carlab, longer: tuple[int, str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = longer[2]
     assert [e["episode"] for e in json.loads((folder / "result.json").read_text())["episodes"]] == [1, 2, 3]
     seeds: list[int] = []
-    choose = CarOptions.choose
+    choose = carlab_cars.choose_car
 
-    def chosen(self: CarOptions, **others: Any) -> Any:
+    def chosen(car: str, **others: Any) -> Any:
         seeds.append(others["seed"])
-        return choose(self, **others)
+        return choose(car, **others)
 
-    monkeypatch.setattr(CarOptions, "choose", chosen)
+    monkeypatch.setattr(carlab_cars, "choose_car", chosen)
     wanted = json.loads((folder / "campaign.json").read_text())
     other = {**wanted, "plan": {**wanted["plan"], "seed": 7}}
     (folder / "campaign.json").write_text(json.dumps(other))
@@ -256,7 +257,7 @@ def interrupted(plan: Any, models: Path, recordings: list[Path], *others: Any) -
 def test_an_interrupted_run_tells_how_it_goes_on(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("carlab.experiment.campaign.train_beside", interrupted)
+    monkeypatch.setattr("carlab.experiment.campaign.campaign.train_in_subprocess", interrupted)
     folder = tmp_path / "run"
     shutil.copytree(learned[2], folder)
     wanted = json.loads((folder / "campaign.json").read_text())
@@ -280,13 +281,31 @@ def test_the_car_that_a_command_names_is_the_one_that_it_was(options: CarOptions
     assert tyro.cli(CarOptions, args=shlex.split(options.typed())) == options
 
 
-def test_a_run_that_learned_nothing_is_not_to_be_taken_up(
+def test_a_run_that_learned_nothing_is_not_to_be_resumed(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Interrupted before anything was there, its folder goes; a command that names it would lead nowhere."""
-    monkeypatch.setattr("carlab.experiment.campaign.train_beside", interrupted)
+    monkeypatch.setattr("carlab.experiment.campaign.campaign.train_in_subprocess", interrupted)
     code, text = carlab("learn", "--out", tmp_path / "runs", *TINY)
     assert code == 130
     left = list((tmp_path / "runs").iterdir())
     assert [f"--resume {folder}" in text for folder in left] == [True] * len(left)
     assert ("--resume" in text) == bool(left)
+
+
+@pytest.mark.parametrize("name", ["agent.zip", "policy.npz", "dynamics.pt"])
+def test_a_run_folder_of_a_stranger_runs_no_code(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, name: str
+) -> None:
+    """The model that the run goes on from holds a pickle that would make a folder."""
+    folder, made = tmp_path / "run", tmp_path / "made"
+    shutil.copytree(learned[2], folder)
+    model = folder / "models" / "0002"
+    for file in ("policy.npz",) if name == "agent.zip" else (name,):
+        (model / file).unlink()
+    (model / name).write_bytes(b"cposix\nmkdir\n(V" + str(made).encode() + b"\ntR.")
+    code, text = carlab("learn", "--resume", folder, "--episodes", 3)
+    assert not made.exists()
+    assert code == 1
+    assert "Traceback" not in text
+    assert "anew." in text

@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
+from carlab.benchmark.cases import proof_set
+from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.cli import prove
-from carlab.concealment import proof_set
-from carlab.concealment.proof_set import CaseSpec
 
 Carlab = Callable[..., tuple[int, str]]
 ROOT = Path(__file__).resolve().parents[2]
-STAND_IN = ROOT / "tests" / "concealment" / "stand_in.py"
+STAND_IN = ROOT / "tests" / "benchmark" / "stand_in.py"
 SPECS = [
     CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=10.0, hold_s=6.0),
     CaseSpec("null", 2, fit_s=8.0, hold_s=5.0),
@@ -59,12 +59,12 @@ def test_a_proof_from_seal_to_results_and_again(small: Path, carlab: Carlab) -> 
     assert all(line["threads"] == "1" for line in seen(small))
     scores = json.loads((small / "scores.json").read_text())
     shares = {rate["figure"]: rate["share"] for rate in scores["summary"]["rates"]}
-    assert shares["named first, strictly, all strengths"] == 1.0
+    assert shares["correct effect first, strictly, all strengths"] == 1.0
     assert shares["false alarms, null and parameters"] == 1.0  # the stand-in always says steering_lag
     assert (small / "confusion.png").read_bytes()[:4] == b"\x89PNG"
     page = (small / "results.md").read_text()
     assert "| steering_lag | 1 | 1 | 1 |" in page
-    assert "null null: said steering_lag" in page
+    assert "null null: answered steering_lag" in page
     assert "seeds: 1 to 2" in page
     runs = [json.loads(path.read_text()) for path in small.glob("reports/*/run.json")]
     assert all(run["exit_status"] == 0 and run["peak_memory_mib"] > 1.0 and run["jobs"] == 2 for run in runs)
@@ -82,7 +82,7 @@ def test_a_proof_from_seal_to_results_and_again(small: Path, carlab: Carlab) -> 
 
 
 def test_the_cases_are_the_same_however_many_jobs(small: Path, tmp_path: Path) -> None:
-    from carlab.concealment.runner import Proof
+    from carlab.benchmark.proof.runner import Proof
 
     files = []
     for jobs in (1, 2):
@@ -113,8 +113,8 @@ INTERRUPTED = """
 import sys
 from pathlib import Path
 from carlab.cli import prove, run
-from carlab.concealment import proof_set
-from carlab.concealment.proof_set import CaseSpec
+from carlab.benchmark.cases import proof_set
+from carlab.benchmark.cases.proof_set import CaseSpec
 root, stand_in = sys.argv[1:]
 waiting = '''
 import pathlib, runpy, sys, time

@@ -8,8 +8,9 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.image import imread
 
-from carlab.experiment.regression_picture import SHOWN_NAT, SIZE_INCHES, draw, picture
-from carlab.experiment.regression_study import FIGURES, METHODS, Row
+from carlab.studies.regression.methods import METHODS
+from carlab.studies.regression.picture import MAX_SHOWN_NAT, SIZE_INCHES, draw, picture
+from carlab.studies.regression.scores import FIGURES, Row
 
 
 def row(method, rows, nll, calibration=0.05, **others):
@@ -67,7 +68,7 @@ def test_a_value_far_off_is_a_number_at_the_edge_and_squeezes_no_other(panels):
         others = [getattr(r, name) for r in ROWS if r.rows == 50]
         assert low < min(others)
         assert max(others) < high
-    assert panels.axes[0].get_ylim()[1] < -6.4 + 1.2 * SHOWN_NAT
+    assert panels.axes[0].get_ylim()[1] < -6.4 + 1.2 * MAX_SHOWN_NAT
 
 
 def test_where_most_are_far_off_none_is_cut():

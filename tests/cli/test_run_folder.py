@@ -14,10 +14,10 @@ from carlab.cli.runs import ask_to_place
 from carlab.core.clock import MonotonicClock
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import NEUTRAL, Action, CarState
-from carlab.experiment.interrupts import Interrupts
-from carlab.experiment.scripted_policies import ReplayPolicy
-from carlab.experiment.teleop_policy import KeyboardSource, TeleopInput
-from carlab.recording.mcap_source import read_episode
+from carlab.experiment.episodes.interrupts import Interrupts
+from carlab.experiment.episodes.scripted_policies import ReplayPolicy
+from carlab.experiment.episodes.teleop_policy import KeyboardSource, TeleopInput
+from carlab.recording.mcap.source import read_episode
 
 Carlab = Callable[..., tuple[int, str]]
 
@@ -27,7 +27,7 @@ def test_a_run_keeps_its_results_and_its_log(carlab: Carlab, tmp_path: Path, mon
         logging.getLogger("test").warning("tick %d", view.step)
         return NEUTRAL
 
-    monkeypatch.setattr("carlab.experiment.scripted_policies.NeutralPolicy.act", act)
+    monkeypatch.setattr("carlab.experiment.episodes.scripted_policies.NeutralPolicy.act", act)
     handlers = list(logging.getLogger().handlers)
     folder = tmp_path / "with space ü"
     argv = ("--policy", "neutral", "--episodes", "2", "--ticks", "5", "--out", folder, "--no-rerun", "--no-picture")
@@ -85,7 +85,7 @@ def test_an_interrupted_import_leaves_no_half_file(
     def interrupted(self: object, item: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("carlab.recording.mcap_sink.McapSink.write", interrupted)
+    monkeypatch.setattr("carlab.recording.mcap.sink.McapSink.write", interrupted)
     assert carlab("import", tmp_path / "drive.csv")[0] == 130
     assert [entry.name for entry in tmp_path.iterdir()] == ["drive.csv"]
 

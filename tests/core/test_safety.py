@@ -6,58 +6,17 @@ from dataclasses import fields, replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from logging_car import LoggingCar, gate, seen
 
-from carlab.core.car import Car
-from carlab.core.clock import SimulatedClock
-from carlab.core.documents import SafetyEvent
 from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, ConfigError, NotArmedError
 from carlab.core.geofence import rectangle
 from carlab.core.outcome import EndReason
-from carlab.core.quantities import Action, ActionLimits, CarState, Health, Observation, Reality
+from carlab.core.quantities import Action, ActionLimits, CarState, Observation
 from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyState, SafetyStop, limit, slew
 
 ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True)
 PERIOD_S = 1.0 / 30.0
 NUMBERS = [f.name for f in fields(SafetyEnvelope) if f.name != "arena_m"]
-
-
-class LoggingCar(Car):
-    """Writes down every command; has no physics."""
-
-    def __init__(self) -> None:
-        self.name, self.reality = "log", Reality.SIMULATED
-        self.limits, self.clock = ActionLimits(), SimulatedClock(10.0)
-        self.log: list[Action] = []
-        self.stops: list[bool] = []
-
-    def open(self) -> None: ...
-    def observe(self) -> Observation:
-        return seen(self.clock.now_s())
-
-    def arm(self) -> None: ...
-    def command(self, action: Action) -> Action:
-        self.check(action)
-        self.log.append(action)
-        return action
-
-    def stop(self, *, planned: bool) -> None:
-        self.stops.append(planned)
-
-    def reset_fault(self) -> None: ...
-    def health(self) -> Health:
-        return Health(True)
-
-    def close(self) -> None: ...
-
-
-def seen(t_s: float, state: CarState | None = None, tracked: bool = True) -> Observation:
-    return Observation(state or CarState(), t_s, t_s, 1, tracked)
-
-
-def gate(**envelope: object) -> tuple[SafeCar, LoggingCar, list[SafetyEvent]]:
-    car, events = LoggingCar(), []
-    safe = SafeCar(car, SafetyEnvelope(**envelope), events.append)  # type: ignore[arg-type]
-    return safe, car, events
 
 
 def test_nothing_passes_before_arming() -> None:

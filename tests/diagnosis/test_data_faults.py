@@ -8,13 +8,13 @@ from scipy.signal import lfilter
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from carlab.diagnosis.data_faults import check
-from carlab.diagnosis.fault_integration import check_integration
-from carlab.diagnosis.fault_kit import held_means, lagged
-from carlab.recording.audit_report import RefusedError
-from carlab.recording.export import write_csv
-from carlab.recording.foreign_csv import import_csv
-from carlab.recording.forgiving_import import import_mended
+from carlab.diagnosis.recording_faults.episode_motion import held_means, lagged
+from carlab.diagnosis.recording_faults.find import check
+from carlab.diagnosis.recording_faults.integration_step import check_integration
+from carlab.recording.audit.report import RefusedError
+from carlab.recording.csv.export import write_csv
+from carlab.recording.csv.foreign import import_csv
+from carlab.recording.csv.repairing_import import import_mended
 from sim_backends.car_parameters import SimulatorConfig
 
 NOMINAL = SimulatorConfig.from_preset()

@@ -7,26 +7,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import Case
+from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.cars import load_car_file
-from carlab.concealment import make_case
-from carlab.concealment.case import Case
-from carlab.concealment.measurement import read_csv, write_csv
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import Outcome, diagnose
-from carlab.diagnosis.duels import pruned
-from carlab.diagnosis.fit import Fit, Fitter, Scale, base_parameters, effect_parameters, with_effect
-from carlab.diagnosis.judge import Texts
-from carlab.diagnosis.measurement_noise import estimate_noise
-from carlab.diagnosis.prediction import Predictor, errors
-from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separating_drive
-from carlab.diagnosis.residual_terms import TERMS, responses
-from carlab.diagnosis.search import Search
-from carlab.diagnosis.shots import Shots, cut, tracks_of
-from carlab.recording.foreign_csv import import_csv
-from sim_backends.effects import EFFECTS
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale, base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.selection.elimination import eliminate
+from carlab.diagnosis.selection.evidence import Texts
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem
+from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.unexplained.residual_terms import TERMS, responses
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.recording.csv.foreign import import_csv
+from sim_backends.effects import EFFECTS, confusable_effects
 
 Table = dict[str, np.ndarray]
-TEXTS = Texts(effect_sentence, separating_drive, LOOK_ALIKES)
+TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 
 
 def episodes(path: Path, table: Table) -> list[EpisodeData]:
@@ -55,9 +57,9 @@ def drag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 
 
 @pytest.fixture(scope="module")
-def shots(drag: tuple[Path, float]) -> Shots:
-    """Shots of that drive."""
-    return cut(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), 0.8, 0.5)
+def windows(drag: tuple[Path, float]) -> PredictionWindows:
+    """PredictionWindows of that drive."""
+    return cut_windows(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), 0.8, 0.5)
 
 
 def turned(table: Table, angle: float = 2.1, shift: tuple[float, float] = (3.0, -5.0)) -> Table:
@@ -153,33 +155,33 @@ def test_a_name_is_not_given_to_what_something_outside_the_catalogue_explains_be
     assert [e.id for e in told.effects] == [taken_for]
 
 
-def test_an_effect_that_unseen_blocks_do_not_miss_is_taken_out_again(drag: tuple[Path, float], shots: Shots) -> None:
+def test_an_effect_that_unseen_blocks_do_not_miss_is_eliminated(
+    drag: tuple[Path, float], windows: PredictionWindows
+) -> None:
     car = load_car_file(drag[0] / "car.toml").simulator
     floor = np.array([0.006, 0.006, 0.005, 0.015, 0.015, 0.04])
-    search = Search(car, shots, floor, LOOK_ALIKES)
-    scale = Scale.of(errors(Predictor(shots, car)(), shots)[0], floor, 0.2)
+    problem = SearchProblem(car, windows, floor, confusable_effects())
+    scale = Scale.of(prediction_errors(simulate_windows(windows, car), windows)[0], floor, 0.2)
     named = ("aerodynamic_drag", "steering_asymmetry", "torque_steer")
-    fit = search.refit(named, search.refit((), Fit(car, (), np.zeros(0), 0.0, np.zeros(0)), scale), scale)
-    kept, best, apart = pruned(search, named, fit, scale)
-    assert kept == ("aerodynamic_drag",)
-    assert set(best.config.effects) == {"aerodynamic_drag"}
-    assert apart["aerodynamic_drag"].standard_errors > 2.0
+    base = refit(problem, (), Fit(car, (), np.zeros(0), 0.0, np.zeros(0)), scale)
+    kept = eliminate(problem, refit(problem, named, base.fit, scale), RunControl())
+    assert kept.model.effects == ("aerodynamic_drag",)
+    assert set(kept.model.fit.config.effects) == {"aerodynamic_drag"}
+    assert kept.deletions["aerodynamic_drag"].standard_errors > 2.0
 
 
-def test_impulse_responses_add_up_to_what_the_simulator_does(drag: tuple[Path, float], shots: Shots) -> None:
+def test_impulse_responses_add_up_to_what_the_simulator_does(
+    drag: tuple[Path, float], windows: PredictionWindows
+) -> None:
     """The linear answer to -c v|v| / m against switching the drag on in the simulator."""
     car = load_car_file(drag[0] / "car.toml").simulator
     scale = Scale(np.array([8, 16, 24]), np.ones((3, 6)))
     coefficient = 0.02
-    plain = errors(Predictor(shots, car)(), shots)[0]
-    dragged = errors(
-        Predictor(shots, with_effect(car, "aerodynamic_drag").with_values(
-            {"effects.aerodynamic_drag.coefficient": coefficient}
-        ))(),
-        shots,
-    )[0]  # fmt: skip
+    plain = prediction_errors(simulate_windows(windows, car), windows)[0]
+    with_drag = with_effect(car, "aerodynamic_drag").with_values({"effects.aerodynamic_drag.coefficient": coefficient})
+    dragged = prediction_errors(simulate_windows(windows, with_drag), windows)[0]
     term = next(t for t in TERMS if t.formula == "v |v|")
-    linear = -coefficient / car.parameters.mass_kg * responses(shots, car, scale).of(term, 0)
+    linear = -coefficient / car.parameters.mass_kg * responses(windows, car, scale).of(term, 0)
     true = scale.white(dragged - plain)
     tame = np.abs(true).max(axis=(1, 2)) < 1.0  # a car at the edge of a spin answers by no straight line
     for channel in (0, 3):  # x and vx
@@ -188,16 +190,18 @@ def test_impulse_responses_add_up_to_what_the_simulator_does(drag: tuple[Path, f
         assert a @ b / (b @ b) == pytest.approx(1.0, abs=0.1)
 
 
-def test_leaving_a_fold_out_by_one_step_is_as_good_as_a_refit(drag: tuple[Path, float], shots: Shots) -> None:
+def test_leaving_a_fold_out_by_one_step_is_as_good_as_a_refit(
+    drag: tuple[Path, float], windows: PredictionWindows
+) -> None:
     car = with_effect(load_car_file(drag[0] / "car.toml").simulator, "aerodynamic_drag")
     free = (*base_parameters(car), *effect_parameters("aerodynamic_drag", car))
-    noise = estimate_noise(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), shots.bent)
-    fitter = Fitter(shots, Scale(np.array([8, 16, 24]), np.tile(3.0 * noise.measured, (3, 1))))
+    noise = estimate_noise(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), windows.curvature_bias)
+    fitter = Fitter(windows, Scale(np.array([8, 16, 24]), np.tile(3.0 * noise.measured, (3, 1))))
     fit = fitter.fit(car, free, iterations=30)
-    folds = (shots.block // 2) % 3
-    quick = fitter.unseen(fit, folds, 12.0)
+    folds = (windows.block // 2) % 3
+    quick = fitter.leave_fold_out_loss(fit, folds, 12.0)
     for fold in range(3):
         own = folds == fold
-        apart = Fitter(shots.take(~own), fitter.scale).fit(fit.config, free, fit.z, iterations=30)
-        exact = Fitter(shots.take(own), fitter.scale).loss(car, free, apart.z, most=12.0).sum()
+        apart = Fitter(windows.take(~own), fitter.scale).fit(fit.config, free, fit.z, iterations=30)
+        exact = Fitter(windows.take(own), fitter.scale).loss(car, free, apart.z, most=12.0).sum()
         assert quick[own].sum() == pytest.approx(exact, rel=0.1)

@@ -9,28 +9,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import Case
+from carlab.benchmark.world.driver import HumanDriver
+from carlab.benchmark.world.driver import Track as Course
+from carlab.benchmark.world.measurement import Noise, as_table, record, write_csv
+from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import drive as simulated_drive
 from carlab.cars import load_car_file
-from carlab.concealment import make_case
-from carlab.concealment.case import Case
-from carlab.concealment.driver import HumanDriver
-from carlab.concealment.driver import Track as Course
-from carlab.concealment.measurement import Noise, as_table, record, write_csv
-from carlab.concealment.physics import World
-from carlab.concealment.simulation import drive as simulated_drive
 from carlab.diagnosis.diagnose import diagnose
-from carlab.diagnosis.judge import Texts
-from carlab.diagnosis.measurement_noise import estimate_noise
-from carlab.diagnosis.prediction import Predictor
-from carlab.diagnosis.report_text import LOOK_ALIKES, effect_sentence, separating_drive
-from carlab.diagnosis.scoring import noise_floor
-from carlab.diagnosis.shots import Shots, Track, cut, tracks_of
-from carlab.diagnosis.starts import corrected
-from carlab.diagnosis.velocity_window import smear_s2
-from carlab.diagnosis.vibration import find_vibration
-from carlab.recording.foreign_csv import import_csv
+from carlab.diagnosis.identification.held_out_errors import noise_floor
+from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.selection.evidence import Texts
+from carlab.diagnosis.unexplained.vibration import find_vibration
+from carlab.prediction.initial_states import without_curvature_bias
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import PredictionWindows, Track, cut_windows, tracks_of
+from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import confusable_effects
 
-TEXTS = Texts(effect_sentence, separating_drive, LOOK_ALIKES)
+TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 SEEDS = (61, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (62, 63)))
 
 
@@ -43,11 +44,11 @@ class Drive:
     tracks: list[Track]
     nominal: SimulatorConfig
 
-    def clean_at(self, shots: Shots) -> np.ndarray:
-        """Noise-free states at the starts of shots (S, 6)."""
+    def clean_at(self, windows: PredictionWindows) -> np.ndarray:
+        """Noise-free states at the starts of windows (S, 6)."""
         recording = self.case.recordings[0]
-        rows = np.round(shots.t0_s * 30.0).astype(int)
-        assert np.allclose(recording.t_s[rows] - recording.t_s[0], shots.t0_s, atol=1e-3)
+        rows = np.round(windows.t0_s * 30.0).astype(int)
+        assert np.allclose(recording.t_s[rows] - recording.t_s[0], windows.t0_s, atol=1e-3)
         return recording.clean[rows]
 
 
@@ -75,8 +76,8 @@ def shaking(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 def test_noise_is_what_was_added(plain: Drive) -> None:
     """Differentiated velocities have noise that is not white; a white noise's formula would be 15 % too high."""
-    shots = cut(plain.tracks, 0.8, 0.3)
-    found = estimate_noise(plain.tracks, shots.bent).measured
+    windows = cut_windows(plain.tracks, 0.8, 0.3)
+    found = estimate_noise(plain.tracks, windows.curvature_bias).measured
     added = np.std(plain.case.recordings[0].error, axis=0)
     assert np.allclose(found[:3] / added[:3], 1.0, atol=0.1)
     assert np.allclose(found[3:] / added[3:], 1.0, atol=0.15)
@@ -84,31 +85,35 @@ def test_noise_is_what_was_added(plain: Drive) -> None:
 
 
 def test_floor_is_the_generators(plain: Drive) -> None:
-    """The floor after a second against what the generator's own truth and shot starts give."""
-    shots = cut(plain.tracks, 1.0, 0.25)
-    floor = noise_floor(shots, estimate_noise(plain.tracks, shots.bent), plain.nominal)[-1]
+    """The floor after a second against what the generator's own truth and window starts give."""
+    windows = cut_windows(plain.tracks, 1.0, 0.25)
+    floor = noise_floor(windows, estimate_noise(plain.tracks, windows.curvature_bias), plain.nominal)[-1]
     assert np.exp(np.mean(np.log(floor / np.array(plain.case.floor)))) == pytest.approx(1.0, abs=0.15)
 
 
 def test_starts_are_nearer_the_truth_without_their_bias(plain: Drive) -> None:
-    shots = cut(plain.tracks, 0.8, 0.3)
-    better = corrected(shots, plain.nominal)
-    truth = plain.clean_at(shots)
-    before, after = (np.sqrt(np.mean((s.start - truth) ** 2, axis=0)) for s in (shots, better))
+    windows = cut_windows(plain.tracks, 0.8, 0.3)
+    better = without_curvature_bias(windows, plain.nominal)
+    truth = plain.clean_at(windows)
+    before, after = (np.sqrt(np.mean((s.initial_states - truth) ** 2, axis=0)) for s in (windows, better))
     assert np.all(after[3:] < before[3:])
     assert after[5] < 0.95 * before[5]
-    noise = estimate_noise(plain.tracks, better.bent).start
+    noise = estimate_noise(plain.tracks, better.curvature_bias).initial_state
     assert np.allclose(noise[[0, 1, 3, 4]] / after[[0, 1, 3, 4]], 1.0, atol=0.25)
 
 
 def test_a_simulator_without_its_steering_takes_less_away(plain: Drive) -> None:
     """Bent commands have no counterpart in the recording, and so hardly move the starts."""
-    shots = cut(plain.tracks, 0.8, 0.3)
+    windows = cut_windows(plain.tracks, 0.8, 0.3)
     rng = np.random.default_rng(0)
-    shuffled = rng.permutation(len(shots))
-    wrong = replace(shots, history=shots.history[shuffled], commands=shots.commands[shuffled])
-    moved = np.sqrt(np.mean((corrected(wrong, plain.nominal).start - shots.start) ** 2, axis=0))
-    right = np.sqrt(np.mean((corrected(shots, plain.nominal).start - shots.start) ** 2, axis=0))
+    shuffled = rng.permutation(len(windows))
+    wrong = replace(windows, past_commands=windows.past_commands[shuffled], commands=windows.commands[shuffled])
+    moved = np.sqrt(
+        np.mean((without_curvature_bias(wrong, plain.nominal).initial_states - windows.initial_states) ** 2, axis=0)
+    )
+    right = np.sqrt(
+        np.mean((without_curvature_bias(windows, plain.nominal).initial_states - windows.initial_states) ** 2, axis=0)
+    )
     assert moved[5] < 0.3 * right[5]
 
 
@@ -121,14 +126,14 @@ def test_window_of_velocities_is_found(plain: Drive, tmp_path: Path, window_s: f
     what = simulated_drive(world, human, 60.0, start=human.start())
     noise = Noise(car.position_std, car.yaw_std, window_s)
     write_csv(tmp_path / "drive.csv", as_table(record(what, world, noise, np.random.default_rng(7))))
-    shots = cut(tracks_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
-    assert np.sqrt(20.0 * smear_s2(shots, plain.nominal)) == pytest.approx(window_s, abs=0.025)
+    windows = cut_windows(tracks_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
+    assert np.sqrt(20.0 * velocity_window_variance_s2(windows, plain.nominal)) == pytest.approx(window_s, abs=0.025)
 
 
 def test_velocities_of_the_moment_have_no_window(plain: Drive) -> None:
-    shots = cut(plain.tracks, 0.8, 0.3)
-    exact = replace(shots, measured=Predictor(shots, plain.nominal)()[0])
-    assert np.sqrt(20.0 * smear_s2(exact, plain.nominal)) < 0.03
+    windows = cut_windows(plain.tracks, 0.8, 0.3)
+    exact = replace(windows, measured=simulate_windows(windows, plain.nominal)[0])
+    assert np.sqrt(20.0 * velocity_window_variance_s2(exact, plain.nominal)) < 0.03
 
 
 def test_vibration_of_a_wheel_is_found_with_its_radius(shaking: Drive, plain: Drive) -> None:

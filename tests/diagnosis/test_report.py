@@ -23,10 +23,10 @@ from carlab.diagnosis.findings import (
     RecordingUse,
     Unexplained,
 )
-from carlab.diagnosis.report import write_report
-from carlab.diagnosis.report_figures import restarts
-from carlab.diagnosis.report_svg import nice_ticks
-from carlab.diagnosis.report_text import number
+from carlab.diagnosis.report.figures import restarts
+from carlab.diagnosis.report.sentences import number
+from carlab.diagnosis.report.svg import nice_ticks
+from carlab.diagnosis.report.write import write_report
 
 _spec = importlib.util.spec_from_file_location("report_material", Path(__file__).with_name("report_material.py"))
 material = importlib.util.module_from_spec(_spec)

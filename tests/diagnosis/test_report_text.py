@@ -17,8 +17,7 @@ from carlab.diagnosis.findings import (
     Unexplained,
     Where,
 )
-from carlab.diagnosis.report_text import (
-    LOOK_ALIKES,
+from carlab.diagnosis.report.sentences import (
     attained,
     confidence_words,
     drive_command,
@@ -33,7 +32,9 @@ from carlab.diagnosis.report_text import (
     verdict_title,
     wrong_sentence,
 )
-from sim_backends.effects import CATALOGUE
+from sim_backends.effects import CATALOGUE, confusable_effects
+
+LOOK_ALIKES = confusable_effects()
 
 PAIRS = [(a, b) for a in LOOK_ALIKES for b in LOOK_ALIKES[a]]
 INSEPARABLE = {"command_delay", "mocap_latency"}
@@ -141,7 +142,7 @@ def test_a_mismatch_names_its_effects_and_its_sets() -> None:
         "leaves out two things: a lag of the motor (or a delay of the throttle: these recordings cannot tell)" in text
     )
     assert "and a moment against turning" in text
-    assert "from 4 to 2.5 noise floors, 50 % of what there was to gain" in text
+    assert "from 4 to 2.5 noise floors, which removes 50 % of the error above the noise" in text
     assert "cannot tell" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
 
 
@@ -149,11 +150,11 @@ def test_the_share_of_what_was_attainable() -> None:
     assert attained(diagnosis("mismatch", refit=4.0, with_effects=1.0)) == pytest.approx(1.0)
     assert math.isnan(attained(diagnosis("none", refit=1.0, with_effects=1.0)))
     text = verdict_sentence(diagnosis("mismatch", finding("motor_lag"), refit=4.0, with_effects=0.97))
-    assert "100 % of what there was to gain" in text
+    assert "removes 100 % of the error above the noise" in text
 
 
 @pytest.mark.parametrize("verdict", ["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"])
-def test_every_verdict_has_a_sentence_even_with_nothing_to_go_by(verdict: str) -> None:
+def test_every_verdict_has_a_sentence_even_with_no_figures(verdict: str) -> None:
     bare = replace(diagnosis(verdict), held_out={})
     assert verdict_sentence(bare)[0].isupper()
     assert verdict_sentence(bare).endswith(".")
@@ -164,7 +165,7 @@ def test_every_verdict_has_a_sentence_even_with_nothing_to_go_by(verdict: str) -
     assert why
 
 
-def test_verdicts_tell_faults_rests_and_reasons() -> None:
+def test_verdicts_state_faults_residuals_and_reasons() -> None:
     fault = DataFault("wrong_unit", "yaw", 3, "unusable")
     assert "(wrong unit)" in verdict_sentence(replace(diagnosis("data"), data_faults=(fault,)))
     rest = Unexplained(0.7, ("vx",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
@@ -178,12 +179,12 @@ def test_verdicts_tell_faults_rests_and_reasons() -> None:
 
 
 @pytest.mark.parametrize(("verdict", "which"), [("none", "nominal"), ("parameters", "refit")])
-def test_an_error_above_the_noise_is_not_passed_over(verdict: str, which: str) -> None:
+def test_an_error_above_the_noise_is_stated(verdict: str, which: str) -> None:
     far, near = diagnosis(verdict), diagnosis(verdict)
     near = replace(near, held_out={k: replace(v, score=1.02) for k, v in near.held_out.items()})
     assert far.held_out[which].score > 3.0
-    assert "something is left that was not found" in verdict_sentence(far)
-    assert "something is left" not in verdict_sentence(near)
+    assert "something is missing that the diagnosis does not find" in verdict_sentence(far)
+    assert "something is missing" not in verdict_sentence(near)
 
 
 def test_the_next_drive_separates_the_strongest_set() -> None:

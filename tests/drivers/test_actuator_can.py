@@ -20,19 +20,19 @@ from can.interfaces.virtual import VirtualBus
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
 from carlab.core.quantities import Action
-from drivers import vesc_can_codec
 from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
-from drivers.can_link import CanLink
 from drivers.config import ActuatorConfig
 from drivers.emulators.can_firmware import CanFirmware
 from drivers.emulators.command_log import CommandLog, read_log
 from drivers.emulators.faults import FaultyFrameLink, WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
-from drivers.sender_logic import SenderState
-from drivers.sender_process import SenderThread
-from drivers.vesc_can_codec import CanFrame
-from drivers.vesc_can_device import VescCanDevice
+from drivers.links.can_link import CanLink
+from drivers.links.link import CanFrame
+from drivers.sender.logic import SenderState
+from drivers.sender.process import SenderThread
+from drivers.vesc import can_codec as vesc_can_codec
+from drivers.vesc.can_device import VescCanDevice
 
 ROOT = Path(__file__).resolve().parents[2]
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)

@@ -17,7 +17,7 @@ from drivers.config import ActuatorConfig
 from drivers.emulators.command_log import CommandLog, LogEntry
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
-from drivers.sender_process import SenderProcess
+from drivers.sender.process import SenderProcess
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENT_S = 20.0

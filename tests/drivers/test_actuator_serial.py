@@ -28,9 +28,9 @@ from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
-from drivers.sender_logic import SenderState
-from drivers.vesc_payloads import FirmwareVersion, MotorValues, get_values, set_current
-from drivers.vesc_serial_codec import encode_frame
+from drivers.sender.logic import SenderState
+from drivers.vesc.payloads import FirmwareVersion, MotorValues, get_values, set_current
+from drivers.vesc.serial_codec import encode_frame
 
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)  # 3 A, servo 0.65

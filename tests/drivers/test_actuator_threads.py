@@ -14,7 +14,7 @@ from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from drivers.emulators.serial_firmware import SerialFirmware
-from drivers.sender_logic import SenderState
+from drivers.sender.logic import SenderState
 
 MOVING = Action(0.5, 0.3)
 PATIENT_S = 20.0

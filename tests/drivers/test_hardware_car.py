@@ -27,7 +27,7 @@ from drivers.config import ActuatorConfig, HardwareConfig
 from drivers.dry_run_car import DryRunCar
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.hardware_car import HardwareCar
-from drivers.vesc_payloads import MotorValues
+from drivers.vesc.payloads import MotorValues
 
 
 class HandPoses:

@@ -15,11 +15,11 @@ from carlab.core.errors import ActionOutOfRangeError
 from carlab.core.quantities import Action
 from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
-from drivers.link import LinkStatistics
-from drivers.sender_logic import Order, SenderLogic, SenderState, Wish
-from drivers.vesc_device import VescSerialDevice
-from drivers.vesc_payloads import FirmwareVersion, MotorValues
-from drivers.vesc_serial_codec import VescFrameDecoder
+from drivers.links.link import LinkStatistics
+from drivers.sender.logic import Order, SenderLogic, SenderState, Wish
+from drivers.vesc.payloads import FirmwareVersion, MotorValues
+from drivers.vesc.serial_codec import VescFrameDecoder
+from drivers.vesc.serial_device import VescSerialDevice
 
 CONFIG = ActuatorConfig(rate_hz=100.0, watchdog_s=0.15, latch_s=0.5)
 CALIBRATION = ActuatorCalibration(max_current_a=10.0, servo_min=0.2, servo_max=0.8)
@@ -60,7 +60,10 @@ class Bench:
         self.now_s += dt_s
         if self.is_answering:
             self.logic.telemetry(self.now_s, HEALTHY)
-        return self.logic.tick(self.now_s)
+        command = self.logic.decide(self.now_s)
+        if command is not None:
+            self.logic.written(self.now_s, command)
+        return command
 
 
 def armed() -> Bench:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from drivers.slots import Slot
+from drivers.sender.slots import Slot
 
 ROOT = Path(__file__).resolve().parents[2]
 WRITER = """
 import sys, struct, zlib
-from drivers.slots import Slot
+from drivers.sender.slots import Slot
 slot = Slot.attach(int(sys.argv[1]), 2048)
 n = 0
 while True:

@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from carlab.core.errors import ProtocolError
-from drivers import vesc_can_codec as codec
-from drivers import vesc_payloads as payloads
-from drivers.vesc_can_codec import CanFrame, CanReassembler, Packet, Send
+from drivers.links.link import CanFrame
+from drivers.vesc import can_codec as codec
+from drivers.vesc import payloads as payloads
+from drivers.vesc.can_codec import CanReassembler, Packet, Send
 
 SHARED_DBC = Path(__file__).resolve().parents[2].parent / "shared" / "reference" / "vesc.dbc"
 
@@ -61,7 +62,7 @@ def test_status_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
         assert values is not None
         for name, value in expected.pop(vector["can_id"]).items():
             assert getattr(values, name) == pytest.approx(value), name
-        assert codec.encode_status(Packet(frame.packet), 23, values) == frame
+        assert codec.encode_status(Packet(codec.packet_of(frame)), 23, values) == frame
     assert not expected
 
 
@@ -99,8 +100,8 @@ def test_all_simple_commands_have_four_bytes() -> None:
 @settings(max_examples=60, deadline=None)
 def test_transport_brings_any_payload_across(payload: bytes) -> None:
     frames = codec.encode_payload(23, 42, payload, Send.IS_REPLY)
-    assert all(len(f.data) <= 8 and f.controller_id == 23 for f in frames)
-    assert len(frames) == 1 if len(payload) <= 6 else frames[-1].packet == Packet.PROCESS_RX_BUFFER
+    assert all(len(f.data) <= 8 and codec.controller_of(f) == 23 for f in frames)
+    assert len(frames) == 1 if len(payload) <= 6 else codec.packet_of(frames[-1]) == Packet.PROCESS_RX_BUFFER
     receiver = CanReassembler(23)
     found = [p for f in frames if (p := receiver.feed(f)) is not None]
     assert [(p.sender_id, p.send, p.payload) for p in found] == [(42, Send.IS_REPLY, payload)]

@@ -15,7 +15,7 @@ from drivers.emulators.faults import WireFaults
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.speed import sender_lateness
-from drivers.vesc_payloads import MotorValues, decode_reply
+from drivers.vesc.payloads import MotorValues, decode_reply
 
 
 def test_motor_times_out_servo_never_and_only_motor_commands_feed() -> None:

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from carlab.core.errors import ProtocolError
-from drivers import vesc_payloads as payloads
-from drivers.vesc_serial_codec import VescFrameDecoder, crc16, encode_frame
+from drivers.vesc import payloads as payloads
+from drivers.vesc.serial_codec import VescFrameDecoder, crc16, encode_frame
 
 FIELD_NAMES = {
     "temp_fet": "temp_fet_c", "temp_motor": "temp_motor_c", "i_motor": "motor_current_a", "i_in": "input_current_a",

@@ -19,9 +19,9 @@ from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState
 from carlab.core.task import RecordedTask
-from carlab.experiment.session import Session, SessionHooks
-from carlab.recording.rerun_sink import RerunSink
-from carlab.recording.run_directory import RunDirectory
+from carlab.experiment.episodes.session import Session, SessionHooks
+from carlab.recording.rerun.sink import RerunSink
+from carlab.recording.run_folder import RunDirectory
 
 MISBEHAVE_AT_TICK = 20
 FOREVER_TICKS = 3000

@@ -25,24 +25,24 @@ from carlab.core.observation import encode
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Reality
-from carlab.experiment import training
-from carlab.experiment.campaign import Campaign, CampaignHooks, taken_up
-from carlab.experiment.campaign_figures import EpisodeFigures
-from carlab.experiment.campaign_report import keep_row, learning_curve, restore_rows, write_report
-from carlab.experiment.session import EpisodeResult, SessionHooks
-from carlab.experiment.training import TrainingPlan, recorded_features
+from carlab.experiment.campaign import training
+from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
+from carlab.experiment.campaign.figures import EpisodeFigures
+from carlab.experiment.campaign.report import keep_row, learning_curve, restore_rows, write_report
+from carlab.experiment.campaign.training import TrainingPlan, recorded_features
+from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
 from carlab.recording.drained_file import DrainedFile
-from carlab.recording.learning_curve import write_learning_curve
-from carlab.recording.mcap_sink import McapSink
-from carlab.recording.mcap_source import read_documents, read_episode
+from carlab.recording.mcap.sink import McapSink
+from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.recorder import Recorder
-from carlab.recording.run_directory import RunDirectory
+from carlab.recording.rerun.learning_curve import write_learning_curve
+from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import read_log
-from learning import car_fit
-from learning.car_fit import load_car
 from learning.evaluation import negative_log_likelihood
-from learning.sac_agent import SacAgent, SacPolicy, SacSettings
-from learning.transitions import transitions_of
+from learning.policy.sac_agent import SacAgent, SacPolicy, SacSettings
+from learning.world import car_fit
+from learning.world.car_fit import load_car
+from learning.world.transitions import transitions_of
 
 
 def listened_to(choice: CarChoice) -> list[Action]:
@@ -97,13 +97,13 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
     with choice.car:
         go_on(CampaignHooks(stop=(run.models / "0001").is_dir))
         found.after_the_stop = names(run)
-        found.first_model = (run.models / "0001" / "agent.zip").read_bytes()
+        found.first_model = (run.models / "0001" / "policy.npz").read_bytes()
         with pytest.raises(DataError) as error:
             go_on(CampaignHooks(on_training=kill))
         found.said = str(error.value)
         found.after_the_kill = names(run)
         (run.models / "0002.partial").mkdir()  # as where the whole program was killed with it
-        (run.models / "0002.partial" / "agent.zip").write_bytes(b"rubbish")
+        (run.models / "0002.partial" / "policy.npz").write_bytes(b"rubbish")
         go_on(CampaignHooks())
     return found
 
@@ -112,14 +112,14 @@ def test_a_run_goes_on_where_it_was_ended(story: Story) -> None:
     assert story.after_the_stop == ["models/0001"]
     assert story.after_the_kill == ["episodes/0001.mcap", "models/0001"]
     assert "exit code -9" in story.said
-    assert "take the run up again" in story.said
+    assert "go on with --resume" in story.said
     assert "\n" not in story.said
     assert names(story.run) == ["episodes/0001.mcap", "episodes/0002.mcap", "models/0001", "models/0002"]
     assert [r.reason for r in story.results] == [EndReason.COMPLETED] * 2
     assert [p.name for p in sorted((story.run.models / "0002").iterdir())] == [
-        "agent.zip", "diagnosis.json", "dynamics.pt", "moments.pt", "training.json",
+        "diagnosis.json", "dynamics.pt", "policy.npz", "training.json",
     ]  # fmt: skip
-    assert (story.run.models / "0001" / "agent.zip").read_bytes() == story.first_model, "it was not learned again"
+    assert (story.run.models / "0001" / "policy.npz").read_bytes() == story.first_model, "it was not learned again"
 
 
 def test_a_run_that_has_all_its_episodes_does_nothing(story: Story) -> None:
@@ -129,16 +129,25 @@ def test_a_run_that_has_all_its_episodes_does_nothing(story: Story) -> None:
     assert names(story.run) == before
 
 
-def test_the_plan_is_taken_up_again(story: Story, tmp_path: Path) -> None:
-    found = taken_up(story.run, choose_car("sim"), CampaignHooks())
+def test_the_plan_is_resumed_again(story: Story, tmp_path: Path) -> None:
+    found = resumed_campaign(story.run, choose_car("sim"), CampaignHooks())
     assert (found.plan, found.episodes, found.max_ticks) == (story.plan, 2, TICKS)
     assert (found.place, found.record_rerun) == (True, False)
     other = RunDirectory.create(tmp_path, "other")
-    for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}'):
+    whole = json.loads((story.run.path / "campaign.json").read_text())
+    changes: list[dict[str, object]] = [
+        {"threads": "x"},
+        {"method": "other"},
+        {"device": "mps"},
+        {"ticks": 0},
+        {"seed": 1.5},
+    ]
+    wrong_plans = [json.dumps({**whole, "plan": {**whole["plan"], **change}}) for change in changes]
+    for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}', *wrong_plans):
         if content is not None:
             (other.path / "campaign.json").write_text(content)
         with pytest.raises(DataError, match="no run of carlab learn"):
-            taken_up(other, choose_car("sim"), CampaignHooks())
+            resumed_campaign(other, choose_car("sim"), CampaignHooks())
 
 
 def test_the_curve_has_the_figures_of_the_recordings(story: Story) -> None:
@@ -156,7 +165,7 @@ def test_the_curve_has_the_figures_of_the_recordings(story: Story) -> None:
         assert row["speed_mps"] == pytest.approx(np.hypot(vx, vy))
         assert row["parked"] is False
         assert row["end"] == driven.metadata["end_reason"] == "COMPLETED"
-        assert row["foretold"] == trained["return_in_model"]
+        assert row["predicted_return"] == trained["return_in_model"]
     assert [r["rows"] for r in rows] == [0, TICKS - HISTORY]
     assert rows[0]["updates"] > rows[1]["updates"] == 32, "before the first there is most to learn"
     assert [str(r) for r in learning_curve(story.run)] == [str(f) for f in story.figures]
@@ -164,7 +173,7 @@ def test_the_curve_has_the_figures_of_the_recordings(story: Story) -> None:
     assert (story.run.path / "learn.rrd").stat().st_size > 1000
 
 
-def test_surprise_is_that_of_the_model_that_had_not_seen_the_episode(story: Story) -> None:
+def test_likelihood_is_that_of_the_model_that_had_not_seen_the_episode(story: Story) -> None:
     rows = transitions_of([read_episode(story.run.episode_path(1))], HISTORY)
     inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
     nll = [
@@ -258,7 +267,7 @@ def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_somethi
         campaign = Campaign(choice, story.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
         assert len(list(campaign.go_on())) == 2
     assert len(ticks_s) > TICKS
-    assert not {"training", "reality check"} & set(alive)
+    assert not {"training", "quick check"} & set(alive)
     learning = np.array(learning_s)
     second = learning[learning > ticks_s[0]]
     assert len(second) > 3, "it learned a second time, after the first episode"
@@ -316,11 +325,11 @@ def test_where_the_program_was_killed_by_a_second_signal_the_episode_is_driven_a
             recorder.emit(replace(document, reason=EndReason.LOOP_HUNG) if ended else document)
     campaign = Campaign(choose_car("sim"), story.plan, 3, run)
     shutil.copytree(story.run.models / "0002", run.models / "0004")
-    campaign.set_stopped_aside()
+    campaign.set_aside_stopped_episode()
     assert len(run.recordings()) == 3, "something was learned from it"
     shutil.rmtree(run.models / "0004")
-    campaign.set_stopped_aside()
-    campaign.set_stopped_aside()
+    campaign.set_aside_stopped_episode()
+    campaign.set_aside_stopped_episode()
     assert [p.name for p in run.recordings()] == ["0001.mcap", "0002.mcap"]
     assert (run.stopped / "0003.mcap").is_file()
     assert run.next_episode() == 4
@@ -335,7 +344,7 @@ def test_a_row_that_was_not_written_is_made_up_from_the_recording(story: Story, 
     whole = json.loads((story.run.path / "learn.json").read_text())
     (run.path / "learn.json").write_text(json.dumps({**whole, "episodes": whole["episodes"][:1]}))
     restore_rows(run, story.plan.task)
-    wanted = [replace(f, reality="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in story.figures]
+    wanted = [replace(f, verdict="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in story.figures]
     assert str(learning_curve(run)[1]) == str(wanted[1])
     before = (run.path / "learn.json").read_bytes()
     restore_rows(run, story.plan.task)
@@ -348,8 +357,7 @@ def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.
     taught = SacAgent.load(agent, SacSettings(), 0)
     for name, write in (
         ("dynamics.pt", lambda folder: car_fit.save_car(learned, folder / "dynamics.pt")),
-        ("agent.zip", taught.save),
-        ("moments.pt", taught.save),
+        ("policy.npz", taught.save),
     ):
 
         def full(folder: Path, name: str = name, write: Any = write) -> None:

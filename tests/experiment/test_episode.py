@@ -14,8 +14,13 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import NEUTRAL, Action, CarState
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask, RecordedTask
-from carlab.experiment.episode import EpisodeHooks, run_episode
-from carlab.experiment.scripted_policies import ManoeuvrePolicy, NeutralPolicy, ReplayPolicy, ReverseParkingPolicy
+from carlab.experiment.episodes.episode import EpisodeHooks, run_episode
+from carlab.experiment.episodes.scripted_policies import (
+    ManoeuvrePolicy,
+    NeutralPolicy,
+    ReplayPolicy,
+    ReverseParkingPolicy,
+)
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.simulated_car import SimulatedCar
 

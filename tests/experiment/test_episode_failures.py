@@ -14,7 +14,7 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, Observation
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
-from carlab.experiment.episode import EpisodeHooks, first_observation, run_episode
+from carlab.experiment.episodes.episode import EpisodeHooks, first_observation, run_episode
 from sim_backends.simulated_car import SimulatedCar
 
 PERIOD_S = 1.0 / 30.0

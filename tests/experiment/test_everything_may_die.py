@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from carlab.core.episode_data import EpisodeData
-from carlab.recording.mcap_source import read_episode
+from carlab.recording.mcap.source import read_episode
 from drivers.emulators.command_log import LogEntry, read_log
 
 PROGRAM = Path(__file__).with_name("driving_program.py")

@@ -9,8 +9,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
-import carlab.experiment.gym_registration  # noqa: F401
-from carlab.experiment.gym_env import CarEnv
+import carlab.experiment.episodes.gym_registration  # noqa: F401
+from carlab.experiment.episodes.gym_env import CarEnv
 
 
 @pytest.fixture(params=["carlab/Parking-v0", "carlab/Path-v0"])

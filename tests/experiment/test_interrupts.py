@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import pytest
 
 from carlab.core.outcome import EndReason
-from carlab.experiment.interrupts import SIGNALS, Flag, Interrupts, LoopWatch
+from carlab.experiment.episodes.interrupts import SIGNALS, Flag, Interrupts, LoopWatch
 
 PATIENT_S = 20.0
 

@@ -14,13 +14,13 @@ import tomli_w
 import torch
 
 from carlab.cars import choose_car
-from carlab.experiment import campaign, training
-from carlab.experiment.campaign import Campaign, CampaignHooks, prior_simulator, taken_up
-from carlab.experiment.session import Session
-from carlab.experiment.training import TrainingPlan
-from carlab.recording.run_directory import RunDirectory
-from learning.car_fit import load_car, save_car
-from learning.sac_agent import SacAgent, SacPolicy
+from carlab.experiment.campaign import campaign, training
+from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, prior_simulator, resumed_campaign
+from carlab.experiment.campaign.training import TrainingPlan
+from carlab.experiment.episodes.session import Session
+from carlab.recording.run_folder import RunDirectory
+from learning.policy.sac_agent import SacAgent, SacPolicy
+from learning.world.car_fit import load_car, save_car
 
 SMALL = {"history": 1, "model_steps": 20, "updates": 32, "ticks": 12, "threads": 1}
 
@@ -29,14 +29,14 @@ SMALL = {"history": 1, "model_steps": 20, "updates": 32, "ticks": 12, "threads":
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two episodes in this process, for the stand-in is in this process, too; nothing is to be learned well."""
     monkeypatch.setattr(
-        campaign, "train_beside",
+        campaign, "train_in_subprocess",
         lambda plan, models, recordings, envelope, tell, stop: training.train(plan, models, recordings, envelope, tell),
     )  # fmt: skip
-    monkeypatch.setattr("learning.gap.STEPS", 10)
-    monkeypatch.setattr("learning.function_posterior.PRIOR_DRAWS", 64)
-    monkeypatch.setattr("learning.function_posterior.DRAWS", 16)
-    monkeypatch.setattr("learning.parameter_posterior.HOTTEST", 2)
-    monkeypatch.setattr("learning.parameter_posterior.MOVES", 1)
+    monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 10)
+    monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
+    monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)
+    monkeypatch.setattr("learning.posterior.parameter_posterior.MAX_TEMPERING_STEPS", 2)
+    monkeypatch.setattr("learning.posterior.parameter_posterior.RANDOM_WALK_STEPS", 1)
 
 
 def learned(folder: Path, device: str, episodes: int) -> RunDirectory:
@@ -68,7 +68,7 @@ def test_a_run_learns_there_and_drives_here(device: str, tmp_path: Path, monkeyp
         return noted
 
     car = noting("car", lambda dynamics, path: dynamics.posterior.parameters.device, save_car)
-    monkeypatch.setattr("learning.car_fit.save_car", car)
+    monkeypatch.setattr("learning.world.car_fit.save_car", car)
     policy = noting("policy", lambda agent, folder: device_of(agent), SacAgent.save)
     monkeypatch.setattr(SacAgent, "save", policy)
     monkeypatch.setattr(campaign, "Session", noting("driving", lambda car, policy, *_: device_of(policy), Session))
@@ -82,9 +82,9 @@ def test_a_run_learns_there_and_drives_here(device: str, tmp_path: Path, monkeyp
     assert figures["rows"] == SMALL["ticks"] - SMALL["history"]
     assert np.isfinite(figures["last_episode_nll"])
     choice = choose_car("sim", seed=0)
-    assert taken_up(there, choice, CampaignHooks()).plan.device == "cuda"
-    assert taken_up(there, choice, CampaignHooks(), "cpu").plan.device == "cpu"
+    assert resumed_campaign(there, choice, CampaignHooks()).plan.device == "cuda"
+    assert resumed_campaign(there, choice, CampaignHooks(), "cpu").plan.device == "cpu"
     old = json.loads((there.path / campaign.CAMPAIGN_FILE).read_text())
     del old["plan"]["device"]
     (there.path / campaign.CAMPAIGN_FILE).write_text(json.dumps(old))
-    assert taken_up(there, choice, CampaignHooks()).plan.device == "cpu"
+    assert resumed_campaign(there, choice, CampaignHooks()).plan.device == "cpu"

@@ -16,11 +16,11 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Observation
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
-from carlab.experiment import session as session_module
-from carlab.experiment.session import Session, SessionHooks, wait_until_still
-from carlab.recording.mcap_source import read_episode
+from carlab.experiment.episodes import session as session_module
+from carlab.experiment.episodes.session import Session, SessionHooks, wait_until_still
+from carlab.recording.mcap.source import read_episode
 from carlab.recording.recorder import Recorder
-from carlab.recording.run_directory import RunDirectory
+from carlab.recording.run_folder import RunDirectory
 from sim_backends.simulated_car import SimulatedCar
 
 PATIENT_S = 20.0

@@ -7,7 +7,7 @@ from carlab.core.errors import NotReadyError
 from carlab.core.outcome import EndReason
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import CarState, Observation
-from carlab.experiment.teleop_policy import (
+from carlab.experiment.episodes.teleop_policy import (
     GamepadMapping,
     GamepadSource,
     KeyboardSource,

@@ -19,14 +19,15 @@ from carlab.core.errors import DataError, DivergedError
 from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
 from carlab.core.quantities import CarState
-from carlab.experiment import training
-from carlab.experiment.training import PARKED_BONUS, TrainingPlan, train, train_beside
-from carlab.recording.mcap_source import read_episode
-from carlab.recording.run_directory import RunDirectory
-from learning import car_fit, model_env
-from learning.history import HistoryChoice
-from learning.sac_agent import SacAgent
-from learning.simulator_model import CarModel
+from carlab.experiment.campaign import training
+from carlab.experiment.campaign.training import PARKED_BONUS, TrainingPlan, train
+from carlab.experiment.campaign.training_process import train_in_subprocess
+from carlab.recording.mcap.source import read_episode
+from carlab.recording.run_folder import RunDirectory
+from learning.policy.sac_agent import SacAgent
+from learning.priors.simulator_model import CarModel
+from learning.world import car_fit, model_env
+from learning.world.history import HistoryChoice
 
 
 def test_the_model_is_told_by_how_much_recorded_velocities_are_late(
@@ -66,7 +67,7 @@ def test_after_three_episodes_it_is_found_how_many_commands_count(
     found = [train(plan, tmp_path / str(n), recordings[:n], ENVELOPE, lambda *what: None) for n in (2, 3)]
     assert asked == [3]
     assert [f.get("history_asked") for f in found] == [None, 6]
-    assert "asks for 6 past commands" in found[1]["history_words"]
+    assert "supports 6 past commands" in found[1]["history_words"]
 
 
 def test_what_diverged_is_learned_again_with_smaller_steps(
@@ -142,7 +143,7 @@ def test_the_learned_car_keeps_more_room_and_is_paid_for_standing_in_its_spot(
     there = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
     assert trained._bonus is not None
     assert trained._bonus(there).tolist() == pytest.approx([PARKED_BONUS, 0.0])
-    assert judged._bonus is None, "what is foretold is the task's reward alone"
+    assert judged._bonus is None, "the predicted return is the task's reward alone"
 
 
 def test_an_episode_that_ended_before_its_first_tick_is_no_obstacle(tmp_path: Path) -> None:
@@ -165,7 +166,7 @@ def test_what_goes_wrong_in_the_other_process_is_said_in_a_sentence(
         run.episode_path(1).write_bytes(recording)
     plan = tiny_plan(choose_car("sim"), model_steps=1, **changes)
     with pytest.raises(DataError, match=said) as error:
-        train_beside(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)
+        train_in_subprocess(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)
     assert "\n" not in str(error.value)
     assert names(run) == ([] if recording is None else ["episodes/0001.mcap"])
     assert multiprocessing.active_children() == []

@@ -13,10 +13,10 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
-from carlab.experiment.campaign import prior_simulator
-from carlab.experiment.session import Session
-from carlab.experiment.training import TrainingPlan
-from carlab.recording.run_directory import RunDirectory
+from carlab.experiment.campaign.campaign import prior_simulator
+from carlab.experiment.campaign.training import TrainingPlan
+from carlab.experiment.episodes.session import Session
+from carlab.recording.run_folder import RunDirectory
 
 HISTORY = 2
 TICKS = 25

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from learning.domain_models import uniform
-from learning.normaliser import Normaliser
+from learning.networks.normaliser import Normaliser
+from learning.priors.domain_models import uniform
 
 UNITS = Normaliser(
     torch.tensor([0.5, -1.0]), torch.tensor([2.0, 0.5]), torch.tensor([1.0, -2.0]), torch.tensor([2.0, 0.5])

@@ -13,20 +13,21 @@ from typing import Any, cast
 
 import numpy as np
 
-from carlab.concealment.base_car import BaseCar
-from carlab.concealment.catalogue import Draw, index
-from carlab.concealment.measurement import Noise, Recording, record
-from carlab.concealment.physics import World
-from carlab.concealment.refit import channel_scores, cut_shots
-from carlab.concealment.simulation import drive
+from carlab.benchmark.cases.refit import channel_scores, cut_shots
+from carlab.benchmark.effects.catalogue import Draw
+from carlab.benchmark.effects.forms import all_forms
+from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.measurement import Noise, Recording, record
+from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import drive
 from carlab.core.episode_data import EpisodeData
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import STATE_NAMES, Action, CarState
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
-from carlab.experiment.scripted_policies import ReverseParkingPolicy
-from carlab.experiment.session import Session
-from carlab.recording.run_directory import RunDirectory
+from carlab.experiment.episodes.scripted_policies import ReverseParkingPolicy
+from carlab.experiment.episodes.session import Session
+from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.simulated_car import SimulatedCar
 
@@ -114,7 +115,7 @@ def concealed_drives(effect: str | None, size: float, seed: int, episodes: int =
     for k in range(episodes):
         world = World(true)
         if effect is not None:
-            form = index()[(effect, "catalogue")]
+            form = all_forms()[(effect, "catalogue")]
             parameters = form.sized(size * form.typical, drawn)
             form.attach(world, parameters)
         rng = np.random.default_rng((seed, 2, k))

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from learning.adam import Adam
+from learning.networks.adam import Adam
 
 
 def generator(seed=0):

@@ -11,18 +11,19 @@ import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from learning.authors_fsvgd import (
+from learning.evaluation import negative_log_likelihood
+from learning.functional_svgd.authors_fsvgd import (
     WorldDynamics,
     authors_settings,
     fit_authors_fsvgd,
     in_world,
     world_rows,
 )
-from learning.evaluation import negative_log_likelihood
-from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, fit
-from learning.function_prior import RbfCovariance
-from learning.normaliser import Normaliser
-from learning.particles import Network
+from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.priors.function_prior import RbfCovariance
 
 HISTORY = 2
 
@@ -44,7 +45,7 @@ def constant(change: list[float]) -> WorldDynamics:
     network = Network(width, 7, (4,))
     parameters = torch.zeros(3, network.parameters)
     units = Normaliser(torch.zeros(width), torch.ones(width), torch.tensor(change), torch.ones(7))
-    return WorldDynamics(Posterior(network, parameters, torch.zeros(7), units), HISTORY)
+    return WorldDynamics(ParticlePosterior(network, parameters, torch.zeros(7), units), HISTORY)
 
 
 def test_rows_are_those_of_the_world() -> None:
@@ -63,7 +64,7 @@ def test_rows_are_those_of_the_world() -> None:
 
 
 def test_a_step_is_carried_on_in_the_world() -> None:
-    """A car that looks along y with 1 m/s ahead and 0.5 m/s to the left; it is pushed and turned to look along -x."""
+    """A car that looks along y with 1 m/s ahead and 0.5 m/s to the left; it is moved and rotated to head along -x."""
     features = torch.tensor([[2.0, 1.0, 1.0, 0.0, 1.0, 0.5, 0.1, 0.1, 0.2, 0.3, 0.4]])
     assert np.allclose(in_world(features)[0, 4:6], [-0.5, 1.0], atol=1e-6)
     world = constant([0.1, -0.2, -1.0, -1.0, 0.3, 0.0, 0.05])
@@ -81,7 +82,7 @@ def test_a_fit_learns_and_before_any_episode_there_is_none() -> None:
         unfitted.posterior.parameters,
         unfitted.posterior.network.initial(10, torch.Generator().manual_seed(1)),
     )
-    before, after = unfitted.surprise(episodes[2])[0], fitted.surprise(episodes[2])[0]
+    before, after = unfitted.score_episode(episodes[2])[0], fitted.score_episode(episodes[2])[0]
     assert after < before - 5.0
 
 
@@ -103,27 +104,29 @@ def noisy() -> tuple[torch.Tensor, ...]:
 
 
 class TestHeldOutRows:
-    """Twelve rows of noise are learned by heart; others tell when."""
+    """Twelve rows of noise are overfitted; held-out rows show when."""
 
     SETTINGS = FsvgdSettings(
-        particles=4, steps=1500, hidden=(64, 64), learning_rate=3e-3, noise_std=0.3, learn_noise=False, natural=False,
-        falling_rate=False, checked_every=100, bandwidth=0.1,
+        particles=4, steps=1500, hidden=(64, 64), learning_rate=3e-3, noise_std=0.3, fit_noise=False, natural=False,
+        anneal_rate=False, validation_period=100, bandwidth=0.1,
     )  # fmt: skip
     UNITS = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
 
     def test_the_best_of_the_looks_is_kept(self, noisy: tuple[torch.Tensor, ...]) -> None:
         x, y, others, truth = noisy
-        last = fit(x, y, x, None, self.UNITS, self.SETTINGS)
-        kept = fit(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
-        surprise = [negative_log_likelihood(p.predict(others), truth) for p in (kept, last)]
-        assert surprise[0] < surprise[1] - 0.5
+        last = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS)
+        kept = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
+        nll = [negative_log_likelihood(p.predict(others), truth) for p in (kept, last)]
+        assert nll[0] < nll[1] - 0.5
 
     def test_patience_ends_the_fit_with_the_same_networks(self, noisy: tuple[torch.Tensor, ...]) -> None:
         x, y, others, truth = noisy
-        told: list[int] = []
-        kept = fit(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
-        soon = fit(x, y, x, None, self.UNITS, replace(self.SETTINGS, patience=3), told.append, held_out=(others, truth))
-        assert max(told, default=0) < 1500
+        steps_done: list[int] = []
+        kept = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
+        soon = fit_fsvgd(
+            x, y, x, None, self.UNITS, replace(self.SETTINGS, patience=3), steps_done.append, held_out=(others, truth)
+        )
+        assert max(steps_done, default=0) < 1500
         assert torch.equal(soon.parameters, kept.parameters)
 
     def test_the_priors_exponent_scales_it(self, noisy: tuple[torch.Tensor, ...]) -> None:
@@ -134,6 +137,6 @@ class TestHeldOutRows:
             for length in (0.1, 3.0):
                 prior = GaussianProcessPrior(torch.cat([x, others]), RbfCovariance((1.0,), (length,)))
                 settings = replace(self.SETTINGS, steps=60, prior_exponent=exponent)
-                found[exponent, length] = fit(x, y, others, prior, self.UNITS, settings).parameters
+                found[exponent, length] = fit_fsvgd(x, y, others, prior, self.UNITS, settings).parameters
         assert torch.equal(found[0.0, 0.1], found[0.0, 3.0])
         assert not torch.allclose(found[1.0, 0.1], found[1.0, 3.0], atol=1e-3)

@@ -20,15 +20,15 @@ from carlab.core.errors import DataError
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState
 from carlab.core.task import ParkingTask
-from carlab.experiment.episode import EpisodeHooks, run_episode
-from learning.car_dynamics import CarDynamics, inputs_of, moved
-from learning.car_fit import FILE_VERSION, CarFitSettings, fit_car, load_car, save_car
+from carlab.experiment.episodes.episode import EpisodeHooks, run_episode
 from learning.evaluation import negative_log_likelihood
-from learning.fsvgd import EDGE, Posterior
-from learning.normaliser import Normaliser
-from learning.particles import Network
-from learning.simulator_model import CarModel
-from learning.transitions import transitions_of
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.posterior.particle_posterior import MIN_INPUT_CLIP, ParticlePosterior
+from learning.priors.simulator_model import CarModel
+from learning.world.car_dynamics import CarDynamics, advance, inputs_of
+from learning.world.car_fit import FILE_VERSION, CarFitSettings, fit_car, load_car, save_car
+from learning.world.transitions import transitions_of
 from sim_backends.car_parameters import SimulatorConfig
 
 HISTORY = 3
@@ -69,7 +69,7 @@ def test_a_drive_is_carried_on_exactly(drive: tuple[EpisodeData, list[Transition
     assert np.ptp(driven.states[:, 2]) > 6.0, "yaw jumps from pi to -pi on the way"
     features = torch.from_numpy(np.array([t.features for t in own]))
     action = torch.from_numpy(np.array([t.action.to_array() for t in own]))
-    after = moved(features, action, torch.from_numpy(rows.targets)).numpy()
+    after = advance(features, action, torch.from_numpy(rows.targets)).numpy()
     np.testing.assert_allclose(after, [t.next_features for t in own], atol=1e-12)
     wanted = driven.states[rows.tick + 1]
     np.testing.assert_allclose(after[:, [0, 1, 4, 5, 6]], wanted[:, [0, 1, 3, 4, 5]], atol=1e-12)
@@ -77,7 +77,7 @@ def test_a_drive_is_carried_on_exactly(drive: tuple[EpisodeData, list[Transition
     np.testing.assert_allclose(np.exp(1j * yaw), np.exp(1j * wanted[:, 2]), atol=1e-12)
 
 
-def test_a_model_is_asked_what_a_recording_teaches_it(drive: tuple[EpisodeData, list[Transition]]) -> None:
+def test_inputs_at_a_step_are_those_of_the_recorded_rows(drive: tuple[EpisodeData, list[Transition]]) -> None:
     driven, transitions = drive
     rows = transitions_of([driven], HISTORY)
     features = torch.from_numpy(np.array([transitions[k].features for k in rows.tick]))
@@ -89,32 +89,32 @@ def test_a_model_is_asked_what_a_recording_teaches_it(drive: tuple[EpisodeData, 
 
 def test_without_a_history_a_step_forgets_the_command() -> None:
     features = torch.tensor([[1.0, 2.0, 1.0, 0.0, 0.5, 0.0, 0.0]])  # heading along y
-    after = moved(features, torch.tensor([[0.3, 0.4]]), torch.tensor([[0.2, 0.1, math.pi / 2, 0.1, 0.0, -0.2]]))
+    after = advance(features, torch.tensor([[0.3, 0.4]]), torch.tensor([[0.2, 0.1, math.pi / 2, 0.1, 0.0, -0.2]]))
     assert after[0].tolist() == pytest.approx([0.9, 2.2, 0.0, -1.0, 0.6, 0.0, -0.2], abs=1e-6)
 
 
-def known_car(values: Tensor, freedom: float = math.inf, noise: float = 0.5) -> CarDynamics:
+def known_car(values: Tensor, dof: float = math.inf, noise: float = 0.5) -> CarDynamics:
     """Particles that each say one value (L, 6), whatever the input."""
     network = Network(INPUTS, 6, (4,))
     parameters = torch.zeros(len(values), network.parameters)
     parameters[:, -6:] = values
     units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.full((6,), 0.3), torch.arange(1.0, 7.0))
-    return CarDynamics(Posterior(network, parameters, torch.full((6,), noise), units, freedom), HISTORY)
+    return CarDynamics(ParticlePosterior(network, parameters, torch.full((6,), noise), units, dof), HISTORY)
 
 
-@pytest.mark.parametrize("freedom", [math.inf, 5.0])
-def test_draws_are_those_of_the_mixture(freedom: float) -> None:
+@pytest.mark.parametrize("dof", [math.inf, 5.0])
+def test_draws_are_those_of_the_mixture(dof: float) -> None:
     """Equal shares of four Gaussians: mean and variance by the law of total variance, kurtosis by their moments.
 
     Of Student noise each has a scale of its own: the root of 5 over the middle of a quarter of chi square.
     """
     values = torch.randn(4, 6, generator=torch.Generator().manual_seed(2))
-    car = known_car(values, freedom, noise=0.85)
+    car = known_car(values, dof, noise=0.85)
     count = 40_000
     drawn = car.sample(torch.zeros(count, INPUTS), torch.Generator().manual_seed(0)).double()
     unit = torch.arange(1.0, 7.0).double()
     means = 0.3 + values.double() * unit
-    scales = np.ones(4) if math.isinf(freedom) else np.sqrt(freedom / chi2.ppf([0.125, 0.375, 0.625, 0.875], freedom))
+    scales = np.ones(4) if math.isinf(dof) else np.sqrt(dof / chi2.ppf([0.125, 0.375, 0.625, 0.875], dof))
     stds = 0.85 * unit * torch.from_numpy(scales)[:, None]
     mean = means.mean(dim=0)
     away = means - mean
@@ -125,7 +125,7 @@ def test_draws_are_those_of_the_mixture(freedom: float) -> None:
     assert torch.all((found - variance).abs() < 4 * ((fourth - variance**2) / count).sqrt())
     predicted = car.predict(torch.zeros(1, INPUTS))
     torch.testing.assert_close(predicted.mean[0].double(), mean, rtol=1e-5, atol=1e-5)
-    variance = (away**2).mean(dim=0) + (0.85 * unit) ** 2 * (1.0 if math.isinf(freedom) else 5.0 / 3.0)
+    variance = (away**2).mean(dim=0) + (0.85 * unit) ** 2 * (1.0 if math.isinf(dof) else 5.0 / 3.0)
     torch.testing.assert_close(predicted.std[0].double(), variance.sqrt(), rtol=1e-5, atol=1e-5)
 
 
@@ -134,7 +134,7 @@ def test_every_particle_gets_its_share_and_every_row_a_particle_of_its_own() -> 
     drawn = car.sample(torch.zeros(200, INPUTS), torch.Generator().manual_seed(0))
     said = (drawn[:, 0] - 0.3).round().int()
     assert torch.bincount(said).tolist() == [40] * 5
-    assert len(said.unique_consecutive()) > 100, "they are not dealt in order"
+    assert len(said.unique_consecutive()) > 100, "they are not assigned in order"
 
 
 @pytest.mark.parametrize("count", [1, 3, 7, 64])
@@ -154,7 +154,7 @@ def test_a_row_is_answered_for_its_own_inputs() -> None:
     (first, _), (last, _) = network.split(parameters)
     first[:, 0, 0] = last[:, 0, :] = 1.0
     units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.zeros(6), torch.ones(6))
-    car = CarDynamics(Posterior(network, parameters, torch.full((6,), 1e-4), units), HISTORY)
+    car = CarDynamics(ParticlePosterior(network, parameters, torch.full((6,), 1e-4), units), HISTORY)
     inputs = torch.zeros(100, INPUTS)
     inputs[:, 0] = torch.arange(100.0) / 20.0
     drawn = car.sample(inputs, torch.Generator().manual_seed(0))
@@ -168,7 +168,7 @@ def test_a_world_that_feeds_on_itself_does_not_run_away() -> None:
     (first, _), (last, _) = network.split(parameters)
     first[:, 2, 0] = last[:, 0, 5] = 1.0
     units = Normaliser(torch.zeros(INPUTS), torch.full((INPUTS,), 2.0), torch.zeros(6), torch.full((6,), 2.0))
-    car = CarDynamics(Posterior(network, parameters, torch.full((6,), 1e-6), units), HISTORY)
+    car = CarDynamics(ParticlePosterior(network, parameters, torch.full((6,), 1e-6), units), HISTORY)
     features = torch.zeros(1, 7 + 2 * HISTORY)
     features[0, 3], features[0, 6] = 1.0, 0.75
     generator, rates = torch.Generator().manual_seed(0), []
@@ -176,56 +176,59 @@ def test_a_world_that_feeds_on_itself_does_not_run_away() -> None:
         features = car.step(features, torch.zeros(1, 2), generator)
         rates.append(float(features[0, 6]))
     assert rates[:5] == pytest.approx([1.5, 3.0, 6.0, 12.0, 24.0], rel=1e-3)
-    assert rates[-1] == pytest.approx(24.0 + 95 * 2.0 * EDGE, rel=1e-3)
+    assert rates[-1] == pytest.approx(24.0 + 95 * 2.0 * MIN_INPUT_CLIP, rel=1e-3)
 
 
-TURN = torch.eye(6).double() + 0.4 * torch.randn(6, 6, generator=torch.Generator().manual_seed(8)).double()
+DECORRELATION = torch.eye(6).double() + 0.4 * torch.randn(6, 6, generator=torch.Generator().manual_seed(8)).double()
 
 
-def turned(car: CarDynamics, by: torch.Tensor = TURN) -> CarDynamics:
-    """The same numbers in turned units."""
-    return replace(car, posterior=replace(car.posterior, normaliser=car.posterior.normaliser.turned(by)))
+def decorrelated(car: CarDynamics, by: torch.Tensor = DECORRELATION) -> CarDynamics:
+    """The same numbers in decorrelated units."""
+    return replace(car, posterior=replace(car.posterior, normaliser=car.posterior.normaliser.decorrelated(by)))
 
 
 def test_noise_of_one_draw_is_correlated_as_the_turn_says() -> None:
-    car = turned(known_car(torch.zeros(4, 6)))
+    car = decorrelated(known_car(torch.zeros(4, 6)))
     drawn = car.sample(torch.zeros(40_000, INPUTS), torch.Generator().manual_seed(0)).double().numpy()
     unit = np.arange(1.0, 7.0)
-    back = np.linalg.inv(TURN.numpy())
+    back = np.linalg.inv(DECORRELATION.numpy())
     shape = 0.25 * unit[:, None] * (back @ back.T) * unit
     assert np.allclose(np.cov(drawn.T), shape, atol=0.03 * np.sqrt(np.outer(np.diag(shape), np.diag(shape))))
     predicted = car.predict(torch.zeros(1, INPUTS))
-    assert np.allclose(predicted.own_stds[0, 0], np.sqrt(np.diag(shape)), rtol=1e-4)
+    assert np.allclose(predicted.marginal_scales[0, 0], np.sqrt(np.diag(shape)), rtol=1e-4)
     assert np.allclose(predicted.mean, 0.3, atol=1e-5)
 
 
 def test_particles_taken_over_into_other_units_are_the_same_functions() -> None:
     inputs = torch.randn(50, INPUTS, generator=torch.Generator().manual_seed(1))
-    for car in (some_car(), turned(some_car(), TURN.T)):
-        for normaliser in (car.posterior.normaliser.unturned().turned(TURN), car.posterior.normaliser.unturned()):
+    for car in (some_car(), decorrelated(some_car(), DECORRELATION.T)):
+        for normaliser in (
+            car.posterior.normaliser.without_decorrelation().decorrelated(DECORRELATION),
+            car.posterior.normaliser.without_decorrelation(),
+        ):
             parameters = car.posterior.parameters_for(normaliser)
             there = replace(car.posterior, parameters=parameters, normaliser=normaliser).predict(inputs)
             torch.testing.assert_close(there.means, car.predict(inputs).means, rtol=1e-4, atol=1e-5)
 
 
-def some_car(freedom: float = math.inf) -> CarDynamics:
+def some_car(dof: float = math.inf) -> CarDynamics:
     generator = torch.Generator().manual_seed(5)
     network = Network(INPUTS, 6, (8, 4), "silu")
     units = Normaliser(*(torch.rand(n, generator=generator) + 0.5 for n in (INPUTS, INPUTS, 6, 6)))
     noise = torch.rand(6, generator=generator)
-    return CarDynamics(Posterior(network, network.initial(3, generator), noise, units, freedom), HISTORY)
+    return CarDynamics(ParticlePosterior(network, network.initial(3, generator), noise, units, dof), HISTORY)
 
 
 def whole_car() -> CarDynamics:
-    """With all that a car has which was learned from many rows: a trend, turned and correlated errors, a reach."""
+    """A car as learned from many rows: with a trend, decorrelated and correlated errors, and an input clip."""
     generator = torch.Generator().manual_seed(8)
-    car = turned(some_car())
+    car = decorrelated(some_car())
     root = torch.eye(6) + 0.3 * torch.randn((6, 6), generator=generator)
     shape = root @ root.T
     scale = shape.diagonal().rsqrt()
     trend = 0.5 * torch.randn((1 + INPUTS, 6), generator=generator)
-    reach = 0.5 + torch.rand(INPUTS, generator=generator)
-    posterior = replace(car.posterior, trend=trend, correlation=scale[:, None] * shape * scale, reach=reach)
+    input_clip = 0.5 + torch.rand(INPUTS, generator=generator)
+    posterior = replace(car.posterior, trend=trend, correlation=scale[:, None] * shape * scale, input_clip=input_clip)
     return replace(car, posterior=posterior)
 
 
@@ -234,14 +237,14 @@ def test_draws_of_a_whole_car_have_the_moments_of_its_parts() -> None:
     posterior, units = car.posterior, car.posterior.normaliser
     assert posterior.trend is not None
     assert posterior.correlation is not None
-    assert posterior.reach is not None
+    assert posterior.input_clip is not None
     row = 3.0 * torch.randn((1, INPUTS), generator=torch.Generator().manual_seed(1))
     seen = (row - units.input_mean) / units.input_std
-    assert bool((seen.abs() > posterior.reach).any()), "some of it is beyond the reach"
-    seen = seen.clamp(-posterior.reach, posterior.reach)
+    assert bool((seen.abs() > posterior.input_clip).any()), "some of it is clipped"
+    seen = seen.clamp(-posterior.input_clip, posterior.input_clip)
     network = posterior.network(posterior.parameters, seen)[:, 0].double()
     line = (posterior.trend[0] + seen[0] @ posterior.trend[1:]).double()
-    back = units.output_std.double()[:, None] * torch.linalg.inv(TURN.double())
+    back = units.output_std.double()[:, None] * torch.linalg.inv(DECORRELATION.double())
     centres = units.output_mean.double() + (network + line) @ back.T
     noise = posterior.noise_std.double()
     own = back @ (noise[:, None] * posterior.correlation.double() * noise) @ back.T
@@ -254,11 +257,11 @@ def test_draws_of_a_whole_car_have_the_moments_of_its_parts() -> None:
     assert torch.allclose(predicted.mean[0].double(), centres.mean(dim=0), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("freedom", [math.inf, 2.5, None])
-def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float | None) -> None:
-    car = whole_car() if freedom is None else some_car(freedom)
-    if freedom == 2.5:
-        car = turned(car)
+@pytest.mark.parametrize("dof", [math.inf, 2.5, None])
+def test_a_car_from_its_file_predicts_alike(tmp_path: Path, dof: float | None) -> None:
+    car = whole_car() if dof is None else some_car(dof)
+    if dof == 2.5:
+        car = decorrelated(car)
     save_car(car, tmp_path / "car.pt")
     again = load_car(tmp_path / "car.pt")
     assert again.history == HISTORY
@@ -266,9 +269,9 @@ def test_a_car_from_its_file_predicts_alike(tmp_path: Path, freedom: float | Non
     ours, theirs = car.predict(inputs), again.predict(inputs)
     assert torch.equal(ours.means, theirs.means)
     assert torch.equal(ours.stds, theirs.stds)
-    assert (ours.turn is None) == (theirs.turn is None) == (freedom == math.inf)
-    assert ours.freedom == theirs.freedom == (math.inf if freedom is None else freedom)
-    densities = [negative_log_likelihood(told, torch.zeros(50, 6)) for told in (ours, theirs)]
+    assert (ours.decorrelation is None) == (theirs.decorrelation is None) == (dof == math.inf)
+    assert ours.dof == theirs.dof == (math.inf if dof is None else dof)
+    densities = [negative_log_likelihood(predicted, torch.zeros(50, 6)) for predicted in (ours, theirs)]
     assert densities[0] == densities[1]
     first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, again))
     assert torch.equal(first, second)
@@ -332,15 +335,15 @@ def test_a_file_that_is_no_learned_car_is_refused_with_what_to_do(tmp_path: Path
 def test_without_rows_the_learned_car_is_its_simulator() -> None:
     """Mean and spread of its particles against cars drawn from the ranges."""
     model = CarModel(SimulatorConfig(kind="kinematic"), 1, {"motor.drive_gain": (5.0, 12.0)})
-    told: list[int] = []
-    car = fit_car(None, model, CarFitSettings(steps=600, particles=12), progress=told.append)
+    steps_done: list[int] = []
+    car = fit_car(None, model, CarFitSettings(steps=600, particles=12), progress=steps_done.append)
     inputs = model.inputs(300, torch.Generator().manual_seed(9))
     gains = torch.linspace(5.0, 12.0, 101)[:, None]
     truth = model(inputs, gains)
     found = car.predict(inputs)
     away = (found.mean - truth.mean(dim=0)).square().mean(dim=0).sqrt()
     assert torch.all(away < 0.25 * truth.flatten(0, 1).std(dim=0))
-    assert told == [200, 400, 600]
+    assert steps_done == [200, 400, 600]
 
 
 def test_rows_with_another_history_are_refused(drive: tuple[EpisodeData, list[Transition]]) -> None:

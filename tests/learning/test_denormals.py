@@ -5,11 +5,11 @@ import torch
 
 from learning.devices import denormals_flushed
 
-TINY = torch.tensor([1e-39, 1.0])
+CHOLESKY_JITTER = torch.tensor([1e-39, 1.0])
 
 
 def counted() -> bool:
-    return bool((TINY * 1.0)[0])
+    return bool((CHOLESKY_JITTER * 1.0)[0])
 
 
 def test_they_are_zero_inside_and_nowhere_else() -> None:

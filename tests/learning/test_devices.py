@@ -19,26 +19,29 @@ from torch import Tensor
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import feature_size
 from carlab.core.task import ParkingTask, PathTask
-from carlab.experiment.regression_study import METHODS, Way, run_study
-from learning import system_identification
-from learning.authors_fsvgd import fit_authors_fsvgd
-from learning.car_dynamics import CarDynamics
-from learning.car_fit import CarFitSettings, fit_car, load_car, save_car
+from carlab.studies.regression.methods import METHODS, Way
+from carlab.studies.regression.study import run_study
+from learning.baselines import system_identification
+from learning.baselines.system_identification import grey_box, identify
 from learning.devices import settle
-from learning.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids, draw_parameters
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
-from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, Posterior, fit
-from learning.function_posterior import FunctionPosterior, infer
-from learning.function_prior import RbfCovariance
-from learning.model_env import ModelEnv
-from learning.normaliser import Normaliser
-from learning.parameter_posterior import posterior_parameters
-from learning.particles import Network
-from learning.sac_agent import SacAgent, SacSettings
-from learning.sim_fsvgd import ParticleSettings, fit_particles, measurement_points
-from learning.simulator_model import CarModel
-from learning.system_identification import grey_box, identify
-from learning.transitions import Transitions
+from learning.functional_svgd.authors_fsvgd import fit_authors_fsvgd
+from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.policy.sac_agent import SacAgent, SacSettings
+from learning.posterior.distillation import DistillationSettings, distil, measurement_points
+from learning.posterior.function_posterior import FunctionPosterior
+from learning.posterior.inference import infer
+from learning.posterior.parameter_posterior import posterior_parameters
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.priors.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids, draw_parameters
+from learning.priors.function_prior import RbfCovariance
+from learning.priors.simulator_model import CarModel
+from learning.world.car_dynamics import CarDynamics
+from learning.world.car_fit import CarFitSettings, fit_car, load_car, save_car
+from learning.world.model_env import ModelEnv
+from learning.world.transitions import Transitions
 from sim_backends.car_parameters import SimulatorConfig
 
 ROWS, HISTORY = 48, 1
@@ -53,12 +56,12 @@ RANGES = {"motor.drive_gain": (6.0, 10.0), "steering.max_angle": (0.3, 0.7)}
 @pytest.fixture(autouse=True)
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stand-in takes its time for an operation; nothing here is to be learned well."""
-    monkeypatch.setattr("learning.gap.STEPS", 10)
-    monkeypatch.setattr("learning.system_identification.STEPS", 10)
-    monkeypatch.setattr("learning.function_posterior.PRIOR_DRAWS", 64)
-    monkeypatch.setattr("learning.function_posterior.DRAWS", 16)
-    monkeypatch.setattr("learning.parameter_posterior.HOTTEST", 3)
-    monkeypatch.setattr("learning.parameter_posterior.MOVES", 2)
+    monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 10)
+    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 10)
+    monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
+    monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)
+    monkeypatch.setattr("learning.posterior.parameter_posterior.MAX_TEMPERING_STEPS", 3)
+    monkeypatch.setattr("learning.posterior.parameter_posterior.RANDOM_WALK_STEPS", 2)
 
 
 def close(found: Any, wanted: Any, tolerance: float = 1e-4) -> None:
@@ -139,7 +142,7 @@ def test_simulators(device: str, model: DomainModel) -> None:
 def test_what_data_and_simulator_say(device: str, model: DomainModel | None) -> None:
     at = TRUE.inputs(12, torch.Generator().manual_seed(3))
     there, here = everywhere(lambda at: inferred(model, at), device)
-    assert there.freedom == here.freedom < 10.0, "the branch of outliers was taken"
+    assert there.dof == here.dof < 10.0, "the branch of outliers was taken"
     close(there.noise_std, here.noise_std)
     for found, wanted in zip(there.predict(at.to(device)), here.predict(at), strict=True):
         close(found, wanted)
@@ -166,11 +169,11 @@ def test_draws_of_parameters(device: str) -> None:
 
 
 def test_particles(device: str) -> None:
-    def fitted(at: str) -> Posterior:
+    def fitted(at: str) -> ParticlePosterior:
         inputs = pendulum()[0].to(at)
         points = measurement_points(Pendulum(), inputs, PENDULUM_UNITS.to(at), torch.Generator().manual_seed(2), 256)
-        settings = ParticleSettings(particles=6, hidden=(16, 16), steps=40, sets=4)
-        return fit_particles(inferred(None, at), points, settings)
+        settings = DistillationSettings(particles=6, hidden=(16, 16), steps=40, sets=4)
+        return distil(inferred(None, at), points, settings)
 
     there, here = everywhere(fitted, device)
     close(there.parameters, here.parameters)
@@ -179,20 +182,20 @@ def test_particles(device: str) -> None:
 
 
 @pytest.mark.parametrize("natural", [True, False])
-@pytest.mark.parametrize("together", [True, False])
-def test_particles_as_the_authors_fit_them(device: str, natural: bool, together: bool) -> None:
+@pytest.mark.parametrize("interacting", [True, False])
+def test_particles_as_the_authors_fit_them(device: str, natural: bool, interacting: bool) -> None:
     inputs, outputs = pendulum()
     pool = TRUE.inputs(40, torch.Generator().manual_seed(4))
     settings = FsvgdSettings(
-        particles=4, hidden=(8,), steps=20, batch=16, measurement_points=8, natural=natural, together=together,
+        particles=4, hidden=(8,), steps=20, batch=16, measurement_points=8, natural=natural, interacting=interacting,
         noise_rows=2.0,
     )  # fmt: skip
 
-    def fitted(at: str) -> Posterior:
+    def fitted(at: str) -> ParticlePosterior:
         units = PENDULUM_UNITS.to(at)
         everything = units.inputs(torch.cat([inputs, pool]).to(at))
         prior = GaussianProcessPrior(everything, RbfCovariance((1.0,) * 3, (0.8,)))
-        return fit(inputs.to(at), outputs.to(at), pool.to(at), prior, units, settings)
+        return fit_fsvgd(inputs.to(at), outputs.to(at), pool.to(at), prior, units, settings)
 
     there, here = everywhere(fitted, device)
     close(there.parameters, here.parameters, 1e-3)
@@ -200,7 +203,7 @@ def test_particles_as_the_authors_fit_them(device: str, natural: bool, together:
 
 
 def test_identification(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("STEPS", "ROUND_STEPS"):
+    for name in ("STEPS", "REFINEMENT_STEPS"):
         monkeypatch.setattr(system_identification, name, 50)
     inputs, outputs = pendulum()
     pool = TRUE.inputs(40, torch.Generator().manual_seed(4))
@@ -266,7 +269,7 @@ def test_a_car_is_learned_as_the_authors_do(device: str) -> None:
     episode = EpisodeData(np.arange(41) / 30.0, states, sent, sent, np.zeros(40))
     there, here = everywhere(lambda at: fit_authors_fsvgd([episode], HISTORY, 30, device=at), device)
     close(there.posterior.parameters, here.posterior.parameters, 1e-3)
-    assert there.surprise(episode) == pytest.approx(here.surprise(episode), rel=1e-3)
+    assert there.score_episode(episode) == pytest.approx(here.score_episode(episode), rel=1e-3)
     unfitted = fit_authors_fsvgd([], HISTORY, device=device)
     assert unfitted.posterior.parameters.device.type == "cuda"
 
@@ -277,7 +280,7 @@ def learned(device: str) -> CarDynamics:
     network = Network(width, 6, (16,))
     units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(6), torch.full((6,), 0.05))
     numbers = network.initial(5, torch.Generator().manual_seed(6))
-    return CarDynamics(Posterior(network, numbers, torch.full((6,), 0.1), units, 3.0).to(device), HISTORY)
+    return CarDynamics(ParticlePosterior(network, numbers, torch.full((6,), 0.1), units, 3.0).to(device), HISTORY)
 
 
 TASKS = [ParkingTask(history_length=HISTORY, max_ticks=6), PathTask(history_length=HISTORY, max_ticks=6)]
@@ -309,14 +312,15 @@ def test_a_policy_is_trained_kept_and_trained_on(device: str, tmp_path: Path) ->
     agents = []
     for at in (device, "cpu"):
         agent = SacAgent(SMALL, 0, at)
-        agent.train(ModelEnv(learned(at), TASKS[0], SMALL.cars, device=at), 24, judge=lambda agent: 1.0, judged=2)
+        agent.train(
+            ModelEnv(learned(at), TASKS[0], SMALL.cars, device=at), 24, evaluate=lambda agent: 1.0, n_evaluations=2
+        )
         agents.append(agent)
     seen = np.random.default_rng(2).normal(size=(50, feature_size(HISTORY))).astype(np.float32)
     there, here = (agent.act(seen) for agent in agents)
     if not torch.cuda.is_available():  # A real one draws its exploration from a generator of its own.
         np.testing.assert_allclose(there, here, atol=1e-3)
     agents[0].save(tmp_path)
-    assert isinstance(torch.load(tmp_path / "moments.pt", weights_only=True)["actor"]["mean"], Tensor)
     again = SacAgent.load(tmp_path, SMALL, 0, device)
     assert again.policy().sac.device.type == "cpu", "what drives a car does so on the CPU"
     np.testing.assert_allclose(again.act(seen), there, atol=1e-6)
@@ -333,10 +337,7 @@ def test_a_gradient_step_is_that_of_the_cpu(device: str) -> None:
         agent.train(ModelEnv(learned(at), TASKS[0], SMALL.cars, device=at), 0)
         agents.append(agent.policy().sac)
     there, here = agents
-    there.policy.load_state_dict(here.policy.state_dict())
-    there.load_optimiser_state(here.optimiser_state())
-    with torch.no_grad():
-        there.log_ent_coef.copy_(here.log_ent_coef)
+    there.load_learned_state(here.learned_state())
     there.replay_buffer = copy.copy(here.replay_buffer)
     there.replay_buffer.device = there.device
     for agent in agents:
@@ -350,7 +351,7 @@ def test_a_gradient_step_is_that_of_the_cpu(device: str) -> None:
 
 @pytest.mark.parametrize("way", ["ours", "authors"])
 def test_a_regression_study(device: str, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("STEPS", "ROUND_STEPS"):
+    for name in ("STEPS", "REFINEMENT_STEPS"):
         monkeypatch.setattr(system_identification, name, 20)
     there = None
     for there, here in zip(

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from learning.domain_models import KinematicCar, Pendulum, Sinusoids, draw_parameters
+from learning.priors.domain_models import KinematicCar, Pendulum, Sinusoids, draw_parameters
 
 
 def generator(seed=0):
@@ -29,7 +29,9 @@ def test_shapes_and_draws_of_their_own(model, inputs, outputs):
 
 
 def test_a_pendulum_follows_its_equation_in_small_steps():
-    model = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6), dissipative=True, rate_gap=(0.8, 0.3, 0.3), substeps=2000)
+    model = Pendulum(
+        frictions=(0.4, 0.6), drags=(0.4, 0.6), dissipative=True, rate_discrepancy=(0.8, 0.3, 0.3), substeps=2000
+    )
     x, parameters = model.inputs(3, generator()).double(), draw_parameters(model, 2, generator(1)).double()
     ours = model(x, parameters)
     for k in range(2):
@@ -75,25 +77,25 @@ def test_a_rolling_car_drives_the_circle_of_its_wheels():
     for k in range(6):
         row = torch.tensor([[0, 0, 0, 1, speed[k], across[k], rate[k], steering, throttle]], dtype=torch.float64)
         change = model(row, parameters[k : k + 1])[0, 0]
-        turned = float(rate[k]) / 30.0
+        rotated = float(rate[k]) / 30.0
         radius = math.hypot(float(speed[k]), float(across[k])) / float(rate[k])
-        chord = 2 * radius * math.sin(turned / 2)
+        chord = 2 * radius * math.sin(rotated / 2)
         assert math.hypot(float(change[0]), float(change[1])) == pytest.approx(chord, rel=1e-4)
-        assert math.atan2(float(change[2]), 1.0 + float(change[3])) == pytest.approx(turned, rel=1e-6)
+        assert math.atan2(float(change[2]), 1.0 + float(change[3])) == pytest.approx(rotated, rel=1e-6)
         assert float(change[6]) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_turning_the_world_turns_the_car_with_it():
-    model, turn = KinematicCar(), 0.9
+    model, angle = KinematicCar(), 0.9
     x = model.inputs(7, generator()).double()
     parameters = draw_parameters(model, 3, generator(1)).double()
-    c, s = math.cos(turn), math.sin(turn)
+    c, s = math.cos(angle), math.sin(angle)
 
-    def turned(rows):
+    def rotated(rows):
         px, py, sin, cos, vx, vy, *rest = rows.unbind(-1)
         place, velocity = (c * px - s * py, s * px + c * py), (c * vx - s * vy, s * vx + c * vy)
         return torch.stack([*place, sin * c + cos * s, cos * c - sin * s, *velocity, *rest], dim=-1)
 
-    ours = turned(torch.cat([model(x, parameters), torch.zeros(3, 7, 2)], dim=-1))
-    theirs = model(turned(x), parameters)
+    ours = rotated(torch.cat([model(x, parameters), torch.zeros(3, 7, 2)], dim=-1))
+    theirs = model(rotated(x), parameters)
     assert torch.allclose(ours[..., :7], theirs, atol=1e-12)

@@ -41,42 +41,42 @@ def test_the_spread_is_that_of_draws_from_it():
     assert np.allclose(prediction.std, draws.std(axis=0), rtol=0.01)
 
 
-class TestTurnedErrors:
+class TestDecorrelatedErrors:
     """Errors of an output that follow another's."""
 
-    TURN = np.array([[1.7, 0.0, -0.2], [0.3, 1.0, 0.0], [0.0, 0.0, 2.0]])
+    DECORRELATION = np.array([[1.7, 0.0, -0.2], [0.3, 1.0, 0.0], [0.0, 0.0, 2.0]])
     STDS = np.array([0.5, 1.0, 2.0])
-    BACK = np.linalg.inv(TURN)
+    BACK = np.linalg.inv(DECORRELATION)
     SHAPE = BACK @ np.diag(STDS**2) @ BACK.T
 
-    def mixture(self, freedom=math.inf):
-        return Mixture(random(4, 6, 3), torch.tensor(self.STDS)[None, None], freedom, torch.tensor(self.TURN))
+    def mixture(self, dof=math.inf):
+        return Mixture(random(4, 6, 3), torch.tensor(self.STDS)[None, None], dof, torch.tensor(self.DECORRELATION))
 
-    @pytest.mark.parametrize("freedom", [3.5, math.inf])
-    def test_the_joint_density_is_scipys(self, freedom):
-        mixture, targets = self.mixture(freedom), 2.0 * random(6, 3, seed=1)
-        one = multivariate_normal if math.isinf(freedom) else partial(multivariate_t, df=freedom)
+    @pytest.mark.parametrize("dof", [3.5, math.inf])
+    def test_the_joint_density_is_scipys(self, dof):
+        mixture, targets = self.mixture(dof), 2.0 * random(6, 3, seed=1)
+        one = multivariate_normal if math.isinf(dof) else partial(multivariate_t, df=dof)
         each = [[one(m, self.SHAPE).pdf(y) for m, y in zip(k, targets.numpy(), strict=True)] for k in mixture.means]
         assert np.allclose(mixture.log_density(targets), np.log(np.mean(each, axis=0)), atol=1e-12)
 
     def test_each_output_has_the_spread_that_it_has_alone(self):
-        assert np.allclose(self.mixture().own_stds, np.sqrt(np.diag(self.SHAPE)))
+        assert np.allclose(self.mixture().marginal_scales, np.sqrt(np.diag(self.SHAPE)))
         assert np.allclose(self.mixture().aleatoric_std, np.sqrt(np.diag(self.SHAPE)))
 
     def test_its_calibration_is_that_of_draws(self):
         draws = np.random.default_rng(5).multivariate_normal(np.zeros(3), self.SHAPE, 40_000)
         flat = Mixture(torch.zeros(1, 40_000, 3).double(), *self.mixture().stds.expand(1, 1, 1, 3), math.inf)
-        flat = replace(flat, turn=torch.tensor(self.TURN))
+        flat = replace(flat, decorrelation=torch.tensor(self.DECORRELATION))
         assert calibration_error(flat, torch.tensor(draws)) < 0.005
-        assert calibration_error(replace(flat, turn=None), torch.tensor(draws)) > 0.05
+        assert calibration_error(replace(flat, decorrelation=None), torch.tensor(draws)) > 0.05
 
     def test_smoothed_it_has_the_same_covariance(self):
         sharp = self.mixture()
         for mixture in (sharp, sharp.smoothed(0.6), sharp.gaussians()):
-            turned = mixture.means.numpy() @ self.TURN.T
-            # Of the turned errors, whose components are independent of each other.
-            variance = turned.var(axis=0) + (mixture.stds.numpy() ** 2).mean(axis=0)
-            exact = (sharp.means.numpy() @ self.TURN.T).var(axis=0) + self.STDS**2
+            decorrelated = mixture.means.numpy() @ self.DECORRELATION.T
+            # Of the decorrelated errors, whose components are independent of each other.
+            variance = decorrelated.var(axis=0) + (mixture.stds.numpy() ** 2).mean(axis=0)
+            exact = (sharp.means.numpy() @ self.DECORRELATION.T).var(axis=0) + self.STDS**2
             assert np.allclose(variance, exact)
             assert np.allclose(mixture.mean, sharp.mean)
 
@@ -103,9 +103,9 @@ def test_components_of_student_noise_have_one_scale_for_all_outputs():
     assert np.allclose(found, np.log(np.mean(each, axis=0)), atol=1e-12)
 
 
-@pytest.mark.parametrize(("freedom", "factor"), [(2.5, 5.0), (4.0, 2.0), (np.inf, 1.0), (2.0, np.inf), (1.5, np.inf)])
-def test_the_noise_of_heavy_tails_deviates_by_more_than_its_scale(freedom, factor):
-    mixture = Mixture(torch.tensor([[[1.0]], [[3.0]]]), torch.tensor([[[0.5]]]), freedom)
+@pytest.mark.parametrize(("dof", "factor"), [(2.5, 5.0), (4.0, 2.0), (np.inf, 1.0), (2.0, np.inf), (1.5, np.inf)])
+def test_the_noise_of_heavy_tails_deviates_by_more_than_its_scale(dof, factor):
+    mixture = Mixture(torch.tensor([[[1.0]], [[3.0]]]), torch.tensor([[[0.5]]]), dof)
     assert float(mixture.aleatoric_std) == pytest.approx(0.5 * np.sqrt(factor))
     assert float(mixture.std) == pytest.approx(np.sqrt(1.0 + 0.25 * factor))
 
@@ -116,7 +116,7 @@ def test_as_gaussians_a_student_mixture_is_nearly_itself():
     exact = [student(4.0, m, s).pdf(at[:, 0].numpy()) for m, s in ((-1.0, 0.5), (2.0, 1.5))]
     found = mixture.gaussians(200)
     assert found.means.shape == (400, 9, 1)
-    assert math.isinf(found.freedom)
+    assert math.isinf(found.dof)
     assert np.allclose(found.log_density(at), np.log(np.mean(exact, axis=0)), atol=0.05)
     sharp = Mixture(random(4, 5, 3), random(4, 1, 3, seed=1).exp())
     assert sharp.gaussians() is sharp
@@ -152,14 +152,12 @@ def test_with_heavy_tails_spread_and_noise_are_one_student_distribution():
     assert np.allclose(found.log_density(torch.from_numpy(at)[:, None]), theirs, atol=1e-6)
 
 
-@pytest.mark.parametrize("freedom", [2.5, 20.0])
-def test_calibration_of_heavy_tails_is_by_their_own_quantiles(freedom):
-    draws = torch.tensor(student(freedom).rvs((50_000, 2), random_state=2) * [0.5, 2.0])
+@pytest.mark.parametrize("dof", [2.5, 20.0])
+def test_calibration_of_heavy_tails_is_by_their_own_quantiles(dof):
+    draws = torch.tensor(student(dof).rvs((50_000, 2), random_state=2) * [0.5, 2.0])
     stds = torch.tensor([[[0.5, 2.0]]]).double()
-    assert calibration_error(Mixture(torch.zeros(1, 50_000, 2).double(), stds, freedom), draws) < 0.003
-    assert calibration_error(Mixture(torch.zeros(1, 50_000, 2).double(), stds), draws) > (
-        0.04 if freedom < 3.0 else 0.004
-    )
+    assert calibration_error(Mixture(torch.zeros(1, 50_000, 2).double(), stds, dof), draws) < 0.003
+    assert calibration_error(Mixture(torch.zeros(1, 50_000, 2).double(), stds), draws) > (0.04 if dof < 3.0 else 0.004)
 
 
 def test_calibration_is_by_the_mixtures_own_quantiles():

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from carlab.core.errors import DataError
-from learning.ensemble import deep_ensemble
+from learning.baselines.ensemble import deep_ensemble
 from learning.evaluation import calibration_error, negative_log_likelihood
-from learning.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit
-from learning.function_prior import RbfCovariance
-from learning.normaliser import Normaliser
+from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit_fsvgd
+from learning.networks.normaliser import Normaliser
+from learning.priors.function_prior import RbfCovariance
 
 UNIT = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
 EMPTY = torch.zeros(0, 1)
@@ -29,8 +29,8 @@ def lines(x, count=400, seed=0):
 def test_fitted_to_a_simulator_alone_it_predicts_like_its_draws():
     pool = torch.linspace(-2, 2, 64)[:, None]
     prior = SimulatorPrior(lines(pool), pool)
-    settings = FsvgdSettings(steps=1500, hidden=(32, 32), learn_noise=False, noise_std=0.05)
-    prediction = fit(EMPTY, EMPTY, pool, prior, UNIT, settings).predict(pool)
+    settings = FsvgdSettings(steps=1500, hidden=(32, 32), fit_noise=False, noise_std=0.05)
+    prediction = fit_fsvgd(EMPTY, EMPTY, pool, prior, UNIT, settings).predict(pool)
     assert torch.allclose(prediction.mean[:, 0], pool[:, 0], atol=0.25)
     exact = (0.25 * pool[:, 0] ** 2 + 0.09).sqrt()
     assert torch.allclose(prediction.epistemic_std[:, 0], exact, rtol=0.4, atol=0.05)
@@ -42,8 +42,8 @@ def test_with_data_it_comes_near_the_conjugate_posterior():
     x, y = torch.tensor([[-1.0], [0.5]]), torch.tensor([[-1.6], [0.9]])
     noise = 0.2
     prior = SimulatorPrior(lines(torch.cat([x, pool]), 4000), torch.cat([x, pool]))
-    settings = FsvgdSettings(steps=3000, hidden=(32, 32), learn_noise=False, noise_std=noise)
-    prediction = fit(x, y, pool, prior, UNIT, settings).predict(pool)
+    settings = FsvgdSettings(steps=3000, hidden=(32, 32), fit_noise=False, noise_std=noise)
+    prediction = fit_fsvgd(x, y, pool, prior, UNIT, settings).predict(pool)
     features = torch.cat([x, torch.ones_like(x)], dim=1)
     precision = torch.diag(torch.tensor([4.0, 1 / 0.09])) + features.T @ features / noise**2
     mean = torch.linalg.solve(precision, torch.tensor([[4.0], [0.0]]) + features.T @ y / noise**2)
@@ -63,12 +63,12 @@ def test_one_particle_finds_the_most_probable_function():
         particles=1,
         steps=4000,
         measurement_points=0,
-        learn_noise=False,
+        fit_noise=False,
         noise_std=0.3,
         weight_decay=0.0,
         hidden=(64, 64),
     )
-    found = fit(x, y, x, prior, UNIT, settings).predict(x).mean
+    found = fit_fsvgd(x, y, x, prior, UNIT, settings).predict(x).mean
     kernel = covariance(x)[0] + 1e-2 * torch.eye(9)
     ridge = kernel @ torch.linalg.solve(kernel + 0.3**2 * torch.eye(9), y)
     assert torch.allclose(found, ridge, atol=0.02)
@@ -78,7 +78,9 @@ def test_the_noise_of_the_data_is_found():
     x = 2.0 * torch.rand(400, 1, generator=generator()) - 1.0
     y = 0.5 * x + 0.15 * torch.randn(400, 1, generator=generator(1))
     settings = FsvgdSettings(steps=1500, hidden=(16,), noise_std=0.6, particles=5)
-    posterior = fit(x, y, x, GaussianProcessPrior(torch.cat([x, x]), RbfCovariance((1.0,), (0.8,))), UNIT, settings)
+    posterior = fit_fsvgd(
+        x, y, x, GaussianProcessPrior(torch.cat([x, x]), RbfCovariance((1.0,), (0.8,))), UNIT, settings
+    )
     assert float(posterior.noise_std) == pytest.approx(0.15, rel=0.1)
     assert negative_log_likelihood(posterior.predict(x), y) < -0.4
 
@@ -95,7 +97,7 @@ def test_members_of_an_ensemble_do_not_feel_each_other():
     """The first member of three is what it is alone; Adam makes its step free of the number of members."""
     x = torch.linspace(-1, 1, 20)[:, None]
     y = torch.sin(3 * x)
-    settings = FsvgdSettings(particles=3, steps=300, hidden=(8,), learn_noise=False)
+    settings = FsvgdSettings(particles=3, steps=300, hidden=(8,), fit_noise=False)
     found = deep_ensemble(x, y, UNIT, settings).networks  # Three are too few to leave rows out.
     three, network = found.parameters, found.network
     start = network.initial(3, generator(), "cpu")
@@ -114,7 +116,7 @@ def test_each_member_of_an_ensemble_leaves_out_another_fifth():
     """A row that is changed changes all members but a fifth, and these by nothing."""
     x = torch.linspace(-1, 1, 20)[:, None]
     y = torch.sin(3 * x)
-    settings = FsvgdSettings(particles=10, steps=30, hidden=(8,), learn_noise=False)
+    settings = FsvgdSettings(particles=10, steps=30, hidden=(8,), fit_noise=False)
     before = deep_ensemble(x, y, UNIT, settings).networks.parameters
     blind = torch.zeros(10)
     for row in range(20):
@@ -146,7 +148,7 @@ def test_noise_of_an_ensemble_is_that_of_rows_that_were_not_seen():
 def test_the_same_seed_gives_the_same_model():
     pool = torch.linspace(-2, 2, 16)[:, None]
     settings = FsvgdSettings(steps=50, hidden=(8,))
-    first, second = (fit(EMPTY, EMPTY, pool, SimulatorPrior(lines(pool), pool), UNIT, settings) for _ in range(2))
+    first, second = (fit_fsvgd(EMPTY, EMPTY, pool, SimulatorPrior(lines(pool), pool), UNIT, settings) for _ in range(2))
     assert torch.equal(first.parameters, second.parameters)
 
 
@@ -160,7 +162,7 @@ def test_the_same_seed_gives_the_same_model():
 )
 def test_what_cannot_be_fitted_is_said(inputs, outputs, prior, said):
     with pytest.raises(DataError, match=said):
-        fit(inputs, outputs, torch.ones(4, 1), prior, UNIT, FsvgdSettings(steps=1))
+        fit_fsvgd(inputs, outputs, torch.ones(4, 1), prior, UNIT, FsvgdSettings(steps=1))
 
 
 def test_an_ensemble_refuses_rows_that_are_not_whole():

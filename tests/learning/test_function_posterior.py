@@ -11,40 +11,48 @@ from linear_simulator import EMPTY, NOISE, UNITS, Linear, features, rows, tensor
 from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student
 
-from learning import function_posterior
 from learning.evaluation import negative_log_likelihood
-from learning.function_posterior import DRAWS, infer
-from learning.gap import EXPECTED_GAP, MIDDLE_LENGTH, TINY
+from learning.posterior import inference
+from learning.posterior.discrepancy import CHOLESKY_JITTER, PRIOR_DISCREPANCY_STD, PRIOR_LENGTHSCALE
+from learning.posterior.inference import PARAMETER_DRAWS, infer
 
 
-def said(parameters, x):
+def simulated_mean(parameters, x):
     """Normalised outputs of the simulator with the mean of some parameters (O, N)."""
     raw = features(x) @ parameters.double().numpy().mean(axis=0)
     return (raw - UNITS.output_mean.numpy()[:, None]) / UNITS.output_std.numpy()[:, None]
 
 
-def kernel(gap, first, second, parameters=None):
-    """The gap's covariance at raw inputs, of raw outputs (O, N, M); with draws of the parameters of a simulator."""
+def kernel(discrepancy, first, second, parameters=None):
+    """The discrepancy's covariance at raw inputs, of raw outputs (O, N, M); with draws of a simulator's parameters."""
     a, b = ((np.asarray(v, dtype=float) - UNITS.input_mean.numpy()) / UNITS.input_std.numpy() for v in (first, second))
     found = []
     for k, unit in enumerate(UNITS.output_std.double().numpy()):
-        s, length, w, c = (v[k].double().numpy() for v in (gap.scales, gap.lengths, gap.slopes, gap.offsets))
+        s, length, w, c = (
+            v[k].double().numpy()
+            for v in (discrepancy.scales, discrepancy.lengthscales, discrepancy.slopes, discrepancy.offsets)
+        )
         distance = (((a[:, None] - b[None]) / length) ** 2).sum(axis=2)
         own = s**2 * np.exp(-0.5 * distance) + (w * a) @ (w * b).T + c**2
         if parameters is not None:
-            d, long = (v[k].double().numpy() for v in (gap.doubts, gap.doubt_lengths))
+            d, long = (
+                v[k].double().numpy() for v in (discrepancy.multiplier_stds, discrepancy.multiplier_lengthscales)
+            )
             near = np.exp(-0.5 * (((a[:, None] - b[None]) / long) ** 2).sum(axis=2))
-            own = own + d**2 * said(parameters, first)[k][:, None] * said(parameters, second)[k] * near
+            own = (
+                own
+                + d**2 * simulated_mean(parameters, first)[k][:, None] * simulated_mean(parameters, second)[k] * near
+            )
         found.append(unit**2 * own)
     return np.stack(found)
 
 
-def apart(x, y, at, gap, noise):
-    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of the gap alone, output by output."""
+def apart(x, y, at, discrepancy, noise):
+    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of the discrepancy alone, output by output."""
     means, covariances = [], []
-    between, within, own = kernel(gap, x, at), kernel(gap, x, x), kernel(gap, at, at)
+    between, within, own = kernel(discrepancy, x, at), kernel(discrepancy, x, x), kernel(discrepancy, at, at)
     for k, (middle, unit) in enumerate(zip(UNITS.output_mean.numpy(), UNITS.output_std.double().numpy(), strict=True)):
-        seen = within[k] + (noise[k] ** 2 + TINY * unit**2) * np.eye(len(x))
+        seen = within[k] + (noise[k] ** 2 + CHOLESKY_JITTER * unit**2) * np.eye(len(x))
         gain = np.linalg.solve(seen, between[k]).T
         means.append(middle + gain @ (np.asarray(y, dtype=float)[:, k] - middle))
         covariances.append(own[k] - gain @ between[k])
@@ -56,8 +64,8 @@ def raw_noise(posterior):
     return (posterior.noise_std * UNITS.output_std).double().numpy()
 
 
-def together(x, y, at, gap, noise, parameters=None):
-    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of simulator and gap, in numpy.
+def together(x, y, at, discrepancy, noise, parameters=None):
+    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of simulator and discrepancy, in numpy.
 
     Outputs share the simulator's parameters, so that all rows of all outputs are conditioned on at once.
     """
@@ -66,13 +74,13 @@ def together(x, y, at, gap, noise, parameters=None):
     def joint(first, second):
         """Covariances (2 N, 2 M), output by output."""
         a, b = (np.concatenate(features(v)) for v in (first, second))
-        of_gap = np.zeros((len(a), len(b)))
-        if gap is not None:
-            for k, block in enumerate(kernel(gap, first, second, parameters)):
-                of_gap[k * len(first) : (k + 1) * len(first), k * len(second) : (k + 1) * len(second)] = block
-        return a @ b.T + of_gap
+        of_discrepancy = np.zeros((len(a), len(b)))
+        if discrepancy is not None:
+            for k, block in enumerate(kernel(discrepancy, first, second, parameters)):
+                of_discrepancy[k * len(first) : (k + 1) * len(first), k * len(second) : (k + 1) * len(second)] = block
+        return a @ b.T + of_discrepancy
 
-    seen = joint(x, x) + np.diag(np.repeat(noise**2 + TINY * units**2, n))
+    seen = joint(x, x) + np.diag(np.repeat(noise**2 + CHOLESKY_JITTER * units**2, n))
     gain = np.linalg.solve(seen, joint(x, at)).T
     mean = (gain @ np.asarray(y, dtype=float).T.ravel()).reshape(2, m)
     covariance = joint(at, at) - gain @ joint(x, at)
@@ -94,7 +102,7 @@ class TestWithoutSimulator:
     def test_predictions_are_the_gaussian_processs(self, found):
         at, _ = rows(1500, seed=1)
         mean, std = found.predict(at)
-        theirs, exact, _ = apart(self.x, self.y, at, found.gap, raw_noise(found))
+        theirs, exact, _ = apart(self.x, self.y, at, found.discrepancy, raw_noise(found))
         assert np.allclose(mean, theirs, atol=2e-5)
         assert np.allclose(std, exact, rtol=1e-5)
 
@@ -103,7 +111,7 @@ class TestWithoutSimulator:
         means, covariances = found.marginals(at.view(7, 5, 2))
         units = UNITS.output_std.numpy()
         for k in range(7):
-            mean, _, exact = apart(self.x, self.y, at[5 * k : 5 * k + 5], found.gap, raw_noise(found))
+            mean, _, exact = apart(self.x, self.y, at[5 * k : 5 * k + 5], found.discrepancy, raw_noise(found))
             assert np.allclose(means[k].numpy().T * units + UNITS.output_mean.numpy(), mean, atol=2e-5)
             assert np.allclose(covariances[k], exact / units[:, None, None] ** 2, atol=2e-5)
 
@@ -120,7 +128,7 @@ def over_seeds(x, y, at, count, **settings):
     for seed in range(count):
         found = infer(Linear(), x, y, UNITS, NOISE, seed=seed, **settings)
         mean, std = found.predict(at)
-        theirs, exact, _ = together(x, y, at, found.gap, raw_noise(found), found.parameters)
+        theirs, exact, _ = together(x, y, at, found.discrepancy, raw_noise(found), found.parameters)
         own, wanted = (v**2 - raw_noise(found) ** 2 for v in (std.double().numpy(), exact))
         off.append((mean.numpy() - theirs) / np.sqrt(wanted))
         ratios.append(own / wanted)
@@ -131,15 +139,16 @@ class TestWithSimulator:
     at, _ = rows(40, seed=1)
 
     @pytest.mark.parametrize(
-        "settings", [{}, {"gap_std": torch.tensor([0.1, 0.03])}, {"with_gap": False, "noise_known": True}]
+        "settings",
+        [{}, {"discrepancy_std": torch.tensor([0.1, 0.03])}, {"with_discrepancy": False, "noise_known": True}],
     )
-    def test_it_is_the_gaussian_process_of_simulator_and_gap(self, settings):
+    def test_it_is_the_gaussian_process_of_simulator_and_discrepancy(self, settings):
         """Within the error of 128 draws of the parameters, and closer on the average of six seeds."""
         off, ratios = over_seeds(*rows(12), self.at, 6, **settings)
-        assert np.abs(off).max() < 4.0 / math.sqrt(DRAWS)
-        assert np.abs(ratios - 1.0).max() < 4.5 * math.sqrt(2.0 / DRAWS)
-        assert np.abs(off.mean(axis=0)).max() < 2.0 / math.sqrt(DRAWS)
-        assert np.abs(ratios.mean(axis=0) - 1.0).max() < 2.0 * math.sqrt(2.0 / DRAWS)
+        assert np.abs(off).max() < 4.0 / math.sqrt(PARAMETER_DRAWS)
+        assert np.abs(ratios - 1.0).max() < 4.5 * math.sqrt(2.0 / PARAMETER_DRAWS)
+        assert np.abs(off.mean(axis=0)).max() < 2.0 / math.sqrt(PARAMETER_DRAWS)
+        assert np.abs(ratios.mean(axis=0) - 1.0).max() < 2.0 * math.sqrt(2.0 / PARAMETER_DRAWS)
 
     def test_marginals_are_those_of_the_same_process(self):
         x, y = rows(12)
@@ -147,18 +156,20 @@ class TestWithSimulator:
         means, covariances = found.marginals(self.at[:20].view(4, 5, 2))
         units = UNITS.output_std.numpy()
         for k in range(4):
-            mean, _, exact = together(x, y, self.at[5 * k : 5 * k + 5], found.gap, raw_noise(found), found.parameters)
+            mean, _, exact = together(
+                x, y, self.at[5 * k : 5 * k + 5], found.discrepancy, raw_noise(found), found.parameters
+            )
             exact = exact / units[:, None, None] ** 2
             std = np.sqrt(exact.diagonal(axis1=1, axis2=2))
             assert (np.abs(means[k].numpy().T * units + UNITS.output_mean.numpy() - mean) / units < 0.35 * std.T).all()
             scaled = (covariances[k].numpy() - exact) / (std[:, :, None] * std[:, None, :])
             assert np.abs(scaled).max() < 0.5
 
-    def test_without_a_gap_noise_that_is_known_is_the_expected_one(self):
-        found = infer(Linear(), *rows(12), UNITS, NOISE, with_gap=False, noise_known=True)
-        assert found.gap is None
+    def test_known_noise_without_discrepancy_stays(self):
+        found = infer(Linear(), *rows(12), UNITS, NOISE, with_discrepancy=False, noise_known=True)
+        assert found.discrepancy is None
         assert np.allclose(raw_noise(found), NOISE)
-        assert math.isinf(found.freedom)
+        assert math.isinf(found.dof)
 
     def test_without_a_gap_what_no_parameters_explain_is_noise(self):
         """Least squares' own estimate of it, on rows with waves that the simulator cannot make, and on rows without."""
@@ -166,7 +177,7 @@ class TestWithSimulator:
         (right,) = tensors((features(x) @ np.array([0.8, -1.1, 0.4])).T)
         right += NOISE * torch.randn(right.shape, generator=torch.Generator().manual_seed(1))
         for y in (right, wrong):
-            found = infer(Linear(), x, y, UNITS, NOISE, with_gap=False)
+            found = infer(Linear(), x, y, UNITS, NOISE, with_discrepancy=False)
             a, b = features(x).reshape(-1, 3), y.double().numpy().T.reshape(-1)
             left = (b - a @ np.linalg.lstsq(a, b, rcond=None)[0]).reshape(2, -1)
             theirs = np.sqrt((left**2).sum(axis=1) / (30 - 1.5))
@@ -179,7 +190,7 @@ class TestWithSimulator:
         shape = features(x)
         y = (shape @ np.array([0.8, -1.1, 0.4])).T + NOISE.numpy() * rng.normal(size=(700, 2))
         parameters = [
-            infer(Linear(), x, *tensors(y), UNITS, NOISE, with_gap=False, noise_known=True, seed=s).parameters
+            infer(Linear(), x, *tensors(y), UNITS, NOISE, with_discrepancy=False, noise_known=True, seed=s).parameters
             for s in range(3)
         ]
         scaled = np.concatenate([shape[k] / NOISE.double().numpy()[k] for k in range(2)])
@@ -195,38 +206,38 @@ class TestWithSimulator:
         x, wrong = rows(100)
         (right,) = tensors((features(x) @ np.array([0.8, -1.1, 0.4])).T)
         right += NOISE * torch.randn(right.shape, generator=torch.Generator().manual_seed(1))
-        small, large = (infer(Linear(), x, y, UNITS, NOISE).gap.scales for y in (right, wrong))
+        small, large = (infer(Linear(), x, y, UNITS, NOISE).discrepancy.scales for y in (right, wrong))
         assert (small < 0.7 * large).all()
-        assert (small < EXPECTED_GAP).all()
+        assert (small < PRIOR_DISCREPANCY_STD).all()
 
 
 class TestWithoutRows:
     at, _ = rows(10, seed=1)
 
     @pytest.mark.parametrize("expected", [None, torch.tensor([0.3, 0.7])])
-    def test_it_is_the_simulators_draws_and_the_expected_gap(self, expected):
-        found = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, gap_std=expected)
+    def test_it_is_the_simulators_draws_and_the_prior_discrepancy(self, expected):
+        found = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, discrepancy_std=expected)
         means, covariances = found.marginals(self.at.view(2, 5, 2))
-        assert found.parameters.shape == (DRAWS, 3)
+        assert found.parameters.shape == (PARAMETER_DRAWS, 3)
         drawn = np.einsum("onk,pk->pon", features(self.at), found.parameters.double().numpy())
         drawn = (drawn - UNITS.output_mean.numpy()[:, None]) / UNITS.output_std.numpy()[:, None]
-        size = [EXPECTED_GAP] * 2 if expected is None else (expected / UNITS.output_std).tolist()
+        size = [PRIOR_DISCREPANCY_STD] * 2 if expected is None else (expected / UNITS.output_std).tolist()
         x = (self.at.double().numpy() - UNITS.input_mean.numpy()) / UNITS.input_std.numpy()
         distance = ((x[:, None] - x[None]) ** 2).sum(axis=2)
         for k in range(2):
-            near, own = np.exp(-0.5 * distance / MIDDLE_LENGTH**2), drawn[:, k].mean(axis=0)
-            of_gap = size[k] ** 2 * (near + x @ x.T / 2 + 1.0 + own[:, None] * own * near)
-            exact = np.cov(drawn[:, k].T, bias=True) + of_gap
+            near, own = np.exp(-0.5 * distance / PRIOR_LENGTHSCALE**2), drawn[:, k].mean(axis=0)
+            of_discrepancy = size[k] ** 2 * (near + x @ x.T / 2 + 1.0 + own[:, None] * own * near)
+            exact = np.cov(drawn[:, k].T, bias=True) + of_discrepancy
             assert np.allclose(means[:, k].flatten(), drawn[:, k].mean(axis=0), atol=1e-5)
             for b in range(2):
                 some = slice(5 * b, 5 * b + 5)
                 assert np.allclose(covariances[b, k], exact[some, some], atol=1e-4)
 
     def test_draws_of_the_parameters_are_the_priors(self):
-        mean, std = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, with_gap=False).predict(self.at)
+        mean, std = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, with_discrepancy=False).predict(self.at)
         exact = np.sqrt((features(self.at) ** 2).sum(axis=2).T + NOISE.numpy() ** 2)
-        assert np.abs(mean.numpy() / exact).max() < 4.0 / math.sqrt(DRAWS)
-        assert np.allclose(std, exact, rtol=4.0 / math.sqrt(2.0 * DRAWS))
+        assert np.abs(mean.numpy() / exact).max() < 4.0 / math.sqrt(PARAMETER_DRAWS)
+        assert np.allclose(std, exact, rtol=4.0 / math.sqrt(2.0 * PARAMETER_DRAWS))
 
 
 class TestOutliers:
@@ -251,15 +262,15 @@ class TestOutliers:
         found, clean = (infer(model, self.x, v, UNITS, self.noise) for v in (y, self.y))
         ours = self.error(found.predict(self.at)[0])
         assert (ours < self.error(clean.predict(self.at)[0]) + 0.2 * self.noise.numpy()).all()
-        assert found.freedom < 10.0
+        assert found.dof < 10.0
         assert np.allclose(raw_noise(found), self.noise, rtol=0.5)
         ordinary = together if model else apart
-        theirs = ordinary(self.x, y, self.at, found.gap, raw_noise(found))[0]
+        theirs = ordinary(self.x, y, self.at, found.discrepancy, raw_noise(found))[0]
         assert (self.error(theirs) > 3.0 * ours).all()
 
-    def test_of_few_rows_they_are_told_no_more_than_of_clean_ones(self):
+    def test_few_rows_keep_gaussian_weights_with_outliers(self):
         found, clean = (infer(None, self.x[:39], v[:39], UNITS, self.noise) for v in (self.spoilt(3.0), self.y))
-        assert found.freedom == clean.freedom
+        assert found.dof == clean.dof
 
 
 class TestCorrelatedErrors:
@@ -276,15 +287,15 @@ class TestCorrelatedErrors:
         """Nats a row of others by knowing, and the prediction."""
         x, y = self.both(count, 0, tied)
         found = infer(model, x, y, UNITS, 2.0 * NOISE)
-        monkeypatch.setattr(function_posterior, "output_correlation", lambda w: (torch.eye(2).double(), torch.ones(2)))
+        monkeypatch.setattr(inference, "output_correlation", lambda w: (torch.eye(2).double(), torch.ones(2)))
         apart = infer(model, x, y, UNITS, 2.0 * NOISE)
         at, seen = self.both(500, 1, tied)
-        told, blind = (float(f.prediction(at).log_density(seen).mean()) for f in (found, apart))
-        return told - blind, found.prediction(at)
+        joint, independent = (float(f.prediction(at).log_density(seen).mean()) for f in (found, apart))
+        return joint - independent, found.prediction(at)
 
     @pytest.mark.parametrize("count", [300, 600])
-    def test_other_rows_are_likelier_by_the_information_that_the_outputs_share(self, monkeypatch, count):
-        """Mutual information of two Gaussians, ``-log(1 - r^2) / 2``, less what the function's own doubt hides.
+    def test_held_out_rows_gain_the_mutual_information_of_the_outputs(self, monkeypatch, count):
+        """Mutual information of two Gaussians, ``-log(1 - r^2) / 2``, less what the function's uncertainty hides.
 
         Of as many rows as a step of the search sees, and of twice as many.
         """
@@ -292,7 +303,7 @@ class TestCorrelatedErrors:
         shared = -0.5 * math.log(1.0 - tied**2)
         gained, prediction = self.gained(monkeypatch, Linear(), tied, count)
         assert 0.7 * shared < gained < 1.1 * shared
-        back = np.linalg.inv(prediction.turn.double().numpy())
+        back = np.linalg.inv(prediction.decorrelation.double().numpy())
         scale = prediction.stds[0].median(dim=0).values.double().numpy()
         shape = back @ (scale[:, None] * prediction.correlation.double().numpy() * scale) @ back.T
         assert shape[0, 1] / np.sqrt(shape[0, 0] * shape[1, 1]) == pytest.approx(tied, abs=0.03)
@@ -302,57 +313,65 @@ class TestCorrelatedErrors:
         assert abs(gained) < 0.03
 
 
-class TestStarts:
-    """The evidence of a gap has several optima, and rows that are left out choose."""
+class TestRestarts:
+    """The evidence has several optima; the leave-one-out density chooses."""
 
     @pytest.mark.parametrize(
-        ("model", "expected"), [(None, 0.01), (None, EXPECTED_GAP), (Linear(), EXPECTED_GAP)], ids=str
+        ("model", "expected"), [(None, 0.01), (None, PRIOR_DISCREPANCY_STD), (Linear(), PRIOR_DISCREPANCY_STD)], ids=str
     )
-    def test_other_rows_are_likelier(self, model, expected):
-        """Over three draws of sixty rows; and in none of them less likely."""
+    def test_restarts_raise_the_density_of_held_out_rows(self, model, expected):
+        """Over three draws of sixty rows, and lower in none of them."""
         gained = []
         for seed in range(3):
             at, y = rows(300, 100 + seed)
             one, several = (
-                infer(model, *rows(60, seed), UNITS, NOISE, gap_std=expected * UNITS.output_std, seed=seed, **starts)
-                for starts in ({"starts": (1.0,)}, {})
+                infer(
+                    model,
+                    *rows(60, seed),
+                    UNITS,
+                    NOISE,
+                    discrepancy_std=expected * UNITS.output_std,
+                    seed=seed,
+                    **restart_scales,
+                )
+                for restart_scales in ({"restart_scales": (1.0,)}, {})
             )
             before, after = (negative_log_likelihood(found.prediction(at), y) for found in (one, several))
             gained.append(before - after)
         assert min(gained) > -0.02
         assert np.mean(gained) > 0.3
 
-    def test_densities_in_turned_outputs_are_comparable_by_their_volume(self):
-        """Errors of any normal distribution and the same ones turned twice, by scipy."""
+    def test_densities_of_decorrelated_outputs_differ_by_the_log_determinant(self):
+        """Errors of a normal distribution and the same ones transformed twice, by scipy."""
         rng = np.random.default_rng(4)
         first, second, root = rng.normal(size=(3, 2, 2))
-        units = UNITS.turned(torch.tensor(first)).turned(torch.tensor(second))
-        turn, spread = second @ first, root @ root.T + np.eye(2)
+        units = UNITS.decorrelated(torch.tensor(first)).decorrelated(torch.tensor(second))
+        decorrelation, spread = second @ first, root @ root.T + np.eye(2)
         alone = rng.normal(size=(5, 2))
-        told = multivariate_normal(cov=spread).logpdf(alone)
-        there = multivariate_normal(cov=turn @ spread @ turn.T).logpdf(alone @ turn.T)
-        assert np.allclose(there + units.log_volume, told)
-        assert UNITS.log_volume == 0.0
+        joint = multivariate_normal(cov=spread).logpdf(alone)
+        there = multivariate_normal(cov=decorrelation @ spread @ decorrelation.T).logpdf(alone @ decorrelation.T)
+        assert np.allclose(there + units.decorrelation_log_det, joint)
+        assert UNITS.decorrelation_log_det == 0.0
 
-    def test_a_start_from_which_nothing_can_be_computed_is_passed_over(self):
+    def test_a_restart_without_a_computable_covariance_is_skipped(self):
         x, y = rows(50)
         at, _ = rows(5, seed=1)
-        first, both = (infer(None, x, y, UNITS, NOISE, starts=s).predict(at) for s in ((1.0,), (1.0, math.nan)))
+        first, both = (infer(None, x, y, UNITS, NOISE, restart_scales=s).predict(at) for s in ((1.0,), (1.0, math.nan)))
         assert torch.equal(first[0], both[0])
         assert torch.equal(first[1], both[1])
 
 
 class TestFewRows:
-    """What is learned of a covariance from few rows is uncertain."""
+    """A covariance fitted to few rows is uncertain."""
 
     def test_predictions_have_heavy_tails_where_it_is_learned(self):
         x, y = rows(15)
-        assert infer(None, x, y, UNITS, NOISE).freedom < 10.0
-        assert infer(Linear(), x, y, UNITS, NOISE, with_gap=False).freedom < 10.0
-        assert math.isinf(infer(Linear(), x, y, UNITS, NOISE, with_gap=False, noise_known=True).freedom)
-        assert math.isinf(infer(Linear(), EMPTY, EMPTY, UNITS, NOISE).freedom)
+        assert infer(None, x, y, UNITS, NOISE).dof < 10.0
+        assert infer(Linear(), x, y, UNITS, NOISE, with_discrepancy=False).dof < 10.0
+        assert math.isinf(infer(Linear(), x, y, UNITS, NOISE, with_discrepancy=False, noise_known=True).dof)
+        assert math.isinf(infer(Linear(), EMPTY, EMPTY, UNITS, NOISE).dof)
 
-    def test_other_rows_are_less_surprising_with_them(self):
+    def test_heavy_tails_raise_the_density_of_held_out_rows(self):
         """Over eight draws of twelve rows, of their marginal densities by scipy."""
         gained = []
         for seed in range(8):
@@ -360,7 +379,7 @@ class TestFewRows:
             x, y = rows(200, 100 + seed)
             mean, std = (v.double().numpy() for v in found.predict(x))
             off = (y.double().numpy() - mean) / std
-            gained.append((student(found.freedom).logpdf(off) - norm.logpdf(off)).mean())
+            gained.append((student(found.dof).logpdf(off) - norm.logpdf(off)).mean())
         assert np.mean(gained) > 0.02
 
 
@@ -373,12 +392,12 @@ def test_the_same_seed_gives_the_same_numbers():
 
 
 def test_of_too_many_rows_some_are_taken(monkeypatch):
-    monkeypatch.setattr(function_posterior, "LARGEST", 25)
+    monkeypatch.setattr(inference, "MAX_ROWS", 25)
     x, y = rows(60)
     found = infer(None, x, y, UNITS, NOISE)
     places = UNITS.inputs(x).double()
     taken = [int((places == row).all(dim=1).nonzero().item()) for row in found.inputs]
     assert len(set(taken)) == 25
     at, _ = rows(10, seed=1)
-    theirs, _, _ = apart(x[taken], y[taken], at, found.gap, raw_noise(found))
+    theirs, _, _ = apart(x[taken], y[taken], at, found.discrepancy, raw_noise(found))
     assert np.allclose(found.predict(at)[0], theirs, atol=2e-5)

@@ -11,7 +11,7 @@ from linear_simulator import EMPTY, NOISE, UNITS, Linear, rows
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.function_posterior import infer
+from learning.posterior.inference import infer
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
-from learning.function_prior import RbfCovariance, gaussian_process, simulator_marginal
-from learning.particles import SLOPE, Network
-from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
+from learning.functional_svgd.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
+from learning.networks.particles import LEAKY_RELU_SLOPE, Network
+from learning.priors.function_prior import RbfCovariance, gaussian_process, simulator_marginal
 
 
 def generator(seed=0):
@@ -26,7 +26,7 @@ class TestNetwork:
     smooth = Network(3, 2, (8, 5), "silu")
 
     @pytest.mark.parametrize(
-        ("network", "activation"), [(network, torch.nn.LeakyReLU(SLOPE)), (smooth, torch.nn.SiLU())]
+        ("network", "activation"), [(network, torch.nn.LeakyReLU(LEAKY_RELU_SLOPE)), (smooth, torch.nn.SiLU())]
     )
     def test_each_particle_is_an_ordinary_network(self, network, activation):
         parameters, inputs = network.initial(4, generator()).double(), normal(6, 3)
@@ -153,8 +153,8 @@ class TestPriors:
         draws = normal(40_000, 2) * torch.tensor([0.5, 0.2]) + torch.tensor([1.0, -0.3])
         x = self.inputs[:, :1]
         outputs = (draws[:, None, :1] * x + draws[:, None, 1:]).view(-1, 6, 1)
-        gap = RbfCovariance((0.3,), (1.0, 1.0))
-        prior = simulator_marginal(outputs, self.inputs, gap, jitter=0.05)
+        discrepancy = RbfCovariance((0.3,), (1.0, 1.0))
+        prior = simulator_marginal(outputs, self.inputs, discrepancy, jitter=0.05)
         distance = cdist(self.inputs, self.inputs, "sqeuclidean")
         exact = 0.25 * (x @ x.T).numpy() + 0.04 + 0.09 * np.exp(-0.5 * distance) + 0.05 * np.eye(6)
         values = normal(3, 6, 1, seed=3)

@@ -14,9 +14,9 @@ from carlab.core.geofence import can_stop_inside, rectangle
 from carlab.core.quantities import Action, CarState
 from carlab.core.safety import SafetyEnvelope, limit
 from carlab.core.task import ParkingTask
-from learning.car_dynamics import StepInBody
-from learning.model_env import REWARD_SCALE, ModelEnv, policy_view
-from learning.sac import FastSac
+from learning.policy.sac import FastSac
+from learning.world.car_dynamics import StepInBody
+from learning.world.model_env import REWARD_SCALE, ModelEnv, policy_view
 
 HISTORY = 2
 WIDTH = 7 + 2 * HISTORY
@@ -26,7 +26,7 @@ TASK = replace(ParkingTask(), history_length=HISTORY, max_ticks=10**9)
 
 @dataclass
 class Rolling(StepInBody):
-    """A car without doubt: throttle pushes it and steering turns it, one command late."""
+    """A deterministic car: throttle pushes it and steering turns it, one command late."""
 
     history: int = HISTORY
 
@@ -114,10 +114,11 @@ def test_commands_pass_the_gate_of_the_real_car() -> None:
     rng = np.random.default_rng(0)
     sent = [Action(0.0, 0.0)] * 50
     for _ in range(8):
-        asked = rng.uniform(-1.5, 1.5, (50, 2)).astype(np.float32)
-        env.step(asked)
+        requested = rng.uniform(-1.5, 1.5, (50, 2)).astype(np.float32)
+        env.step(requested)
         sent = [
-            limit(Action.from_array(a), s, PERIOD_S, envelope) for a, s in zip(asked.astype(float), sent, strict=True)
+            limit(Action.from_array(a), s, PERIOD_S, envelope)
+            for a, s in zip(requested.astype(float), sent, strict=True)
         ]
         np.testing.assert_allclose(env.features[:, -2:].numpy(), [a.to_array() for a in sent], atol=1e-6)
     assert max(abs(a.throttle) for a in sent) > 0.3
@@ -200,7 +201,7 @@ def test_the_last_tick_of_a_car_that_parks_is_no_cut() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_starts_are_recorded_ones_in_the_share_asked_for(share: float) -> None:
+def test_starts_are_recorded_ones_in_the_given_share(share: float) -> None:
     rng = np.random.default_rng(0)
     recorded = rng.uniform(-0.5, 0.5, (10, WIDTH))
     env = ModelEnv(Still(), TASK, 4000, recorded=recorded, from_recorded=share, seed=3)

@@ -10,9 +10,9 @@ from scipy.stats import cauchy, norm
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, CarState
-from learning.domain_models import draw_parameters
-from learning.simulator_model import OF_THE_PLACE, CarModel, known_ranges
-from learning.transitions import transitions_of, velocity_delay_s
+from learning.priors.domain_models import draw_parameters
+from learning.priors.simulator_model import CarModel, known_ranges
+from learning.world.transitions import transitions_of, velocity_delay_s
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.plant import Plant
@@ -21,6 +21,7 @@ QUIET = MocapParameters(latency_s=0.0)
 HISTORY = 8
 TICKS = 90
 OBSERVATIONS = ("marker_offset", "mocap_yaw_misalignment", "position_scale", "velocity_filter_lag", "mocap_latency")
+OF_THE_PLACE = {e.id for e in EFFECTS.values() if e.depends_on & {"place", "heading"}}
 MASS = {"vehicle.mass": (2.0, 2.0)}
 
 
@@ -77,16 +78,16 @@ def test_a_row_is_a_step_of_the_car_with_the_effect(name):
     at_s = float(late.tick.mean()) * config.control_period_s
     right, without = error(predicted(config, late, at_s), late), error(predicted(plain, late), late)
     drifts = name in ("battery_sag", "friction_drift")
-    # A row tells no motion before it, which lagging side forces have felt.
+    # A row does not hold the earlier motion, on which lagging side forces depend.
     assert right < (0.55 if name == "tyre_relaxation" else 0.35) * without or without < 1e-6
     has_memory = bool(getattr(EFFECTS[name], "states", ())) or getattr(EFFECTS[name], "has_state", False)
     if not has_memory and not drifts:
         assert np.allclose(predicted(config, rows), rows.targets, atol=2e-5)
 
 
-def test_effects_of_the_place_are_those_that_a_turned_world_changes():
-    """Every effect whose step depends on where the car is or on its heading is left out, and no other."""
-    from sim_backends.batch_rollout import rollout
+def test_effects_of_the_place_are_those_that_a_rotated_world_changes():
+    """Every effect whose step depends on where the car is or on its heading is ignored, and no other."""
+    from sim_backends.batch.rollout import rollout
 
     start = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.1, 0.4], [0.7, -0.4, 1.1, 1.5, 0.1, 0.4]], dtype=torch.float64)
     sent = torch.tensor([[[0.4, 0.5]]], dtype=torch.float64).expand(2, 1, 2)
@@ -109,8 +110,8 @@ def seen(states, ahead, left, angle, scale):
     px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
     py = y + np.sin(yaw) * ahead + np.cos(yaw) * left
     px, py, along, across = ((1 + scale) * v for v in (px, py, along, across))
-    turned = [np.cos(angle) * along + np.sin(angle) * across, np.cos(angle) * across - np.sin(angle) * along]
-    return np.stack([px, py, yaw + angle, *turned, rate], axis=1)
+    rotated = [np.cos(angle) * along + np.sin(angle) * across, np.cos(angle) * across - np.sin(angle) * along]
+    return np.stack([px, py, yaw + angle, *rotated, rate], axis=1)
 
 
 def test_what_motion_capture_adds_is_undone_and_done_again():

@@ -7,10 +7,10 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from learning.domain_models import Pendulum, draw_parameters
-from learning.function_posterior import infer
-from learning.motor_pendulum import SLIDING_RADPS, MotorPendulum
-from learning.normaliser import Normaliser
+from learning.networks.normaliser import Normaliser
+from learning.posterior.inference import infer
+from learning.priors.domain_models import Pendulum, draw_parameters
+from learning.priors.motor_pendulum import SLIDING_RADPS, MotorPendulum
 
 LOSSES = {"frictions": (0.4, 0.6), "drags": (0.4, 0.6), "dry": (0.1, 0.4), "lags": (0.02, 0.06)}
 
@@ -37,9 +37,9 @@ def changed(row, drawn):
     return np.array([math.sin(end[0]) - sin, math.cos(end[0]) - cos, end[1] - rate])
 
 
-@pytest.mark.parametrize("gap", [{}, {"rate_gap": (0.8, 0.3, 0.3, 0.7), "command_gap": 0.5}])
-def test_it_follows_its_equations_with_the_torque_as_a_state(gap):
-    model = MotorPendulum(**LOSSES, **gap)
+@pytest.mark.parametrize("discrepancy", [{}, {"rate_discrepancy": (0.8, 0.3, 0.3, 0.7), "command_discrepancy": 0.5}])
+def test_it_follows_its_equations_with_the_torque_as_a_state(discrepancy):
+    model = MotorPendulum(**LOSSES, **discrepancy)
     x, parameters = model.inputs(12, generator()).double(), draw_parameters(model, 4, generator(1)).double()
     ours = model(x, parameters).numpy()
     theirs = [[changed(row, drawn) for row in x.tolist()] for drawn in parameters.tolist()]
@@ -95,8 +95,8 @@ def test_a_gap_in_the_dynamics_finds_what_the_motor_does(lag):
     outputs = truth(inputs, draw_parameters(truth, 1, generator(5)))[0]
     outputs = outputs + 0.005 * torch.randn(outputs.shape, generator=generator(6))
     units = Normaliser(torch.zeros(5), torch.tensor([1.0, 1.0, 3.5, 2.0, 2.0]), torch.zeros(3), torch.full((3,), 0.5))
-    process = MotorPendulum(rate_gap=(1.0, 0.5, 0.5, 1.0), command_gap=0.5)
-    found = infer(process, inputs, outputs, units, torch.full((3,), 0.005), with_gap=False, noise_known=True)
+    process = MotorPendulum(rate_discrepancy=(1.0, 0.5, 0.5, 1.0), command_discrepancy=0.5)
+    found = infer(process, inputs, outputs, units, torch.full((3,), 0.005), with_discrepancy=False, noise_known=True)
     of_command, of_past = found.parameters[:, 11], found.parameters[:, 12]
     ratio = of_past / (1.0 + of_command)
     share = lag / 0.05 * (1.0 - math.exp(-0.05 / lag))

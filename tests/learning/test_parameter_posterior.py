@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.domain_models import uniform
-from learning.normaliser import Normaliser
-from learning.parameter_posterior import posterior_parameters
+from learning.networks.normaliser import Normaliser
+from learning.posterior.parameter_posterior import posterior_parameters
+from learning.priors.domain_models import uniform
 
 PRIOR_MEAN, PRIOR_STD = torch.tensor([1.0, -0.5, 0.2]), torch.tensor([0.5, 2.0, 1.0])
 
@@ -138,7 +138,7 @@ def by_quadrature(log_likelihood):
 
 
 def test_both_of_two_answers_are_found():
-    """A narrow one that fits, and a wide one that fits worse: which is the likelier shifts while data gains weight."""
+    """A narrow one that fits, and a wide one that fits worse: their order changes while data gains weight."""
 
     def shape(t):
         return torch.where(t < 0.3, (t - 0.3) ** 2, ((t - 0.3) ** 2).clamp_max(1.3))

@@ -10,11 +10,11 @@ import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from carlab.experiment.regression_cases import CASES, BodyFrame, in_body_frame
-from carlab.experiment.regression_recordings import recorded_case
-from carlab.experiment.regression_study import run_study
-from learning.domain_models import KinematicCar, draw_parameters
-from sim_backends.batch_rollout import rollout
+from carlab.studies.regression.cases import CASES, BodyFrame, in_body_frame
+from carlab.studies.regression.recordings import recorded_case
+from carlab.studies.regression.study import run_study
+from learning.priors.domain_models import KinematicCar, draw_parameters
+from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 
 
@@ -22,9 +22,9 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def test_turned_rows_are_those_of_complex_numbers() -> None:
+def test_rotated_rows_match_complex_arithmetic() -> None:
     rng = np.random.default_rng(1)
-    yaw, turned = rng.uniform(-3.0, 3.0, 50), rng.uniform(-0.3, 0.3, 50)
+    yaw, rotated = rng.uniform(-3.0, 3.0, 50), rng.uniform(-0.3, 0.3, 50)
     place, velocity, moved, faster = (rng.normal(size=50) + 1j * rng.normal(size=50) for _ in range(4))
     others = rng.normal(size=(50, 3))
 
@@ -32,19 +32,19 @@ def test_turned_rows_are_those_of_complex_numbers() -> None:
         return np.stack([p.real, p.imag, np.sin(angle), np.cos(angle), v.real, v.imag, rate], axis=1)
 
     before = np.hstack([row(place, yaw, velocity, others[:, 0]), others[:, 1:]])
-    after = row(place + moved, yaw + turned, velocity + faster, others[:, 0] + 1.0)
+    after = row(place + moved, yaw + rotated, velocity + faster, others[:, 0] + 1.0)
     inputs, outputs = (t.numpy() for t in in_body_frame(torch.tensor(before), torch.tensor(after)))
     back = np.exp(-1j * yaw)
     assert np.allclose(inputs[:, 4] + 1j * inputs[:, 5], back * velocity)
     assert np.allclose(outputs[:, 0] + 1j * outputs[:, 1], back * moved)
     assert np.allclose(outputs[:, 4] + 1j * outputs[:, 5], back * faster)
-    assert np.allclose(outputs[:, 2:4], np.stack([np.sin(turned), np.cos(turned) - 1.0], axis=1))
+    assert np.allclose(outputs[:, 2:4], np.stack([np.sin(rotated), np.cos(rotated) - 1.0], axis=1))
     assert np.allclose(outputs[:, 6], 1.0)
     assert np.allclose(inputs[:, :4], [0.0, 0.0, 0.0, 1.0])
 
 
 def test_the_kinematic_car_is_the_same_from_where_it_is() -> None:
-    """Its changes seen from the car are the changes of the car at the origin: why the study may turn its rows."""
+    """Its changes seen from the car are the changes of the car at the origin: so the study may rotate its rows."""
     model = KinematicCar()
     rows = model.inputs(200, generator()).double()
     parameters = draw_parameters(model, 5, generator(1)).double()

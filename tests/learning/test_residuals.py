@@ -1,4 +1,4 @@
-"""What a model leaves: Student distributions by scipy, and what few rows may say."""
+"""Residual distributions against scipy, and with few rows."""
 
 import math
 
@@ -9,69 +9,69 @@ from scipy.stats import multivariate_t, norm
 
 from carlab.core.errors import DataError
 from learning.evaluation import negative_log_likelihood
-from learning.residuals import residuals
+from learning.posterior.residuals import fit_residuals
 
 SHAPE = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, -0.3], [0.0, -0.3, 1.0]])
 SIZE = np.array([0.5, 2.0, 0.01])
 TRUE = SHAPE * SIZE[:, None] * SIZE
 
 
-def drawn(rows, freedom, seed=0):
-    return torch.tensor(multivariate_t(np.zeros(3), TRUE, df=freedom).rvs(rows, random_state=seed))
+def drawn(rows, dof, seed=0):
+    return torch.tensor(multivariate_t(np.zeros(3), TRUE, df=dof).rvs(rows, random_state=seed))
 
 
-@pytest.mark.parametrize("freedom", [3.0, 1e9])
-def test_the_distribution_is_the_one_that_errors_were_drawn_from(freedom):
-    found = residuals(drawn(4000, freedom))
+@pytest.mark.parametrize("dof", [3.0, 1e9])
+def test_the_distribution_is_the_one_that_errors_were_drawn_from(dof):
+    found = fit_residuals(drawn(4000, dof))
     assert found.scale.numpy() == pytest.approx(SIZE, rel=0.07)
     size = SIZE[:, None] * SIZE
     assert (found.factor @ found.factor.T).numpy() / size == pytest.approx(SHAPE, abs=0.1)
-    assert found.freedom == 3.0 if freedom == 3.0 else found.freedom >= 20.0
+    assert found.dof == 3.0 if dof == 3.0 else found.dof >= 20.0
 
 
 def test_its_likelihood_about_a_mean_is_scipys():
-    found = residuals(drawn(200, 4.0))
+    found = fit_residuals(drawn(200, 4.0))
     means, targets = torch.randn((1, 50, 3), generator=torch.Generator().manual_seed(0)).double(), drawn(50, 4.0, 1)
-    theirs = multivariate_t(np.zeros(3), (found.factor @ found.factor.T).numpy(), df=found.freedom)
-    ours = negative_log_likelihood(found.about(means), targets)
+    theirs = multivariate_t(np.zeros(3), (found.factor @ found.factor.T).numpy(), df=found.dof)
+    ours = negative_log_likelihood(found.centred_at(means), targets)
     assert ours == pytest.approx(-theirs.logpdf((targets - means[0]).numpy()).mean(), rel=1e-9)
-    assert float(found.surprise(targets)[0]) == pytest.approx(
+    assert float(found.mahalanobis_sq(targets)[0]) == pytest.approx(
         float(targets[0] @ torch.linalg.inv(found.factor @ found.factor.T) @ targets[0])
     )
 
 
 @pytest.mark.parametrize("rows", [30, 200])
-def test_new_errors_are_hardly_less_likely_than_under_the_truth(rows):
-    """And far likelier than under independent normal errors of the same rows."""
+def test_new_errors_lose_little_density_against_the_truth(rows):
+    """And with a far higher density than under independent normal errors of the same rows."""
     new, lost, gained = drawn(20_000, 3.0, 99), [], []
     truth = -multivariate_t(np.zeros(3), TRUE, df=3.0).logpdf(new.numpy()).mean()
     for seed in range(4):
         seen = drawn(rows, 3.0, seed)
-        ours = negative_log_likelihood(residuals(seen).about(torch.zeros((1, len(new), 3)).double()), new)
+        ours = negative_log_likelihood(fit_residuals(seen).centred_at(torch.zeros((1, len(new), 3)).double()), new)
         lost.append(ours - truth)
         gained.append(-norm(0.0, seen.numpy().std(axis=0)).logpdf(new.numpy()).sum(axis=1).mean() - ours)
     assert 0.0 < np.mean(lost) < (0.4 if rows == 30 else 0.04)
     assert np.mean(gained) > 0.8
 
 
-def test_few_rows_are_believed_little():
+def test_few_rows_keep_the_prior_scale():
     """Two rows that a model meets exactly: the expected noise stands, with tails."""
     none = torch.zeros((2, 3)).double()
-    found = residuals(none, torch.tensor([0.1, 0.2, 0.3]), 1.0)
-    assert 2.5 <= found.freedom <= 3.0
+    found = fit_residuals(none, torch.tensor([0.1, 0.2, 0.3]), 1.0)
+    assert 2.5 <= found.dof <= 3.0
     assert found.scale.numpy() == pytest.approx(np.array([0.1, 0.2, 0.3]) / math.sqrt(3.0), rel=0.35)
-    assert (residuals(none, torch.tensor([0.1, 0.2, 0.3]), 1.0, spent=1.0).scale > found.scale).all()
+    assert (fit_residuals(none, torch.tensor([0.1, 0.2, 0.3]), 1.0, fitted_rows=1.0).scale > found.scale).all()
 
 
 def test_nothing_and_numbers_that_are_missing_are_refused():
     for bad in (torch.zeros((0, 2)), torch.full((4, 2), math.nan)):
         with pytest.raises(DataError, match="finite and of one row"):
-            residuals(bad)
+            fit_residuals(bad)
 
 
 def test_an_output_that_is_constant_keeps_a_width():
     errors = torch.cat([drawn(50, 1e9), torch.zeros((50, 1)).double()], dim=1)
-    for found in (residuals(errors), residuals(torch.zeros((5, 2)).double())):
-        assert torch.isfinite(found.turn).all()
+    for found in (fit_residuals(errors), fit_residuals(torch.zeros((5, 2)).double())):
+        assert torch.isfinite(found.whitening).all()
         assert float(found.scale.min()) >= 0.99e-15
-    assert residuals(errors).scale[:3].numpy() == pytest.approx(SIZE, rel=0.4)
+    assert fit_residuals(errors).scale[:3].numpy() == pytest.approx(SIZE, rel=0.4)

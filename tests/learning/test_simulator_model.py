@@ -8,11 +8,11 @@ import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
-from learning.domain_models import draw_parameters
-from learning.simulator_model import CarModel
-from learning.system_identification import identify
-from learning.transitions import transitions_of
-from sim_backends.batch_rollout import rollout
+from learning.baselines.system_identification import identify
+from learning.priors.domain_models import draw_parameters
+from learning.priors.simulator_model import CarModel
+from learning.world.transitions import transitions_of
+from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
 
 QUIET = MocapParameters(latency_s=0.0)

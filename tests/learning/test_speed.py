@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from carlab.experiment.training import velocity_delay_s
+from carlab.experiment.campaign.training import velocity_delay_s
 from learning import speed
-from learning.car_dynamics import CarDynamics
-from learning.car_fit import CarFitSettings, fit_car
 from learning.evaluation import Mixture
-from learning.simulator_model import CarModel
-from learning.transitions import Transitions
+from learning.priors.simulator_model import CarModel
+from learning.world.car_dynamics import CarDynamics
+from learning.world.car_fit import CarFitSettings, fit_car
+from learning.world.transitions import Transitions
 
 
 def test_networks_alone_whole_predictions_and_steps_of_the_learned_car_have_figures_of_their_own(
@@ -39,23 +39,23 @@ def test_networks_alone_whole_predictions_and_steps_of_the_learned_car_have_figu
     assert isinstance(whole, Mixture)
     assert whole.means.shape == bare.shape
     assert drawn.shape == (256, 6)
-    assert not torch.allclose(whole.means, bare, atol=0.01), "trend and turn are part of a prediction"
-    assert whole.turn is not None
+    assert not torch.allclose(whole.means, bare, atol=0.01), "trend and decorrelation are part of a prediction"
+    assert whole.decorrelation is not None
     assert whole.correlation is not None
-    assert np.isfinite(whole.freedom)
+    assert np.isfinite(whole.dof)
 
 
 def test_a_whole_fit_is_that_of_carlab_learn(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[Transitions, CarModel, CarFitSettings, str]] = []
+    calls: list[tuple[Transitions, CarModel, CarFitSettings, str]] = []
 
     def fewer(rows: Transitions, model: CarModel, settings: CarFitSettings, *, device: str) -> CarDynamics:
-        asked.append((rows, model, settings, device))
+        calls.append((rows, model, settings, device))
         return fit_car(rows, model, CarFitSettings(steps=20), device=device)
 
     monkeypatch.setattr(speed, "fit_car", fewer)
     monkeypatch.setattr(speed, "SIZES", {})
     (figures,) = speed.training_speed().values()
-    ((rows, model, settings, device),) = asked
+    ((rows, model, settings, device),) = calls
     assert figures["whole_fit_s"] > 0.01
     assert (len(rows), rows.history, model.history, device) == (100, 3, 3, "cpu")
     assert settings == CarFitSettings()

@@ -9,12 +9,12 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from carlab.core.errors import DataError
-from learning.domain_models import Pendulum, Sinusoids, draw_parameters
+from learning.baselines.system_identification import grey_box, identify
 from learning.evaluation import negative_log_likelihood
-from learning.fsvgd import FsvgdSettings
-from learning.function_prior import RbfCovariance
-from learning.normaliser import Normaliser
-from learning.system_identification import grey_box, identify
+from learning.functional_svgd.fsvgd import FsvgdSettings
+from learning.networks.normaliser import Normaliser
+from learning.priors.domain_models import Pendulum, Sinusoids, draw_parameters
+from learning.priors.function_prior import RbfCovariance
 
 
 def generator(seed=0):
@@ -42,7 +42,7 @@ def test_parameters_of_a_pendulum_are_those_of_nonlinear_least_squares():
 
     exact = least_squares(residual, [10.0, 1.0]).x
     assert np.allclose([float(v) for v in identifiable], exact, rtol=2e-2)
-    assert float(found.left.scale.mean()) == pytest.approx(0.02, rel=0.15)
+    assert float(found.residuals.scale.mean()) == pytest.approx(0.02, rel=0.15)
     assert float(truth[2] / truth[1]) == pytest.approx(exact[0], rel=0.1)
 
 
@@ -55,7 +55,7 @@ def test_several_starts_find_the_frequency():
     assert torch.allclose(found.parameters, truth[0], atol=1e-2)
 
 
-def test_rows_that_something_spoilt_do_not_pull_at_the_parameters():
+def test_outliers_do_not_move_the_parameters():
     """One row of eight is off by forty noises: least squares follow them, a likelihood with tails does not."""
     inputs, outputs, truth = pendulum(80, 0.02)
     spoilt = outputs.clone()
@@ -68,8 +68,8 @@ def test_rows_that_something_spoilt_do_not_pull_at_the_parameters():
 
     assert frequency(found.parameters) == pytest.approx(frequency(clean.parameters), rel=0.01)
     assert frequency(found.parameters) == pytest.approx(frequency(truth), rel=0.02)
-    assert found.left.freedom < 4.0 < clean.left.freedom
-    assert float(found.left.scale.max()) < 0.03
+    assert found.residuals.dof < 4.0 < clean.residuals.dof
+    assert float(found.residuals.scale.max()) < 0.03
 
 
 class Edged:
@@ -92,23 +92,23 @@ def test_a_way_down_that_ends_where_the_simulator_breaks_down_takes_nothing_away
     y[::8] -= 0.8 * x[::8].sign()
     found = identify(Edged(), x, y, torch.tensor([0.02]))
     assert 0.8 < float(found.parameters) <= 1.0
-    assert torch.isfinite(found.left.factor).all()
+    assert torch.isfinite(found.residuals.factor).all()
 
 
-def test_errors_that_vary_together_are_found_to():
+def test_correlated_errors_are_identified():
     """The second output's noise is nine tenths of the first's: what a likelihood gains by it is the closed form's."""
     inputs, outputs, _ = pendulum(800, 0.0)
     noise = 0.02 * torch.randn(outputs.shape, generator=generator(4))
     noise[:, 1] = 0.9 * noise[:, 0] + math.sqrt(1.0 - 0.9**2) * noise[:, 1]
     given = outputs + noise
     simulator = identify(Pendulum(), inputs[:400], given[:400], torch.full((3,), 0.02))
-    told = negative_log_likelihood(simulator.predict(inputs[400:]), given[400:])
+    nll = negative_log_likelihood(simulator.predict(inputs[400:]), given[400:])
     off = (given[400:] - simulator.mean(inputs[400:])).double().numpy()
     apart = -norm(0.0, off.std(axis=0)).logpdf(off).sum(axis=1).mean()
-    assert apart - told == pytest.approx(-0.5 * math.log(1.0 - 0.9**2), abs=0.15)
+    assert apart - nll == pytest.approx(-0.5 * math.log(1.0 - 0.9**2), abs=0.15)
 
 
-def test_grey_box_takes_up_what_the_simulator_lacks():
+def test_grey_box_learns_the_simulators_error():
     inputs, outputs, _ = pendulum(300, 0.02, frictions=(0.5, 0.5), drags=(0.5, 0.5))
     noise = torch.full((3,), 0.02)
     simulator = identify(Pendulum(), inputs[:200], outputs[:200], noise)

@@ -11,13 +11,13 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import Action
 from carlab.core.task import ParkingTask
-from carlab.experiment.episode import run_episode
-from learning.ridge import PENALTIES, Ridge
-from learning.transitions import OUTPUTS, Transitions, has_whole_step, transitions_of, velocity_delay_s
+from carlab.experiment.episodes.episode import run_episode
+from learning.baselines.ridge import PENALTIES, Ridge
+from learning.world.transitions import OUTPUTS, Transitions, has_whole_step, transitions_of, velocity_delay_s
 
 
 def episode(ticks=30, seed=0):
-    """An episode whose every number tells where it stands."""
+    """An episode whose numbers encode their position."""
     rng = np.random.default_rng(seed)
     sent = np.stack([np.arange(ticks) / 100.0, -np.arange(ticks) / 100.0], axis=1)
     states = rng.normal(size=(ticks + 1, 6))

@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from carlab.core.angles import wrap
 from learning.evaluation import Mixture
-from learning.world_outputs import measured_seven_outputs, seven_outputs
+from learning.world.world_outputs import measured_seven_outputs, seven_outputs
 
 MEANS = torch.tensor([[[0.1, -0.02, 0.3, 0.5, -0.4, 1.0]], [[0.0, 0.05, -0.2, -0.3, 0.2, -2.0]]])
 STDS = torch.tensor([[[0.02, 0.01, 0.1, 0.2, 0.3, 0.5]], [[0.01, 0.04, 0.3, 0.1, 0.2, 0.4]]])

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from mocap.emulated_scene import RigidBodySample
-from mocap.emulator import NatNetServer
-from mocap.mocap_config import MocapConfig
+from mocap.config import MocapConfig
+from mocap.emulators.natnet_server import NatNetServer
+from mocap.emulators.scene import RigidBodySample
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]

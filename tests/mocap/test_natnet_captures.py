@@ -12,7 +12,7 @@ from natnet.packet_buffer import PacketBuffer
 from natnet.version import Version
 from scipy.spatial.transform import Rotation
 
-from mocap.natnet_codec import (
+from mocap.natnet.codec import (
     BitstreamVersion,
     Connect,
     EchoResponse,
@@ -28,7 +28,7 @@ from mocap.natnet_codec import (
     layouts_that_fit,
     split_message,
 )
-from mocap.natnet_models import MarkerSetDescription, RigidBodyDescription
+from mocap.natnet.models import MarkerSetDescription, RigidBodyDescription
 
 V3 = BitstreamVersion(3, 0)
 CLOCK_HZ = 3312787  # as the captured server info says

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from carlab.core.errors import NotOpenError, NotReadyError
-from mocap.bitstream_switch import BitstreamSwitch
-from mocap.emulated_scene import EmulatedBody
-from mocap.emulator import NatNetServer
-from mocap.emulator_faults import ServerFaults
-from mocap.mocap_config import MocapConfig
-from mocap.natnet_client import NatNetClient
-from mocap.natnet_codec import (
+from mocap.config import MocapConfig
+from mocap.emulators.faults import ServerFaults
+from mocap.emulators.natnet_server import NatNetServer
+from mocap.emulators.scene import EmulatedBody
+from mocap.natnet.bitstream_switch import BitstreamSwitch
+from mocap.natnet.client import NatNetClient
+from mocap.natnet.codec import (
     Frame,
     MessageId,
     decode_frame,
@@ -29,7 +29,7 @@ from mocap.natnet_codec import (
     encode_request,
     split_message,
 )
-from mocap.natnet_models import (
+from mocap.natnet.models import (
     FRAME_BITSTREAM_CHANGED,
     SERVED_BITSTREAMS,
     BitstreamVersion,
@@ -155,7 +155,7 @@ def test_the_bitstream_changes_in_flight(serve: Serve, configure: Configure, unt
 
 @pytest.fixture
 def quick_to_reconnect(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mocap.upkeep.RECONNECT_PERIOD_S", 0.5)
+    monkeypatch.setattr("mocap.natnet.upkeep.RECONNECT_PERIOD_S", 0.5)
 
 
 @pytest.mark.usefixtures("quick_to_reconnect")

@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from carlab.core.errors import ConfigError, NotReadyError
-from mocap.discovery import discover
-from mocap.emulator import NatNetServer
-from mocap.emulator_faults import ServerFaults
-from mocap.mocap_config import MocapConfig
-from mocap.natnet_client import NatNetClient
-from mocap.natnet_models import BitstreamVersion
+from mocap.config import MocapConfig
+from mocap.emulators.faults import ServerFaults
+from mocap.emulators.natnet_server import NatNetServer
+from mocap.natnet.client import NatNetClient
+from mocap.natnet.discovery import discover
+from mocap.natnet.models import BitstreamVersion
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]

@@ -13,7 +13,7 @@ from natnet.packet_buffer import PacketBuffer
 from natnet.version import Version
 
 from carlab.core.errors import ProtocolError
-from mocap.natnet_codec import (
+from mocap.natnet.codec import (
     BitstreamVersion,
     Frame,
     decode_connect,
@@ -28,7 +28,7 @@ from mocap.natnet_codec import (
     explain_frame_error,
     split_message,
 )
-from mocap.natnet_models import (
+from mocap.natnet.models import (
     SERVED_BITSTREAMS,
     AnalogSource,
     Asset,

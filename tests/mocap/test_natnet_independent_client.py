@@ -20,9 +20,9 @@ from natnet import DataDescriptions, DataFrame
 from natnet import NatNetClient as OtherClient
 from scipy.spatial.transform import Rotation
 
-from mocap.emulated_scene import EmulatedBody, RigidBodySample
-from mocap.emulator import NatNetServer
-from mocap.natnet_models import SERVED_BITSTREAMS, BitstreamVersion
+from mocap.emulators.natnet_server import NatNetServer
+from mocap.emulators.scene import EmulatedBody, RigidBodySample
+from mocap.natnet.models import SERVED_BITSTREAMS, BitstreamVersion
 
 FRAMES = 240
 BODIES = (EmulatedBody("car", 7), EmulatedBody("trailer", 9))

@@ -20,12 +20,12 @@ from carlab.core.errors import NotReadyError
 from carlab.core.pose_source import PoseSource
 from carlab.core.quantities import PoseSample
 from mocap import axes
-from mocap.emulated_scene import EmulatedBody, RigidBodySample
-from mocap.emulator import NatNetServer
-from mocap.emulator_faults import ServerFaults
-from mocap.mocap_config import MocapConfig
-from mocap.natnet_models import BitstreamVersion, MarkerSetDescription, RigidBodyDescription
-from mocap.natnet_sockets import udp_socket
+from mocap.config import MocapConfig
+from mocap.emulators.faults import ServerFaults
+from mocap.emulators.natnet_server import NatNetServer
+from mocap.emulators.scene import EmulatedBody, RigidBodySample
+from mocap.natnet.models import BitstreamVersion, MarkerSetDescription, RigidBodyDescription
+from mocap.natnet.sockets import udp_socket
 from mocap.rigid_body import RigidBodyPoseSource, select_body
 
 Serve = Callable[..., NatNetServer]

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from mocap.natnet_models import MessageId
+from mocap.natnet.models import MessageId
+from mocap.natnet.upkeep import Upkeep
 from mocap.stream_statistics import StreamStatistics
 from mocap.time_alignment import ClockAlignment
-from mocap.upkeep import Upkeep
 
 CLOCK_HZ = 10_000_000.0
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carlab.recording.csv_mapping import CANONICAL, DART, ETH
-from carlab.recording.data_audit import Severity
-from carlab.recording.export import write_csv
-from carlab.recording.foreign_csv import import_csv
+from carlab.recording.audit.audit import Severity
+from carlab.recording.csv.export import write_csv
+from carlab.recording.csv.foreign import import_csv
+from carlab.recording.csv.mapping import CANONICAL, DART, ETH
 from carlab.recording.pose_velocity import pose_jumps
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from carlab.recording.audit_report import Severity
-from carlab.recording.clocks import even_clock
+from carlab.recording.audit.report import Severity
+from carlab.recording.csv.clocks import even_clock
 
 
 class TestEvenClock:

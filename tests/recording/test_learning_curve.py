@@ -8,7 +8,7 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from carlab.core.quantities import STATE_NAMES
-from carlab.recording.learning_curve import write_learning_curve
+from carlab.recording.rerun.learning_curve import write_learning_curve
 
 
 def values_of(path: Path, timeline: str) -> dict[str, dict[int, list[float]]]:
@@ -36,11 +36,11 @@ def test_figures_lie_over_the_episodes_and_states_with_their_bands_over_the_tick
     assert [p.name for p in tmp_path.iterdir()] == ["learn.rrd"]
     assert values_of(tmp_path / "learn.rrd", "episode") == {"learning/total_reward": {1: [4.0]}}
     found = values_of(tmp_path / "learn.rrd", "tick")
-    assert set(found) == {f"states/{name}/{what}" for name in STATE_NAMES for what in ("measured", "foretold")}
+    assert set(found) == {f"states/{name}/{what}" for name in STATE_NAMES for what in ("measured", "predicted")}
     for k, name in enumerate(STATE_NAMES):
         measured = found[f"states/{name}/measured"]
         assert [measured[t][0] for t in range(12)] == [*driven[0][:, k], *driven[1][:, k]]
-        foretold = found[f"states/{name}/foretold"]
-        assert sorted(foretold) == [2, 3, 4, 5]
+        predicted = found[f"states/{name}/predicted"]
+        assert sorted(predicted) == [2, 3, 4, 5]
         for tick, m, s in ((2, mean[0, 1, k], std[0, 1, k]), (5, mean[1, 2, k], std[1, 2, k])):
-            np.testing.assert_allclose(foretold[tick], [m, m - 2.0 * s, m + 2.0 * s])
+            np.testing.assert_allclose(predicted[tick], [m, m - 2.0 * s, m + 2.0 * s])

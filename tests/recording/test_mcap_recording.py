@@ -18,9 +18,9 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action, CarState, Observation, PoseSample, Reality
-from carlab.recording import mcap_schemas as schemas
-from carlab.recording.mcap_sink import McapSink, write_episode
-from carlab.recording.mcap_source import read_documents, read_episode, read_recording
+from carlab.recording.mcap import schemas as schemas
+from carlab.recording.mcap.sink import McapSink, write_episode
+from carlab.recording.mcap.source import read_documents, read_episode, read_recording
 from carlab.recording.recorder import Recorder
 
 RERUN = Path(sys.executable).with_name("rerun")

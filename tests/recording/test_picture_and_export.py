@@ -10,8 +10,8 @@ import pytest
 from matplotlib.image import imread
 
 from carlab.core.errors import DataError
+from carlab.recording.csv.export import table_of, write_csv, write_parquet
 from carlab.recording.episode_builder import episode_from_documents, goal_of, polygon_of
-from carlab.recording.export import table_of, write_csv, write_parquet
 from carlab.recording.picture import outline, save_summary
 
 

@@ -14,10 +14,10 @@ import pytest
 from carlab.core.documents import EpisodeEnded, EpisodeStarted, SafetyEvent, Tick, Transition
 from carlab.core.errors import DataError, NotOpenError
 from carlab.core.outcome import EndReason
-from carlab.recording.mcap_sink import McapSink
-from carlab.recording.mcap_source import read_documents, read_episode, read_recording
+from carlab.recording.mcap.sink import McapSink
+from carlab.recording.mcap.source import read_documents, read_episode, read_recording
 from carlab.recording.recorder import Recorder
-from carlab.recording.rerun_sink import RerunSink
+from carlab.recording.rerun.sink import RerunSink
 from carlab.recording.sink import Sink
 
 
@@ -268,7 +268,7 @@ import importlib.util
 spec = importlib.util.spec_from_file_location("documents_of_a_test", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
-from carlab.recording.mcap_sink import McapSink
+from carlab.recording.mcap.sink import McapSink
 from carlab.recording.recorder import Recorder
 from carlab.core.documents import Tick
 recorder = Recorder([McapSink(sys.argv[2])])
@@ -311,9 +311,9 @@ import importlib.util
 spec = importlib.util.spec_from_file_location("documents_of_a_test", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
-from carlab.recording.mcap_sink import McapSink
+from carlab.recording.mcap.sink import McapSink
 from carlab.recording.recorder import Recorder
-from carlab.recording.rerun_sink import RerunSink
+from carlab.recording.rerun.sink import RerunSink
 folder = sys.argv[2]
 recorder = Recorder([McapSink(folder + "/1.mcap"), RerunSink(folder + "/1.rrd"), McapSink(folder + "/2.mcap")])
 recorder.open()

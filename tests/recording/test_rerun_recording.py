@@ -9,11 +9,11 @@ from rerun.chunk import RrdReader
 from carlab.core.documents import EpisodeEnded, SafetyEvent
 from carlab.core.errors import DataError, NotReadyError
 from carlab.core.outcome import EndReason
-from carlab.recording import rerun_blueprint as look
 from carlab.recording.episode_builder import episode_from_documents
 from carlab.recording.recorder import Recorder
-from carlab.recording.rerun_sink import RerunSink, episode_to_rrd
-from carlab.recording.screenshot import save_screenshot, vulkan_is_there
+from carlab.recording.rerun import blueprint as look
+from carlab.recording.rerun.screenshot import save_screenshot, vulkan_is_there
+from carlab.recording.rerun.sink import RerunSink, episode_to_rrd
 
 RERUN = Path(sys.executable).with_name("rerun")
 needs_rerun = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed beside this Python")
@@ -185,8 +185,8 @@ def test_the_viewer_draws_a_picture_without_a_window(tmp_path, make_documents):
 
 def test_without_a_driver_the_sentence_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "0001.rrd").write_bytes(b"")
-    monkeypatch.setattr("carlab.recording.screenshot.vulkan_is_there", lambda: False)
-    monkeypatch.setattr("carlab.recording.screenshot.rerun_program", lambda: RERUN)
+    monkeypatch.setattr("carlab.recording.rerun.screenshot.vulkan_is_there", lambda: False)
+    monkeypatch.setattr("carlab.recording.rerun.screenshot.rerun_program", lambda: RERUN)
     with pytest.raises(NotReadyError, match="apt-get install mesa-vulkan-drivers libvulkan1"):
         save_screenshot(tmp_path / "0001.rrd", tmp_path / "x.png")
     with pytest.raises(DataError, match="is not there"):

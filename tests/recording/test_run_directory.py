@@ -6,7 +6,7 @@ import subprocess
 import pytest
 
 from carlab.core.errors import DataError
-from carlab.recording.run_directory import RunDirectory, environment, git_state
+from carlab.recording.run_folder import RunDirectory, environment, git_state
 
 
 def test_a_new_run_has_its_folders_configuration_and_environment(tmp_path):

@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.quantities import Action, CarState
-from sim_backends.batch_rollout import rollout
+from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.dynamics.plain_loop import rollout_one_by_one
 from sim_backends.effects import EFFECTS
-from sim_backends.plain_loop import rollout_one_by_one
 from sim_backends.plant import Plant
 
 LAGS = {
@@ -99,7 +99,7 @@ def test_batch_equals_singles_and_chunks_do_not_matter(monkeypatch):
     together = rollout(config, start, commands).states
     for i in range(9):
         assert torch.allclose(rollout(config, start[i : i + 1], commands[i : i + 1]).states[0], together[i], atol=1e-13)
-    monkeypatch.setattr("sim_backends.batch_rollout.CARS_AT_ONCE", 4)
+    monkeypatch.setattr("sim_backends.batch.rollout.CARS_AT_ONCE", 4)
     assert torch.allclose(rollout(config, start, commands).states, together, atol=1e-13)
 
 
@@ -111,7 +111,7 @@ def test_arrays_and_tensors_give_the_same(monkeypatch):
     mu = torch.linspace(0.3, 0.5, 7, dtype=torch.float64)
     results = []
     for few in (512, 0):
-        monkeypatch.setattr("sim_backends.batch_rollout.FEW_CARS", few)
+        monkeypatch.setattr("sim_backends.batch.rollout.FEW_CARS", few)
         results.append(rollout(config, start, commands, values={"tyre.front.mu": mu}, measured=True))
     for name in ("states", "measured"):
         assert torch.allclose(getattr(results[0], name), getattr(results[1], name), atol=1e-11)

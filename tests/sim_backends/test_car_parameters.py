@@ -150,3 +150,20 @@ def test_a_number_may_have_a_deviation_with_or_without_a_range():
             SimulatorConfig.from_tables({"motor": {"drive_gain": {"value": 8.2, "std": wrong}}})
     with pytest.raises(ConfigError, match="'low' is missing"):
         SimulatorConfig.from_tables({"motor": {"drive_gain": {"value": 8.2, "high": 9.0, "std": 0.1}}})
+
+
+def test_a_latency_that_the_car_file_does_not_state_is_unknown_until_it_is_set() -> None:
+    """The simulator uses the default; files that are written do not state it either."""
+    silent = SimulatorConfig.from_tables({"mocap": {"rate": 100.0}})
+    assert silent.unknown == {"mocap.latency"}
+    assert silent.mocap.latency_s == SimulatorConfig().mocap.latency_s
+    assert "latency" not in silent.to_tables()["mocap"]
+    assert SimulatorConfig.from_tables(silent.to_tables()).unknown == {"mocap.latency"}
+    assert silent.with_values({"motor.damping": 2.0}).unknown == {"mocap.latency"}
+    known = silent.with_values({"mocap.latency": 0.02})
+    assert not known.unknown
+    assert known.to_tables()["mocap"]["latency"] == 0.02
+    for stated in ({"mocap": {"latency": 0.008}}, {"effects": {"mocap_latency": {"latency": 0.01}}}):
+        assert not SimulatorConfig.from_tables(stated).unknown
+    assert not SimulatorConfig().unknown
+    assert not SimulatorConfig.from_preset().unknown

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from sim_backends.array_ops import FLOATS
-from sim_backends.batch_rollout import rollout
+from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.compiled.tracing import Tracer, gradients
+from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.effects import EFFECTS
-from sim_backends.tracing import Tracer, gradients
 
 EVERYTHING = {  # all but the one that turns a kinematic or linear-tyre car into a dynamic one
     name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items() if name != "tyre_saturation"
@@ -45,7 +45,7 @@ def test_more_cars_than_a_chunk_of_the_derivative(monkeypatch):
     start, commands = some(23, 4)
     gradients_found = []
     for chunk in (1000, 7):
-        monkeypatch.setattr("sim_backends.compiled_stepper.CHUNK_CARS", chunk)
+        monkeypatch.setattr("sim_backends.compiled.stepper.CHUNK_CARS", chunk)
         leaf = commands.clone().requires_grad_()
         rollout(SimulatorConfig(), start, leaf).states.square().sum().backward()
         gradients_found.append(leaf.grad)
@@ -55,7 +55,7 @@ def test_more_cars_than_a_chunk_of_the_derivative(monkeypatch):
 def test_few_and_many_cars_use_the_same_arithmetic(monkeypatch):
     start, commands = some(40, 6)
     few = rollout(SimulatorConfig(), start, commands).states
-    monkeypatch.setattr("sim_backends.compiled_step.FEW_CARS", 10)
+    monkeypatch.setattr("sim_backends.compiled.step.FEW_CARS", 10)
     many = rollout(SimulatorConfig(), start.flip(0), commands.flip(0)).states.flip(0)
     assert torch.equal(few, many)
 

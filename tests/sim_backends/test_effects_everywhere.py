@@ -10,7 +10,7 @@ import torch
 
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.quantities import Action, CarState
-from sim_backends.batch_rollout import rollout
+from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS
 from sim_backends.plant import Plant
@@ -80,7 +80,7 @@ def test_the_catalogue_is_complete():
     assert all(effect.catalogued == (name in IDS) for name, effect in EFFECTS.items())
     assert all(bool(effect.class_statement) != effect.catalogued for effect in EFFECTS.values())
     for effect in EFFECTS.values():
-        assert set(effect.look_alikes) <= set(EFFECTS)
+        assert {c.effect for c in effect.confusable} <= set(EFFECTS)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -135,7 +135,7 @@ def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeyp
     leaf = commands.clone().requires_grad_()
     compiled = rollout(config, start, leaf).states
     with monkeypatch.context() as patch:  # the code for many cars, which writes over what is not needed any more
-        patch.setattr("sim_backends.compiled_step.FEW_CARS", 2)
+        patch.setattr("sim_backends.compiled.step.FEW_CARS", 2)
         many = rollout(config, start, commands).states
     for other in (operators, compiled.detach(), many):
         assert torch.allclose(arrays, other, rtol=0, atol=1e-10)

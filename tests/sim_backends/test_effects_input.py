@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from sim_backends.actuators import ActuatorChain
-from sim_backends.array_ops import FLOATS
-from sim_backends.batch_rollout import rollout
+from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.dynamics.actuators import ActuatorChain
+from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.effects import EFFECTS
 from sim_backends.effects.first_order import lag_weights
 
@@ -150,7 +150,7 @@ def test_throttle_delay_moves_the_drive_alone():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_lag_weights_are_exact_from_no_lag_to_a_slow_one(dtype):
-    from sim_backends.torch_ops import torch_ops
+    from sim_backends.dynamics.torch_ops import torch_ops
 
     time_constant = torch.tensor([0.0, 1e-9, 1e-5, 1e-3, 5e-3, 0.02, 0.5, 30.0], dtype=dtype, requires_grad=True)
     weights = lag_weights(torch_ops(time_constant), time_constant, 0.01)

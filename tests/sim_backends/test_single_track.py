@@ -7,12 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from carlab.core.quantities import Action, CarState
-from sim_backends.array_ops import ARRAYS, FLOATS
 from sim_backends.car_parameters import CarParameters, SimulatorConfig
+from sim_backends.dynamics.array_ops import ARRAYS, FLOATS
+from sim_backends.dynamics.plain_loop import derivative as plain_derivative
+from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.effects import EFFECTS
-from sim_backends.plain_loop import derivative as plain_derivative
 from sim_backends.plant import Plant
-from sim_backends.single_track import SingleTrack
 
 KINDS = ("dynamic", "linear_tyre", "kinematic", "blend")
 MODERATE = [(0.3, 0.2), (-0.6, 0.4), (0.1, -0.3), (0.8, 0.5), (-0.2, 0.0)]
@@ -230,7 +230,9 @@ def test_every_effect_declares_what_the_catalogue_needs():
     for effect_id, effect in EFFECTS.items():
         assert effect.id == effect_id
         assert effect.kind in ("input", "dynamics", "observation")
-        assert effect.sentence.endswith(".")
+        assert effect.summary.endswith(".")
+        texts = (effect.name, effect.sentence, effect.refuted_if)
+        assert all(texts) if effect.catalogued else effect.class_statement
         assert effect.parameters
         for p in effect.parameters:
             assert p.low <= p.typical <= p.high

@@ -1,0 +1,332 @@
+"""Diagnosis of recordings: what a simulator leaves out of them."""
+
+from __future__ import annotations
+
+import hashlib
+import html
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from carlab.api.cars import load_car
+from carlab.api.recordings import Recording, is_csv, required_file
+
+if TYPE_CHECKING:
+    from carlab.cars import CarFile
+    from carlab.core.episode_data import EpisodeData
+    from carlab.diagnosis.findings import (
+        DataFault,
+        Diagnosis,
+        EffectFinding,
+        Estimate,
+        Exhibits,
+        FitErrors,
+        RecordingUse,
+        Verdict,
+    )
+
+RecordingLike = Any
+"""A Recording, an EpisodeData, or the path of an MCAP, a CSV or a run's folder."""
+REPORTED_FAULTS = (
+    *("yaw_wrap_spikes", "outliers", "stale_samples", "clock_drift", "column_shift", "column_scale"),
+    *("wrong_unit", "wrong_sign", "wrong_frame", "integration_error"),
+)
+"""Findings of a CSV's audit that the report names as data faults when they were repaired on reading."""
+
+
+@dataclass(frozen=True)
+class DiagnosisReport:
+    """The result of ``carlab.diagnose``. In a notebook it shows itself as the HTML report.
+
+    Attributes:
+        diagnosis: the verdict with its evidence as data (schema ``carlab.diagnosis/1``).
+        exhibits: what the report's pictures show.
+        model: the car file with everything that was found; ``model.save("model.toml")`` writes it.
+        is_conclusive: False where the recordings are not sufficient for a verdict; ``sentence`` says what to record.
+    """
+
+    diagnosis: Diagnosis
+    exhibits: Exhibits = field(repr=False)
+    model: CarFile = field(repr=False)
+    is_conclusive: bool = True
+
+    @property
+    def verdict(self) -> Verdict:
+        """One of mismatch, parameters, none, data, unexplained, inconclusive."""
+        return self.diagnosis.verdict
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in a sentence."""
+        return self.diagnosis.sentence
+
+    @property
+    def effects(self) -> dict[str, EffectFinding]:
+        """The named effects by id, with parameters (value, std, 90 % interval), evidence, and confusable effects."""
+        return {effect.id: effect for effect in self.diagnosis.effects}
+
+    @property
+    def parameters(self) -> dict[str, Estimate]:
+        """Base parameters as fitted, by dotted name (``motor.drive_gain``), SI units."""
+        return dict(self.diagnosis.parameters)
+
+    @property
+    def held_out(self) -> dict[str, FitErrors]:
+        """Held-out root mean square errors of nominal, refit, with_effects, constant_velocity and noise_floor."""
+        return dict(self.diagnosis.held_out)
+
+    def save(self, folder: Path | str = "diagnosis") -> Path:
+        """Write report.html, report.json, report.rrd, summary.png and model.toml; a report there is replaced.
+
+        Args:
+            folder: made where it is missing.
+
+        Returns:
+            The folder.
+
+        Raises:
+            DataError: the folder cannot be written.
+        """
+        from carlab.diagnosis.report.write import write_report
+
+        write_report(self.diagnosis, self.exhibits, Path(folder), self.model.simulator)
+        return Path(folder)
+
+    def save_decisions(self, folder: Path | str = "diagnosis") -> Path:
+        """Write decisions.json: each decision about a name with the statistics and thresholds that it compared.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        from carlab.diagnosis.report.write import write_decisions
+
+        return write_decisions(self.exhibits, Path(folder))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of report.json."""
+        return self.diagnosis.to_dict()
+
+    def to_html(self) -> str:
+        """The whole report as one self-contained page."""
+        from carlab.diagnosis.report.html_page import render_page
+
+        return render_page(self.diagnosis, self.exhibits)
+
+    def _repr_html_(self) -> str:
+        page = html.escape(self.to_html(), quote=True)
+        return f'<iframe srcdoc="{page}" style="width:100%;height:720px;border:0"></iframe>'
+
+    def __str__(self) -> str:
+        """The verdict, and one sentence for each effect."""
+        return "\n  ".join([self.sentence, *(effect.sentence for effect in self.diagnosis.effects)])
+
+
+@dataclass(slots=True)
+class Material:
+    """Episodes with what reading them found; ``notes`` say in sentences how files were read."""
+
+    episodes: list[EpisodeData] = field(default_factory=list)
+    faults: list[DataFault] = field(default_factory=list)
+    uses: list[RecordingUse] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def diagnose(
+    recordings: RecordingLike | Iterable[RecordingLike],
+    car: str | Path | CarFile = "sim",
+    *,
+    held_out: RecordingLike | Iterable[RecordingLike] = (),
+    holdout_share: float | None = None,
+    effects: Sequence[str] = (),
+    seed: int = 0,
+    out: Path | str | None = None,
+    progress: Callable[[str, float], None] = lambda activity, share: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> DiagnosisReport:
+    """Find what a simulator leaves out of recordings: locate it, name it, model it, and prove it on held-out data.
+
+    Args:
+        recordings: one recording or several, to fit: a ``Recording``, an ``EpisodeData``, a path (MCAP, CSV), or the
+            folder of a run, of which every third episode is held out.
+        car: the simulator in question: a car file, its path, or a name (``sim``, ``eth_rc_car`` ...).
+        held_out: recordings for validation only; without any, the last part of each recording.
+        holdout_share: how much of each recording that is, above 0 and at most 0.5; 0.3 unless given.
+        effects: try only these effects of the catalogue.
+        seed: written into the report; a diagnosis draws no random numbers.
+        out: folder that the report is written to; ``DiagnosisReport.save`` does it later.
+        progress: called with the current activity and the share that is done, in [0, 1].
+        stop: once it returns true, the search ends, and what it found until then is reported.
+
+    Returns:
+        The report; ``is_conclusive`` is False where the recordings are not sufficient.
+
+    Raises:
+        ConfigError: an argument is wrong.
+        DataError: a recording cannot be read, or the report cannot be written.
+    """
+    from carlab.core.errors import ConfigError
+
+    file = load_car(car)
+    to_fit, to_validate = _assigned(as_list(recordings), as_list(held_out))
+    _check_effects(effects)
+    if holdout_share is not None and to_validate:
+        raise ConfigError("--holdout-share counts only where no recording is held out whole; leave it out.")
+    latency_s = file.simulator.mocap.latency_s
+    fit = read_material(to_fit, "fit", latency_s)
+    validation = read_material(to_validate, "held out", latency_s)
+    report = _diagnosed(fit, validation, file, holdout_share, effects, seed, progress, stop)
+    if out is not None:
+        report.save(out)
+    return report
+
+
+def _diagnosed(
+    fit: Material,
+    validation: Material,
+    file: CarFile,
+    holdout_share: float | None,
+    effects: Sequence[str],
+    seed: int,
+    progress: Callable[[str, float], None],
+    stop: Callable[[], bool],
+) -> DiagnosisReport:
+    from carlab.diagnosis.diagnose import Inconclusive
+    from carlab.diagnosis.diagnose import diagnose as search
+    from carlab.diagnosis.findings import Diagnosis, Exhibits
+    from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+    from carlab.diagnosis.report.write import completed
+    from carlab.diagnosis.selection.evidence import Texts
+    from sim_backends.effects import confusable_effects
+
+    uses, faults = (*fit.uses, *validation.uses), (*fit.faults, *validation.faults)
+    try:
+        outcome = search(
+            fit.episodes,
+            validation.episodes,
+            file.simulator,
+            Texts(effect_sentence, separating_drive, confusable_effects()),
+            uses=uses,
+            data_faults=faults,
+            effects=tuple(effects) or None,
+            holdout_share=holdout_share,
+            seed=seed,
+            progress=progress,
+            stop=stop,
+        )
+    except Inconclusive as error:
+        known = error.data_faults or faults
+        why = str(error)
+        if error.verdict == "data":
+            causes = ", ".join(sorted({f.id.replace("_", " ") for f in known}))
+            why = f"The recording is at fault ({causes}), so no physics can be identified: {why}"
+        undecided = Diagnosis(error.verdict, why, (), {}, 1.0, {}, None, tuple(known), uses, seed, 0.0, why)
+        return DiagnosisReport(undecided, Exhibits(), _as_car_file(undecided, file.simulator, file.name), False)
+    model = _as_car_file(outcome.diagnosis, outcome.model, file.name)
+    return DiagnosisReport(completed(outcome.diagnosis), outcome.exhibits, model)
+
+
+def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str) -> CarFile:
+    from carlab.cars import CarFile
+    from carlab.diagnosis.report.write import completed, model_toml, with_doubts
+
+    worded = completed(diagnosis)
+    return CarFile(f"{name} (diagnosed)", model_toml(worded, simulator), with_doubts(worded, simulator), None)
+
+
+def _check_effects(effects: Sequence[str]) -> None:
+    from carlab.core.errors import ConfigError
+    from sim_backends.effects import EFFECTS
+
+    for name in effects:
+        if name not in EFFECTS:
+            raise ConfigError(f"There is no effect '{name}'; there are: {', '.join(EFFECTS)}.")
+
+
+def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLike]:
+    """Recordings as a list; a path is a Path."""
+    from carlab.core.episode_data import EpisodeData
+
+    single = isinstance(given, (str, Path, Recording, EpisodeData))
+    return [Path(item) if isinstance(item, str) else item for item in ([given] if single else given)]
+
+
+def _assigned(
+    recordings: list[RecordingLike], held_out: list[RecordingLike]
+) -> tuple[list[RecordingLike], list[RecordingLike]]:
+    """Recordings to fit and to hold out, with the folders of runs resolved. ConfigError where one is both."""
+    from carlab.core.errors import ConfigError
+
+    if not recordings:
+        raise ConfigError("Name at least one recording to fit, for example carlab diagnose drive.mcap.")
+    to_fit: list[RecordingLike] = []
+    to_validate = list(held_out)
+    for item in recordings:
+        fitted, validated = _episodes_of_run(item) if isinstance(item, Path) else ([item], [])
+        to_fit += fitted
+        to_validate += validated
+    paths = [{p.resolve() for item in items if (p := _path_of(item))} for items in (to_fit, to_validate)]
+    if same := paths[0] & paths[1]:
+        raise ConfigError(f"{min(same).name} is both fitted and held out; name it once.")
+    return to_fit, to_validate
+
+
+def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:
+    """Of a run's folder the episodes to fit and to hold out (every third); of anything else the path itself."""
+    if not (path / "episodes").is_dir():
+        return [path], []
+    from carlab.core.errors import ConfigError
+    from carlab.experiment.campaign.training import has_ticks
+
+    driven = [recording for recording in sorted((path / "episodes").glob("*.mcap")) if has_ticks(recording)]
+    if not driven:
+        raise ConfigError(f"{path} has no finished episode yet.")
+    return [p for k, p in enumerate(driven) if k % 3 != 2], driven[2::3]
+
+
+def _path_of(item: RecordingLike) -> Path | None:
+    return item.path if isinstance(item, Recording) else item if isinstance(item, Path) else None
+
+
+def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Material:
+    """Episodes as a diagnosis expects them: CSV repaired on reading, own recordings as captured by the cameras."""
+    from carlab.api.recordings import load
+    from carlab.diagnosis.findings import RecordingUse
+    from carlab.diagnosis.own_recordings import as_captured
+
+    material = Material()
+    for item in items:
+        path = _path_of(item)
+        if path is None:
+            material.episodes.append(as_captured(item, latency_s))
+            digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
+            material.uses.append(RecordingUse(str(item.metadata.get("source", "episode")), digest, role))
+            continue
+        if is_csv(required_file(path)):
+            _read_csv(path, item.mapping if isinstance(item, Recording) else None, material)
+        else:
+            read = item if isinstance(item, Recording) else load(path)
+            material.episodes += [as_captured(episode, latency_s) for episode in read.episodes]
+            if read.is_recovered:
+                ticks = read.episode.ticks
+                material.notes.append(f"{path} was never finished; {ticks} complete ticks were recovered.")
+        material.uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))
+    return material
+
+
+def _read_csv(path: Path, mapping: Any, material: Material) -> None:
+    """Add a CSV's episodes and what was repaired; what is wrong and not repaired is found again in the episodes."""
+    from carlab.diagnosis.findings import DataFault
+    from carlab.recording.audit.report import Severity
+    from carlab.recording.csv.repairing_import import import_mended
+
+    read = import_mended(path, mapping=mapping)
+    material.episodes += list(read.imported.episodes)
+    material.notes.append(read.imported.announcement)
+    repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
+    rows = read.imported.episodes[-1].ticks + 1
+    material.faults += [
+        DataFault(f.id, f.channel, f.count or rows, f"repaired: {f.sentence}")
+        for f in (*read.mended, *repaired)
+        if f.id in REPORTED_FAULTS
+    ]

@@ -1,0 +1,261 @@
+"""Driving episodes on any car."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from carlab.api.arguments import at_least
+from carlab.api.runs import RunHooks, html_picture, html_table, new_run, write_result
+from carlab.core.errors import ConfigError, NotReadyError
+
+if TYPE_CHECKING:
+    from carlab.cars import CarChoice, CarFile
+    from carlab.core.clock import Clock
+    from carlab.core.documents import Tick
+    from carlab.core.outcome import EndReason
+    from carlab.core.policy import Policy
+    from carlab.core.safety import SafetyEnvelope
+    from carlab.core.task import Task
+    from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
+    from carlab.experiment.episodes.teleop_policy import TeleopPolicy
+    from carlab.recording import RunDirectory
+    from sim_backends.car_parameters import SimulatorConfig
+
+PolicyName = Literal[
+    "parking",
+    "neutral",
+    "keyboard",
+    "gamepad",
+    "steering_steps",
+    "throttle_steps",
+    "steering_chirp",
+    "figure_eight",
+    "throttle_ramp",
+    "coast_down",
+    "slow_circle",
+]
+TaskName = Literal["parking", "path"]
+KEY_THROTTLE = 0.4
+TELEOP_MAX_TICKS = 10**6
+PICTURE_FILE = "summary.png"
+
+
+@dataclass(frozen=True)
+class DriveRun:
+    """What ``carlab.drive`` recorded.
+
+    Attributes:
+        folder: the run's folder.
+        episodes: each with ``data`` (arrays), ``reason`` (how it ended), ``summary`` (figures of the task), ``path``.
+    """
+
+    folder: Path
+    episodes: tuple[EpisodeResult, ...]
+
+    @property
+    def recordings(self) -> list[Path]:
+        """The MCAP files."""
+        return [episode.path for episode in self.episodes]
+
+    @property
+    def picture(self) -> Path:
+        """The summary picture; absent where none was drawn."""
+        return self.folder / PICTURE_FILE
+
+    @property
+    def end(self) -> EndReason | None:
+        """How the last episode ended; None where nothing was driven."""
+        return self.episodes[-1].reason if self.episodes else None
+
+    def __repr__(self) -> str:
+        """One line: folder, number of episodes, last end."""
+        end = "nothing driven" if self.end is None else self.end.name.lower()
+        return f"<DriveRun {self.folder}: {len(self.episodes)} episodes, {end}>"
+
+    def _repr_html_(self) -> str:
+        names = list(self.episodes[0].summary) if self.episodes else []
+        rows = [
+            [e.episode, e.data.ticks, e.total_reward, *(float(e.summary[n]) for n in names), e.reason.name.lower()]
+            for e in self.episodes
+        ]
+        return html_table(["episode", "ticks", "return", *names, "end"], rows) + html_picture(self.picture)
+
+
+def drive(
+    car: str | CarFile = "sim",
+    *,
+    policy: PolicyName | Policy = "parking",
+    task: TaskName | Task = "parking",
+    episodes: int = 1,
+    ticks: int | None = None,
+    seed: int = 0,
+    max_throttle: float | None = None,
+    place: bool = True,
+    out: Path | str = "runs",
+    name: str = "drive",
+    rerun: bool = True,
+    picture: bool = True,
+    vehicle: Path | CarFile | None = None,
+    reality: Path | CarFile | None = None,
+    dry_run: bool = False,
+    hooks: RunHooks | None = None,
+) -> DriveRun:
+    """Drive episodes with a policy on a car, and record them. ^C ends after the tick, twice stops at once.
+
+    Args:
+        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a car that comes with the package, the path of a car
+            file, or a car file: with ``[hardware]`` that real car, else that simulated one.
+        policy: ``parking`` (feedback), a scripted manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, or an object with
+            ``name``, ``reset()`` and ``act(view)``, see ``carlab.core.policy.Policy``.
+        task: ``parking``, ``path``, or an object, see ``carlab.core.task.Task``: start, reward, end, arena.
+        episodes: how many.
+        ticks: control periods an episode; the task's number unless given.
+        seed: of start poses and sensor noise.
+        max_throttle: largest throttle that passes the safety gate, in (0, 1].
+        place: start each episode at the task's start pose; False: from where the car stands.
+        out: folder that receives the run's folder.
+        name: last part of the run folder's name.
+        rerun: record .rrd files beside the MCAP files.
+        picture: draw summary.png.
+        vehicle: car file that ``sim`` and ``emulated`` use in place of the default car's.
+        reality: car file whose physics a simulated or emulated car has in truth; the recordings alone show it.
+        dry_run: real inputs, but no command is sent.
+        hooks: functions that are called on the way.
+
+    Returns:
+        The run; ``episodes`` is empty where it was interrupted before the first.
+
+    Raises:
+        ConfigError: an argument is wrong.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven; nothing has moved.
+    """
+    from carlab.cars import choose_car
+
+    hooks = hooks or RunHooks()
+    at_least(1, episodes=episodes, ticks=ticks)
+    at_least(0, seed=seed)
+    _check(policy, task, max_throttle)
+    choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
+    options = {"seed": seed, "max_ticks": ticks, "place": place, "record_rerun": rerun}
+    with new_run(out, name, choice, hooks) as run:
+        results = _drive(choice, policy, task, max_throttle, run, episodes, hooks, options)
+    _write_results(run, results, picture)
+    return DriveRun(run.path, tuple(results))
+
+
+def _drive(
+    choice: CarChoice,
+    policy: PolicyName | Policy,
+    task: TaskName | Task,
+    max_throttle: float | None,
+    run: RunDirectory,
+    episodes: int,
+    hooks: RunHooks,
+    options: dict[str, Any],
+) -> list[EpisodeResult]:
+    """Open policy and car and drive the episodes; ``options`` go to ``Session``."""
+    from carlab.core.task import TASKS
+    from carlab.experiment.episodes.session import Session
+
+    chosen: Task = TASKS[task]() if isinstance(task, str) else task
+    driver, teleop = _policy(policy, max_throttle, choice.simulator)
+    session_hooks = hooks.session()
+    with contextlib.ExitStack() as stack:
+        if teleop is not None:
+            session_hooks = _by_hand(session_hooks, teleop, choice.car.clock)
+            options = {**options, "max_ticks": options["max_ticks"] or TELEOP_MAX_TICKS}
+            stack.enter_context(teleop)
+        stack.enter_context(choice.car)
+        envelope = _envelope(choice.envelope, chosen, max_throttle)
+        session = Session(
+            choice.car, driver, chosen, envelope, run, choice.control_period_s, config_toml=choice.config_toml,
+            hooks=session_hooks, **options,
+        )  # fmt: skip
+        return session.drive(episodes)
+
+
+def _write_results(run: RunDirectory, results: Sequence[EpisodeResult], picture: bool) -> None:
+    from carlab.recording import read_episode, save_summary
+
+    if results:
+        write_result(run, results)
+    if results and picture:
+        save_summary([read_episode(r.path) for r in results if r.path.exists()], run.path / PICTURE_FILE)
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _check(policy: PolicyName | Policy, task: TaskName | Task, max_throttle: float | None) -> None:
+    from carlab.core.manoeuvres import MANOEUVRES
+    from carlab.core.task import TASKS
+
+    policies = ("parking", "neutral", "keyboard", "gamepad", *MANOEUVRES)
+    for option, given, known in (("policy", policy, policies), ("task", task, tuple(TASKS))):
+        if isinstance(given, str) and given not in known:
+            raise ConfigError(f"--{option} {given}: choose one of {', '.join(known)}.")
+    if max_throttle is not None and not 0.0 < max_throttle <= 1.0:
+        raise ConfigError(f"--max-throttle {max_throttle:g}: above 0, at most 1.")
+    if task == "path" and policy == "parking":
+        raise ConfigError("The parking policy follows no path; choose another --policy for --task path.")
+    if policy == "keyboard" and not has_screen():
+        raise NotReadyError("Keyboard", ["its window needs a screen and there is none; use --policy gamepad."])
+
+
+def _envelope(own: SafetyEnvelope, task: Task, max_throttle: float | None) -> SafetyEnvelope:
+    """The car's limits, in the arena of the task where the car has none of its own."""
+    limits = own if own.arena_m else replace(own, arena_m=task.arena_m)
+    return limits if max_throttle is None else replace(limits, max_throttle=max_throttle)
+
+
+def _policy(
+    policy: PolicyName | Policy, max_throttle: float | None, simulator: SimulatorConfig
+) -> tuple[Policy, TeleopPolicy | None]:
+    """The policy, and the same once more where a person drives."""
+    from carlab.core.manoeuvres import MANOEUVRES
+    from carlab.experiment.episodes.scripted_policies import ManoeuvrePolicy, NeutralPolicy, ReverseParkingPolicy
+    from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
+
+    if not isinstance(policy, str):
+        return policy, None
+    if policy in ("keyboard", "gamepad"):
+        # A gamepad at full travel means the largest throttle; a key never means more than that either.
+        top = max_throttle or 1.0
+        source = KeyboardSource(min(KEY_THROTTLE / top, 1.0)) if policy == "keyboard" else GamepadSource()
+        teleop = TeleopPolicy(source, top)
+        return teleop, teleop
+    if policy == "neutral":
+        return NeutralPolicy(), None
+    if policy == "parking":
+        return ReverseParkingPolicy.for_car(simulator), None
+    return ManoeuvrePolicy(MANOEUVRES[policy]()), None
+
+
+def _by_hand(hooks: SessionHooks, teleop: TeleopPolicy, clock: Clock) -> SessionHooks:
+    """Hooks for a person who drives: the dead-man ends an episode, and a simulated car runs in real time."""
+    from carlab.core.clock import MonotonicClock
+
+    if isinstance(clock, MonotonicClock):
+        return replace(hooks, stop_reason=teleop.stop_reason)
+    wall = MonotonicClock()
+    offset_s = [0.0]
+    on_episode: Callable[[int, int], None] = hooks.on_episode
+    on_tick: Callable[[Tick], None] = hooks.on_tick
+
+    def begin(number: int, ticks: int) -> None:
+        on_episode(number, ticks)
+        offset_s[0] = wall.now_s() - clock.now_s()
+
+    def wait(tick: Tick) -> None:
+        on_tick(tick)
+        wall.sleep_until(offset_s[0] + tick.t_s)
+
+    return replace(hooks, stop_reason=teleop.stop_reason, on_episode=begin, on_tick=wait)

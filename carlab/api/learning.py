@@ -1,0 +1,366 @@
+"""Learning to park: learn the car, learn a policy in the learned car, drive, and again."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from carlab.api.arguments import above_zero, at_least
+from carlab.api.cars import typed_car
+from carlab.api.runs import RunHooks, existing_run, html_picture, html_table, new_run, write_result
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.cars import CarChoice, CarFile
+    from carlab.core.outcome import EndReason
+    from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+    from carlab.experiment.campaign.figures import EpisodeFigures
+    from carlab.experiment.campaign.quick_check import QuickCheck
+    from carlab.experiment.campaign.training import TrainingPlan
+    from carlab.experiment.episodes.interrupts import Interrupts
+    from carlab.experiment.episodes.session import EpisodeResult
+    from carlab.recording.run_folder import RunDirectory
+    from sim_backends.car_parameters import SimulatorConfig
+
+EPISODES = 20
+Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
+Device = Literal["cpu", "cuda"]
+PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
+"""Arguments that a run keeps when it is resumed."""
+
+
+@dataclass(slots=True)
+class LearnHooks(RunHooks):
+    """Functions that are called while a campaign goes on; by default nothing is done.
+
+    Attributes:
+        on_training: what is being learned, steps done, steps in all.
+        on_learned: figures of a training that ended.
+        on_figures: figures of an episode that ended.
+        on_checking: a quick check of an episode against the simulator begins.
+        on_check: its result.
+    """
+
+    on_training: Callable[[str, int, int], None] = lambda activity, done, total: None
+    on_learned: Callable[[dict[str, Any]], None] = lambda figures: None
+    on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
+    on_checking: Callable[[], None] = lambda: None
+    on_check: Callable[[QuickCheck], None] = lambda check: None
+
+
+@dataclass(frozen=True)
+class LearnRun:
+    """What ``carlab.learn`` learned and recorded.
+
+    Attributes:
+        folder: the run's folder; ``carlab.learn(resume=folder)`` goes on with it.
+        wanted: how many episodes the run is to have.
+        episodes: figures of the episodes that this call drove: return, predicted return, distance to the goal ...
+        results: the same episodes with their data and how they ended.
+    """
+
+    folder: Path
+    wanted: int
+    episodes: tuple[EpisodeFigures, ...]
+    results: tuple[EpisodeResult, ...]
+
+    @property
+    def recordings(self) -> list[Path]:
+        """The finished MCAP files of the whole run."""
+        from carlab.recording.run_folder import RunDirectory
+
+        return RunDirectory(self.folder).recordings() if self.folder.is_dir() else []
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the run has all its episodes."""
+        return len(self.recordings) >= self.wanted
+
+    @property
+    def picture(self) -> Path:
+        """The learning curve as a picture."""
+        return self.folder / "learn.png"
+
+    @property
+    def end(self) -> EndReason | None:
+        """How the last episode ended; None where nothing was driven."""
+        return self.results[-1].reason if self.results else None
+
+    def __repr__(self) -> str:
+        """One line: folder, episodes driven, episodes wanted."""
+        return f"<LearnRun {self.folder}: {len(self.recordings)} of {self.wanted} episodes>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            [e.episode, e.total_reward, e.predicted_return, e.distance_m, "yes" if e.parked else "no", e.end.lower()]
+            for e in self.episodes
+        ]
+        columns = ["episode", "return", "predicted return", "distance [m]", "parked", "end"]
+        return html_table(columns, rows) + html_picture(self.picture)
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """The arguments of ``learn``."""
+
+    car: str | CarFile
+    episodes: int | None
+    ticks: int | None
+    prior: str | Path | CarFile
+    method: Method
+    history: int | None
+    model_steps: int | None
+    updates: int
+    seed: int
+    device: Device | None
+    place: bool
+    resume: Path | None
+    out: Path
+    name: str
+    rerun: bool
+    vehicle: Path | CarFile | None
+    reality: Path | CarFile | None
+    dry_run: bool
+
+    @property
+    def typed(self) -> str:
+        """The car as one would type it."""
+        return typed_car(self.car, self.vehicle, self.reality, self.dry_run)
+
+
+def learn(
+    car: str | CarFile = "sim",
+    *,
+    episodes: int | None = None,
+    ticks: int | None = None,
+    prior: str | Path | CarFile = "kinematic",
+    method: Method = "sim-fsvgd",
+    history: int | None = None,
+    model_steps: int | None = None,
+    updates: int = 30000,
+    seed: int = 0,
+    device: Device | None = None,
+    place: bool = True,
+    resume: Path | str | None = None,
+    out: Path | str = "runs",
+    name: str = "learn",
+    rerun: bool = True,
+    vehicle: Path | CarFile | None = None,
+    reality: Path | CarFile | None = None,
+    dry_run: bool = False,
+    hooks: LearnHooks | None = None,
+) -> LearnRun:
+    """Learn the car, learn to park in the learned car, drive, and again with what was recorded.
+
+    Args:
+        car: as for ``carlab.drive``.
+        episodes: how many in all; 20 unless given, or as many as a resumed run was started with.
+        ticks: control periods an episode; the task's number (100) unless given.
+        prior: the simulator that is the prior: ``kinematic``, ``nominal``, or a car file such as a diagnosed model.
+        method: ``sim-fsvgd``; ``fsvgd`` without a simulator; ``fsvgd-authors`` with the settings of the paper.
+        history: past commands that model and policy see; as many as the car's delays need unless given.
+        model_steps: optimiser steps of the model before each episode; 2500 unless given.
+        updates: gradient steps of the policy before an episode.
+        seed: of all random numbers.
+        device: where model and policy are trained; ``cpu`` unless given.
+        place: start each episode at the task's start pose; False: from where the car stands.
+        resume: folder of a run to go on with.
+        out: folder that receives the run's folder.
+        name: last part of the run folder's name.
+        rerun: record .rrd files beside the MCAP files.
+        vehicle: as for ``carlab.drive``.
+        reality: as for ``carlab.drive``.
+        dry_run: real inputs, but no command is sent.
+        hooks: functions that are called on the way.
+
+    Returns:
+        The run; ``is_complete`` is False where it was interrupted or ended for safety.
+
+    Raises:
+        ConfigError: an argument is wrong, or not that of the run to resume.
+        DataError: training failed, or the folder to resume is no run.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven; nothing has moved.
+    """
+    request = _Request(
+        car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
+        None if resume is None else Path(resume), Path(out), name, rerun, vehicle, reality, dry_run,
+    )  # fmt: skip
+    return _learn(request, hooks or LearnHooks())
+
+
+@dataclass(slots=True)
+class _Progress:
+    """Figures of the episodes so far."""
+
+    run: RunDirectory
+    hooks: LearnHooks
+    rows: list[EpisodeFigures] = field(default_factory=list)
+
+    def on_figures(self, row: EpisodeFigures) -> None:
+        from carlab.experiment.campaign.report import keep_row
+
+        self.rows.append(row)
+        keep_row(self.run, row)
+        self.hooks.on_figures(row)
+
+    def on_check(self, check: QuickCheck) -> None:
+        from carlab.experiment.campaign.report import keep_check
+
+        if self.rows and self.rows[-1].episode == check.episode:
+            self.rows[-1] = self.rows[-1].with_check(check)
+        keep_check(self.run, check)
+        self.hooks.on_check(check)
+
+    def campaign_hooks(self, interrupts: Interrupts) -> CampaignHooks:
+        from carlab.experiment.campaign.campaign import CampaignHooks
+
+        own = self.hooks
+        return CampaignHooks(
+            own.session(),
+            own.on_training,
+            own.on_learned,
+            self.on_figures,
+            own.on_checking,
+            self.on_check,
+            interrupts.requested.is_set,
+        )
+
+
+def _learn(request: _Request, hooks: LearnHooks) -> LearnRun:
+    from carlab.cars import choose_car
+    from carlab.experiment.campaign.campaign import seed_of
+    from carlab.experiment.campaign.report import write_report
+    from carlab.experiment.episodes.interrupts import Interrupts
+
+    _check(request)
+    started = None if request.resume is None else seed_of(request.resume)
+    choice = choose_car(
+        request.car,
+        vehicle=request.vehicle,
+        reality=request.reality,
+        dry_run=request.dry_run,
+        seed=request.seed if started is None else started,
+    )
+    results: list[EpisodeResult] = []
+    with contextlib.ExitStack() as stack:
+        campaign = (_begun if request.resume is None else _resumed)(request, choice, hooks, stack)
+        progress = _Progress(campaign.run, hooks)
+        stack.enter_context(choice.car)
+        campaign.hooks = progress.campaign_hooks(stack.enter_context(Interrupts()))
+        if request.resume is None:
+            campaign.write_plan()
+        elif request.episodes is not None and request.episodes != campaign.episodes:
+            campaign.episodes = request.episodes
+            campaign.write_plan()
+        for result in campaign.go_on():
+            results.append(result)
+            hooks.on_result(result)
+            write_report(campaign.run, campaign.plan, progress.rows[-1])
+    if results and campaign.run.path.is_dir():
+        write_result(campaign.run, results)
+    return LearnRun(campaign.run.path, campaign.episodes, tuple(progress.rows), tuple(results))
+
+
+def _check(request: _Request) -> None:
+    from learning.devices import available
+
+    above_zero(episodes=request.episodes, updates=request.updates, ticks=request.ticks, model_steps=request.model_steps)
+    at_least(0, history=request.history, seed=request.seed)
+    available(request.device or "cpu")
+
+
+def _begun(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
+    from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+
+    plan = _plan(request, choice)
+    run = stack.enter_context(new_run(request.out, request.name, choice, hooks, keep="models"))
+    return Campaign(
+        choice, plan, request.episodes or EPISODES, run, CampaignHooks(), request.ticks, request.place, request.rerun,
+        _questioned(request), request.typed,
+    )  # fmt: skip
+
+
+def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
+    from carlab.experiment.campaign.campaign import CampaignHooks, check_same_car, resumed_campaign
+    from carlab.experiment.campaign.report import restore_rows
+    from learning.devices import available
+
+    assert request.resume is not None
+    run = stack.enter_context(existing_run(request.resume, choice, hooks))
+    check_same_car(run, choice, request.typed)
+    campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
+    available(campaign.plan.device)
+    _check_as_before(request, campaign.plan, choice)
+    campaign.set_aside_stopped_episode()
+    restore_rows(run, campaign.plan.task)
+    return campaign
+
+
+def _plan(request: _Request, choice: CarChoice) -> TrainingPlan:
+    import tomli_w
+
+    from carlab.core.task import ParkingTask
+    from carlab.experiment.campaign.campaign import PAPER_HISTORY, needed_history
+    from carlab.experiment.campaign.training import TrainingPlan
+
+    history = request.history
+    if history is None:
+        history = PAPER_HISTORY if request.method == "fsvgd-authors" else needed_history(choice.simulator)
+    if (ticks := request.ticks or ParkingTask().max_ticks) <= history:
+        raise ConfigError(f"--ticks {ticks}: nothing is learned from fewer than --history ({history}) and one more.")
+    text = tomli_w.dumps(_prior(request, choice).to_tables())
+    return TrainingPlan(
+        text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,
+        device=request.device or "cpu",
+    )  # fmt: skip
+
+
+def _prior(request: _Request, choice: CarChoice) -> SimulatorConfig:
+    """The simulator that is the prior."""
+    from carlab.experiment.campaign.campaign import check_period, prior_simulator
+
+    if request.prior == "kinematic" or request.prior == "nominal":
+        kind: Literal["kinematic", "nominal"] = "kinematic" if request.prior == "kinematic" else "nominal"
+        return prior_simulator(choice.simulator, kind)
+    simulator = prior_simulator(_prior_file(request.prior).simulator, "nominal")
+    check_period(simulator, choice.control_period_s, f"car '{_name_of(request.car)}'")
+    return simulator
+
+
+def _prior_file(prior: str | Path | CarFile) -> CarFile:
+    from carlab.cars import CarFile, is_preset, load_car_file
+
+    if isinstance(prior, CarFile):
+        return prior
+    file = Path(prior)
+    if file.suffix != ".toml" and not is_preset(file) and not file.is_file():
+        raise ConfigError(f"--prior {prior}: neither kinematic nor nominal nor a car file that is there.")
+    return load_car_file(file)
+
+
+def _name_of(car: str | CarFile) -> str:
+    return car if isinstance(car, str) else car.name
+
+
+def _questioned(request: _Request) -> SimulatorConfig | None:
+    """The simulator that episodes are checked against, where it is not that of the car's file."""
+    return None if request.prior in ("kinematic", "nominal") else _prior_file(request.prior).simulator
+
+
+def _check_as_before(request: _Request, plan: TrainingPlan, choice: CarChoice) -> None:
+    """Raise ConfigError for an argument that is given and differs from the run to resume."""
+    usual = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
+    before = {name: getattr(plan, name) for name in PLANNED}
+    given = [n for n in PLANNED if getattr(request, n) not in (usual[n], before[n])]
+    if request.prior != usual["prior"] and _plan(request, choice).prior_toml != plan.prior_toml:
+        raise ConfigError("--prior: this run was started with another one; leave it out, or start a new run.")
+    if given:
+        option = given[0].replace("_", "-")
+        raise ConfigError(
+            f"--{option} {getattr(request, given[0])}: this run was started with {before[given[0]]}; leave it out, or "
+            "start a new run."
+        )

@@ -1,0 +1,155 @@
+"""Prediction errors of a simulator on a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from carlab.api.cars import load_car
+from carlab.api.diagnosis import Material, RecordingLike, as_list, read_material
+from carlab.api.runs import html_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from carlab.cars import CarFile
+    from carlab.diagnosis.findings import FitErrors
+    from carlab.diagnosis.score_recording import PartScore, RecordingScore
+    from carlab.prediction.errors import ChannelError
+
+ERROR_COLUMNS = ("position_m", "yaw_rad", "vx", "vy", "yaw_rate", "score")
+
+
+@dataclass(frozen=True)
+class PredictionErrors:
+    """Errors after a horizon, by the same windows and initial states as the held-out errors of a diagnosis.
+
+    Attributes:
+        material: the recordings as they were read, with what was repaired.
+        score: windows, errors (S, 6) of each model, and predicted trajectories.
+    """
+
+    material: Material
+    score: RecordingScore
+
+    @property
+    def horizon_s(self) -> float:
+        """How far was predicted [s]: a whole number of control periods."""
+        return self.score.horizon_s
+
+    @property
+    def summary(self) -> dict[str, FitErrors]:
+        """Root mean square errors in the whole recording of model, constant velocity, no change, and noise floor."""
+        return summary_of(self.score.whole)
+
+    @property
+    def last_part(self) -> dict[str, FitErrors]:
+        """The same in the last part, which a diagnosis of this recording alone holds out; empty where too short."""
+        return {} if self.score.last is None else summary_of(self.score.last)
+
+    def channels(self, model: str = "model") -> tuple[ChannelError, ...]:
+        """Rms, median, 90th percentile and bias of each state channel in the whole recording.
+
+        Args:
+            model: ``model``, ``constant velocity`` or ``no change``.
+        """
+        from carlab.prediction.errors import channel_errors
+
+        return channel_errors(self.score.whole.errors[model])
+
+    def table(self) -> list[dict[str, Any]]:
+        """One dict for each model: position_m [m], yaw_rad [rad], vx, vy [m/s], yaw_rate [rad/s], score."""
+        return [{"model": name, **asdict(errors)} for name, errors in self.summary.items()]
+
+    def plot(self) -> Figure:
+        """Draw recorded and predicted paths of the longest episode (matplotlib)."""
+        from matplotlib.figure import Figure
+
+        pairs = zip(self.score.episodes, self.score.overlays, strict=True)
+        episode, predicted = max(pairs, key=lambda pair: pair[0].ticks)
+        figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+        axes = figure.add_subplot(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        axes.plot(episode.states[:, 0], episode.states[:, 1], color="#333333", linewidth=1.0, label="recorded")
+        label = f"predicted, restarted every {self.horizon_s:.2g} s"
+        axes.plot(predicted[:, 0], predicted[:, 1], ".", markersize=2.5, color="#D55E00", label=label)
+        axes.legend()
+        return figure
+
+    def save(self, path: Path | str) -> list[Path]:
+        """Write the recording with the predictions as .rrd (rerun): one file for each episode.
+
+        Args:
+            path: FILE.rrd; several episodes become FILE-1.rrd, FILE-2.rrd ...
+
+        Returns:
+            The files.
+
+        Raises:
+            DataError: a file cannot be written.
+        """
+        from carlab.recording import episode_to_rrd
+
+        first, written = Path(path), []
+        several = len(self.score.episodes) > 1
+        pairs = zip(self.score.episodes, self.score.overlays, strict=True)
+        for number, (episode, overlay) in enumerate(pairs, start=1):
+            file = first.with_name(f"{first.stem}-{number}.rrd") if several else first
+            name = Path(self.material.uses[0].path).name
+            episode_to_rrd(episode, file, name, overlays={"predicted": overlay})
+            written.append(file)
+        return written
+
+    def __str__(self) -> str:
+        """The table as text."""
+        head = f"{'error after ' + format(self.horizon_s, '.2f') + ' s':20}"
+        lines = [head + "".join(f"{column:>12}" for column in ERROR_COLUMNS)]
+        rows = ("".join(f"{row[column]:12.4f}" for column in ERROR_COLUMNS) for row in self.table())
+        lines += [f"{name:20}{values}" for name, values in zip(self.summary, rows, strict=True)]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        rows = [[row["model"], *(row[column] for column in ERROR_COLUMNS)] for row in self.table()]
+        return html_table([f"error after {self.horizon_s:.2f} s", *ERROR_COLUMNS], rows)
+
+
+def predict(
+    recording: RecordingLike | Iterable[RecordingLike],
+    car: str | Path | CarFile = "sim",
+    *,
+    horizon_s: float = 1.0,
+    stride_s: float = 0.25,
+    holdout_share: float = 0.3,
+) -> PredictionErrors:
+    """Predict a recording from many initial states along it, and compare.
+
+    Args:
+        recording: one recording or several: a ``Recording``, an ``EpisodeData``, or the path of an MCAP or a CSV.
+        car: the simulator: a car file, its path, or a name.
+        horizon_s: how far to predict [s].
+        stride_s: from one initial state to the next [s].
+        holdout_share: how much of the recording the last part is, above 0 and at most 0.5.
+
+    Returns:
+        The errors, beside those of constant velocity and of no change. A model that a diagnosis saved has the error
+        that its report states.
+
+    Raises:
+        ConfigError: an argument is wrong.
+        DataError: the recording holds no window of that length in which the car moves.
+    """
+    from carlab.diagnosis.score_recording import score_recording
+
+    simulator = load_car(car).simulator
+    material = read_material(as_list(recording), "scored", simulator.mocap.latency_s)
+    score = score_recording(
+        material.episodes, simulator, horizon_s=horizon_s, stride_s=stride_s, holdout_share=holdout_share
+    )
+    return PredictionErrors(material, score)
+
+
+def summary_of(part: PartScore) -> dict[str, FitErrors]:
+    """Root mean square errors of each model in a part of a recording, and its noise floor."""
+    errors = {name: part.held_out.summary(values) for name, values in part.errors.items()}
+    return errors | {"noise floor": part.held_out.floor_summary()}

@@ -1,0 +1,189 @@
+"""Recordings by path, whatever their format."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from carlab.core.episode_data import EpisodeData
+    from carlab.recording.audit.report import AuditReport
+    from carlab.recording.csv.mapping import ColumnMapping
+
+CSV_ENDINGS = (".csv", ".csv.gz")
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One recording file.
+
+    Attributes:
+        path: the file.
+        episodes: one episode, or several where a CSV was split.
+        announcement: of a CSV, which layout was recognised and what was converted.
+        audit: of a CSV, what was found in it; None for MCAP.
+        mapping: the mapping that the CSV was read with; None where its layout was recognised.
+        is_recovered: whether the MCAP file was never finished, and its complete ticks were recovered.
+    """
+
+    path: Path
+    episodes: tuple[EpisodeData, ...]
+    announcement: str = ""
+    audit: AuditReport | None = None
+    mapping: ColumnMapping | None = None
+    is_recovered: bool = False
+
+    @property
+    def episode(self) -> EpisodeData:
+        """The longest episode."""
+        return max(self.episodes, key=lambda episode: episode.ticks)
+
+    @property
+    def duration_s(self) -> float:
+        """Driving time of all episodes [s]."""
+        return float(sum(e.times_s[-1] - e.times_s[0] for e in self.episodes))
+
+    def save(self, path: Path | str) -> Path:
+        """Write the recording as .mcap, .csv, .csv.gz, .parquet, .rrd (rerun) or .png (summary picture).
+
+        Args:
+            path: the file to write; its ending chooses the format.
+
+        Returns:
+            The path.
+
+        Raises:
+            ConfigError: the ending is none of these.
+            DataError: the file exists or cannot be written, or the format holds one episode and there are several.
+        """
+        from carlab.core.errors import ConfigError, DataError
+
+        path = Path(path)
+        name = path.name.lower()
+        if not name.endswith((*CSV_ENDINGS, ".mcap", ".parquet", ".rrd", ".png")):
+            raise ConfigError(f"{path}: name a .mcap, .csv, .csv.gz, .parquet, .rrd or .png file.")
+        if path.exists():
+            raise DataError(f"{path} is there already; remove it or choose another name.")
+        if name.endswith(".png"):
+            from carlab.recording import save_summary
+
+            save_summary(self.episodes, path, self.path.name)
+            return path
+        if len(self.episodes) > 1:
+            raise DataError(f"{self.path} holds {len(self.episodes)} episodes; {path.suffix} holds one.")
+        from carlab.recording import episode_to_rrd, write_csv, write_episode, write_parquet
+
+        if name.endswith(".rrd"):
+            episode_to_rrd(self.episode, path, self.path.name)
+        elif name.endswith(".mcap"):
+            write_episode(self.episode, path)
+        else:
+            (write_parquet if name.endswith(".parquet") else write_csv)(self.episode, path)
+        return path
+
+    def __repr__(self) -> str:
+        """One line: file, episodes, commands, seconds."""
+        ticks = sum(episode.ticks for episode in self.episodes)
+        episodes = "1 episode" if len(self.episodes) == 1 else f"{len(self.episodes)} episodes"
+        return f"<Recording {self.path.name}: {episodes}, {ticks} commands, {self.duration_s:.1f} s>"
+
+    def _repr_html_(self) -> str:
+        rows = [] if self.audit is None else self.audit.rows()
+        found = "".join(
+            f"<tr><td>{row[0]}</td><td>{html.escape(row[1])}</td><td>{html.escape(row[2])}</td>"
+            f"<td style='text-align:left'>{html.escape(row[4])}</td></tr>"
+            for row in rows
+        )
+        table = f"<table><tr><th>severity<th>finding<th>channel<th>sentence</tr>{found}</table>" if found else ""
+        return f"<p>{html.escape(repr(self).strip('<>'))}</p><p>{html.escape(self.announcement)}</p>{table}"
+
+
+def is_csv(path: Path) -> bool:
+    """Whether the file name says CSV."""
+    return path.name.lower().endswith(CSV_ENDINGS)
+
+
+def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None, **options: Any) -> Recording:
+    """Read an MCAP recording or a CSV (.csv, .csv.gz).
+
+    Args:
+        path: the file. A .mcap.partial that was never finished is recovered.
+        mapping: of a CSV, which column is which; a TOML file or a ``ColumnMapping``. Known layouts need none.
+        options: of a CSV, what to change in the mapping, by the names of ``carlab import``'s options:
+            ``velocity_frame="world"``, ``vx_unit="km/h"``, ``steering_sign=-1``, ``gaps="split"`` ...
+
+    Returns:
+        The recording; ``episodes`` have states in SI units, see ``carlab.core.episode_data.EpisodeData``.
+
+    Raises:
+        ConfigError: there is no such file, or an option or mapping is wrong.
+        DataError: the file cannot be read as declared.
+    """
+    from carlab.core.errors import ConfigError
+
+    path = required_file(Path(path))
+    if is_csv(path):
+        from carlab.recording.csv.foreign import import_csv
+
+        resolved = resolved_mapping(path, mapping, options)
+        imported = import_csv(path, mapping=resolved)
+        return Recording(path, imported.episodes, imported.announcement, imported.report, resolved)
+    if mapping is not None or options:
+        raise ConfigError(f"{path} is no CSV; a mapping and its options go with .csv and .csv.gz files.")
+    from carlab.recording.mcap.source import read_episode
+
+    episode = read_episode(path)
+    return Recording(path, (episode,), is_recovered=bool(episode.metadata.get("recovered")))
+
+
+def required_file(path: Path, what: str = "The recording") -> Path:
+    """The path, where it is a file; ConfigError otherwise."""
+    from carlab.core.errors import ConfigError
+
+    if not path.exists():
+        raise ConfigError(f"{what} '{path}' does not exist; check the path.")
+    if path.is_dir():
+        raise ConfigError(f"{what} '{path}' is a folder; name a file in it.")
+    return path
+
+
+CHANNEL_OPTIONS = ("unit", "sign", "scale")
+RENAMED_OPTIONS = {
+    "velocity_lag": "velocity_lag_s",
+    "yaw_offset": "yaw_offset_rad",
+    "command_lag": "command_lag_s",
+    "rate": "rate_hz",
+}
+"""Options of ``carlab import`` whose field of ``ColumnMapping`` has a unit in its name."""
+
+
+def resolved_mapping(
+    path: Path, mapping: ColumnMapping | Path | str | None, options: dict[str, Any]
+) -> ColumnMapping | None:
+    """The mapping with options; None where neither is given, so that the layout is recognised.
+
+    Raises:
+        ConfigError: the mapping file or an option is wrong.
+    """
+    from carlab.recording.csv.mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
+    from carlab.recording.csv.table import read_csv
+
+    columns: dict[str, dict[str, Any]] = {}
+    whole: dict[str, Any] = {}
+    for name, value in options.items():
+        channel, _, part = name.rpartition("_")
+        if value is None:
+            continue
+        if part in CHANNEL_OPTIONS and channel in CHANNELS:
+            columns.setdefault(channel, {})[part] = value
+        else:
+            whole[RENAMED_OPTIONS.get(name, name)] = value
+    if isinstance(mapping, (str, Path)):
+        mapping = load_mapping(mapping)
+    if not columns and not whole:
+        return mapping
+    if not isinstance(mapping, ColumnMapping):
+        mapping = recognise_layout(read_csv(path).header, path.name)
+    return mapping.with_options(columns=columns, **whole)

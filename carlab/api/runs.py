@@ -1,0 +1,147 @@
+"""What calls that drive a car have in common: hooks, the run's folder, and its results."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import logging
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.cars import CarChoice
+    from carlab.core.car import Car
+    from carlab.core.documents import Tick
+    from carlab.core.outcome import EndReason
+    from carlab.core.quantities import CarState
+    from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
+    from carlab.recording.run_folder import RunDirectory
+
+
+def _refuse_to_place(start: CarState) -> None:
+    raise ConfigError(
+        f"The car cannot be put at x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad by itself; "
+        "pass place=False to start from where it stands, or hooks whose place_by_hand asks a person."
+    )
+
+
+@dataclass(slots=True)
+class RunHooks:
+    """Functions that are called while a car is driven; by default nothing is done.
+
+    Attributes:
+        on_start: the run's folder and the car, before the car is opened.
+        place_by_hand: called with a start pose that the car cannot reach by itself; returns when it stands there.
+        on_episode: number of an episode that begins, and its largest number of ticks.
+        on_tick: each tick.
+        on_result: each finished episode.
+        on_abandon: reason and detail, after the control loop hung and the car was stopped; the process must end there.
+    """
+
+    on_start: Callable[[Path, Car], None] = lambda folder, car: None
+    place_by_hand: Callable[[CarState], None] = _refuse_to_place
+    on_episode: Callable[[int, int], None] = lambda episode, ticks: None
+    on_tick: Callable[[Tick], None] = lambda tick: None
+    on_result: Callable[[EpisodeResult], None] = lambda result: None
+    on_abandon: Callable[[EndReason, str], None] = lambda reason, detail: None
+
+    def session(self) -> SessionHooks:
+        """The hooks of a session."""
+        from carlab.experiment.episodes.session import SessionHooks
+
+        return SessionHooks(
+            place_by_hand=self.place_by_hand,
+            on_episode=self.on_episode,
+            on_tick=self.on_tick,
+            on_result=self.on_result,
+            on_abandon=self.on_abandon,
+        )
+
+
+@contextmanager
+def new_run(
+    out: Path | str, name: str, choice: CarChoice, hooks: RunHooks, keep: str = "episodes"
+) -> Iterator[RunDirectory]:
+    """A run's folder, with the program's log in it. It is removed where nothing came into its folder ``keep``."""
+    from carlab.recording.run_folder import RunDirectory
+
+    run = RunDirectory.create(out, name, config_toml=choice.config_toml)
+    try:
+        with _logged(run, choice, hooks):
+            yield run
+    finally:
+        if not any((run.path / keep).iterdir()):
+            shutil.rmtree(run.path, ignore_errors=True)
+
+
+@contextmanager
+def existing_run(path: Path | str, choice: CarChoice, hooks: RunHooks) -> Iterator[RunDirectory]:
+    """A run's folder that is resumed, with the program's log going on in it."""
+    from carlab.recording.run_folder import RunDirectory
+
+    run = RunDirectory.open_existing(path)
+    with _logged(run, choice, hooks):
+        yield run
+
+
+@contextmanager
+def _logged(run: RunDirectory, choice: CarChoice, hooks: RunHooks) -> Iterator[None]:
+    choice.log_to(run.path)
+    hooks.on_start(run.path, choice.car)
+    handler = run.log_handler()
+    logging.getLogger().addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.getLogger().removeHandler(handler)
+        handler.close()
+
+
+def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
+    """Write result.json: each episode's end and figures, after those of a run that was resumed."""
+    from carlab.recording.run_folder import RESULT_FILE
+
+    path = run.path / RESULT_FILE
+    try:
+        before = list(json.loads(path.read_text(encoding="utf-8"))["episodes"])
+    except (OSError, ValueError, KeyError, TypeError):
+        before = []
+    now = {result.episode for result in results}
+    episodes = [e for e in before if e.get("episode") not in now] + [
+        {
+            "episode": result.episode,
+            "ticks": result.data.ticks,
+            "return": result.total_reward,
+            **{name: float(value) for name, value in result.summary.items()},
+            "end_reason": result.reason.name,
+            "end_detail": result.data.metadata["end_detail"],
+        }
+        for result in results
+    ]
+    run.write_result({"end_reason": results[-1].reason.name, "episodes": episodes})
+
+
+def html_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table for a notebook; numbers with four digits."""
+
+    def cell(value: object) -> str:
+        return html.escape(f"{value:.4g}" if isinstance(value, float) else str(value))
+
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in columns)
+    body = "".join("<tr>" + "".join(f"<td>{cell(value)}</td>" for value in row) + "</tr>" for row in rows)
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def html_picture(path: Path) -> str:
+    """A PNG file for a notebook; empty where there is none."""
+    if not path.is_file():
+        return ""
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<img style="max-width:100%" src="data:image/png;base64,{data}">'

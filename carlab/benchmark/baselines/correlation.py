@@ -1,0 +1,72 @@
+"""The largest cross-correlation between errors and commands, both prewhitened (Box and Jenkins, 1970).
+
+A command whose past is left in the errors acts later (or earlier) than the model thinks. Differentiating the pose
+smears every step of a command over neighbouring rows, earlier ones too, with a sum of zero; single lags therefore
+correlate on null cases as well, and what counts is the correlation summed over the lags that a step can reach. A lag
+leaves the same sum as a delay: the delay is named for both.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
+from carlab.benchmark.baselines.data import SLOW_MPS, Prepared, Steps
+from carlab.benchmark.world.simulation import FloatArray
+
+ORDER = 8
+STEP_S = 0.1
+# Lags in rows of 1/30 s, negative ones too, and how many are summed.
+BEFORE, AFTER, WIDE = 7, 10, 12
+# In standard errors of a sum of correlations; quiet on the null cases of the development set.
+LEAST = 1.8
+CLIP = 6.0
+
+
+def largest_correlation(data: Prepared) -> str | None:
+    """The delay that the largest cross-correlation stands for, None where all are small."""
+    steering, throttle = _strongest(data, 0, (1, 2)), _strongest(data, 1, (0,))
+    if max(steering, throttle) < LEAST:
+        return None
+    if min(steering, throttle) >= LEAST:
+        return "command_delay"
+    return "steering_delay" if steering > throttle else "throttle_delay"
+
+
+def _strongest(data: Prepared, command: int, channels: tuple[int, ...]) -> float:
+    """The largest summed correlation of a command with the errors of some channels, in standard errors."""
+    fit, car = data.fit, data.car
+    count = max(1, round(STEP_S / car.control_period))
+    rows = np.arange(ORDER + AFTER, len(fit.t_s) - count - BEFORE, dtype=np.int64)
+    steps = Steps(car, fit.measured[rows], rows, fit.t_s[rows], data.steps.fine, data.steps.parts, count)
+    errors = fit.measured[rows + count, 3:] - steps.ends[:, 3:]
+    whitener = _whitener(fit.commands[:, command])
+    pushes = lfilter(whitener, [1.0], fit.commands[:, command] - fit.commands[:, command].mean())
+    fast = (fit.measured[rows, 3] > 2.0 * SLOW_MPS)[ORDER:]
+    best = 0.0
+    for channel in channels:
+        left = lfilter(whitener, [1.0], errors[:, channel] * _sense(data, rows, command))[ORDER:]
+        ceiling = CLIP * float(np.median(np.abs(left)))
+        left = np.clip(left, -ceiling, ceiling) * fast
+        each = [_correlation(pushes[rows[ORDER:] - lag], left) for lag in range(-BEFORE, AFTER)]
+        sums = np.convolve(each, np.ones(WIDE), "valid") * np.sqrt(len(left) / WIDE)
+        best = max(best, float(np.abs(sums).max()))
+    return best
+
+
+def _sense(data: Prepared, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]], command: int) -> FloatArray:
+    """The effect of steering grows with speed; that of throttle does not."""
+    return data.fit.measured[rows, 3] if command == 0 else np.ones(len(rows))
+
+
+def _whitener(series: FloatArray) -> FloatArray:
+    """Coefficients of the prediction error of an autoregression (Yule and Walker)."""
+    centred = series - series.mean()
+    moments = np.array([centred[: len(centred) - k] @ centred[k:] for k in range(ORDER + 1)]) / len(centred)
+    moments[0] = 1.001 * moments[0] + 1e-12
+    return np.concatenate([[1.0], -solve_toeplitz(moments[:-1], moments[1:])])
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    return float(np.mean((a - a.mean()) * (b - b.mean())) / max(float(a.std() * b.std()), 1e-12))

@@ -1,0 +1,251 @@
+"""The library of terms for regressions on the discrepancy: one for every effect that has one, each with its name.
+
+A term is what its effect, at one moderate size, adds to the residual acceleration of the refitted model, (M, 3). This
+is the table that maps a regression's dominant term back to the catalogue; a name may have several terms (a slope has
+two directions, a patch eight places). Exact signatures are a generous library: the usual one has products of states.
+
+Without a term, and why: mocap_latency (the same column as command_delay), traction_limit (with constant axle loads the
+same as motor_saturation), roll_dynamics (a hidden state of its own).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from carlab.benchmark.baselines.data import Prepared, Steps
+from carlab.benchmark.cases.refit import CommandChange
+from carlab.benchmark.cases.set_check import CHEAP
+from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
+from carlab.benchmark.world.simulation import FloatArray
+
+Term = Callable[[Steps], FloatArray]
+PATCHES = 8
+AT_END_ONLY = ("velocity_filter_lag",)
+# Sizes at which the commands are changed: what is moderate for a 1:10 car.
+_SIZES = {
+    "command_delay": 0.02, "steering_delay": 0.02, "throttle_delay": 0.02, "steering_lag": 0.04, "motor_lag": 0.05,
+    "steering_deadband": 0.03, "steering_offset": 0.02, "steering_asymmetry": 0.05, "throttle_deadband": 0.03,
+    "throttle_nonlinearity": 1.1,
+}  # fmt: skip
+
+
+def library(data: Prepared) -> dict[str, Term]:
+    """All terms by ``id`` or ``id:part``, for one case."""
+    car = data.car
+    terms: dict[str, Term] = {name: _command_term(CHEAP[name][0](size, car)) for name, size in _SIZES.items()}
+    terms |= {name: _command_term(change) for name, change in _other_commands(data).items()}
+    terms |= {
+        "rolling_resistance": _force(lambda s, v: (-np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
+        "aerodynamic_drag": _force(lambda s, v: (-v[:, 3] * np.abs(v[:, 3]), 0.0, 0.0)),
+        "cornering_drag": _force(lambda s, v: (-np.abs(_angle(s)) * np.tanh(v[:, 3] / 0.05), 0.0, 0.0)),
+        "yaw_damping": _force(lambda s, v: (0.0, 0.0, -0.01 * v[:, 5])),
+        "torque_steer": _force(lambda s, v: (0.0, 0.0, 0.01 * s.commands()[:, :, 1].mean(axis=1))),
+        "lateral_bias": _force(lambda s, v: (0.0, np.ones(len(v)), 0.0)),
+        "road_slope:east": _force(lambda s, v: (-np.cos(v[:, 2]), np.sin(v[:, 2]), 0.0)),
+        "road_slope:north": _force(lambda s, v: (-np.sin(v[:, 2]), -np.cos(v[:, 2]), 0.0)),
+        "longitudinal_slip": _force(lambda s, v: (-_forward_acceleration(s), 0.0, 0.0)),
+        "tyre_relaxation": _relaxation,
+        "battery_sag": _command_term_of_time(lambda t: 1.0 - 0.002 * t),
+        "friction_drift": _grip(lambda s: (1.0 + 0.002 * s.t_s, 1.0 + 0.002 * s.t_s)),
+        "friction_ellipse": _grip(lambda s: (1.0, _combined(s, 0.3))),
+        "load_transfer": _grip(lambda s: _transfer(s, 0.05)),
+        "aerodynamic_downforce": _grip(lambda s: (_pressed(s), _pressed(s))),
+        "marker_offset:ahead": _observed(lambda v, rate: np.stack([0 * v[:, 2], v[:, 2], 0 * v[:, 2]], axis=1), 0.01),
+        "marker_offset:left": _observed(lambda v, rate: np.stack([-v[:, 2], 0 * v[:, 2], 0 * v[:, 2]], axis=1), 0.01),
+        "mocap_yaw_misalignment": _observed(lambda v, rate: np.stack([v[:, 1], -v[:, 0], 0 * v[:, 0]], axis=1), 0.01),
+        "velocity_filter_lag": _observed(lambda v, rate: -rate, 0.01),
+    }  # fmt: skip
+    for k, (x, y, radius) in enumerate(_places(data)):
+        terms[f"low_friction_patch:{k}"] = _patch(x, y, radius)
+    if car.kind == "linear_tyre":
+        terms["tyre_saturation"] = _saturated
+    return terms
+
+
+def effect_of(term: str) -> str:
+    """The catalogue's id behind a term."""
+    return term.partition(":")[0]
+
+
+def _command_term(change: CommandChange) -> Term:
+    made: dict[int, FloatArray] = {}
+
+    def term(s: Steps) -> FloatArray:
+        key = id(s.fine)
+        if key not in made:
+            made.clear()
+            made[key] = change(s.fine, np.tile(s.parts, len(s.fine) // len(s.parts)))
+        return _gained(s, s.rolled(series=made[key]))
+
+    return term
+
+
+def _command_term_of_time(factor: Callable[[FloatArray], FloatArray]) -> Term:
+    def change(series: FloatArray, lengths: FloatArray) -> FloatArray:
+        out = series.copy()
+        out[:, 1] *= factor(np.cumsum(lengths))
+        return out
+
+    return _command_term(change)
+
+
+def _gained(s: Steps, ends: FloatArray) -> FloatArray:
+    return np.asarray((ends - s.ends)[:, 3:] / s.length_s)
+
+
+def _force(forces: Callable[[Steps, FloatArray], tuple[object, object, object]]) -> Term:
+    """Forces in N and a moment in N m, for steps and their middle states."""
+
+    def term(s: Steps) -> FloatArray:
+        along, across, moment = (np.broadcast_to(np.asarray(f), len(s.starts)) for f in forces(s, s.middle))
+        return np.stack([along / s.car.mass, across / s.car.mass, moment / s.car.yaw_inertia], axis=1)
+
+    return term
+
+
+def _grip(factors: Callable[[Steps], tuple[object, object]]) -> Term:
+    """Friction of the front and the rear axle times something."""
+
+    def term(s: Steps) -> FloatArray:
+        front, rear = (np.broadcast_to(np.asarray(f), len(s.starts)) for f in factors(s))
+        return _gained(s, s.rolled(scaled={"tyre.front.mu": front, "tyre.rear.mu": rear}))
+
+    return term
+
+
+def _observed(seen: Callable[[FloatArray, FloatArray], FloatArray], size: float) -> Term:
+    """What is measured is v + size seen(v, rate): undo it at the start, do it at the end."""
+
+    def term(s: Steps) -> FloatArray:
+        starts = s.starts.copy()
+        starts[:, 3:] -= size * seen(s.starts[:, 3:], s.rates(at_end=False))
+        ends = s.rolled(starts=starts)
+        ends[:, 3:] += size * seen(s.ends[:, 3:], s.rates(at_end=True))
+        return _gained(s, ends)
+
+    return term
+
+
+def _angle(s: Steps) -> FloatArray:
+    return np.asarray(s.car.max_angle * s.commands()[:, :, 0].mean(axis=1))
+
+
+def _push(s: Steps) -> FloatArray:
+    return np.asarray(s.car.drive_gain * s.commands()[:, :, 1].mean(axis=1))
+
+
+def _combined(s: Steps, scale: float) -> FloatArray:
+    share = np.clip(scale * _push(s) / (s.car.mu_rear * s.car.load_rear), -0.9, 0.9)
+    return np.asarray(np.sqrt(1.0 - share**2))
+
+
+def _forward_acceleration(s: Steps) -> FloatArray:
+    turned = (s.ends - s.starts)[:, 3] / s.length_s
+    return np.asarray(turned - s.middle[:, 4] * s.middle[:, 5])
+
+
+def _transfer(s: Steps, height: float) -> tuple[FloatArray, FloatArray]:
+    moved = s.car.mass * _forward_acceleration(s) * height / s.car.wheelbase
+    return 1.0 - moved / s.car.load_front, 1.0 + moved / s.car.load_rear
+
+
+def _pressed(s: Steps) -> FloatArray:
+    return np.asarray(1.0 + 0.1 * s.middle[:, 3] ** 2 / (s.car.mass * GRAVITY_MPS2))
+
+
+def _sides(car: BaseCar, state: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lateral forces of the two axles by the model's tyres."""
+    vx, vy, r = state[:, 3], state[:, 4], state[:, 5]
+    front = np.arctan2(vy + car.front_axle * r, np.maximum(np.abs(vx), 0.3)) - d
+    rear = np.arctan2(vy - car.rear_axle * r, np.maximum(np.abs(vx), 0.3))
+    if car.kind == "linear_tyre":
+        return (-car.mu_front * car.load_front * car.b_front * car.c_front * front,
+                -car.mu_rear * car.load_rear * car.b_rear * car.c_rear * rear)  # fmt: skip
+    return (-car.mu_front * car.load_front * np.sin(car.c_front * np.arctan(car.b_front * front)),
+            -car.mu_rear * car.load_rear * np.sin(car.c_rear * np.arctan(car.b_rear * rear)))  # fmt: skip
+
+
+def _by_sides(car: BaseCar, front: FloatArray, rear: FloatArray, d: FloatArray) -> FloatArray:
+    """Accelerations (M, 3) by lateral forces at the axles."""
+    moment = car.front_axle * front * np.cos(d) - car.rear_axle * rear
+    across = (front * np.cos(d) + rear) / car.mass
+    return np.stack([-front * np.sin(d) / car.mass, across, moment / car.yaw_inertia], axis=1)
+
+
+def _relaxation(s: Steps, length: float = 0.05) -> FloatArray:
+    """F lags F_steady by length / vx: the force is short of it by that times its slope."""
+    angles = s.car.max_angle * s.commands()[:, :, 0]
+    begin, end = _sides(s.car, s.starts, angles[:, 0]), _sides(s.car, s.ends, angles[:, -1])
+    late = length / np.maximum(np.abs(s.middle[:, 3]), 0.3) / s.length_s
+    front, rear = (-late * (b - a) for a, b in zip(begin, end, strict=True))
+    d = angles.mean(axis=1)
+    return _by_sides(s.car, front, rear, d)
+
+
+def _saturated(s: Steps) -> FloatArray:
+    """The Pacejka tyre in place of the linear one, with the same numbers."""
+    d = _angle(s)
+    curved = dataclasses.replace(s.car, kind="dynamic")
+    front, rear = (a - b for a, b in zip(_sides(curved, s.middle, d), _sides(s.car, s.middle, d), strict=True))
+    return _by_sides(s.car, front, rear, d)
+
+
+def _places(data: Prepared) -> list[tuple[float, float, float]]:
+    """Discs along the driven path, as far from one another as can be."""
+    points = data.fit.measured[::5, :2]
+    chosen = [points[0]]
+    while len(chosen) < PATCHES:
+        gaps = np.min([np.hypot(*(points - c).T) for c in chosen], axis=0)
+        chosen.append(points[int(gaps.argmax())])
+    apart = float(np.min([np.hypot(*(points - c).T) for c in chosen], axis=0).max())
+    return [(float(x), float(y), max(apart, 0.1)) for x, y in chosen]
+
+
+def _patch(x: float, y: float, radius: float) -> Term:
+    def factors(s: Steps) -> tuple[object, object]:
+        inside = np.hypot(s.middle[:, 0] - x, s.middle[:, 1] - y) < radius
+        return 1.0 - 0.1 * inside, 1.0 - 0.1 * inside
+
+    return _grip(factors)
+
+
+def _other_commands(data: Prepared) -> dict[str, CommandChange]:
+    """Changes of the acting commands whose size follows from the recording's own commands."""
+    steering, throttle = data.fit.commands.T
+    top_rate = float(np.quantile(np.abs(np.diff(steering)), 0.99)) / data.nominal.control_period
+    limit = 0.6 * max(top_rate, 0.1)
+    play = 0.03 / data.car.max_angle
+    ceiling = 0.8 * max(float(np.quantile(np.abs(throttle), 0.99)), 0.05)
+
+    def rate_limited(series: FloatArray, lengths: FloatArray) -> FloatArray:
+        out, state = series.copy(), float(series[0, 0])
+        for k, (wanted, step_s) in enumerate(zip(series[:, 0].tolist(), lengths.tolist(), strict=True)):
+            state += min(max(wanted - state, -limit * step_s), limit * step_s)
+            out[k, 0] = state
+        return out
+
+    def with_play(series: FloatArray, lengths: FloatArray) -> FloatArray:
+        out, state = series.copy(), float(series[0, 0])
+        for k, wanted in enumerate(series[:, 0].tolist()):
+            state = min(max(state, wanted - 0.5 * play), wanted + 0.5 * play)
+            out[k, 0] = state
+        return out
+
+    def mapped(channel: int, function: Callable[[FloatArray], FloatArray]) -> CommandChange:
+        def change(series: FloatArray, lengths: FloatArray) -> FloatArray:
+            out = series.copy()
+            out[:, channel] = function(series[:, channel])
+            return out
+
+        return change
+
+    return {
+        "steering_rate_limit": rate_limited,
+        "steering_backlash": with_play,
+        "steering_nonlinearity": mapped(0, lambda u: 1.5 * np.tanh(u / 1.5)),
+        "motor_saturation": mapped(1, lambda u: np.clip(u, -ceiling, ceiling)),
+        "brake_asymmetry": mapped(1, lambda u: np.where(u < 0.0, 1.1 * u, u)),
+    }

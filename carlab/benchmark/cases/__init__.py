@@ -1,0 +1,1 @@
+"""Cases with concealed physics: recordings, nominal car file and the sealed answer."""

@@ -1,0 +1,120 @@
+"""Which cases a proof set holds: counts of the full run, a short set, development and test seeds apart."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from carlab.benchmark.cases.case import Case, CaseKind, make_case
+from carlab.benchmark.effects.catalogue import EFFECT_IDS, FormName, look_alike
+from carlab.benchmark.effects.data_faults import FAULTS
+from carlab.benchmark.effects.forms import all_forms
+
+STRENGTHS = (0.5, 1.0, 2.0, 4.0)
+SEED_BASE = {"development": 1_000_000, "test": 2_000_000}
+# Faults that can sit on top of physics which is still to be found.
+ON_TOP = ("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples")
+Purpose = Literal["development", "test"]
+
+
+@dataclass(frozen=True)
+class CaseSpec:
+    """The arguments of one case."""
+
+    kind: CaseKind
+    seed: int
+    effects: tuple[str, ...] = ()
+    form: FormName = "catalogue"
+    excess: float = 0.0
+    fault: str | None = None
+    period_s: float = 1.0 / 30.0
+    fit_s: float = 100.0
+    hold_s: float = 40.0
+
+    def make(self) -> Case:
+        """Draw, size and record it."""
+        return make_case(
+            self.kind,
+            self.seed,
+            effects=self.effects,
+            form=self.form,
+            excess=self.excess,
+            fault=self.fault,
+            period_s=self.period_s,
+            fit_s=self.fit_s,
+            hold_s=self.hold_s,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self)
+
+
+def full_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
+    """The counts of the protocol: 4 cases an effect, 100 null, 40 pairs, 40 outside, 2 a data fault.
+
+    Half of an effect's cases have the catalogue's form, half another; every strength comes once an effect, and which
+    form has which strength changes from effect to effect. One single case in ten has a data fault on top.
+    """
+    return _specs(purpose, seed, per_effect=4, nulls=100, pairs=40, outside=40, per_fault=2)
+
+
+def short_set(
+    purpose: Purpose, seed: int = 0, effects: tuple[str, ...] = ("steering_lag", "rolling_resistance")
+) -> list[CaseSpec]:
+    """A handful of short cases of each kind."""
+    specs = _specs(purpose, seed, per_effect=1, nulls=2, pairs=0, outside=1, per_fault=0, effects=effects)
+    return [CaseSpec(s.kind, s.seed, s.effects, s.form, s.excess, s.fault, s.period_s, 40.0, 20.0) for s in specs]
+
+
+def drawn(specs: list[CaseSpec], count: int, seed: int = 0) -> list[CaseSpec]:
+    """So many of the cases, drawn without replacement, in their order; all where there are no more."""
+    order = np.random.default_rng((seed, 7)).permutation(len(specs))[:count]
+    return [specs[k] for k in sorted(order.tolist())]
+
+
+def _specs(
+    purpose: Purpose,
+    seed: int,
+    *,
+    per_effect: int,
+    nulls: int,
+    pairs: int,
+    outside: int,
+    per_fault: int,
+    effects: tuple[str, ...] = EFFECT_IDS,
+) -> list[CaseSpec]:
+    rng = np.random.default_rng((SEED_BASE[purpose], seed))
+    known = all_forms()
+    base = SEED_BASE[purpose] + 100_000 * seed
+    specs: list[CaseSpec] = []
+
+    def add(kind: CaseKind, ids: tuple[str, ...] = (), form: FormName = "catalogue", excess: float = 0.0,
+            fault: str | None = None) -> None:  # fmt: skip
+        specs.append(CaseSpec(kind, base + len(specs), ids, form, excess, fault))
+
+    for name in effects:
+        strengths = rng.permutation(np.resize(STRENGTHS, per_effect))
+        for k in range(per_effect):
+            wanted: FormName = "catalogue" if k % 2 == 0 else "other"
+            form = wanted if (name, wanted) in known else "catalogue" if wanted == "other" else "other"
+            fault = str(rng.choice(ON_TOP)) if rng.random() < 0.1 else None
+            add("single", (name,), form, float(strengths[k]), fault)
+    for k in range(nulls):
+        add("null" if k % 2 == 0 else "parameters")
+    for k in range(pairs):
+        while True:
+            one, two = (str(n) for n in rng.choice(EFFECT_IDS, 2, replace=False))
+            # A linear nominal car with tyres that saturate differs so much that a second effect would be a detail.
+            if not look_alike(one, two) and "tyre_saturation" not in (one, two):
+                break
+        add("pair", (one, two), "catalogue" if k % 2 == 0 else "other", float(rng.choice(STRENGTHS)))
+    kinds = [name for name, form in known if form == "outside"]
+    for k in range(outside):
+        add("outside", (kinds[k % len(kinds)],), "outside", float(rng.choice(STRENGTHS)))
+    for name in FAULTS:
+        for _ in range(per_fault):
+            add("fault", fault=name)
+    return specs

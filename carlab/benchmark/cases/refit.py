@@ -1,0 +1,245 @@
+"""The generator's own small least-squares refit of a single-track model; it sizes the concealed effects, nothing else.
+
+Shots start from states estimated from the recording (a local cubic over nine poses), as any tool must. The noise floor
+of a channel is what the truth itself would get from the same shot starts: its noise-free state, moved by what the
+start's error grows to within the horizon, against the noisy recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.benchmark.world.base_car import GRAVITY_MPS2, BaseCar
+from carlab.benchmark.world.measurement import Recording, local_fit, to_body
+from carlab.benchmark.world.simulation import FloatArray
+
+HORIZON_S = 1.0
+PRIOR_SHARE = 0.15
+_SUB = 4
+# A change of the fine command series: (series (n, 2), steering in 1 and throttle; step lengths (n,) in s) -> the same.
+CommandChange = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Rollouts to compare: starts (M, 6), mean commands of substeps (M, S, 2), recorded ends (M, 6), floor errors."""
+
+    car: BaseCar
+    steps_s: FloatArray
+    starts: FloatArray
+    commands: FloatArray
+    recorded: FloatArray
+    floor_errors: FloatArray
+
+    @property
+    def floor(self) -> FloatArray:
+        """Noise floor of the six channels."""
+        return np.asarray(np.sqrt((self.floor_errors**2).mean(axis=0)), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Refit:
+    """Base parameters fitted, and scores on the held-out shots (nominal and refitted)."""
+
+    values: dict[str, float]
+    nominal_score: float
+    score: float
+    fit_score: float
+    channels: tuple[float, ...]
+
+    @property
+    def excess(self) -> float:
+        """sqrt(score^2 - 1), 0 where the score is below 1."""
+        return float(np.sqrt(max(self.score**2 - 1.0, 0.0)))
+
+
+def fine_commands(
+    recording: Recording, car: BaseCar, changes: Sequence[CommandChange] = (), shift_s: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Mean acting commands over every substep, on the clock of the captured states, (N n, 2), and substeps of a period.
+
+    A command issued at t acts at t + command_delay; the row's state is latency older than the row. Substeps end where
+    commands switch.
+    """
+    period = car.control_period
+    age = car.command_delay + car.latency + shift_s
+    switch = age % period
+    before = max(1, round(_SUB * switch / period)) if switch > 1e-6 else 0
+    after = max(1, _SUB - before)
+    parts = [np.linspace(0.0, switch, before, endpoint=False), np.linspace(switch, period, after, endpoint=False)]
+    edges = np.concatenate(parts) if before else np.linspace(0.0, period, after, endpoint=False)
+    steps = np.diff(np.append(edges, period))
+    knots = np.append(recording.t_s, recording.t_s[-1] + period)
+    integral = np.concatenate([np.zeros((1, 2)), np.cumsum(recording.commands * np.diff(knots)[:, None], axis=0)])
+    fine = np.append((recording.t_s[:, None] + edges).ravel(), knots[-1])
+    at = np.stack([np.interp(fine - age, knots, integral[:, k]) for k in range(2)], axis=1)
+    lengths = np.tile(steps, len(recording.t_s))
+    series = np.diff(at, axis=0) / lengths[:, None]
+    for change in changes:
+        series = change(series, lengths)
+    return series, steps
+
+
+def cut_shots(
+    recording: Recording,
+    car: BaseCar,
+    *,
+    every_s: float = 0.5,
+    horizon_s: float = HORIZON_S,
+    true_starts: bool = False,
+    changes: Sequence[CommandChange] = (),
+    shift_s: float = 0.0,
+) -> Shots:
+    """Shots of a recording; ``car`` (the true base parameters, where known) carries start errors over the horizon."""
+    period = car.control_period
+    steps, stride = round(horizon_s / period), max(1, round(every_s / period))
+    first = np.arange(5, len(recording.t_s) - steps, stride)
+    last = first + steps
+    window = 9 if period > 0.02 else 2 * round(0.133 / period) + 1
+    clean = recording.clean
+    if true_starts:
+        starts = clean[first]
+    else:
+        pose, slope = local_fit(recording.measured[:, :3], window, 3, period)
+        starts = np.concatenate([pose, to_body(pose[:, 2], slope)], axis=1)[first]
+    fine, parts = fine_commands(recording, car, changes, shift_s)
+    commands = fine[first[:, None] * len(parts) + np.arange(steps * len(parts))]
+    steps_s = np.tile(parts, steps)
+    floor_errors = in_start_frame(clean[last] - recording.measured[last], starts)
+    if not true_starts:
+        grown = roll(car, car.free(), starts, commands, steps_s) - roll(
+            car, car.free(), clean[first], commands, steps_s
+        )
+        floor_errors = floor_errors + in_start_frame(grown, starts)
+    return Shots(car, steps_s, starts, commands, recording.measured[last], floor_errors)
+
+
+def in_start_frame(errors: FloatArray, starts: FloatArray) -> FloatArray:
+    """Errors (M, 6) with x, y turned into the body frame of each start."""
+    cos, sin = np.cos(starts[:, 2]), np.sin(starts[:, 2])
+    turned = errors.copy()
+    turned[:, 0] = cos * errors[:, 0] + sin * errors[:, 1]
+    turned[:, 1] = cos * errors[:, 1] - sin * errors[:, 0]
+    return turned
+
+
+def channel_scores(shots: Shots, values: Mapping[str, float], floor: FloatArray | None = None) -> FloatArray:
+    """Root mean square over shots of every channel's error after the horizon, in noise floors, (6,)."""
+    ends = roll(shots.car, values, shots.starts, shots.commands, shots.steps_s)
+    errors = in_start_frame(ends - shots.recorded, shots.starts) / (shots.floor if floor is None else floor)
+    return np.asarray(np.sqrt((errors**2).mean(axis=0)), dtype=np.float64)
+
+
+def score(shots: Shots, values: Mapping[str, float], floor: FloatArray | None = None) -> float:
+    """Root mean square over shots and channels of the error after the horizon, in noise floors."""
+    return float(np.sqrt((channel_scores(shots, values, floor) ** 2).mean()))
+
+
+def refit(fit: Shots, held_out: Shots, nominal: BaseCar, iterations: int = 10) -> Refit:
+    """Fit the base parameters by Levenberg and Marquardt's method with weak priors around the nominal car."""
+    names = list(nominal.free())
+    centre = np.array([nominal.free()[name] for name in names])
+    logs = np.zeros(len(names))
+    floor = fit.floor
+    prior = 1.0 / PRIOR_SHARE
+    damping, best = 1e-3, np.inf
+    residual, jacobian = _linearise(fit, names, centre, logs, floor)
+    best = float(residual @ residual + prior**2 * logs @ logs)
+    for _ in range(iterations):
+        normal = jacobian.T @ jacobian + prior**2 * np.eye(len(names))
+        gradient = jacobian.T @ residual + prior**2 * logs
+        step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+        trial = logs + np.clip(step, -0.3, 0.3)
+        new_residual, new_jacobian = _linearise(fit, names, centre, trial, floor)
+        cost = float(new_residual @ new_residual + prior**2 * trial @ trial)
+        if cost < best:
+            gain, best = best - cost, cost
+            logs, residual, jacobian, damping = trial, new_residual, new_jacobian, damping / 5
+            if gain < 1e-3 * best:
+                break
+        else:
+            damping *= 10
+    values = dict(zip(names, (centre * np.exp(logs)).tolist(), strict=True))
+    channels = channel_scores(held_out, values)
+    total = float(np.sqrt((channels**2).mean()))
+    return Refit(values, score(held_out, nominal.free()), total, score(fit, values), tuple(channels.tolist()))
+
+
+def _linearise(
+    shots: Shots, names: list[str], centre: FloatArray, logs: FloatArray, floor: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    lanes, count = len(names) + 1, len(shots.starts)
+    delta = 1e-4
+    table = np.repeat(logs[None], lanes, axis=0)
+    table[1:] += delta * np.eye(len(names))
+    values = {name: np.repeat(column, count) for name, column in zip(names, (centre * np.exp(table)).T, strict=True)}
+    ends = roll(
+        shots.car, values, np.tile(shots.starts, (lanes, 1)), np.tile(shots.commands, (lanes, 1, 1)), shots.steps_s
+    )
+    ends = ends.reshape(lanes, count, 6)
+    errors = np.stack([in_start_frame(e - shots.recorded, shots.starts) / floor for e in ends]).reshape(lanes, -1)
+    return errors[0], (errors[1:] - errors[0]).T / delta
+
+
+def roll(
+    car: BaseCar, values: Mapping[str, object], starts: FloatArray, commands: FloatArray, steps_s: FloatArray
+) -> FloatArray:
+    """Ends (M, 6) of M shots of the base model: fixed steps of the classical Runge-Kutta method, all shots at once.
+
+    ``values`` holds the base parameters by dotted name, numbers or arrays (M,).
+    """
+    p = {name if name.startswith("tyre") else name.split(".")[-1]: value for name, value in values.items()}
+    state = [column.copy() for column in starts.T]
+    count = len(starts)
+    angles = np.ascontiguousarray(commands[:, :, 0].T)
+    pushes = np.ascontiguousarray(commands[:, :, 1].T)
+    steps = commands.shape[1]
+    for k in range(steps):
+        step_s = float(steps_s[k])
+        d = p["max_angle"] * angles[k]
+        force = p["drive_gain"] * pushes[k]
+        held = (d, np.sin(d), np.cos(d), force)
+        k1 = _rates(car, p, state, held)
+        k2 = _rates(car, p, [s + 0.5 * step_s * r for s, r in zip(state, k1, strict=True)], held)
+        k3 = _rates(car, p, [s + 0.5 * step_s * r for s, r in zip(state, k2, strict=True)], held)
+        k4 = _rates(car, p, [s + step_s * r for s, r in zip(state, k3, strict=True)], held)
+        state = [
+            s + step_s / 6.0 * (a + 2.0 * (b + c) + e) for s, a, b, c, e in zip(state, k1, k2, k3, k4, strict=True)
+        ]
+    return np.stack(state, axis=1).reshape(count, 6)
+
+
+def _rates(
+    car: BaseCar, p: dict[str, object], state: list[FloatArray], held: tuple[FloatArray, ...]
+) -> list[FloatArray]:
+    q: dict[str, FloatArray] = p  # type: ignore[assignment]
+    _, _, psi, vx, vy, r = state
+    d, sin_d, cos_d, force = held
+    lf, lr, m = car.front_axle, car.rear_axle, car.mass
+    push = force - q["damping"] * vx
+    sin_psi, cos_psi = np.sin(psi), np.cos(psi)
+    travel = [vx * cos_psi - vy * sin_psi, vx * sin_psi + vy * cos_psi, r]
+    front = vy + lf * r
+    slip_f = np.arctan2(front * cos_d - vx * sin_d, np.maximum(np.abs(vx * cos_d + front * sin_d), 0.3))
+    slip_r = np.arctan2(vy - lr * r, np.maximum(np.abs(vx), 0.3))
+    load = m * GRAVITY_MPS2 / (lf + lr)
+    if car.kind == "linear_tyre":
+        ff = -q["tyre.front.mu"] * load * lr * q["tyre.front.B"] * q["tyre.front.C"] * slip_f
+        fr = -q["tyre.rear.mu"] * load * lf * q["tyre.rear.B"] * q["tyre.rear.C"] * slip_r
+    else:
+        ff = -q["tyre.front.mu"] * load * lr * np.sin(q["tyre.front.C"] * np.arctan(q["tyre.front.B"] * slip_f))
+        fr = -q["tyre.rear.mu"] * load * lf * np.sin(q["tyre.rear.C"] * np.arctan(q["tyre.rear.B"] * slip_r))
+    rates = [
+        (push - ff * sin_d) / m + vy * r,
+        (fr + ff * cos_d) / m - vx * r,
+        (lf * ff * cos_d - lr * fr) / q["yaw_inertia"],
+    ]
+    if car.kind in ("kinematic", "blend"):
+        turn = vx * np.tan(d) / (lf + lr)
+        slow = [push / m, (lr * turn - vy) / 0.05, (turn - r) / 0.05]
+        share = np.clip((np.hypot(vx, vy) - 0.3) / 0.2, 0.0, 1.0) if car.kind == "blend" else 0.0
+        rates = [share * a + (1.0 - share) * b for a, b in zip(rates, slow, strict=True)]
+    return travel + rates

@@ -1,0 +1,149 @@
+"""Whether two effects can be told apart on a recording, by the generator's own refit of each with the base parameters.
+
+Only effects of the commands and of age are cheap enough; for others there is no answer and the rule of the look-alike
+column stands alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from carlab.benchmark.cases.refit import CommandChange, Shots, channel_scores, cut_shots, in_start_frame, refit, roll
+from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.measurement import Recording
+from carlab.benchmark.world.simulation import FloatArray
+
+STANDARD_ERRORS = 2.0
+
+
+def _lag(channel: int) -> Callable[[float, BaseCar], CommandChange]:
+    def change(value: float, car: BaseCar) -> CommandChange:
+        def smooth(series: FloatArray, steps_s: FloatArray) -> FloatArray:
+            out = series.copy()
+            lag, state = max(value, 1e-4), 0.0
+            for k, (wanted, step_s) in enumerate(zip(series[:, channel].tolist(), steps_s.tolist(), strict=True)):
+                kept = np.exp(-step_s / lag)
+                out[k, channel] = wanted + (state - wanted) * lag / step_s * (1.0 - kept)
+                state = wanted + (state - wanted) * kept
+            return out
+
+        return smooth
+
+    return change
+
+
+def _map(
+    channel: int, function: Callable[[FloatArray, float, BaseCar], FloatArray]
+) -> Callable[[float, BaseCar], CommandChange]:
+    def change(value: float, car: BaseCar) -> CommandChange:
+        def apply(series: FloatArray, steps_s: FloatArray) -> FloatArray:
+            out = series.copy()
+            out[:, channel] = function(series[:, channel], value, car)
+            return out
+
+        return apply
+
+    return change
+
+
+def _late(channels: tuple[int, ...]) -> Callable[[float, BaseCar], CommandChange]:
+    def change(value: float, car: BaseCar) -> CommandChange:
+        def shift(series: FloatArray, steps_s: FloatArray) -> FloatArray:
+            edges = np.concatenate([[0.0], np.cumsum(steps_s)])
+            out = series.copy()
+            for k in channels:
+                whole = np.concatenate([[0.0], np.cumsum(series[:, k] * steps_s)])
+                out[:, k] = np.diff(np.interp(edges - value, edges, whole)) / steps_s
+            return out
+
+        return shift
+
+    return change
+
+
+def _deadband(u: FloatArray, width: float, car: BaseCar) -> FloatArray:
+    half = 0.5 * width / car.max_angle
+    return u - np.clip(u, -half, half)
+
+
+# Effect: how it changes the acting commands, and where its parameter is looked for.
+CHEAP: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tuple[float, float]]] = {
+    "command_delay": (_late((0, 1)), (-0.03, 0.15)),
+    "mocap_latency": (_late((0, 1)), (-0.03, 0.15)),
+    "steering_delay": (_late((0,)), (0.0, 0.2)),
+    "throttle_delay": (_late((1,)), (0.0, 0.3)),
+    "steering_lag": (_lag(0), (0.0, 0.3)),
+    "motor_lag": (_lag(1), (0.0, 0.5)),
+    "steering_deadband": (_map(0, _deadband), (0.0, 0.3)),
+    "steering_offset": (_map(0, lambda u, v, car: u + v / car.max_angle), (-0.1, 0.1)),
+    "steering_asymmetry": (_map(0, lambda u, v, car: u * (1.0 + v * np.sign(u))), (-0.5, 0.5)),
+    "throttle_deadband": (_map(1, lambda u, v, car: np.sign(u) * np.maximum(np.abs(u) - v, 0) / (1 - v)), (0.0, 0.3)),
+    "throttle_nonlinearity": (_map(1, lambda u, v, car: np.sign(u) * np.abs(u) ** v), (0.4, 2.5)),
+}
+
+
+def indistinguishable(
+    one: str,
+    other: str,
+    nominal: BaseCar,
+    fit: Mapping[str, FloatArray],
+    hold: Mapping[str, FloatArray],
+    floor: FloatArray,
+) -> bool | None:
+    """Whether two effects, each refitted with the base parameters, are within two standard errors on held-out shots.
+
+    Args:
+        one: An effect's id.
+        other: Another's.
+        nominal: The nominal car.
+        fit: Columns of the recording to fit, evenly spaced.
+        hold: Columns of the one held out.
+        floor: Noise floors of the six channels.
+
+    Returns:
+        None where either effect is not among the cheap ones.
+    """
+    if one not in CHEAP or other not in CHEAP:
+        return None
+    recordings = [_recording(table) for table in (fit, hold)]
+    gain = _shot_losses(one, nominal, recordings, floor) - _shot_losses(other, nominal, recordings, floor)
+    error = float(gain.std(ddof=1) * np.sqrt(len(gain)))
+    return abs(float(gain.sum())) <= STANDARD_ERRORS * max(error, 1e-12)
+
+
+def _shot_losses(name: str, nominal: BaseCar, recordings: list[Recording], floor: FloatArray) -> FloatArray:
+    build, bounds = CHEAP[name]
+
+    def cut(value: float) -> list[Shots]:
+        shots = [cut_shots(r, nominal, every_s=1.0, changes=[build(value, nominal)]) for r in recordings]
+        return [_with_floor(s, floor) for s in shots]
+
+    def cost(value: float) -> float:
+        shots = cut(value)
+        fitted = refit(shots[0], shots[0], nominal, iterations=4)
+        return float((channel_scores(shots[0], fitted.values) ** 2).sum())
+
+    best = minimize_scalar(
+        cost, bounds=bounds, method="bounded", options={"xatol": 0.01 * (bounds[1] - bounds[0]), "maxiter": 14}
+    )
+    shots = cut(float(best.x))
+    values = refit(shots[0], shots[1], nominal).values
+    ends = roll(nominal, values, shots[1].starts, shots[1].commands, shots[1].steps_s)
+    errors = in_start_frame(ends - shots[1].recorded, shots[1].starts) / floor
+    return np.asarray(0.5 * (errors**2).sum(axis=1), dtype=np.float64)
+
+
+def _with_floor(shots: Shots, floor: FloatArray) -> Shots:
+    even = np.repeat(floor[None], len(shots.starts), axis=0)
+    return Shots(shots.car, shots.steps_s, shots.starts, shots.commands, shots.recorded, even)
+
+
+def _recording(table: Mapping[str, FloatArray]) -> Recording:
+    pose = [table["x"], table["y"], np.unwrap(table["yaw"])]
+    measured = np.stack([*pose, table["vx"], table["vy"], table["yaw_rate"]], axis=1)
+    return Recording(
+        table["t"], measured, np.stack([table["steering"], table["throttle"]], axis=1), np.zeros_like(measured)
+    )

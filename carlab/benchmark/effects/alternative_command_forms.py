@@ -1,0 +1,166 @@
+"""The same physics of commands as real hardware has it: packets in a queue, servos of second order, soft edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, inverse, plain
+from carlab.benchmark.world.physics import Instant, World
+
+
+def packet_queue(world: World, p: Parameters) -> None:
+    """Both commands ride in packets that a bus with jitter hands over one by one, never one before its forerunner."""
+    mean, seed = p["extra_delay"], int(p["seed"])
+    rng = np.random.default_rng(seed)
+    last_issue, last_arrival, extra = -1.0, 0.0, 0.0
+    before = world.arrival[0]
+
+    def arrive(t: float) -> float:
+        nonlocal last_issue, last_arrival, extra
+        if t != last_issue:  # one packet for both channels
+            last_issue = t
+            extra = mean * (0.6 + 0.8 * float(rng.random()))
+            last_arrival = max(before(t) + extra, last_arrival + 1e-4)
+        return last_arrival
+
+    world.arrival[0] = world.arrival[1] = arrive
+
+
+def polled(world: World, channel: int, mean_s: float) -> None:
+    """A receiver that looks for news every 2 / 3 of the mean delay and hands over what it finds one look later."""
+    look = max(2.0 * mean_s / 3.0, 1e-6)
+    before = world.arrival[channel]
+
+    def arrive(t: float) -> float:
+        acts = before(t)
+        return (math.floor(acts / look) + 2.0) * look if mean_s > 0.0 else acts
+
+    world.arrival[channel] = arrive
+
+
+def polled_steering(world: World, p: Parameters) -> None:
+    """Steering by polling."""
+    polled(world, 0, p["delay"])
+
+
+def polled_throttle(world: World, p: Parameters) -> None:
+    """Throttle by polling."""
+    polled(world, 1, p["delay"])
+
+
+def limited_servo(world: World, p: Parameters) -> None:
+    """A servo of second order whose motor current, so its angular acceleration, is limited."""
+    lag = p["time_constant"]
+    if lag <= 0.0:
+        return
+    z = 0.9
+    w = 2.0 * z / lag
+    top = p["current_share"] * 0.5 * w * w  # a share of what a step of 0.5 rad asks for
+    angle, rate = world.add_state(), world.add_state()
+
+    def servo(now: Instant) -> None:
+        wanted = w * w * (now.d - now.extra[angle]) - 2.0 * z * w * now.extra[rate]
+        now.rates[angle] = now.extra[rate]
+        now.rates[rate] = min(max(wanted, -top), top)
+        now.d = now.extra[angle]
+
+    world.hooks["steer"].append(servo)
+
+
+def soft_rate_limit(world: World, p: Parameters) -> None:
+    """A servo whose speed saturates softly with the error: a motor with back-EMF behind a proportional controller."""
+    rate, gain = p["rate"], 150.0
+    if rate > 1e4:
+        return
+    k = world.add_state()
+
+    def servo(now: Instant) -> None:
+        now.rates[k] = rate * math.tanh(gain * (now.d - now.extra[k]) / rate)
+        now.d = now.extra[k]
+
+    world.hooks["steer"].append(servo)
+
+
+def sprung_play(world: World, p: Parameters) -> None:
+    """Play whose flanks push like springs: the wheel creeps until it is inside the play."""
+    half = 0.5 * p["play"]
+    if half <= 0.0:
+        return
+    k = world.add_state()
+
+    def follow(now: Instant) -> None:
+        gap = now.d - now.extra[k]
+        now.rates[k] = (gap - min(max(gap, -half), half)) / 0.006
+        now.d = now.extra[k]
+
+    world.hooks["steer"].append(follow)
+
+
+def soft_deadband(world: World, p: Parameters) -> None:
+    """A dead-band with rounded edges."""
+    half = max(0.5 * p["width"], 1e-9)
+    world.steering_maps.append(lambda d: d - half * math.tanh(d / half))
+
+
+def linkage(world: World, p: Parameters) -> None:
+    """A steering linkage: the wheel goes with the sine of the servo horn."""
+    top = max(p["saturation"], 0.45)
+    world.steering_maps.append(lambda d: top * math.sin(min(max(d / top, -1.5), 1.5)))
+
+
+def soft_throttle_deadband(world: World, p: Parameters) -> None:
+    """An edge rounded by a hyperbola; full throttle stays full."""
+    width = p["width"]
+    top = math.sqrt(1.0 + width * width) - width
+    world.throttle_maps.append(lambda u: math.copysign((math.sqrt(u * u + width * width) - width) / top, u))
+
+
+def two_lags(world: World, p: Parameters) -> None:
+    """Winding and rotor: two lags in a row, each half."""
+    half = 0.5 * p["time_constant"]
+    if half <= 0.0:
+        return
+    first, second = world.add_state(), world.add_state()
+
+    def push(now: Instant) -> None:
+        now.rates[first] = (now.u - now.extra[first]) / half
+        now.rates[second] = (now.extra[first] - now.extra[second]) / half
+        now.u = now.extra[second]
+
+    world.hooks["throttle"].append(push)
+
+
+def throttle_curve(world: World, p: Parameters) -> None:
+    """The exponential curve of a remote control: a mix of linear and cubic."""
+    mix = p["mix"]
+    world.throttle_maps.append(lambda u: (1.0 - mix) * u + mix * u**3)
+
+
+def seeded(key: str) -> Callable[[float, Draw], dict[str, float]]:
+    """The size, and a seed for jitter."""
+    return lambda size, draw: {key: size, "seed": math.floor(1e6 * draw.shares[0])}
+
+
+FORMS = (
+    Form("command_delay", "other", seeded("extra_delay"), packet_queue, 0.01, 0.15),
+    Form("steering_delay", "other", plain("delay"), polled_steering, 0.01, 0.2),
+    Form("throttle_delay", "other", plain("delay"), polled_throttle, 0.03, 0.4),
+    Form(
+        "steering_lag",
+        "other",
+        lambda size, draw: {"time_constant": size, "current_share": 0.3 + 0.4 * draw.shares[0]},
+        limited_servo,
+        0.01,
+        0.4,
+    ),
+    Form("steering_rate_limit", "other", inverse("rate"), soft_rate_limit, 0.1, 1.5),
+    Form("steering_backlash", "other", plain("play"), sprung_play, 0.01, 0.4),
+    Form("steering_deadband", "other", plain("width"), soft_deadband, 0.01, 0.4),
+    Form("steering_nonlinearity", "other", inverse("saturation"), linkage, 0.7, 2.2),
+    Form("throttle_deadband", "other", plain("width"), soft_throttle_deadband, 0.01, 0.4),
+    Form("throttle_nonlinearity", "other", plain("mix"), throttle_curve, 0.1, 0.95),
+    Form("motor_lag", "other", plain("time_constant"), two_lags, 0.03, 1.0),
+)

@@ -1,0 +1,300 @@
+"""The same physics of forces in another form: exact, softer, or as other books write it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from carlab.benchmark.effects.catalogue import Form, Parameters, factor, plain, signed
+from carlab.benchmark.effects.force_forms import STICTION_MPS
+from carlab.benchmark.effects.tyre_forms import driven_wheels, placed, saturating
+from carlab.benchmark.world.base_car import GRAVITY_MPS2
+from carlab.benchmark.world.physics import Instant, World
+
+
+def soft_motor(world: World, p: Parameters) -> None:
+    """A current limit that closes softly."""
+    top = p["force"]
+
+    def soften(now: Instant) -> None:
+        now.drive = top * math.tanh(now.drive / top)
+
+    world.hooks["drive"].append(soften)
+
+
+def charge_sag(world: World, p: Parameters) -> None:
+    """The battery falls with the charge taken, not with the time (mean throttle about 0.3)."""
+    rate = p["rate"] / 0.3
+    k = world.add_state()
+
+    def sag(now: Instant) -> None:
+        now.rates[k] = abs(now.u)
+        now.drive *= 1.0 - rate * now.extra[k]
+
+    world.hooks["drive"].append(sag)
+
+
+def soft_brake(world: World, p: Parameters) -> None:
+    """The change of gain comes in over 0.2 m/s."""
+    ratio = p["gain_ratio"]
+
+    def brake(now: Instant) -> None:
+        against = 0.5 - 0.5 * math.tanh(math.copysign(1.0, now.drive) * now.vx / 0.2)
+        now.drive *= 1.0 + (ratio - 1.0) * against
+
+    world.hooks["drive"].append(brake)
+
+
+def soft_traction(world: World, p: Parameters) -> None:
+    """Grip that gives way gradually."""
+    share = p["share"]
+
+    def limit(now: Instant) -> None:
+        top = share * now.mu_r * now.fz_r
+        now.fx = top * math.tanh(now.fx / top)
+
+    world.hooks["limit"].append(limit)
+
+
+def stribeck(world: World, p: Parameters) -> None:
+    """Bearings: more friction at a crawl, less when running."""
+    force = p["force"]
+
+    def resist(now: Instant) -> None:
+        now.push_x -= force * (1.0 + 0.6 * math.exp(-abs(now.vx) / 0.3)) * math.tanh(now.vx / STICTION_MPS)
+
+    world.hooks["body"].append(resist)
+
+
+def powered_drag(world: World, p: Parameters) -> None:
+    """Drag with an exponent that is not quite two."""
+    c, exponent = p["coefficient"], p["exponent"]
+
+    def resist(now: Instant) -> None:
+        now.push_x -= c * math.copysign(abs(now.vx) ** exponent, now.vx)
+
+    world.hooks["body"].append(resist)
+
+
+def scrub(world: World, p: Parameters) -> None:
+    """Toe scrub of two front wheels: grows with the tangent of the wheel angle."""
+    c = p["coefficient"]
+
+    def resist(now: Instant) -> None:
+        now.push_x -= c * abs(math.tan(now.d)) * math.tanh(now.vx / 0.1)
+
+    world.hooks["body"].append(resist)
+
+
+def brush_shape(slope: float) -> Callable[[float], float]:
+    """Brush tyre (Pacejka, "Tyre and Vehicle Dynamics", section 3.2): parabolic pressure, full sliding at 3 / slope."""
+
+    def shape(a: float) -> float:
+        z = slope * a / 3.0
+        if abs(z) >= 1.0:
+            return math.copysign(1.0, z)
+        return 3.0 * z - 3.0 * z * abs(z) + z**3
+
+    return shape
+
+
+def brush_tyre(world: World, p: Parameters) -> None:
+    """A brush tyre with the slope and the friction of the formula's numbers."""
+    world.shape_front = brush_shape(p["B_front"] * p["C_front"])
+    world.shape_rear = brush_shape(p["B_rear"] * p["C_rear"])
+
+    def grip(now: Instant) -> None:
+        now.mu_f, now.mu_r = p["mu_front"], p["mu_rear"]
+
+    world.hooks["grip"].insert(0, grip)
+
+
+def friction_circle(world: World, p: Parameters) -> None:
+    """Nothing is lost until the circle is reached; there the side force is cut."""
+    scale = p["scale"]
+
+    def cut(now: Instant) -> None:
+        top = now.mu_r * now.fz_r
+        used = min(abs(scale * now.fx), 0.98 * top)
+        left = math.sqrt(top * top - used * used)
+        now.fr = min(max(now.fr, -left), left)
+
+    world.hooks["tyre"].append(cut)
+
+
+def brush_slip(world: World, p: Parameters) -> None:
+    """Wheel speed as a state with the slip curve of a brush tyre."""
+    driven_wheels(world, p, brush_shape(1.0))
+
+
+def slip_relaxation(world: World, p: Parameters) -> None:
+    """Stretched string: the slip angles relax, not the forces."""
+    length = p["length"]
+    if length <= 0.0:
+        return
+    front, rear = world.add_state(), world.add_state()
+
+    def relax(now: Instant) -> None:
+        rate = max(abs(now.vx), 0.3) / length
+        now.rates[front] = (now.alpha_f - now.extra[front]) * rate
+        now.rates[rear] = (now.alpha_r - now.extra[rear]) * rate
+        now.ff = -now.mu_f * now.fz_f * world.shape_front(now.extra[front])
+        now.fr = -now.mu_r * now.fz_r * world.shape_rear(now.extra[rear])
+
+    world.hooks["tyre"].append(relax)
+
+
+def pitching(world: World, p: Parameters) -> None:
+    """Load transfer through springs: the body pitches at 4 Hz, damped, and the load follows it."""
+    ratio, w, z = p["height"] / world.car.wheelbase, 2 * math.pi * 4.0, 0.7
+    load, rate = world.add_state(), world.add_state()
+
+    def shift(now: Instant) -> None:
+        drag = now.mu_f * now.fz_f * now.shape_f * now.sin_d
+        now.rates[load] = now.extra[rate]
+        now.rates[rate] = w * w * (ratio * (now.fx + drag) - now.extra[load]) - 2 * z * w * now.extra[rate]
+        total = now.fz_f + now.fz_r
+        now.fz_f = min(max(now.fz_f - now.extra[load], 0.02 * total), 0.98 * total)
+        now.fz_r = total - now.fz_f
+
+    world.hooks["load"].append(shift)
+
+
+def settling_grip(world: World, p: Parameters) -> None:
+    """Grip that settles exponentially within two minutes."""
+    change = 120.0 * p["rate"]
+
+    def drift(now: Instant) -> None:
+        grip = 1.0 + change * (1.0 - math.exp(-now.t / 120.0))
+        now.mu_f *= grip
+        now.mu_r *= grip
+
+    world.hooks["grip"].append(drift)
+
+
+def soft_patch(world: World, p: Parameters) -> None:
+    """A patch with a soft edge that each axle meets for itself."""
+    x, y, radius, loss, car = p["x"], p["y"], p["radius"], p["loss"], world.car
+
+    def slip(now: Instant) -> None:
+        cos, sin = math.cos(now.psi), math.sin(now.psi)
+        for along in (car.front_axle, -car.rear_axle):
+            away = math.hypot(now.x + along * cos - x, now.y + along * sin - y)
+            kept = 1.0 - 0.5 * loss * (1.0 - math.tanh((away - radius) / 0.08))
+            if along > 0.0:
+                now.mu_f *= kept
+            else:
+                now.mu_r *= kept
+
+    world.hooks["grip"].append(slip)
+
+
+def wing(world: World, p: Parameters) -> None:
+    """Downforce behind the centre of mass: a tenth of it more on the rear axle than the static split."""
+    c, car = p["coefficient"], world.car
+    rear_share = car.front_axle / car.wheelbase + 0.1
+
+    def press(now: Instant) -> None:
+        force = c * now.vx * now.vx
+        now.fz_f += (1.0 - rear_share) * force
+        now.fz_r += rear_share * force
+
+    world.hooks["load"].insert(0, press)
+
+
+def viscous_yaw(world: World, p: Parameters) -> None:
+    """Damping that grows a little with the yaw rate."""
+    c = p["coefficient"]
+
+    def resist(now: Instant) -> None:
+        now.moment -= c * now.r * (1.0 + 0.1 * abs(now.r))
+
+    world.hooks["body"].append(resist)
+
+
+def torque_by_force(world: World, p: Parameters) -> None:
+    """The moment goes with the force at the axle, not with the throttle."""
+    c = p["coefficient"] / world.car.drive_gain
+
+    def pull(now: Instant) -> None:
+        now.moment += c * now.fx
+
+    world.hooks["body"].append(pull)
+
+
+def gusty_side(world: World, p: Parameters) -> None:
+    """A side pull through the tyres, in proportion to the axle loads, that is weak at a standstill."""
+    force = p["force"]
+
+    def pull(now: Instant) -> None:
+        now.push_y += force * math.tanh(abs(now.vx) / 0.2)
+
+    world.hooks["body"].append(pull)
+
+
+def bowl(world: World, p: Parameters) -> None:
+    """A floor that rises along a line, a little steeper farther up."""
+    weight, direction, angle = world.car.mass * GRAVITY_MPS2, p["direction"], p["angle"]
+    cos, sin = math.cos(direction), math.sin(direction)
+
+    def pull(now: Instant) -> None:
+        force = weight * math.sin(angle * (1.0 + 0.08 * (now.x * cos + now.y * sin)))
+        now.push_x -= force * math.cos(direction - now.psi)
+        now.push_y -= force * math.sin(direction - now.psi)
+
+    world.hooks["body"].append(pull)
+
+
+FORMS = (
+    Form(
+        "motor_saturation", "other", lambda s, draw: {"force": draw.car.drive_gain / max(s, 1e-6)}, soft_motor, 0.3, 3.0
+    ),
+    Form(
+        "traction_limit",
+        "other",
+        lambda s, draw: {"share": draw.car.drive_gain / (draw.car.mu_rear * draw.car.load_rear) / max(s, 1e-6)},
+        soft_traction,
+        0.3,
+        3.0,
+        fixed={"axle": "rear"},
+    ),
+    Form("battery_sag", "other", plain("rate"), charge_sag, 0.0004, 0.008),
+    Form("brake_asymmetry", "other", factor("gain_ratio"), soft_brake, 0.1, 1.5),
+    Form("rolling_resistance", "other", plain("force"), stribeck, 0.05, 2.0),
+    Form(
+        "aerodynamic_drag",
+        "other",
+        lambda s, draw: {"coefficient": s, "exponent": 1.8 + 0.4 * draw.shares[0]},
+        powered_drag,
+        0.05,
+        1.5,
+    ),
+    Form("cornering_drag", "other", plain("coefficient"), scrub, 0.2, 8.0),
+    Form("tyre_saturation", "other", saturating, brush_tyre, 0.5, 1.6, nominal_kind="linear_tyre"),
+    Form("friction_ellipse", "other", plain("scale"), friction_circle, 0.6, 2.5),
+    Form(
+        "longitudinal_slip",
+        "other",
+        lambda s, draw: {"inertia": 2e-4 * s, "stiffness": 40.0 / max(s, 1e-9)},
+        brush_slip,
+        1.0,
+        8.0,
+        smallest=0.5,
+    ),
+    Form("tyre_relaxation", "other", plain("length"), slip_relaxation, 0.03, 1.0),
+    Form("load_transfer", "other", plain("height"), pitching, 0.02, 0.2),
+    Form("friction_drift", "other", signed("rate"), settling_grip, 0.0006, 0.007),
+    Form("low_friction_patch", "other", placed, soft_patch, 0.3, 0.9),
+    Form("aerodynamic_downforce", "other", plain("coefficient"), wing, 0.2, 6.0),
+    Form("yaw_damping", "other", plain("coefficient"), viscous_yaw, 0.005, 0.5),
+    Form("torque_steer", "other", signed("coefficient"), torque_by_force, 0.01, 0.6),
+    Form("lateral_bias", "other", signed("force"), gusty_side, 0.1, 3.0),
+    Form(
+        "road_slope",
+        "other",
+        lambda s, draw: {"angle": s, "direction": math.pi * (2.0 * draw.shares[0] - 1.0)},
+        bowl,
+        0.005,
+        0.2,
+    ),
+)

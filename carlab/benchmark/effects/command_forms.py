@@ -1,0 +1,162 @@
+"""Effects between the command and the wheels, in the catalogue's own form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from carlab.benchmark.effects.catalogue import Form, Parameters, factor, inverse, plain, signed
+from carlab.benchmark.world.physics import Hook, Instant, World
+
+
+def delay_channels(world: World, channels: tuple[int, ...], extra_s: float) -> None:
+    """Let channels (0 steering, 1 throttle) act later."""
+    for channel in channels:
+
+        def later(t: float, before: Callable[[float], float] = world.arrival[channel]) -> float:
+            return before(t) + extra_s
+
+        world.arrival[channel] = later
+
+
+def command_delay(world: World, p: Parameters) -> None:
+    """Both channels later (or earlier) than the car file says."""
+    delay_channels(world, (0, 1), p["extra_delay"])
+
+
+def steering_delay(world: World, p: Parameters) -> None:
+    """Steering later."""
+    delay_channels(world, (0,), p["delay"])
+
+
+def throttle_delay(world: World, p: Parameters) -> None:
+    """Throttle later."""
+    delay_channels(world, (1,), p["delay"])
+
+
+def first_order(world: World, time_constant_s: float, channel: str) -> Hook:
+    """T dy/dt = input - y for the wheel angle (``d``) or the throttle (``u``)."""
+    if time_constant_s <= 0.0:
+        return lambda now: None
+    k = world.add_state()
+    if channel == "d":
+
+        def steer(now: Instant) -> None:
+            now.rates[k] = (now.d - now.extra[k]) / time_constant_s
+            now.d = now.extra[k]
+
+        return steer
+
+    def push(now: Instant) -> None:
+        now.rates[k] = (now.u - now.extra[k]) / time_constant_s
+        now.u = now.extra[k]
+
+    return push
+
+
+def steering_lag(world: World, p: Parameters) -> None:
+    """First-order servo."""
+    world.hooks["steer"].append(first_order(world, p["time_constant"], "d"))
+
+
+def motor_lag(world: World, p: Parameters) -> None:
+    """First-order motor."""
+    world.hooks["throttle"].append(first_order(world, p["time_constant"], "u"))
+
+
+def steering_rate_limit(world: World, p: Parameters) -> None:
+    """The wheel moves towards the wanted angle at no more than ``rate``; exact, since the wanted angle is held."""
+    rate = p["rate"]
+    since, begin, wanted = 0.0, 0.0, 0.0
+
+    def at(t: float) -> float:
+        reach = rate * (t - since) if t > since else 0.0
+        return begin + min(max(wanted - begin, -reach), reach)
+
+    def switched(t: float, angle: float, throttle: float) -> None:
+        nonlocal since, begin, wanted
+        begin, since, wanted = at(t), t, angle
+
+    def limit(now: Instant) -> None:
+        now.d = at(now.t)
+
+    world.switch_listeners.append(switched)
+    world.hooks["steer"].insert(0, limit)
+
+
+def steering_deadband(world: World, p: Parameters) -> None:
+    """Small angles do nothing, larger ones lose half the width."""
+    half = 0.5 * p["width"]
+    world.steering_maps.append(lambda d: d - min(max(d, -half), half))
+
+
+def steering_backlash(world: World, p: Parameters) -> None:
+    """Play operator."""
+    half = 0.5 * p["play"]
+    held = 0.0
+
+    def follow(d: float) -> float:
+        nonlocal held
+        held = min(max(held, d - half), d + half)
+        return held
+
+    world.steering_maps.append(follow)
+
+
+def steering_offset(world: World, p: Parameters) -> None:
+    """Trim: constant angle, there from the first moment."""
+    angle = p["angle"]
+
+    def trim(now: Instant) -> None:
+        now.d += angle
+
+    world.hooks["steer"].append(trim)
+
+
+def steering_asymmetry(world: World, p: Parameters) -> None:
+    """More to one side than to the other."""
+    gain = p["gain"]
+    world.steering_maps.append(lambda d: d + gain * abs(d))
+
+
+def steering_nonlinearity(world: World, p: Parameters) -> None:
+    """Saturating linkage."""
+    top = p["saturation"]
+    if math.isfinite(top):
+        world.steering_maps.append(lambda d: top * math.tanh(d / top))
+
+
+def throttle_deadband(world: World, p: Parameters) -> None:
+    """Small throttle does nothing; full throttle stays full."""
+    width = p["width"]
+    world.throttle_maps.append(lambda u: math.copysign(max(abs(u) - width, 0.0) / (1.0 - width), u))
+
+
+def throttle_nonlinearity(world: World, p: Parameters) -> None:
+    """Throttle curve."""
+    exponent = p["exponent"]
+    world.throttle_maps.append(lambda u: math.copysign(abs(u) ** exponent, u))
+
+
+FORMS = (
+    Form(
+        "command_delay",
+        "catalogue",
+        lambda size, draw: {"extra_delay": max(draw.sign * size, -0.95 * draw.car.command_delay)},
+        command_delay,
+        0.01,
+        0.15,
+    ),
+    Form("steering_delay", "catalogue", plain("delay"), steering_delay, 0.01, 0.2),
+    Form("throttle_delay", "catalogue", plain("delay"), throttle_delay, 0.03, 0.4),
+    Form("steering_lag", "catalogue", plain("time_constant"), steering_lag, 0.01, 0.4),
+    Form("motor_lag", "catalogue", plain("time_constant"), motor_lag, 0.03, 1.0),
+    Form("steering_rate_limit", "catalogue", inverse("rate"), steering_rate_limit, 0.1, 1.5),
+    Form("steering_deadband", "catalogue", plain("width"), steering_deadband, 0.01, 0.4),
+    Form("steering_backlash", "catalogue", plain("play"), steering_backlash, 0.01, 0.4),
+    Form("steering_offset", "catalogue", signed("angle"), steering_offset, 0.003, 0.2),
+    Form("steering_asymmetry", "catalogue", signed("gain"), steering_asymmetry, 0.02, 0.7),
+    Form("steering_nonlinearity", "catalogue", inverse("saturation"), steering_nonlinearity, 0.7, 8.0),
+    Form("throttle_deadband", "catalogue", plain("width"), throttle_deadband, 0.01, 0.4),
+    Form("throttle_nonlinearity", "catalogue", factor("exponent"), throttle_nonlinearity, 0.05, 1.2),
+)

@@ -1,0 +1,149 @@
+"""Faults of the recording itself, put on top of a finished table of columns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.measurement import local_fit, to_body, window_rows, wrapped
+from carlab.benchmark.world.simulation import FloatArray
+
+Table = dict[str, FloatArray]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What was done: the id, the columns it touched and how many rows."""
+
+    id: str
+    columns: tuple[str, ...]
+    rows: int
+
+
+def yaw_wrap_spikes(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """The yaw rate by differentiating a wrapped angle."""
+    out = dict(table)
+    gap = car.control_period
+    raw = np.gradient(wrapped(table["yaw"]), gap)
+    spikes = np.abs(raw) > 0.5 * np.pi / gap
+    out["yaw_rate"] = np.where(spikes, raw, table["yaw_rate"])
+    return out, Fault("yaw_wrap_spikes", ("yaw_rate",), int(spikes.sum()))
+
+
+def outliers(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """Poses of another marker set: jumps of some decimetres in single rows, velocities go with them."""
+    out = dict(table)
+    count = max(3, len(table["t"]) // 150)
+    rows = rng.choice(np.arange(5, len(table["t"]) - 5), count, replace=False)
+    jump = rng.uniform(0.15, 0.6, (count, 2)) * rng.choice((-1.0, 1.0), (count, 2))
+    out["x"], out["y"] = table["x"].copy(), table["y"].copy()
+    out["x"][rows] += jump[:, 0]
+    out["y"][rows] += jump[:, 1]
+    return _derive(out, car), Fault("outliers", ("x", "y"), count)
+
+
+def dropouts(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """Rows that are not there, some in runs."""
+    keep = np.ones(len(table["t"]), dtype=bool)
+    for _ in range(max(2, len(keep) // 250)):
+        first = int(rng.integers(5, len(keep) - 15))
+        keep[first : first + int(rng.integers(1, 9))] = False
+    return {name: column[keep] for name, column in table.items()}, Fault("dropouts", ("t",), int((~keep).sum()))
+
+
+def stale_samples(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """The logger repeats the last pose and velocity where no new one has come."""
+    source = np.arange(len(table["t"]))
+    for _ in range(max(3, len(source) // 60)):
+        first = int(rng.integers(5, len(source) - 10))
+        run = int(rng.integers(1, 5))
+        source[first : first + run] = source[first - 1]
+    moved = {"x", "y", "yaw", "vx", "vy", "yaw_rate"}
+    stale = int((source != np.arange(len(source))).sum())
+    out = {name: column[source] if name in moved else column for name, column in table.items()}
+    return out, Fault("stale_samples", tuple(sorted(moved)), stale)
+
+
+def clock_drift(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """The commands were logged by another clock: theirs gains or loses up to some milliseconds a second."""
+    rate = float(rng.choice((-1.0, 1.0)) * rng.uniform(1e-3, 4e-3))
+    out = dict(table)
+    source = np.clip(np.searchsorted(table["t"], table["t"] * (1.0 + rate), side="right") - 1, 0, len(table["t"]) - 1)
+    for name in ("steering", "throttle"):
+        out[name] = table[name][source]
+    return out, Fault("clock_drift", ("steering", "throttle"), len(source))
+
+
+def column_shift(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """One command column some rows early or late."""
+    name = str(rng.choice(("steering", "throttle")))
+    rows = int(rng.choice((-1, 1)) * rng.integers(4, 12) * max(1, round(1.0 / 30.0 / car.control_period)))
+    out = dict(table)
+    out[name] = np.roll(table[name], rows)
+    return out, Fault("column_shift", (name,), len(table["t"]))
+
+
+def column_scale(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """A velocity column with a wrong factor."""
+    name = str(rng.choice(("vx", "yaw_rate")))
+    out = dict(table)
+    out[name] = table[name] * float(rng.choice((0.5, 0.8, 1.25, 2.0)))
+    return out, Fault("column_scale", (name,), len(table["t"]))
+
+
+def wrong_unit(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """Degrees for radians, millimetres for metres or milliseconds for seconds."""
+    columns, scale = (
+        (("yaw",), 180.0 / np.pi),
+        (("yaw_rate",), 180.0 / np.pi),
+        (("x", "y"), 1000.0),
+        (("t",), 1000.0),
+    )[int(rng.integers(4))]
+    out = dict(table)
+    for name in columns:
+        out[name] = table[name] * scale
+    return out, Fault("wrong_unit", columns, len(table["t"]))
+
+
+def wrong_sign(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """A column with its sign turned."""
+    name = str(rng.choice(("yaw_rate", "steering", "vy", "throttle")))
+    out = dict(table)
+    out[name] = -table[name]
+    return out, Fault("wrong_sign", (name,), len(table["t"]))
+
+
+def wrong_frame(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
+    """Velocities in the world frame."""
+    out = dict(table)
+    cos, sin = np.cos(table["yaw"]), np.sin(table["yaw"])
+    out["vx"] = cos * table["vx"] - sin * table["vy"]
+    out["vy"] = sin * table["vx"] + cos * table["vy"]
+    return out, Fault("wrong_frame", ("vx", "vy"), len(table["t"]))
+
+
+def _derive(table: Table, car: BaseCar) -> Table:
+    pose = np.stack([table["x"], table["y"], np.unwrap(table["yaw"])], axis=1)
+    gap = car.control_period
+    velocity = to_body(pose[:, 2], local_fit(pose, window_rows(0.075, gap), 2, gap)[1])
+    return {**table, "vx": velocity[:, 0], "vy": velocity[:, 1]}
+
+
+FAULTS: dict[str, Callable[[Table, np.random.Generator, BaseCar], tuple[Table, Fault]]] = {
+    fault.__name__: fault
+    for fault in (
+        yaw_wrap_spikes,
+        outliers,
+        dropouts,
+        stale_samples,
+        clock_drift,
+        column_shift,
+        column_scale,
+        wrong_unit,
+        wrong_sign,
+        wrong_frame,
+    )
+}

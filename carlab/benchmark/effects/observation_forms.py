@@ -1,0 +1,91 @@
+"""Effects of motion capture and logger, in the catalogue's own form and one other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from carlab.benchmark.effects.catalogue import Form, Parameters, plain, signed
+from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import FloatArray
+
+
+def mocap_latency(world: World, p: Parameters) -> None:
+    """Every measured channel is ``latency`` old (instead of the car file's)."""
+    world.extra_latency_s += p["latency"] - world.car.latency
+
+
+def marker_offset(world: World, p: Parameters) -> None:
+    """The tracked point is not the centre of mass."""
+    ahead, left = p["ahead"], p["left"]
+
+    def move(t: FloatArray, pose: FloatArray) -> FloatArray:
+        cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        moved = pose.copy()
+        moved[:, 0] += cos * ahead - sin * left
+        moved[:, 1] += sin * ahead + cos * left
+        return moved
+
+    world.pose_changes.append(move)
+
+
+def mocap_yaw_misalignment(world: World, p: Parameters) -> None:
+    """The rigid body's heading is turned against the car's."""
+    turn = np.array([0.0, 0.0, p["angle"]])
+    world.pose_changes.append(lambda t, pose: pose + turn)
+
+
+def velocity_filter_lag(world: World, p: Parameters) -> None:
+    """First-order filter on the velocity columns, fed by what changes linearly between captures."""
+    lag = p["time_constant"]
+
+    def smooth(t: FloatArray, v: FloatArray) -> FloatArray:
+        if lag <= 0.0:
+            return v
+        out = v.copy()
+        gap = float(t[1] - t[0])
+        keep = math.exp(-gap / lag)
+        ramp = lag / gap * (1.0 - keep)
+        for k in range(1, len(v)):
+            out[k] = keep * out[k - 1] + (ramp - keep) * v[k - 1] + (1.0 - ramp) * v[k]
+        return out
+
+    world.velocity_changes.append(smooth)
+
+
+def moving_average(world: World, p: Parameters) -> None:
+    """A causal moving average over twice the time constant."""
+    span = 2.0 * p["time_constant"]
+
+    def smooth(t: FloatArray, v: FloatArray) -> FloatArray:
+        if span <= 0.0:
+            return v
+        gap = float(t[1] - t[0])
+        whole = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * gap * (v[1:] + v[:-1]), axis=0)])
+        begin = np.maximum(t - span, t[0])
+        early = np.stack([np.interp(begin, t, whole[:, k]) for k in range(3)], axis=1)
+        return np.where((t > t[0])[:, None], (whole - early) / np.maximum(t - begin, gap)[:, None], v)
+
+    world.velocity_changes.append(smooth)
+
+
+FORMS = (
+    Form(
+        "mocap_latency", "catalogue", lambda size, draw: {"latency": draw.car.latency + size}, mocap_latency, 0.01, 0.3
+    ),
+    Form(
+        "marker_offset",
+        "catalogue",
+        lambda size, draw: {
+            "ahead": size * math.cos(2 * math.pi * draw.shares[0]),
+            "left": size * math.sin(2 * math.pi * draw.shares[0]),
+        },
+        marker_offset,
+        0.01,
+        0.3,
+    ),
+    Form("mocap_yaw_misalignment", "catalogue", signed("angle"), mocap_yaw_misalignment, 0.01, 0.3),
+    Form("velocity_filter_lag", "catalogue", plain("time_constant"), velocity_filter_lag, 0.02, 0.5),
+    Form("velocity_filter_lag", "other", plain("time_constant"), moving_average, 0.02, 0.5),
+)

@@ -1,0 +1,196 @@
+"""Tyres, axle loads and grip in the catalogue's own form (and roll, for which the catalogue has no equation)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from carlab.benchmark.effects.catalogue import Draw, Form, Parameters, plain, signed
+from carlab.benchmark.world.base_car import GRAVITY_MPS2
+from carlab.benchmark.world.physics import Hook, Instant, World, pacejka_shape
+
+WHEEL_RADIUS_M = 0.033  # the catalogue and the car file give none; that of a 1:10 touring car
+
+
+def saturating(size: float, draw: Draw) -> dict[str, float]:
+    """Pacejka numbers with the slope of the linear tyre; the larger the size, the earlier the knee."""
+    car, b = draw.car, max(size, 1e-4)
+    return {
+        "B_front": b * car.b_front,
+        "C_front": car.c_front,
+        "mu_front": car.mu_front / b,
+        "B_rear": b * car.b_rear,
+        "C_rear": car.c_rear,
+        "mu_rear": car.mu_rear / b,
+    }
+
+
+def tyre_saturation(world: World, p: Parameters) -> None:
+    """The magic formula where the car file says linear."""
+    world.shape_front = pacejka_shape(p["B_front"], p["C_front"])
+    world.shape_rear = pacejka_shape(p["B_rear"], p["C_rear"])
+
+    def grip(now: Instant) -> None:
+        now.mu_f, now.mu_r = p["mu_front"], p["mu_rear"]
+
+    world.hooks["grip"].insert(0, grip)
+
+
+def friction_ellipse(world: World, p: Parameters) -> None:
+    """Longitudinal force at the rear takes side force away."""
+    scale = p["scale"]
+
+    def share(now: Instant) -> None:
+        used = min(max(scale * now.fx / (now.mu_r * now.fz_r), -0.98), 0.98)
+        now.fr *= math.sqrt(1.0 - used * used)
+
+    world.hooks["tyre"].append(share)
+
+
+def longitudinal_slip(world: World, p: Parameters) -> None:
+    """Wheel speed as a state: J dw/dt = T - R F_x; slope ``stiffness`` at zero slip, friction of the axle at most.
+
+    The catalogue leaves F_x(slip) open; a hyperbolic tangent between slope and limit is the usual choice.
+    """
+    driven_wheels(world, p, math.tanh)
+
+
+def driven_wheels(world: World, p: Parameters, curve: Callable[[float], float]) -> None:
+    """Speed of the driven wheels as a state; ``curve`` goes from slope one at no slip to one at the limit."""
+    inertia, stiffness = p["inertia"] / WHEEL_RADIUS_M**2, p["stiffness"]
+    k = world.add_state(rolling=True)
+
+    def spin(now: Instant) -> None:
+        slip = (now.extra[k] - now.vx) / max(abs(now.vx), 0.3)
+        top = now.mu_r * now.fz_r
+        force = top * curve(stiffness * slip / top)
+        now.rates[k] = (now.fx - force) / inertia
+        now.fx = force
+
+    world.hooks["limit"].append(spin)
+
+
+def tyre_relaxation(world: World, p: Parameters) -> None:
+    """Side forces of both axles build up over a length of road."""
+    length = p["length"]
+    if length <= 0.0:
+        return
+    front, rear = world.add_state(), world.add_state()
+
+    def relax(now: Instant) -> None:
+        rate = max(abs(now.vx), 0.3) / length
+        now.rates[front] = (now.ff - now.extra[front]) * rate
+        now.rates[rear] = (now.fr - now.extra[rear]) * rate
+        now.ff, now.fr = now.extra[front], now.extra[rear]
+
+    world.hooks["tyre"].append(relax)
+
+
+def load_transfer(world: World, p: Parameters) -> None:
+    """Load moves to the rear with m ax h / L; ax holds all tyre forces (solved exactly: they are linear in load)."""
+    ratio = p["height"] / world.car.wheelbase
+
+    def shift(now: Instant) -> None:
+        drag = now.mu_f * now.shape_f * now.sin_d  # -F_front sin d = drag * F_z,front
+        front = (now.fz_f - ratio * now.fx) / (1.0 + ratio * drag)
+        total = now.fz_f + now.fz_r
+        now.fz_f = min(max(front, 0.02 * total), 0.98 * total)
+        now.fz_r = total - now.fz_f
+
+    world.hooks["load"].append(shift)
+
+
+def roll_dynamics(world: World, p: Parameters) -> None:
+    """Second-order roll angle after lateral acceleration; the load it shifts between the sides costs both axles grip.
+
+    The catalogue gives no equation: grip falls with the square of roll (in g), by ``loss``.
+    """
+    w, z, loss = 2 * math.pi * p["frequency"], p["damping"], p["loss"]
+    angle, rate = world.add_state(), world.add_state()
+
+    def roll(now: Instant) -> None:
+        kept = max(1.0 - loss * now.extra[angle] ** 2, 0.2)
+        now.ff *= kept
+        now.fr *= kept
+        side = (now.ff * now.cos_d + now.fr) / (world.car.mass * GRAVITY_MPS2)
+        now.rates[angle] = now.extra[rate]
+        now.rates[rate] = w * w * (side - now.extra[angle]) - 2 * z * w * now.extra[rate]
+
+    world.hooks["tyre"].append(roll)
+
+
+def friction_drift(world: World, p: Parameters) -> None:
+    """Grip of both axles drifts with time since the first row."""
+    rate = p["rate"]
+
+    def drift(now: Instant) -> None:
+        now.mu_f *= 1.0 + rate * now.t
+        now.mu_r *= 1.0 + rate * now.t
+
+    world.hooks["grip"].append(drift)
+
+
+def patch_hook(p: Parameters) -> Hook:
+    """Less grip while the centre of mass is inside a disc."""
+    x, y, radius, kept = p["x"], p["y"], p["radius"], 1.0 - p["loss"]
+
+    def slip(now: Instant) -> None:
+        if (now.x - x) ** 2 + (now.y - y) ** 2 < radius * radius:
+            now.mu_f *= kept
+            now.mu_r *= kept
+
+    return slip
+
+
+def low_friction_patch(world: World, p: Parameters) -> None:
+    """A slippery disc on the floor."""
+    world.hooks["grip"].append(patch_hook(p))
+
+
+def aerodynamic_downforce(world: World, p: Parameters) -> None:
+    """Load grows with speed squared, split like the static loads."""
+    c = p["coefficient"] / (world.car.mass * GRAVITY_MPS2)
+
+    def press(now: Instant) -> None:
+        more = 1.0 + c * now.vx * now.vx
+        now.fz_f *= more
+        now.fz_r *= more
+
+    world.hooks["load"].insert(0, press)
+
+
+def placed(size: float, draw: Draw) -> dict[str, float]:
+    """A disc around a place on the track."""
+    return {"x": draw.place[0], "y": draw.place[1], "radius": 0.5 + 0.5 * draw.shares[0], "loss": min(size, 0.9)}
+
+
+FORMS = (
+    Form("tyre_saturation", "catalogue", saturating, tyre_saturation, 0.5, 1.6, nominal_kind="linear_tyre"),
+    Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
+    Form(
+        "longitudinal_slip",
+        "catalogue",
+        lambda size, draw: {"inertia": 2e-4 * size, "stiffness": 40.0 / max(size, 1e-9)},
+        longitudinal_slip,
+        1.0,
+        8.0,
+        smallest=0.5,
+    ),
+    Form("tyre_relaxation", "catalogue", plain("length"), tyre_relaxation, 0.03, 1.0),
+    Form("load_transfer", "catalogue", plain("height"), load_transfer, 0.02, 0.2),
+    Form(
+        "roll_dynamics",
+        "other",
+        lambda size, draw: {
+            "frequency": 1.5 + 2.5 * draw.shares[0],
+            "damping": 0.2 + 0.4 * draw.shares[1],
+            "loss": size,
+        },
+        roll_dynamics,
+        0.3,
+        4.0,
+    ),
+    Form("friction_drift", "catalogue", signed("rate"), friction_drift, 0.0006, 0.007),
+    Form("low_friction_patch", "catalogue", placed, low_friction_patch, 0.3, 0.9),
+    Form("aerodynamic_downforce", "catalogue", plain("coefficient"), aerodynamic_downforce, 0.2, 6.0),
+)

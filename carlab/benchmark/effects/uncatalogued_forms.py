@@ -1,0 +1,205 @@
+"""Physics that the catalogue has no name for: the right answer is "unexplained", with channel and class.
+
+``class_words``: the class statement is right where it holds at least one word of each group.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from carlab.benchmark.effects.catalogue import Form, FormName, Parameters, plain, signed
+from carlab.benchmark.world.physics import Instant, World
+from carlab.benchmark.world.simulation import FloatArray
+
+OUTSIDE: FormName = "outside"
+
+
+def wind(world: World, p: Parameters) -> None:
+    """A steady wind over the floor: drag of the air's speed less that in still air."""
+    c, speed, heading = 0.15, p["speed"], p["heading"]
+
+    def blow(now: Instant) -> None:
+        air_x = now.vx - speed * math.cos(heading - now.psi)
+        air_y = now.vy - speed * math.sin(heading - now.psi)
+        fast, still = math.hypot(air_x, air_y), math.hypot(now.vx, now.vy)
+        now.push_x -= c * (fast * air_x - still * now.vx)
+        now.push_y -= 2.0 * c * (fast * air_y - still * now.vy)
+
+    world.hooks["body"].append(blow)
+
+
+def camber(world: World, p: Parameters) -> None:
+    """Toe and camber: side force of the front axle alone, in proportion to its load."""
+    force = p["share"] * world.car.load_front
+
+    def push(now: Instant) -> None:
+        now.ff += force * math.tanh(abs(now.vx) / 0.2)
+
+    world.hooks["tyre"].append(push)
+
+
+def locked_differential(world: World, p: Parameters) -> None:
+    """Two rear wheels of one speed: a moment that falls with speed, -k r / max(|vx|, 0.3)."""
+    k = p["moment"]
+
+    def resist(now: Instant) -> None:
+        now.moment -= k * math.tanh(now.r / max(abs(now.vx), 0.3))
+
+    world.hooks["body"].append(resist)
+
+
+def warm_up(world: World, p: Parameters) -> None:
+    """Tyres that gain grip by the work they do and lose it to the air."""
+    gain = p["gain"]
+    k = world.add_state()
+
+    def heat(now: Instant) -> None:
+        work = abs(now.ff * now.alpha_f * now.vx) + abs(now.fr * now.alpha_r * now.vx)
+        now.rates[k] = work / 2.0 - now.extra[k] / 4.0
+
+    def grip(now: Instant) -> None:
+        more = 1.0 + gain * math.tanh(now.extra[k])
+        now.mu_f *= more
+        now.mu_r *= more
+
+    world.hooks["grip"].append(grip)
+    world.hooks["tyre"].append(heat)
+
+
+def imbalance(world: World, p: Parameters) -> None:
+    """A bent wheel: a side force at the front that turns with the wheel (radius 0.06 m), growing with speed."""
+    force, k = p["force"], world.add_state()
+
+    def shake(now: Instant) -> None:
+        now.rates[k] = now.vx / 0.06
+        now.ff += force * abs(now.vx) * math.sin(now.extra[k])
+
+    world.hooks["tyre"].append(shake)
+
+
+def quantised(world: World, p: Parameters) -> None:
+    """A servo with few positions."""
+    step = p["step"]
+    if step > 0.0:
+        world.steering_maps.append(lambda d: step * math.floor(d / step + 0.5))
+
+
+def scale_error(world: World, p: Parameters) -> None:
+    """Motion capture whose metre is too long."""
+    scale = np.array([1.0 + p["scale"], 1.0 + p["scale"], 1.0])
+
+    def stretch(t: FloatArray, pose: FloatArray) -> FloatArray:
+        return np.asarray(pose * scale, dtype=np.float64)
+
+    world.pose_changes.append(stretch)
+
+
+def cable(world: World, p: Parameters) -> None:
+    """A cable that pulls the car's tail towards a point like a soft spring."""
+    k, x, y, car = p["stiffness"], p["x"], p["y"], world.car
+
+    def pull(now: Instant) -> None:
+        cos, sin = math.cos(now.psi), math.sin(now.psi)
+        dx, dy = x - (now.x - car.rear_axle * cos), y - (now.y - car.rear_axle * sin)
+        along, across = k * (dx * cos + dy * sin), k * (dy * cos - dx * sin)
+        now.push_x += along
+        now.push_y += across
+        now.moment -= car.rear_axle * across
+
+    world.hooks["body"].append(pull)
+
+
+def motor_hysteresis(world: World, p: Parameters) -> None:
+    """A motor controller that holds its throttle until the command has moved by more than half a width."""
+    half, held = 0.5 * p["width"], 0.0
+
+    def follow(u: float) -> float:
+        nonlocal held
+        held = min(max(held, u - half), u + half)
+        return held
+
+    world.throttle_maps.append(follow)
+
+
+def compliance_steer(world: World, p: Parameters) -> None:
+    """Wheels that the side force bends back: less angle the harder the corner, by a lag of 30 ms."""
+    softness, k = p["softness"], world.add_state()
+
+    def bend(now: Instant) -> None:
+        now.d -= softness * now.extra[k]
+
+    def feel(now: Instant) -> None:
+        now.rates[k] = (now.ff - now.extra[k]) / 0.03
+
+    world.hooks["steer"].append(bend)
+    world.hooks["tyre"].append(feel)
+
+
+def sagging_servo(world: World, p: Parameters) -> None:
+    """A servo whose supply sags with the motor: its speed of turning falls with the throttle."""
+    lag = p["lag"]
+    if lag <= 0.0:
+        return
+    k = world.add_state()
+
+    def servo(now: Instant) -> None:
+        now.rates[k] = (now.d - now.extra[k]) / (1e-3 + lag * min(abs(world_throttle[0]), 1.0))
+        now.d = now.extra[k]
+
+    world_throttle = [0.0]
+    world.switch_listeners.append(lambda t, angle, throttle: world_throttle.__setitem__(0, throttle))
+    world.hooks["steer"].append(servo)
+
+
+def bumpy_floor(world: World, p: Parameters) -> None:
+    """Joints between floor plates every 0.8 m: the car is held back as it crosses them."""
+    force = p["force"]
+
+    def hold(now: Instant) -> None:
+        joint = math.cos(math.pi * now.x / 0.8) ** 8 + math.cos(math.pi * now.y / 0.8) ** 8
+        now.push_x -= force * joint * math.tanh(now.vx / 0.05)
+
+    world.hooks["body"].append(hold)
+
+
+FORMS = (
+    Form(
+        "wind",
+        OUTSIDE,
+        lambda s, draw: {"speed": s, "heading": math.pi * (2.0 * draw.shares[0] - 1.0)},
+        wind,
+        0.3,
+        8.0,
+        class_words=(("heading", "direction", "world", "wind"),),
+    ),
+    Form("camber", OUTSIDE, signed("share"), camber, 0.01, 0.4,
+         class_words=(("constant", "even", "bias", "steering"),)),
+    Form("locked_differential", OUTSIDE, plain("moment"), locked_differential, 0.02, 2.0,
+         class_words=(("odd", "yaw rate", "yaw_rate", "curvature", "steering"),)),
+    Form("tyre_warm_up", OUTSIDE, signed("gain"), warm_up, 0.05, 0.6,
+         class_words=(("odd", "slip", "history", "state", "lateral", "time", "steering"),)),
+    Form("wheel_imbalance", OUTSIDE, plain("force"), imbalance, 0.2, 6.0,
+         class_words=(("period", "frequen", "oscillat", "vibrat", "speed"),)),
+    Form("command_quantisation", OUTSIDE, plain("step"), quantised, 0.03, 0.5, class_words=(("steering",),)),
+    Form("mocap_scale", OUTSIDE, signed("scale"), scale_error, 0.003, 0.2,
+         class_words=(("speed", "proportion", "scale", "gain"),)),
+    Form(
+        "cable_pull",
+        OUTSIDE,
+        lambda s, draw: {"stiffness": s, "x": 2.0 * draw.shares[0] - 1.0, "y": 2.0 * draw.shares[1] - 1.0},
+        cable,
+        0.02,
+        1.0,
+        class_words=(("place", "position", "location"),),
+    ),
+    Form("motor_hysteresis", OUTSIDE, plain("width"), motor_hysteresis, 0.03, 0.6,
+         class_words=(("throttle", "history", "hysteresis", "state"),)),
+    Form("compliance_steer", OUTSIDE, plain("softness"), compliance_steer, 0.005, 0.15,
+         class_words=(("odd", "lateral", "steering", "force"),)),
+    Form("sagging_servo", OUTSIDE, plain("lag"), sagging_servo, 0.05, 1.5,
+         class_words=(("steering", "rate", "history", "lag"), ("throttle", "lag", "state", "history"))),
+    Form("floor_joints", OUTSIDE, plain("force"), bumpy_floor, 0.2, 5.0,
+         class_words=(("place", "position", "location"),)),
+)  # fmt: skip

@@ -1,0 +1,1 @@
+"""Run a set of cases: make, seal, diagnose in child processes, open the seal, score."""

@@ -1,0 +1,108 @@
+"""Rates of false and missed names over the range of each decision threshold, from the decisions of finished runs.
+
+A diagnosis records each decision about a name with the statistics that it compared with thresholds
+(``decisions.json``). One threshold is varied while the others stay, and the recorded decisions are repeated. Later
+decisions of a run are repeated as they were recorded, although an earlier one may turn out differently.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+FACTORS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)
+"""Multiples of a threshold at which the decisions are repeated."""
+SCHEMA = "carlab.decisions/1"
+COLUMNS = ("threshold", "value", "false names", "missed names")
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Outcome of the decisions that one setting takes part in, at one value of it.
+
+    false, wrong     names accepted that are not concealed, and opportunities to accept one
+    missed, true     concealed names not accepted, and opportunities to accept one
+    """
+
+    setting: str
+    value: float
+    is_present_value: bool
+    false: int
+    wrong: int
+    missed: int
+    true: int
+
+    def row(self) -> list[str]:
+        """Cells of the table; the present value is marked with an asterisk."""
+        value = f"{self.value:.4g}{' *' if self.is_present_value else ''}"
+        return [self.setting, value, _rate(self.false, self.wrong), _rate(self.missed, self.true)]
+
+
+def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, Any]]) -> list[Rates]:
+    """Repeat the decisions of every case at several values of each threshold.
+
+    Args:
+        answers: of the opened seal, by name of the case.
+        decisions: content of ``decisions.json``, by name of the case.
+
+    Returns:
+        Rates by setting, in the order of the values.
+    """
+    cases = [
+        ({effect["id"] for effect in answers[name]["effects"]}, list(content["decisions"]))
+        for name, content in sorted(decisions.items())
+        if content.get("schema") == SCHEMA
+    ]
+    present = {
+        condition["setting"]: float(condition["threshold"]) for _, made in cases for condition in _conditions(made)
+    }
+    return [
+        _rates(cases, setting, factor * threshold, factor == 1.0)
+        for setting, threshold in sorted(present.items())
+        for factor in FACTORS
+    ]
+
+
+def _conditions(decisions: Iterable[Mapping[str, Any]]) -> Iterable[Mapping[str, Any]]:
+    return (c for decision in decisions for conditions in decision["alternatives"] for c in conditions)
+
+
+def _rates(
+    cases: Sequence[tuple[set[str], list[dict[str, Any]]]], setting: str, value: float, is_present_value: bool
+) -> Rates:
+    false = wrong = missed = true = 0
+    for concealed, made in cases:
+        for key, group in groupby(made, key=lambda d: (d["stage"], d["step"])):
+            decided = list(group)
+            if not any(c["setting"] == setting for c in _conditions(decided)):
+                continue
+            steps = [decided] if key[0] == "accept" else [[decision] for decision in decided]
+            for step in steps:
+                has_true = any(d["effect"] in concealed for d in step)
+                has_wrong = any(d["effect"] not in concealed for d in step)
+                accepted = next((d["effect"] for d in step if passes(d, setting, value)), None)
+                wrong += has_wrong
+                true += has_true
+                false += accepted is not None and accepted not in concealed
+                missed += has_true and accepted is None
+    return Rates(setting, value, is_present_value, false, wrong, missed, true)
+
+
+def passes(decision: Mapping[str, Any], setting: str, value: float) -> bool:
+    """Whether the name passes with ``setting`` at ``value``: all conditions of one alternative hold."""
+
+    def holds(condition: Mapping[str, Any]) -> bool:
+        threshold = value if condition["setting"] == setting else condition["threshold"]
+        above = condition["statistic"] > threshold
+        return bool(above if condition["above"] else not above)
+
+    return any(all(holds(c) for c in conditions) for conditions in decision["alternatives"])
+
+
+def _rate(count: int, of: int) -> str:
+    return f"{count / of:.3f} ({count} of {of})" if of else "none"
+
+
+__all__ = ["COLUMNS", "Rates", "calibrate", "passes"]

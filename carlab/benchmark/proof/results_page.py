@@ -1,0 +1,77 @@
+"""Results of a proof as Markdown: command, figures, effects, failures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from carlab.benchmark.baselines.scores import COLUMNS, comparison_rows
+from carlab.benchmark.proof.scores import per_effect, table_rows
+
+Row = Mapping[str, Any]
+
+
+def results_page(
+    facts: Mapping[str, str],
+    rows: Mapping[str, Row],
+    runs: Mapping[str, Mapping[str, Any]],
+    summary: Mapping[str, Any],
+    comparison: Sequence[Mapping[str, Any]],
+) -> str:
+    """Return the page.
+
+    Args:
+        facts: Command, date, versions, as name and value.
+        rows: Rows by case, from ``score_cases``.
+        runs: Reports by case, from ``Proof.reports``.
+        summary: From ``summarise``.
+        comparison: From ``compare``; empty without baselines.
+    """
+    parts = ["# Proof on concealed effects", "\n".join(f"* {name}: {value}" for name, value in facts.items())]
+    parts.append(markdown(("figure", "value", "n", "target"), table_rows(summary)))
+    if comparison:
+        parts += [
+            "## Comparison with the baselines",
+            "Baselines cannot answer with sets, so names count strictly here. Scores of the baselines use the "
+            "generator's model and the true noise floor; those of the tool use its own model and its own estimate.",
+            markdown(("figure", *COLUMNS), comparison_rows(comparison)),
+        ]
+    found = [
+        (name, str(e["strict"]), str(e["with_sets"]), str(e["cases"])) for name, e in per_effect(rows.values()).items()
+    ]
+    parts += ["## Each effect", markdown(("effect", "strictly first", "with sets", "cases"), found)]
+    parts += ["## Failures", failures(rows, runs)]
+    return "\n\n".join(parts) + "\n"
+
+
+def failures(rows: Mapping[str, Row], runs: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return one line for each case with a wrong answer."""
+    lines = []
+    for name, row in sorted(rows.items(), key=lambda item: (item[1]["kind"], item[1]["true"], item[0])):
+        run = runs.get(name, {})
+        true = " + ".join(row["true"]) or row["kind"]
+        answered = " + ".join(row["named"]) or row["verdict"]
+        strength = f", excess {row['excess']:.1f}" if row["excess"] else ""
+        if not row["reported"]:
+            words = str(run.get("words", "")).strip().splitlines()
+            why = "took too long" if run.get("exit_status") is None else f"exit status {run['exit_status']}"
+            lines.append(f"* {name}: {row['kind']} {true}: no report ({why}): {words[-1] if words else ''}")
+        elif not right(row):
+            lines.append(f"* {name}: {row['kind']} {true}{strength}: answered {answered}")
+    return "\n".join(lines) or "None."
+
+
+def right(row: Row) -> bool:
+    """Return whether the answer to a case is correct, by the criterion of its kind."""
+    if row["kind"] == "single":
+        return bool(row["set_top1"])
+    if row["kind"] == "pair":
+        return bool(row["both_found"])
+    if row["kind"] == "outside":
+        return not row["is_spurious"] and bool(row["main_channel_right"])
+    return bool(row["verdict_right"])
+
+
+def markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    return "\n".join(["| " + " | ".join(cells) + " |" for cells in (columns, ["---"] * len(columns), *rows)])

@@ -1,0 +1,265 @@
+"""A proof from cases to scores: make and seal, diagnose in child processes, open the seal. Resumes where it stopped.
+
+Folder of a proof:
+
+    seal.json            the hash, made known before the first diagnosis
+    handed/NAME/         fit.csv, hold.csv, car.toml: all that a diagnosis gets (copied into a fresh folder elsewhere)
+    answers/             plan, names, nonce and one answer a case; no diagnosis is told of it
+    reports/NAME/        report.json, decisions.json and run.json (exit status, seconds, peak memory)
+    oracle/NAME/         the same, where the tool was told the names
+    baselines/NAME.json  what the baselines said
+    checks/NAME.json     whether the generator's refit can tell apart what a report says is one set
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.cases.seal import check, digest, file_digest, new_name, new_nonce
+from carlab.benchmark.cases.set_check import CHEAP, indistinguishable
+from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, run_child, side_by_side
+from carlab.benchmark.proof.worker import FILES, read_json, write_json
+from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.measurement import COLUMNS, read_csv
+from carlab.core.errors import DataError
+
+Progress = Callable[[str, int, int, str], None]
+DIAGNOSE = (sys.executable, "-m", "carlab", "diagnose", "--decisions")
+COMPARED = ("single", "null", "parameters", "outside")
+WORKER = (sys.executable, "-m", "carlab.benchmark.proof.worker")
+
+
+def silent(stage: str, done: int, total: int, note: str) -> None:
+    """Report nothing."""
+
+
+class Proof:
+    """One proof on disk.
+
+    Args:
+        root: Folder of the proof; made where it is not there.
+        specs: The cases. A folder that was begun with other ones is refused.
+        command: How a diagnosis is started; ``fit.csv --car car.toml --holdout hold.csv --out out`` is appended, and
+            ``--effects ID ...`` where the tool is told the names.
+        progress: Called with stage (``make``, ``seal``, ``diagnose``, ``oracle``, ``baselines``), done, total and a
+            note.
+        timeout_s: A diagnosis that takes longer is ended and counts as failed.
+        stop_requested: Asked before each case; True ends the stage after the running ones, to be resumed.
+        abandon: Asked all along; True kills the running cases, which are done anew when the stage is resumed.
+        jobs: Child processes at a time; with more than one, each computes with one thread.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        specs: Sequence[CaseSpec],
+        *,
+        command: Sequence[str] = DIAGNOSE,
+        progress: Progress = silent,
+        timeout_s: float = 1800.0,
+        stop_requested: Callable[[], bool] = lambda: False,
+        abandon: Callable[[], bool] = lambda: False,
+        jobs: int = 1,
+    ) -> None:
+        self.root = root.absolute()
+        self.specs = list(specs)
+        self.command = tuple(command)
+        self.progress = progress
+        self.timeout_s = timeout_s
+        self.stop_requested = stop_requested
+        self.abandon = abandon
+        self.jobs = jobs
+        self._answers = self.root / "answers"
+
+    def make(self) -> str | None:
+        """Make the cases that are not there yet, then seal. Returns the seal's hash, None where it was stopped."""
+        specs = dict(zip(self._names(), self.specs, strict=True))
+
+        def make_one(name: str) -> ChildEnd:
+            order = {"spec": specs[name].as_dict(), "handed": str(self.root / "handed" / name)}
+            return self._work("make", {**order, "answer": str(self._answers / f"{name}.json")})
+
+        if not self._stage("make", list(specs), lambda name: (self._answers / f"{name}.json").exists(), make_one):
+            return None
+        return self.seal()
+
+    def seal(self) -> str:
+        """Hash the answers, once; the hash is in seal.json and told to ``progress``."""
+        path = self.root / "seal.json"
+        if not path.exists():
+            nonce = new_nonce()
+            answers = self._load_answers()
+            write_json(self._answers / "nonce.json", {"nonce": nonce})
+            write_json(path, {"sha256": digest(answers, nonce), "cases": len(answers)})
+        sealed = str(read_json(path)["sha256"])
+        self.progress("seal", len(self.specs), len(self.specs), sealed)
+        return sealed
+
+    def diagnose(self, *, oracle: bool = False) -> bool:
+        """Diagnose every case that has no report yet; with ``oracle`` the single and paired ones, told their names.
+
+        Returns whether all are done. Raises DataError where nothing is sealed yet.
+        """
+        self._need_seal()
+        names = sorted(self._names())  # sorted: random names give a random order of kinds
+        told: dict[str, tuple[str, ...]] = {}
+        if oracle:
+            by_name = dict(zip(self._names(), self.specs, strict=True))
+            told = {n: by_name[n].effects for n in names if by_name[n].kind in ("single", "pair")}
+            names = list(told)
+        folder = self.root / ("oracle" if oracle else "reports")
+        return self._stage(
+            "oracle" if oracle else "diagnose",
+            names,
+            lambda name: (folder / name / "run.json").exists(),
+            lambda name: self._diagnose_one(name, folder / name, told.get(name, ())),
+        )
+
+    def baselines(self) -> bool:
+        """Run the baselines on cases of the kinds COMPARED; they get the same files and the true noise floor.
+
+        Returns whether all are done. Raises DataError where nothing is sealed yet.
+        """
+        self._need_seal()
+        folder = self.root / "baselines"
+
+        def run_one(name: str) -> ChildEnd:
+            floor = read_json(self._answers / f"{name}.json")["floor"]
+            order = {"handed": str(self.root / "handed" / name), "to": str(folder / f"{name}.json"), "floor": floor}
+            return self._work("baselines", order)
+
+        names = sorted(n for n, spec in zip(self._names(), self.specs, strict=True) if spec.kind in COMPARED)
+        return self._stage("baselines", names, lambda name: (folder / f"{name}.json").exists(), run_one)
+
+    def open_seal(self) -> dict[str, Any]:
+        """The answers by name, after the seal has been checked. Raises DataError where anything was changed."""
+        answers = self._load_answers()
+        nonce = str(read_json(self._answers / "nonce.json")["nonce"])
+        check(answers, nonce, str(read_json(self.root / "seal.json")["sha256"]))
+        for name, answer in answers.items():
+            for file, sha in answer["files"].items():
+                if file_digest(self.root / "handed" / name / file) != sha:
+                    raise DataError(
+                        f"The seal is broken: {name}/{file} is not the file that was sealed; the run is void."
+                    )
+        return answers
+
+    def reports(self, *, oracle: bool = False) -> dict[str, dict[str, Any]]:
+        """What the diagnoses left, by name: ``report`` (None where there is none), ``exit_status``, ``seconds``."""
+        found = {}
+        folder = self.root / ("oracle" if oracle else "reports")
+        for run in sorted(folder.glob("*/run.json")):
+            report = run.with_name("report.json")
+            entry = read_json(run)
+            try:
+                entry["report"] = read_json(report) if report.exists() else None
+            except ValueError:
+                entry["report"] = None
+            found[run.parent.name] = entry
+        return found
+
+    def decisions(self) -> dict[str, dict[str, Any]]:
+        """Decisions about names with their statistics, by name of the case; of cases that recorded them."""
+        paths = sorted((self.root / "reports").glob("*/decisions.json"))
+        return {path.parent.name: read_json(path) for path in paths}
+
+    def baseline_reports(self) -> dict[str, dict[str, Any]]:
+        """What the baselines said, by name of the case."""
+        return {path.stem: read_json(path) for path in sorted((self.root / "baselines").glob("*.json"))}
+
+    def same(self, name: str, one: str, other: str) -> bool | None:
+        """Whether the generator's own refit cannot tell two effects apart on a case; None where it has no opinion."""
+        answer = read_json(self._answers / f"{name}.json")
+        if answer["fault"] is not None or any(effect not in CHEAP for effect in (one, other)):
+            return None
+        kept = self.root / "checks" / f"{name}.json"
+        known = read_json(kept) if kept.exists() else {}
+        key = " ".join(sorted((one, other)))
+        if key not in known:
+            folder = self.root / "handed" / name
+            fit, hold = (read_csv(folder / file) for file in FILES[:2])
+            floor = np.array([answer["floor"][channel] for channel in COLUMNS[1:7]])
+            known[key] = indistinguishable(one, other, BaseCar.read(folder / "car.toml"), fit, hold, floor)
+            write_json(kept, known)
+        return None if known[key] is None else bool(known[key])
+
+    def _need_seal(self) -> None:
+        if not (self.root / "seal.json").exists():
+            raise DataError("Seal the answers before the first diagnosis: call make() first.")
+
+    def _names(self) -> list[str]:
+        path = self._answers / "plan.json"
+        plan = json.loads(json.dumps([spec.as_dict() for spec in self.specs]))
+        if not path.exists():
+            write_json(path, {"plan": plan, "names": [new_name() for _ in plan]})
+        kept = read_json(path)
+        if kept["plan"] != plan:
+            raise DataError(f"{self.root} was begun with other cases; give it those, or another folder.")
+        return list(kept["names"])
+
+    def _load_answers(self) -> dict[str, Any]:
+        return {name: read_json(self._answers / f"{name}.json") for name in self._names()}
+
+    def _stage(
+        self, stage: str, names: Sequence[str], there: Callable[[str], bool], work: Callable[[str], ChildEnd]
+    ) -> bool:
+        todo = [name for name in names if not there(name)]
+        done = len(names) - len(todo)
+        self.progress(stage, done, len(names), "")
+        stopped = False
+
+        def finished(name: str, end: ChildEnd) -> None:
+            nonlocal done, stopped
+            if end.abandoned:
+                stopped = True
+                return
+            done += 1
+            self.progress(stage, done, len(names), name)
+
+        complete = side_by_side(
+            self.jobs,
+            todo,
+            work,
+            stop_requested=lambda: self.stop_requested() or self.abandon(),
+            finished=finished,
+        )
+        return complete and not stopped
+
+    def _work(self, what: str, order: dict[str, Any]) -> ChildEnd:
+        end = run_child(
+            (*WORKER, what), self.root, timeout_s=self.timeout_s, words_in=json.dumps(order), environment=ONE_THREAD,
+            abandon=self.abandon,
+        )  # fmt: skip
+        if end.exit_status != 0 and not end.abandoned:
+            last = end.words.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
+            raise DataError(f"A case of the proof could not be done ({what}): {last[0]}")
+        return end
+
+    def _diagnose_one(self, name: str, to: Path, told: tuple[str, ...]) -> ChildEnd:
+        with tempfile.TemporaryDirectory(prefix="diagnosis-") as fresh:
+            here = Path(fresh)
+            for file in FILES:
+                shutil.copyfile(self.root / "handed" / name / file, here / file)
+            command = [*self.command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out"]
+            if told:
+                command += ["--effects", *told]
+            environment = ONE_THREAD if self.jobs > 1 else {}
+            end = run_child(command, here, timeout_s=self.timeout_s, environment=environment, abandon=self.abandon)
+            if end.abandoned:
+                return end
+            to.mkdir(parents=True, exist_ok=True)
+            for file in ("report.json", "decisions.json", "model.toml"):
+                if (here / "out" / file).exists():
+                    shutil.copyfile(here / "out" / file, to / file)
+        run = {"exit_status": end.exit_status, "seconds": round(end.seconds, 3), "jobs": self.jobs}
+        write_json(to / "run.json", {**run, "peak_memory_mib": round(end.peak_memory_mib, 1), "words": end.words})
+        return end

@@ -1,0 +1,85 @@
+"""A child process that makes a case or runs the baselines on one: reads what to do from its standard input (JSON).
+
+python -m carlab.benchmark.proof.worker make|baselines
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.cases.seal import file_digest
+from carlab.benchmark.world.measurement import read_csv, write_csv
+from carlab.core.errors import DataError
+
+FILES = ("fit.csv", "hold.csv", "car.toml")
+ANOTHER_SEED = 10_000_000  # far from every seed of a set
+ATTEMPTS = 4
+
+
+def make(order: dict[str, Any]) -> None:
+    """Make one case: its files into ``handed``, its answer to ``answer``.
+
+    A seed with which the effect cannot be driven at any strength is replaced by another, always the same one.
+    """
+    spec = CaseSpec(**{**order["spec"], "effects": tuple(order["spec"]["effects"])})
+    begin = time.perf_counter()
+    for attempt in range(ATTEMPTS):
+        try:
+            case = dataclasses.replace(spec, seed=spec.seed + attempt * ANOTHER_SEED).make()
+            break
+        except DataError:
+            if attempt == ATTEMPTS - 1:
+                raise
+    folder = Path(order["handed"])
+    folder.mkdir(parents=True, exist_ok=True)
+    write_csv(folder / "fit.csv", case.fit)
+    write_csv(folder / "hold.csv", case.hold)
+    case.nominal.write(folder / "car.toml")
+    answer = case.answer()
+    answer["files"] = {file: file_digest(folder / file) for file in FILES}
+    answer["seconds_to_make"] = round(time.perf_counter() - begin, 3)
+    write_json(Path(order["answer"]), answer)
+
+
+def baselines(order: dict[str, Any]) -> None:
+    """Run every baseline on one case and write what they say to ``to``."""
+    from carlab.benchmark.baselines.run import run_baselines
+    from carlab.benchmark.world.base_car import BaseCar
+
+    folder = Path(order["handed"])
+    fit, hold = (read_csv(folder / file) for file in FILES[:2])
+    write_json(Path(order["to"]), run_baselines(fit, hold, BaseCar.read(folder / "car.toml"), order["floor"]))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object."""
+    return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write a JSON object whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_suffix(".partial")
+    draft.write_text(json.dumps(value, indent=1, allow_nan=False), encoding="utf-8")
+    draft.replace(path)
+
+
+def main() -> int:
+    """Do what the argument says; exit status 1 and one sentence where the case cannot be had."""
+    order = json.loads(sys.stdin.read())
+    try:
+        {"make": make, "baselines": baselines}[sys.argv[1]](order)
+    except DataError as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,303 @@
+"""A car that nobody here wrote: the models of the package commonroad-vehicle-models, made a 1:10 car by similarity.
+
+The package (Althoff and Würsching, "CommonRoad: Vehicle models (version 2020a)", TU Munich) brings two models with
+tyre forces and wheel spin: ``multi_body`` (29 states: body, axles and four wheels, Magic Formula with combined slip)
+and ``drift`` (9 states: single track, load transfer, wheel spin). Equations and numbers are the package's; what is
+added here is how a radio command reaches it, a driver, and motion capture.
+
+Scaling. Lengths by 1/10, times by the root of that, masses by its cube, so that accelerations stay what they are
+(Froude's similarity: density and gravity are the same). Every number of the vehicle follows from its dimension; the
+tyre's coefficients are pure numbers and stay, but ``p_vx1``, which the package multiplies with the load inside a sine
+and so is one over a force.
+
+Interface. The package asks for a steering rate and a longitudinal acceleration (drive torque over mass and wheel
+radius). The rate asked is the one that reaches the commanded angle in one control period; the package itself bounds
+it. The acceleration asked is FULL_MPS2 times the throttle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any, Literal
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.driver import HumanDriver, Track
+from carlab.benchmark.world.measurement import Noise, Recording, record
+from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import Drive, FloatArray
+from carlab.core.errors import ConfigError, DataError
+
+Model = Literal["multi_body", "drift"]
+VEHICLE = 2  # BMW 320i, driven by its rear wheels
+SCALE = 0.1
+MAX_ANGLE_RAD = 0.5
+FULL_MPS2 = 6.0
+START_MPS = 1.0
+ROLLING_MPS = 0.7  # below 0.1 m/s the package forgets its tyres and wheels; it is kept well away from there
+DRIVER_GRIP = 0.75  # share of the tyres' grip that he uses: beyond it inner wheels lift, which the package knows not
+RTOL = 1e-6
+SPUN_RAD = 1.4
+CALLS = 1500
+SMALL_S = 2e-4
+
+# Powers of the length scale: length 1, time 1/2, mass 3.
+_VEHICLE_POWERS = {
+    **dict.fromkeys(("l", "w", "a", "b", "T_f", "T_r", "h_cg", "h_raf", "h_rar", "h_s", "R_w"), 1.0),
+    **dict.fromkeys(("m", "m_s", "m_uf", "m_ur"), 3.0),
+    **dict.fromkeys(("I_Phi_s", "I_y_s", "I_z", "I_xz_s", "I_uf", "I_ur", "I_y_w"), 5.0),
+    **dict.fromkeys(("K_sf", "K_sr", "K_ras", "K_zt"), 2.0),  # N/m
+    **dict.fromkeys(("K_sdf", "K_sdr", "K_rad"), 2.5),  # N s/m
+    **dict.fromkeys(("K_tsf", "K_tsr"), 4.0),  # N m/rad
+    **dict.fromkeys(("D_f", "D_r"), -1.0),  # rad/m
+    **dict.fromkeys(("K_lt", "E_f", "E_r"), -2.0),  # m/N, rad/m2
+}
+_STEERING_POWERS = {"v_min": -0.5, "v_max": -0.5, "kappa_dot_max": -1.5, "kappa_dot_dot_max": -2.0}
+_LONGITUDINAL_POWERS = {"v_min": 0.5, "v_max": 0.5, "v_switch": 0.5, "j_max": -0.5, "j_dot_max": -1.0}
+_TYRE_POWERS = {"p_vx1": -3.0}
+
+
+def require_public_simulator() -> None:
+    """Raise ConfigError where the package is not installed."""
+    if find_spec("vehiclemodels") is None:
+        raise ConfigError("The public simulator needs commonroad-vehicle-models: pip install 'carlab[studies]'.")
+
+
+def parameters(scale: float = SCALE) -> Any:
+    """The package's vehicle, scaled by dynamic similarity; 1.0 gives it as it comes."""
+    require_public_simulator()
+    from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
+
+    p = setup_vehicle_parameters(VEHICLE)
+    parts = ((p, _VEHICLE_POWERS), (p.steering, _STEERING_POWERS), (p.longitudinal, _LONGITUDINAL_POWERS))
+    for part, powers in (*parts, (p.tire, _TYRE_POWERS)):
+        for name, power in powers.items():
+            setattr(part, name, getattr(part, name) * scale**power)
+    return p
+
+
+class PublicCar:
+    """One of the package's models, and the car it looks like to its driver.
+
+    Args:
+        model: Which.
+        command_delay_s: From a command to the package's inputs.
+    """
+
+    def __init__(self, model: Model, command_delay_s: float = 0.05) -> None:
+        self.model = model
+        self.p = parameters()
+        if model == "multi_body":
+            from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb as rates
+        else:
+            from vehiclemodels.vehicle_dynamics_std import vehicle_dynamics_std as rates
+        self._spins = range(23, 27) if model == "multi_body" else range(7, 9)
+        self._rates: Callable[[list[float], list[float], Any], list[float]] = rates
+        p = self.p
+        grip = DRIVER_GRIP * p.tire.p_dy1
+        # Only for the hand and the eye of the driver: he knows his car.
+        self.car = BaseCar(
+            mass=p.m, yaw_inertia=p.I_z, front_axle=p.a, rear_axle=p.b, mu_front=grip, mu_rear=grip,
+            drive_gain=FULL_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=command_delay_s,
+        )  # fmt: skip
+
+    def start(self, x: float, y: float, yaw: float, speed: float) -> FloatArray:
+        """The package's state while rolling straight ahead."""
+        core = [x, y, 0.0, speed, yaw, 0.0, 0.0]
+        if self.model == "multi_body":
+            from vehiclemodels.init_mb import init_mb as init
+        else:
+            from vehiclemodels.init_std import init_std as init
+        return np.array(init(core, self.p), dtype=np.float64)
+
+    def rates(self, state: FloatArray, inputs: Sequence[float]) -> list[float]:
+        """The package's right-hand side; inputs are steering rate [rad/s] and acceleration [m/s^2] as asked.
+
+        The package forbids negative wheel spin by changing its caller's state, and sets the rate to 0 where spin is
+        negative. An integrator that tries states does not hear of the change, and a wheel a hair below 0 would stay
+        locked for ever; so spin is held at 0 before the call and may only grow from there after it.
+        """
+        x = state.tolist()
+        locked = [i for i in self._spins if x[i] <= 0.0]
+        for i in locked:
+            x[i] = 0.0
+        found = self._rates(x, list(inputs), self.p)
+        for i in locked:
+            found[i] = max(found[i], 0.0)
+        return found
+
+    def motion(self, states: FloatArray) -> FloatArray:
+        """x, y, yaw, vx, vy, yaw_rate at the centre of mass, (N, 6), of states (N, n)."""
+        x, y, yaw, rate = states[:, 0], states[:, 1], states[:, 4], states[:, 5]
+        if self.model == "multi_body":
+            vx, vy = states[:, 3], states[:, 10]
+        else:
+            vx, vy = states[:, 3] * np.cos(states[:, 6]), states[:, 3] * np.sin(states[:, 6])
+        return np.stack([x, y, yaw, vx, vy, rate], axis=1)
+
+    def rear_slip(self, states: FloatArray) -> FloatArray:
+        """Longitudinal slip of the rear wheels, their mean where there are two, (N,); positive when braking."""
+        spin = states[:, 25:27].mean(axis=1) if self.model == "multi_body" else states[:, 8]
+        slip: FloatArray = 1.0 - self.p.R_w * spin / np.maximum(self.motion(states)[:, 3], 0.1)
+        return slip
+
+
+class RollingDriver(HumanDriver):
+    """The same person, who keeps the car rolling forwards and does not want to spin it.
+
+    Neither model of the package can stand or reverse with its tyres, and past a right angle of side slip its
+    equations mean nothing.
+    """
+
+    def __call__(self, t: float, state: FloatArray) -> tuple[float, float]:
+        """Commands for the tick at t [s]."""
+        steering, throttle = super().__call__(t, state)
+        speed = math.hypot(state[3], state[4])
+        most = math.atan(self._car.wheelbase * self._grip / max(speed, 0.3) ** 2) / self._car.max_angle
+        if state[3] < ROLLING_MPS:
+            throttle = max(throttle, 0.3)
+        return float(np.clip(steering, -most, most)), throttle
+
+    def _intend(self, t: float, off: float) -> None:
+        super()._intend(t, off)
+        while self._mode in ("stand", "reverse"):
+            super()._intend(t, off)
+
+
+@dataclass(frozen=True)
+class PublicDrive:
+    """A drive of the public car: its recording, and the package's states at the captures, (N, n), noise-free."""
+
+    recording: Recording
+    drive: Drive
+    states: FloatArray
+
+
+class AbandonedError(Exception):
+    """A drive was given up because somebody asked for it."""
+
+
+def drive_public(
+    car: PublicCar, seed: int, part: int, duration_s: float, abandon: Callable[[], bool] = lambda: False
+) -> PublicDrive:
+    """Drive and record; ``part`` tells the recordings of one seed apart. The same arguments give the same drive.
+
+    Raises:
+        AbandonedError: where ``abandon``, asked at every tick, says so.
+        DataError: where the package cannot be integrated or the car has spun.
+    """
+    track = Track(np.random.default_rng((seed, 1)))
+    human = RollingDriver(car.car, track, np.random.default_rng((seed, 2, part)))
+    x, y, yaw = human.start()[:3]
+    driven, states = _integrate(car, human, duration_s, car.start(x, y, yaw, START_MPS), abandon)
+    noise = Noise(car.car.position_std, car.car.yaw_std)
+    recording = record(driven, World(car.car), noise, np.random.default_rng((seed, 3, part)))
+    return PublicDrive(recording, driven, states)
+
+
+def _integrate(
+    car: PublicCar, driver: Callable[[float, FloatArray], tuple[float, float]], duration_s: float, state: FloatArray,
+    abandon: Callable[[], bool],
+) -> tuple[Drive, FloatArray]:  # fmt: skip
+    base = car.car
+    period, per_row = base.control_period, round(base.control_period * base.mocap_rate)
+    count = round(duration_s / period) + 1
+    capture_s = np.arange((count - 1) * per_row + 1, dtype=np.float64) * (period / per_row) - base.latency
+    states = np.empty((len(capture_s), len(state)))
+    commands = np.empty((count, 2))
+    early = int(np.searchsorted(capture_s, 0.0, side="right"))
+    for row in range(early):
+        states[row] = state
+        states[row, :2] += capture_s[row] * START_MPS * np.array([math.cos(state[4]), math.sin(state[4])])
+    done, acting = early, (0.0, 0.0)
+    pending: list[tuple[float, tuple[float, float]]] = []
+    log = [(0.0, *acting)]
+    for tick in range(count):
+        if abandon():
+            raise AbandonedError
+        t, end = tick * period, (tick + 1) * period
+        steering, throttle = driver(t, car.motion(states[done - 1 : done])[0])
+        commands[tick] = steering, throttle
+        pending.append((t + base.command_delay, (base.max_angle * steering, FULL_MPS2 * throttle)))
+        while t < end:
+            until = min(end, pending[0][0]) if pending else end
+            if until > t + 1e-12:
+                upto = int(np.searchsorted(capture_s, until, side="right"))
+                at = np.append(capture_s[done:upto], until)
+                found = _segment(car, acting, period, (t, until), state, at)
+                states[done:upto], state = found[:-1], found[-1]
+                done, t = upto, until
+            else:
+                t = until
+            if pending and pending[0][0] <= t + 1e-12:
+                acting = pending.pop(0)[1]
+                log.append((t, *acting))
+    switches = np.array(log)
+    row_s = np.arange(count, dtype=np.float64) * period
+    made = Drive(row_s, commands, capture_s, car.motion(states), per_row, switches[:, 0], switches[:, 1:])
+    return made, states
+
+
+def _segment(
+    car: PublicCar, acting: tuple[float, float], period: float, span: tuple[float, float], state: FloatArray,
+    at: FloatArray,
+) -> FloatArray:  # fmt: skip
+    calls = 0
+
+    def rates(_: float, x: FloatArray) -> list[float]:
+        nonlocal calls
+        calls += 1
+        if calls > CALLS:
+            raise _ChatteringError
+        return car.rates(x, ((acting[0] - x[2]) / period, acting[1]))
+
+    # A capture at the very end is asked for once and given twice.
+    once = np.unique(at)
+    try:
+        try:
+            solved = solve_ivp(rates, span, state, "LSODA", once, rtol=RTOL, atol=0.1 * RTOL)
+            found = solved.y.T if solved.success else np.full((len(once), len(state)), np.nan)
+        except _ChatteringError:
+            calls = -(10**9)
+            found = _small_steps(rates, span[0], state, once)
+    except (ZeroDivisionError, ValueError, OverflowError) as error:
+        raise DataError(
+            f"The package's {car.model} model broke down at {span[0]:.2f} s ({error}); take another seed."
+        ) from error
+    if not np.isfinite(found).all():
+        raise DataError(f"The package's {car.model} model cannot be integrated beyond {span[0]:.2f} s: another seed.")
+    motion = car.motion(found)
+    if (np.abs(np.arctan2(motion[:, 4], motion[:, 3])) > SPUN_RAD).any():
+        raise DataError(f"The car has spun at {span[0]:.2f} s, where the package's equations end; take another seed.")
+    return np.asarray(found[np.searchsorted(once, at)], dtype=np.float64)
+
+
+class _ChatteringError(Exception):
+    """The step control is caught at a jump of the right-hand side."""
+
+
+def _small_steps(
+    rates: Callable[[float, FloatArray], list[float]], t: float, x: FloatArray, at: FloatArray
+) -> FloatArray:
+    """Runge and Kutta's fourth order at SMALL_S or less: wheels change camber's sign, where the package's force jumps.
+
+    A step control would shrink its steps without end there; steps of 0.2 ms are within the stability bound of wheel
+    slip, the fastest thing in the model, 6000 1/s at walking pace.
+    """
+    found = np.empty((len(at), len(x)))
+    for row, until in enumerate(at):
+        count = max(1, math.ceil((until - t) / SMALL_S))
+        h = (until - t) / count
+        for _ in range(count):
+            k1 = np.array(rates(t, x))
+            k2 = np.array(rates(t, x + 0.5 * h * k1))
+            k3 = np.array(rates(t, x + 0.5 * h * k2))
+            k4 = np.array(rates(t, x + h * k3))
+            x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        found[row], t = x, until
+    return found

@@ -1,0 +1,83 @@
+"""The page of the study on a public simulator: what was driven, what was said, and what the equations say of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from carlab.benchmark.proof.results_page import markdown
+from carlab.benchmark.public_simulators.commonroad import DRIVER_GRIP, FULL_MPS2, MAX_ANGLE_RAD, SCALE
+
+ASKED_RATIO = 0.5
+STANCES = {"yes": "in the equations", "akin": "acts alike", "no": "not in the equations"}
+
+
+def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
+    """The page, from what study.json holds."""
+    parts = [
+        "# Diagnosis of a simulator that nobody here wrote",
+        f"{facts['package']}, scaled by {SCALE:g} in length and by dynamic similarity in all else. Full steering is "
+        f"{MAX_ANGLE_RAD:g} rad, full throttle asks for {FULL_MPS2:g} m/s2; the package's own bounds come on top. A "
+        f"person drives who keeps rolling and uses {DRIVER_GRIP:.0%} of the tyres' grip; "
+        f"{facts['seconds_to_fit']:g} s to fit, {facts['seconds_held_out']:g} s held out, 30 Hz, noise on the pose, "
+        "velocities by differentiating. The nominal car file has mass, axle distances and delays as measured and "
+        "guesses for the rest.",
+        f"Asked: held-out error with effects at most {ASKED_RATIO:g} of the refit's. {_verdict(rows)}",
+        markdown(
+            ("seed", "verdict", "nominal", "refit", "with effects", "ratio", "named", "seconds"),
+            [_score_cells(row) for row in rows],
+        ),
+    ]
+    for row in rows:
+        parts.append(f"## Seed {row['seed']}")
+        if row["verdict"] is None:
+            last = str(row["words"]).strip().splitlines()[-1:] or ["nothing said"]
+            parts.append(f"No report (exit status {row['exit_status']}): {last[0]}")
+            continue
+        parts += [f"**{e['id']}**: {e['sentence'] or 'no sentence'}\n\n{_evidence(e)}" for e in row["named"]]
+        if row["unexplained"]:
+            left = row["unexplained"]
+            parts.append(
+                f"Unexplained: {left.get('share', math.nan):.0%} of the refit's excess, channels "
+                f"{', '.join(left.get('channels', [])) or 'none'}; {left.get('class') or 'no class'}"
+                + (f"; {left['formula']}" if left.get("formula") else "")
+                + "."
+            )
+        if row["data_faults"]:
+            parts.append(f"Data faults said: {', '.join(row['data_faults'])}. The recording has none.")
+        parts.append(markdown(("how far the drive went", "value"), [(k, f"{v:g}") for k, v in row["activity"].items()]))
+    return "\n\n".join(parts) + "\n"
+
+
+def _verdict(rows: Sequence[dict[str, Any]]) -> str:
+    met = [row for row in rows if row.get("ratio") is not None and row["ratio"] <= ASKED_RATIO]
+    named = [effect["in_equations"] for row in rows for effect in row.get("named", [])]
+    counts = ", ".join(f"{named.count(stance)} {words}" for stance, words in STANCES.items())
+    return f"Met for {len(met)} of {len(rows)} seeds. Names given: {len(named)} ({counts})."
+
+
+def _score_cells(row: dict[str, Any]) -> tuple[str, ...]:
+    scores = row.get("scores", {})
+    values = [f"{scores[name]:.2f}" if name in scores else "" for name in ("nominal", "refit", "with_effects")]
+    ratio = f"{row['ratio']:.2f}" if row.get("ratio") is not None else ""
+    names = ", ".join(effect["id"] for effect in row.get("named", [])) or "nothing"
+    return (str(row["seed"]), row["verdict"] or "no report", *values, ratio, names, f"{row['seconds']:.0f}")
+
+
+def _evidence(effect: dict[str, Any]) -> str:
+    given = {k: v for k, v in (effect["evidence"] or {}).items() if isinstance(v, int | float)}
+    cells = [(k.replace("_", " "), f"{v:.3g}") for k, v in given.items()]
+    cells += [(name, _value(p, effect["true_values"].get(name))) for name, p in (effect["parameters"] or {}).items()]
+    others = [f"{name} ({STANCES[stance]})" for name, stance in effect["others"].items()]
+    cells += [("not to be told from", ", ".join(others))] if others else []
+    cells.append((f"the package: {STANCES[effect['in_equations']]}", effect["why"]))
+    return markdown(("evidence", "value"), cells)
+
+
+def _value(parameter: dict[str, Any], truth: float | None) -> str:
+    unit = f" {parameter['unit']}" if parameter.get("unit") else ""
+    words = f"{parameter['value']:.3g}{unit}"
+    if parameter.get("low90") is not None and parameter.get("high90") is not None:
+        words += f" ({parameter['low90']:.3g} to {parameter['high90']:.3g})"
+    return words if truth is None else f"{words}; in the package {truth:.3g}"

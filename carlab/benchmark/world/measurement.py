@@ -1,0 +1,130 @@
+"""What motion capture and logger make of a drive: noise on the pose, velocities by differentiating."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import Drive, FloatArray
+
+COLUMNS = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording and, beside it, what it would be without noise.
+
+    t_s (N,), measured (N, 6) as x, y, yaw (unwrapped), vx, vy, yaw_rate; commands (N, 2); error (N, 6) what noise and
+    differentiation add to the noise-free measurement.
+    """
+
+    t_s: FloatArray
+    measured: FloatArray
+    commands: FloatArray
+    error: FloatArray
+
+    @property
+    def clean(self) -> FloatArray:
+        """The noise-free measurement, observation effects included, (N, 6)."""
+        return self.measured - self.error
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Motion-capture noise on the pose and the width of the window by which velocities are had from it."""
+
+    position_std_m: float
+    yaw_std_rad: float
+    window_s: float = 0.075
+
+
+def record(drive: Drive, world: World, noise: Noise, rng: np.random.Generator) -> Recording:
+    """Measure a drive: noise on every captured pose, velocities by a local parabola, observation effects."""
+    pose = drive.captures[:, :3]
+    std = np.array([noise.position_std_m, noise.position_std_m, noise.yaw_std_rad])
+    noisy = _measure(drive, world, noise, rng.normal(size=pose.shape) * std)
+    quiet = _measure(drive, world, noise, np.zeros_like(pose))
+    plain = World(world.car)
+    bias = _measure(drive, plain, noise, np.zeros_like(pose)) - drive.rows
+    return Recording(drive.row_s, noisy, drive.commands, noisy - quiet + bias)
+
+
+def _measure(drive: Drive, world: World, noise: Noise, added: FloatArray) -> FloatArray:
+    gap = (drive.row_s[1] - drive.row_s[0]) / drive.per_row
+    pose = drive.captures[:, :3]
+    for change in world.pose_changes:
+        pose = change(drive.capture_s, pose)
+    pose = pose + added
+    velocity = body_velocity(pose, gap, window_rows(noise.window_s, gap))
+    for change in world.velocity_changes:
+        velocity = change(drive.capture_s, velocity)
+    return np.concatenate([pose, velocity], axis=1)[:: drive.per_row]
+
+
+def window_rows(window_s: float, gap_s: float) -> int:
+    """Odd number of samples, at least 5, that spans about ``window_s``."""
+    return max(5, 2 * round(0.5 * window_s / gap_s) + 1)
+
+
+def local_fit(values: FloatArray, window: int, order: int, gap_s: float) -> tuple[FloatArray, FloatArray]:
+    """Value and slope of a local polynomial (Savitzky and Golay) at every row of (N, k); narrower ones at the ends."""
+    half = window // 2
+    count = len(values)
+    grid = np.arange(window)
+    fitted, slope = np.empty_like(values), np.empty_like(values)
+    for offset in range(window):
+        powers = np.vander((grid - offset).astype(np.float64), order + 1, increasing=True)
+        weights = np.linalg.pinv(powers)
+        if offset == half:
+            for k in range(values.shape[1]):
+                fitted[half : count - half, k] = np.convolve(values[:, k], weights[0][::-1], "valid")
+                slope[half : count - half, k] = np.convolve(values[:, k], weights[1][::-1], "valid")
+        else:
+            first, row = (0, offset) if offset < half else (count - window, count - window + offset)
+            fitted[row] = weights[0] @ values[first : first + window]
+            slope[row] = weights[1] @ values[first : first + window]
+    return fitted, slope / gap_s
+
+
+def to_body(yaw: FloatArray, slope: FloatArray) -> FloatArray:
+    """World rates of (x, y, yaw), (N, 3), as vx, vy, yaw_rate in the body frame."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack([cos * slope[:, 0] + sin * slope[:, 1], cos * slope[:, 1] - sin * slope[:, 0], slope[:, 2]], axis=1)
+
+
+def body_velocity(pose: FloatArray, gap_s: float, window: int) -> FloatArray:
+    """Body velocities by differentiating the pose, each row with the measured yaw."""
+    return to_body(pose[:, 2], local_fit(pose, window, 2, gap_s)[1])
+
+
+def wrapped(yaw: FloatArray) -> FloatArray:
+    """Into (-pi, pi]."""
+    return -np.remainder(-yaw + np.pi, 2 * np.pi) + np.pi
+
+
+def as_table(recording: Recording) -> dict[str, FloatArray]:
+    """The canonical columns."""
+    columns = [recording.t_s, *recording.measured.T, *recording.commands.T]
+    table = dict(zip(COLUMNS, columns, strict=True))
+    table["yaw"] = wrapped(table["yaw"])
+    return table
+
+
+def write_csv(path: Path, table: dict[str, FloatArray]) -> None:
+    """Write columns of equal length; empty fields where a value is missing (NaN)."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(table)
+        for row in zip(*table.values(), strict=True):
+            writer.writerow("" if np.isnan(v) else f"{v:.7g}" if i else f"{v:.6f}" for i, v in enumerate(row))
+
+
+def read_csv(path: Path) -> dict[str, FloatArray]:
+    """Read what write_csv wrote."""
+    with path.open() as file:
+        names = file.readline().strip().split(",")
+    return dict(zip(names, np.genfromtxt(path, delimiter=",", skip_header=1, dtype=np.float64).T, strict=True))

@@ -1,0 +1,203 @@
+"""The equations of motion, written for this package alone; concealed physics hooks into their stages.
+
+Kinematic, dynamic and blended single track after Kabzan et al., "AMZ Driverless"; tyres after Pacejka and Bakker,
+"The magic formula tyre model". Without a hook this is the base model and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from carlab.benchmark.world.base_car import BaseCar
+
+Hook = Callable[["Instant"], None]
+STAGES = ("steer", "throttle", "drive", "load", "grip", "limit", "tyre", "body")
+SLIP_FLOOR_MPS = 0.3
+RELAX_S = 0.05
+BLEND_FROM_MPS = 0.3
+BLEND_OVER_MPS = 0.2
+
+
+class Instant:
+    """Everything there is at one time; hooks read and change it, stage by stage.
+
+    Stages: ``steer`` (front wheel angle d), ``throttle`` (u), ``drive`` (drive force), ``load`` (axle loads), ``grip``
+    (mu), ``limit`` (fx, the force at the rear axle), ``tyre`` (lateral axle forces), ``body`` (push_x, push_y [N] in
+    the body frame and moment [N m]). Hidden states of hooks are ``extra``, their rates go to ``rates``.
+    """
+
+    __slots__ = (
+        "alpha_f", "alpha_r", "cos_d", "d", "drive", "extra", "ff", "fr", "fx", "fx_front", "fz_f", "fz_r", "moment",
+        "mu_f", "mu_r", "psi", "push_x", "push_y", "r", "rates", "shape_f", "shape_r", "sin_d", "t", "u", "vx", "vy",
+        "x", "y",
+    )  # fmt: skip
+
+    t: float
+    x: float
+    y: float
+    psi: float
+    vx: float
+    vy: float
+    r: float
+    d: float
+    u: float
+    sin_d: float
+    cos_d: float
+    drive: float
+    fx: float
+    fx_front: float
+    fz_f: float
+    fz_r: float
+    mu_f: float
+    mu_r: float
+    alpha_f: float
+    alpha_r: float
+    shape_f: float
+    shape_r: float
+    ff: float
+    fr: float
+    push_x: float
+    push_y: float
+    moment: float
+    extra: list[float]
+    rates: list[float]
+
+
+def pacejka_shape(b: float, c: float) -> Callable[[float], float]:
+    """sin(C atan(B a)): lateral force over mu times load, without its sign."""
+    sin, atan = math.sin, math.atan
+    return lambda a: sin(c * atan(b * a))
+
+
+def linear_shape(b: float, c: float) -> Callable[[float], float]:
+    """The slope of the magic formula at zero slip."""
+    slope = b * c
+    return lambda a: slope * a
+
+
+class World:
+    """A true car: base numbers and the hooks of what is concealed in it."""
+
+    def __init__(self, car: BaseCar) -> None:
+        self.car = car
+        shape = linear_shape if car.kind == "linear_tyre" else pacejka_shape
+        self.shape_front = shape(car.b_front, car.c_front)
+        self.shape_rear = shape(car.b_rear, car.c_rear)
+        self.hooks: dict[str, list[Hook]] = {stage: [] for stage in STAGES}
+        self._rolling: list[bool] = []
+        # What is issued at a time acts from: one function a channel (steering, throttle).
+        self.arrival: list[Callable[[float], float]] = [lambda t: t + car.command_delay] * 2
+        # Maps of a command when it starts to act, in order; a map may remember. Steering in rad, throttle in 1.
+        self.steering_maps: list[Callable[[float], float]] = []
+        self.throttle_maps: list[Callable[[float], float]] = []
+        # Told whenever a command starts to act: (t, wheel angle wanted, throttle wanted).
+        self.switch_listeners: list[Callable[[float, float, float], None]] = []
+        # Observation: extra age of every channel [s], and changes of pose and velocity columns (see measurement).
+        self.extra_latency_s = 0.0
+        self.pose_changes: list[Callable[[Any, Any], Any]] = []
+        self.velocity_changes: list[Callable[[Any, Any], Any]] = []
+
+    def add_state(self, *, rolling: bool = False) -> int:
+        """A hidden state that starts at 0, or at the car's speed; its index into ``extra`` and ``rates``."""
+        self._rolling.append(rolling)
+        return len(self._rolling) - 1
+
+    def hidden(self, start_speed_mps: float) -> list[float]:
+        """The hidden states at the start."""
+        return [start_speed_mps if rolling else 0.0 for rolling in self._rolling]
+
+    def derivative(self) -> Derivative:
+        """The right-hand side with all hooks in place."""
+        return Derivative(self)
+
+
+class Derivative:
+    """dy/dt for y = [x, y, psi, vx, vy, r, hidden ...] under the commands ``angle`` [rad] and ``throttle``."""
+
+    def __init__(self, world: World) -> None:
+        car = world.car
+        self.angle = 0.0
+        self.throttle = 0.0
+        self._world = world
+        self._now = Instant()
+        self._hooks = [tuple(world.hooks[stage]) for stage in STAGES]
+        self._extras = len(world.hidden(0.0))
+        self._mass = car.mass
+        self._inertia = car.yaw_inertia
+        self._kinematic = car.kind == "kinematic"
+        self._blend = car.kind == "blend"
+
+    def __call__(self, t: float, values: Any) -> list[float]:
+        """Evaluate at time t [s]; ``values`` is an array of the state."""
+        now, world = self._now, self._world
+        car = world.car
+        steer, throttle, drive, load, grip, limit, tyre, body = self._hooks
+        state = values.tolist()
+        now.t = t
+        now.x, now.y, now.psi, now.vx, now.vy, now.r = state[:6]
+        vx, vy, r = now.vx, now.vy, now.r
+        now.extra = state[6:]
+        now.rates = [0.0] * self._extras
+        now.d = self.angle
+        for hook in steer:
+            hook(now)
+        now.u = self.throttle
+        for hook in throttle:
+            hook(now)
+        now.sin_d = sin_d = math.sin(now.d)
+        now.cos_d = cos_d = math.cos(now.d)
+        now.drive = car.drive_gain * now.u
+        for hook in drive:
+            hook(now)
+        now.fx = now.drive - car.damping * vx
+        now.fx_front = 0.0
+        front_y = vy + car.front_axle * r
+        now.alpha_f = math.atan2(front_y * cos_d - vx * sin_d, max(abs(vx * cos_d + front_y * sin_d), SLIP_FLOOR_MPS))
+        now.alpha_r = math.atan2(vy - car.rear_axle * r, max(abs(vx), SLIP_FLOOR_MPS))
+        now.shape_f = world.shape_front(now.alpha_f)
+        now.shape_r = world.shape_rear(now.alpha_r)
+        now.fz_f, now.fz_r = car.load_front, car.load_rear
+        now.mu_f, now.mu_r = car.mu_front, car.mu_rear
+        for hook in load:
+            hook(now)
+        for hook in grip:
+            hook(now)
+        for hook in limit:
+            hook(now)
+        now.ff = -now.mu_f * now.fz_f * now.shape_f
+        now.fr = -now.mu_r * now.fz_r * now.shape_r
+        now.push_x = now.push_y = now.moment = 0.0
+        for hook in tyre:
+            hook(now)
+        for hook in body:
+            hook(now)
+        rates = self._body_rates(now)
+        sin_psi, cos_psi = math.sin(now.psi), math.cos(now.psi)
+        return [vx * cos_psi - vy * sin_psi, vx * sin_psi + vy * cos_psi, r, *rates, *now.rates]
+
+    def _body_rates(self, now: Instant) -> Sequence[float]:
+        m, car = self._mass, self._world.car
+        ff, sin_d, cos_d = now.ff, now.sin_d, now.cos_d
+        if not self._kinematic:
+            side = ff * cos_d + now.fx_front * sin_d
+            dynamic = (
+                (now.fx + now.fx_front * cos_d - ff * sin_d + now.push_x) / m + now.vy * now.r,
+                (now.fr + side + now.push_y) / m - now.vx * now.r,
+                (car.front_axle * side - car.rear_axle * now.fr + now.moment) / self._inertia,
+            )
+            if not self._blend:
+                return dynamic
+            share = min(max((math.hypot(now.vx, now.vy) - BLEND_FROM_MPS) / BLEND_OVER_MPS, 0.0), 1.0)
+            if share == 1.0:
+                return dynamic
+        tan_d = sin_d / cos_d
+        kinematic = (
+            (now.fx + now.push_x) / m,
+            (now.vx * car.rear_axle * tan_d / car.wheelbase - now.vy) / RELAX_S,
+            (now.vx * tan_d / car.wheelbase - now.r) / RELAX_S,
+        )
+        if self._kinematic:
+            return kinematic
+        return [share * a + (1.0 - share) * b for a, b in zip(dynamic, kinematic, strict=True)]

@@ -1,0 +1,160 @@
+"""A drive of the true car: adaptive integration between the instants at which something switches."""
+
+from __future__ import annotations
+
+import warnings
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import ode
+
+from carlab.benchmark.world.physics import World
+from carlab.core.errors import DataError
+
+FloatArray = NDArray[np.float64]
+Driver = Callable[[float, FloatArray], tuple[float, float]]
+RTOL = 1e-8
+ATOL = 1e-9
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What happened, without noise.
+
+    row_s     (N,)       times of the control ticks, 0 the first
+    commands  (N, 2)     steering and throttle as issued at the ticks
+    capture_s (N s - s + 1,)   capture times; row k was captured at index k s
+    captures  (N s - s + 1, 6) true state there
+    per_row   s, captures a row
+    """
+
+    row_s: FloatArray
+    commands: FloatArray
+    capture_s: FloatArray
+    captures: FloatArray
+    per_row: int
+    switch_s: FloatArray
+    switch_values: FloatArray
+
+    @property
+    def rows(self) -> FloatArray:
+        """True state as captured for each row, (N, 6)."""
+        return self.captures[:: self.per_row]
+
+
+class _Acting:
+    """The commands on their way to the wheels, and the integrator's right-hand side that they reach."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.rates = world.derivative()
+        self.queues: tuple[deque[tuple[float, float]], ...] = (deque(), deque())
+        self.log: list[tuple[float, float, float]] = []
+        self._act(0.0)
+
+    def issue(self, t: float, command: tuple[float, float]) -> None:
+        for queue, arrival, value in zip(self.queues, self.world.arrival, command, strict=True):
+            acts = arrival(t)
+            while queue and queue[-1][0] > acts:  # overtaken: the newer command is the one that stays
+                queue.pop()
+            queue.append((acts, value))
+
+    def next_s(self) -> float:
+        return min((queue[0][0] for queue in self.queues if queue), default=np.inf)
+
+    def switch(self, t: float) -> None:
+        due = False
+        for channel, queue in enumerate(self.queues):
+            while queue and queue[0][0] <= t + 1e-12:
+                value = queue.popleft()[1]
+                due = True
+                if channel == 0:
+                    angle = self.world.car.max_angle * value
+                    for change in self.world.steering_maps:
+                        angle = change(angle)
+                    self.rates.angle = angle
+                else:
+                    for change in self.world.throttle_maps:
+                        value = change(value)
+                    self.rates.throttle = value
+        if due:
+            self._act(t)
+
+    def _act(self, t: float) -> None:
+        self.log.append((t, self.rates.angle, self.rates.throttle))
+        for listener in self.world.switch_listeners:
+            listener(t, self.rates.angle, self.rates.throttle)
+
+
+def drive(
+    world: World,
+    driver: Driver,
+    duration_s: float,
+    *,
+    start: tuple[float, ...] = (0.0,) * 6,
+    rtol: float = RTOL,
+    integrator: str = "dop853",
+) -> Drive:
+    """Drive the car from a standstill with neutral commands behind it.
+
+    Args:
+        world: The true car.
+        driver: Called at every tick with its time and the newest captured state; returns (steering, throttle).
+        duration_s: Length; the last row is the last tick not after it.
+        start: x, y, psi, vx, vy, r at time 0; before it the car is taken to have moved at its first velocity.
+        rtol: Relative tolerance of the integrator (absolute: a tenth of it).
+        integrator: One of scipy's adaptive ones, ``dop853`` or, for quick looks, ``dopri5``.
+
+    Raises:
+        DataError: where the car cannot be integrated (it has left all sense).
+    """
+    car = world.car
+    period = car.control_period
+    count = round(duration_s / period) + 1
+    per_row = max(1, round(period * car.mocap_rate))
+    gap = period / per_row
+    latency = car.latency + world.extra_latency_s
+    acting = _Acting(world)
+    solver = ode(acting.rates).set_integrator(integrator, rtol=rtol, atol=0.1 * rtol, nsteps=4000)
+    t, state = 0.0, np.concatenate([np.asarray(start, dtype=np.float64), world.hidden(start[3])])
+    capture_s = np.arange((count - 1) * per_row + 1, dtype=np.float64) * gap - latency
+    captures = np.empty((len(capture_s), 6))
+    commands = np.empty((count, 2))
+    captured, tick = 0, 0
+    while captured < len(capture_s) or tick < count:
+        next_capture = capture_s[captured] if captured < len(capture_s) else np.inf
+        next_tick = tick * period if tick < count else np.inf
+        due = min(next_capture, next_tick, acting.next_s())
+        if due > t + 1e-12:
+            solver.set_initial_value(state, t)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # asked of the solver below, and said as an error
+                state = solver.integrate(due)
+            if not solver.successful() or not np.isfinite(state).all() or abs(state[3]) > 50.0:
+                raise DataError(f"The concealed car cannot be integrated beyond {t:.3f} s; draw another size or seed.")
+            t = due
+        if acting.next_s() <= t + 1e-12:
+            acting.switch(t)
+        if next_capture <= max(t, due) + 1e-12:
+            captures[captured] = state[:6] if next_capture >= 0.0 else _before(state, next_capture)
+            captured += 1
+        if next_tick <= t + 1e-12:
+            commands[tick] = driver(next_tick, captures[max(captured - 1, 0)] if captured else state[:6])
+            acting.issue(next_tick, (float(commands[tick, 0]), float(commands[tick, 1])))
+            tick += 1
+    log = np.array(acting.log)
+    return Drive(
+        np.arange(count, dtype=np.float64) * period, commands, capture_s, captures, per_row, log[:, 0], log[:, 1:]
+    )
+
+
+def _before(state: FloatArray, t: float) -> FloatArray:
+    early = state[:6].copy()
+    cos, sin = np.cos(early[2]), np.sin(early[2])
+    early[0] += t * (early[3] * cos - early[4] * sin)
+    early[1] += t * (early[3] * sin + early[4] * cos)
+    early[2] += t * early[5]
+    return early

@@ -1,0 +1,5 @@
+"""Exit codes of ``carlab`` that several verbs use."""
+
+EXIT_FAILED = 1
+EXIT_SAFETY_STOP = 4
+EXIT_INTERRUPTED = 130

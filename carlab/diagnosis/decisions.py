@@ -1,0 +1,72 @@
+"""Decisions about names, with the statistics that were compared with thresholds: the content of ``decisions.json``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+SCHEMA = "carlab.decisions/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A comparison: it holds where ``statistic`` is above the threshold, or below it where ``above`` is false.
+
+    ``setting`` is the threshold's dotted name in DiagnosisSettings.
+    """
+
+    setting: str
+    statistic: float
+    threshold: float
+    above: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Whether a name passed a stage: all conditions of one of the alternatives must hold.
+
+    stage          accept (the first that passes is taken), keep or stand (each name by itself)
+    effect         the name
+    alternatives   conditions
+    passed         what the diagnosis decided
+    step           number of effects that were accepted before
+    """
+
+    stage: str
+    effect: str
+    alternatives: tuple[tuple[Condition, ...], ...]
+    passed: bool
+    step: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "stage": self.stage,
+            "effect": self.effect,
+            "step": self.step,
+            "passed": self.passed,
+            "alternatives": [[_condition(c) for c in conditions] for conditions in self.alternatives],
+        }
+
+
+def to_dict(decisions: Sequence[Decision]) -> dict[str, Any]:
+    """Plain data of ``decisions.json``, in the order of the decisions."""
+    return {"schema": SCHEMA, "decisions": [decision.to_dict() for decision in decisions]}
+
+
+def _condition(condition: Condition) -> dict[str, Any]:
+    """Plain data; an infinite statistic becomes the largest number, because JSON has no infinity."""
+    statistic = condition.statistic
+    if math.isnan(statistic):
+        statistic = -math.inf if condition.above else math.inf
+    return {
+        "setting": condition.setting,
+        "statistic": min(max(float(statistic), -1e300), 1e300),
+        "threshold": float(condition.threshold),
+        "above": condition.above,
+    }
+
+
+__all__ = ["SCHEMA", "Condition", "Decision", "to_dict"]

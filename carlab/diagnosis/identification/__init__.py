@@ -1,0 +1,1 @@
+"""Parameter identification: fit of a simulator to prediction windows, measurement noise, velocity window."""

@@ -1,0 +1,382 @@
+"""Fit of a simulator to prediction windows: robust Levenberg-Marquardt, all perturbations in one batch.
+
+Errors are whitened by channel and step. Huber's loss (Huber 1964) at four standard deviations bounds the influence of
+outliers. Base parameters have weak priors; parameters of effects have bounds only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import IndexArray, PredictionWindows
+from sim_backends.car_parameters import LATENCY, SimulatorConfig
+from sim_backends.effects import EFFECTS
+from sim_backends.registry import REGISTRY
+
+BASE = (
+    "vehicle.yaw_inertia",
+    "tyre.front.B",
+    "tyre.front.C",
+    "tyre.front.mu",
+    "tyre.rear.B",
+    "tyre.rear.C",
+    "tyre.rear.mu",
+    "motor.drive_gain",
+    "motor.damping",
+    "steering.max_angle",
+)
+TYRES = tuple(name for name in BASE if name.startswith("tyre."))
+
+
+@dataclass(frozen=True, slots=True)
+class FitParameter:
+    """A parameter that a fit estimates, by its coordinate z.
+
+    Attributes:
+        name: dotted name.
+        origin: value at z = 0.
+        size: change of the value (of its logarithm) per unit of z.
+        low, high: bounds of the value.
+        logarithmic: whether the value is ``origin * exp(size * z)``.
+        prior_z: prior standard deviation of z about 0.
+        choice: whether the value is the position of a word.
+    """
+
+    name: str
+    origin: float
+    size: float
+    low: float
+    high: float
+    logarithmic: bool = False
+    prior_z: float = math.inf
+    choice: bool = False
+
+    def value(self, z: FloatArray) -> FloatArray:
+        """Values at coordinates z."""
+        if self.choice:
+            return np.asarray(np.round(np.clip(z, self.low, self.high)))
+        raw = self.origin * np.exp(self.size * z) if self.logarithmic else self.origin + self.size * z
+        return np.asarray(np.clip(raw, self.low, self.high))
+
+    def coordinate(self, value: float) -> float:
+        """Coordinate of a value."""
+        value = min(max(value, self.low), self.high)
+        if self.logarithmic:
+            return math.log(max(value, 1e-12) / self.origin) / self.size
+        return (value - self.origin) / self.size
+
+
+def base_parameters(
+    config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
+) -> tuple[FitParameter, ...]:
+    """Base parameters that a refit of this simulator estimates: the usual ones, all with a range, and the unknown."""
+    values = config.values()
+    names = [name for name in BASE if config.kind != "kinematic" or name not in (*TYRES, "vehicle.yaw_inertia")]
+    names += [n for n in config.priors if n not in names and not n.startswith(("effects.", "timing.", "mocap."))]
+    found = []
+    for name in names:
+        info, value = REGISTRY[name], values[name]
+        low, high = max(info.low, 0.05 * value), min(info.high, 20.0 * value)
+        share = settings.prior_std_share
+        if name in config.priors:
+            low, high = config.priors[name]
+            share = max((high - low) / (4.0 * abs(value)), 1e-3)
+        if value > 0:
+            found.append(FitParameter(name, value, 0.1, low, high, True, share / 0.1))
+        else:
+            found.append(FitParameter(name, 0.0, 0.1, info.low, 1.0, False))
+    if LATENCY in config.unknown:
+        found.append(
+            FitParameter(LATENCY, values[LATENCY], settings.latency_std_s, 0.0, settings.max_latency_s, prior_z=1.0)
+        )
+    return tuple(found)
+
+
+def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParameter, ...]:
+    """Parameters of one effect; a negative extra delay is at most the delay of the car file."""
+    found = []
+    values = config.values()
+    for p in EFFECTS[effect_id].parameters:
+        name = f"effects.{effect_id}.{p.name}"
+        size = abs(p.typical) or 1.0
+        if p.choices:
+            found.append(FitParameter(name, 0.0, 1.0, 0.0, len(p.choices) - 1.0, choice=True))
+        elif p.identity is not None and math.isinf(p.identity):
+            found.append(FitParameter(name, p.typical, 0.3, max(p.low, 0.02 * p.typical), 50.0 * p.typical, True))
+        else:
+            origin = float(values.get(p.same_as, 0.0)) if p.identity is None else p.identity
+            low = max(p.low, origin - 20.0 * size)
+            if p.reduces:
+                low = max(low, -values[p.reduces])
+            found.append(FitParameter(name, origin, size, low, min(p.high, origin + 20.0 * size)))
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Standard deviations that whiten errors: ``sigma`` (U, 6) by step and channel, and the ``steps`` (U,)."""
+
+    steps: np.ndarray
+    sigma: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        error: FloatArray,
+        floor: FloatArray,
+        share: float = 1.0,
+        settings: IdentificationSettings = DEFAULT.identification,
+    ) -> Scale:
+        """Robust spread of errors (S, K + 1, 6) of the best model so far, at least the floor (6,)."""
+        last = error.shape[1] - 1
+        steps = np.unique(np.linspace(last / settings.loss_steps, last, settings.loss_steps).round().astype(int))
+        spread = 1.4826 * np.median(np.abs(error[:, steps]), axis=0)
+        return cls(steps, np.maximum(share * spread, floor))
+
+    def white(self, error: FloatArray) -> FloatArray:
+        """Whitened errors (..., U, 6) of errors (..., K + 1, 6)."""
+        return error[..., self.steps, :] / self.sigma
+
+
+def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
+    """Huber's loss, element by element."""
+    size = np.abs(white)
+    return np.where(size <= delta, 0.5 * white**2, delta * size - 0.5 * delta**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A fitted simulator.
+
+    Attributes:
+        config: with the fitted parameters.
+        free: the n parameters that were fitted.
+        z: (n,) their coordinates.
+        cost: Huber loss plus prior.
+        loss: (S,) Huber loss of each window.
+        covariance: (n, n) sandwich estimate of the covariance of z, clustered by block.
+        design_effects: (n,) its diagonal over that of independent errors.
+    """
+
+    config: SimulatorConfig
+    free: tuple[FitParameter, ...]
+    z: FloatArray
+    cost: float
+    loss: FloatArray
+    covariance: FloatArray | None = None
+    design_effects: FloatArray | None = None
+
+    @property
+    def design_effect(self) -> float:
+        """Median design effect, at least one: by how much dependent errors overstate a gain."""
+        if self.design_effects is None or not len(self.free):
+            return 1.0
+        return max(1.0, float(np.median(self.design_effects)))
+
+    def values(self) -> dict[str, float]:
+        """Fitted values by dotted name."""
+        return {f.name: float(f.value(np.array(z))) for f, z in zip(self.free, self.z, strict=True)}
+
+
+class Fitter:
+    """Fits parameters of a simulator to windows with a given scale."""
+
+    def __init__(
+        self, windows: PredictionWindows, scale: Scale, settings: IdentificationSettings = DEFAULT.identification
+    ) -> None:
+        self.windows = windows
+        self.scale = scale
+        self.settings = settings
+
+    def huber(self, white: FloatArray) -> FloatArray:
+        """Huber's loss of whitened errors, element by element."""
+        return huber(white, self.settings.huber_delta)
+
+    def white(self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray) -> FloatArray:
+        """Whitened errors (P, S, U, 6) at coordinates z (P, n)."""
+        values = {f.name: f.value(z[:, k]) for k, f in enumerate(free)}
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
+            predicted = simulate_windows(self.windows, config, values)
+            white = self.scale.white(prediction_errors(predicted, self.windows))
+        return np.asarray(np.nan_to_num(white, nan=1e4, posinf=1e4, neginf=-1e4).clip(-1e4, 1e4))
+
+    @staticmethod
+    def prior(free: Sequence[FitParameter], z: FloatArray) -> FloatArray:
+        """Prior loss (P,) at z (P, n)."""
+        return np.asarray(0.5 * ((z / np.array([f.prior_z for f in free])) ** 2).sum(axis=1))
+
+    def loss(
+        self,
+        config: SimulatorConfig,
+        free: Sequence[FitParameter] = (),
+        z: FloatArray | None = None,
+        *,
+        most: float = math.inf,
+    ) -> FloatArray:
+        """Huber loss of each window (S,), with whitened errors no larger than ``most``."""
+        at = np.zeros((1, len(free))) if z is None else z[None]
+        return np.asarray(self.huber(self.white(config, free, at).clip(-most, most))[0].sum(axis=(1, 2)))
+
+    def best_point(self, config: SimulatorConfig, free: Sequence[FitParameter], starts: FloatArray) -> FloatArray:
+        """The point (n,) of (P, n) with the smallest cost."""
+        costs = [
+            self.huber(self.white(config, free, part)).sum(axis=(1, 2, 3)) + self.prior(free, part)
+            for part in np.array_split(starts, max(1, math.ceil(len(starts) / 8)))
+        ]
+        return np.asarray(starts[int(np.argmin(np.concatenate(costs)))])
+
+    def fit(
+        self,
+        config: SimulatorConfig,
+        free: Sequence[FitParameter],
+        start: FloatArray | None = None,
+        *,
+        iterations: int = 12,
+        tolerance: float = 2e-4,
+    ) -> Fit:
+        """Minimise Huber loss plus prior from ``start`` (n,) (zeros unless given)."""
+        count = len(free)
+        z = np.zeros(count) if start is None else np.array(start, dtype=np.float64)
+        if count == 0:
+            loss = self.loss(config)
+            return Fit(config, (), z, float(loss.sum()), loss)
+        free = tuple(free)
+        precision = np.diag([1.0 / f.prior_z**2 for f in free])
+        step = 0.02
+        white = self.white(config, free, z[None])[0]
+        cost = float(self.huber(white).sum() + self.prior(free, z[None])[0])
+        damping = 1e-2
+        for _ in range(iterations):
+            perturbed = z + step * np.eye(count)
+            jacobian = (self.white(config, free, perturbed) - white[None]) / step
+            flat, residual = jacobian.reshape(count, -1), white.reshape(-1)
+            weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(residual), 1e-12))
+            normal = (flat * weight) @ flat.T + precision
+            gradient = flat @ (weight * residual) + precision @ z
+            improved = False
+            for _ in range(3):
+                dampings = damping * np.array([0.1, 1.0, 10.0, 100.0])
+                trials = []
+                for value in dampings:
+                    matrix = normal + value * np.diag(np.diag(normal) + 1e-9)
+                    trials.append(z - np.linalg.solve(matrix, gradient))
+                tried = np.clip(np.array(trials), z - 8.0, z + 8.0)
+                whites = self.white(config, free, tried)
+                costs = self.huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
+                best = int(np.argmin(costs))
+                if costs[best] < cost:
+                    improved = True
+                    gain = cost - float(costs[best])
+                    z, white, cost = tried[best], whites[best], float(costs[best])
+                    damping = max(float(dampings[best]), 1e-6)
+                    break
+                damping *= 1e3
+            if not improved or gain < tolerance * cost:
+                break
+        fitted = config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
+        loss = self.huber(white).sum(axis=(1, 2))
+        return Fit(fitted, free, z, cost, np.asarray(loss))
+
+    def with_covariance(self, fit: Fit) -> Fit:
+        """The same fit with its sandwich covariance, clustered by block (White 1980; Liang and Zeger 1986)."""
+        if not fit.free:
+            return replace(fit, covariance=np.zeros((0, 0)), design_effects=np.zeros(0))
+        jacobian, white = self.linearised(fit)
+        normal, score = self._normal(fit, jacobian, white)
+        blocks, index = np.unique(self.windows.block, return_inverse=True)
+        clustered = np.stack([np.bincount(index, weights=row, minlength=len(blocks)) for row in score])
+        correction = len(blocks) / max(len(blocks) - 1, 1)
+        meat = correction * clustered @ clustered.T
+        bread = np.linalg.pinv(normal)
+        sandwich = bread @ meat @ bread
+        design_effects = np.diag(sandwich) / np.maximum(np.diag(bread), 1e-30)
+        return replace(fit, covariance=sandwich, design_effects=design_effects)
+
+    def leave_fold_out_loss(self, fit: Fit, folds: IndexArray, most: float) -> FloatArray:
+        """Loss of every window (S,) by a fit without its fold, whitened errors no larger than ``most``.
+
+        Each fold is removed from ``fit`` by one Gauss-Newton step (Beirami et al. 2017, approximate leave-k-out), at
+        the cost of a few predictions; a refit costs a hundred.
+
+        Args:
+            fit: of all windows.
+            folds: number of each window's fold (S,).
+            most: bound of the whitened errors.
+        """
+        if not fit.free:
+            return self.loss(fit.config, most=most)
+        jacobian, white = self.linearised(fit)
+        weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
+        normal, score = self._normal(fit, jacobian, white)
+        loss = np.zeros(len(self.windows))
+        for name in np.unique(folds):
+            own = folds == name
+            part = jacobian[:, own].reshape(len(fit.free), -1)
+            left = normal - (part * weight[own].reshape(-1)) @ part.T
+            left = left + 1e-3 * np.diag(np.diag(normal) + 1e-9)
+            step = np.linalg.solve(left, score[:, own].sum(axis=1))
+            step *= min(1.0, self.settings.max_fold_step / max(float(np.abs(step).max()), 1e-12))
+            trials = fit.z + np.array(self.settings.fold_step_shares)[:, None] * step
+            whites = self.white(fit.config, fit.free, trials)
+            seen = self.huber(whites[:, ~own]).sum(axis=(1, 2, 3)) + self.prior(fit.free, trials)
+            loss[own] = self.huber(whites[int(np.argmin(seen)), own].clip(-most, most)).sum(axis=(1, 2))
+        return loss
+
+    def linearised(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
+        """Jacobian (n, S, U, 6) of the whitened errors (S, U, 6) at a fit."""
+        count, step = len(fit.free), 0.02
+        whites = self.white(fit.config, fit.free, np.vstack([fit.z, fit.z + step * np.eye(count)]))
+        return (whites[1:] - whites[0]) / step, whites[0]
+
+    def _normal(self, fit: Fit, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gauss-Newton matrix (n, n) with the prior, and each window's score (n, S)."""
+        weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
+        flat = jacobian.reshape(len(fit.free), -1)
+        normal = (flat * weight.reshape(-1)) @ flat.T + np.diag([1.0 / f.prior_z**2 for f in fit.free])
+        return normal, (jacobian * (weight * white)[None]).sum(axis=(2, 3))
+
+
+def clustered_gain(before: FloatArray, after: FloatArray, windows: PredictionWindows) -> tuple[float, float]:
+    """Fall of the loss from ``before`` to ``after`` (S,) and its standard error, windows of a block taken together."""
+    gain = before - after
+    blocks, index = np.unique(windows.block, return_inverse=True)
+    sums = np.bincount(index, weights=gain, minlength=len(blocks))
+    error = math.sqrt(len(blocks)) * float(sums.std(ddof=1)) if len(blocks) > 1 else math.inf
+    return float(gain.sum()), max(error, 1e-9)
+
+
+def design_effect_of(fit: Fit, effect: str) -> float:
+    """Design effect of an effect's parameters: sandwich over naive variance, at least one.
+
+    Twice the gain of several parameters is a sum of chi-squares weighted by such ratios, so their mean divides it
+    (Kent 1982). The median of all parameters replaces it where the effect's own is undefined (a clip that never acts).
+    """
+    assert fit.design_effects is not None
+    own = [
+        float(d) for f, d in zip(fit.free, fit.design_effects, strict=True)
+        if f.name.startswith(f"effects.{effect}.") and d > 1e-9
+    ]  # fmt: skip
+    return max(fit.design_effect, float(np.mean(own)) if own else 0.0)
+
+
+def with_effect(config: SimulatorConfig, effect_id: str) -> SimulatorConfig:
+    """The simulator with one more effect, switched on at its identity or, where that is infinite, far from acting."""
+    effect = EFFECTS[effect_id]
+    given = {}
+    for p in effect.parameters:
+        identity = p.typical if p.identity is None else p.identity
+        given[p.name] = min(50.0 * p.typical, p.high) if math.isinf(identity) else identity
+    return replace(config, effects={**config.effects, effect_id: given})
+
+
+def describe(values: Mapping[str, float]) -> str:
+    """Values in one line, for the log."""
+    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())

@@ -1,0 +1,99 @@
+"""Held-out errors after a horizon, in units and in noise floors, and the gains of effects by them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.findings import FitErrors
+from carlab.diagnosis.identification.fit import clustered_gain, huber
+from carlab.diagnosis.identification.measurement_noise import Noise
+from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.prediction.errors import final_errors, prediction_errors
+from carlab.prediction.predict import PredictiveModel, SimulatorModel, simulate_windows
+from carlab.prediction.windows import PredictionWindows
+from sim_backends.car_parameters import SimulatorConfig
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """Held-out windows with their noise floor.
+
+    Attributes:
+        windows: S held-out prediction windows.
+        floor: (6,) error that a perfect simulator would leave after the horizon, estimated from the recording: noise
+            of the measurement at the end, and the error of the initial state as it grows.
+        huber_delta: error, over its spread, from which Huber's loss is linear.
+    """
+
+    windows: PredictionWindows
+    floor: FloatArray
+    huber_delta: float = DEFAULT.identification.huber_delta
+
+    @classmethod
+    def of(
+        cls,
+        windows: PredictionWindows,
+        noise: Noise,
+        config: SimulatorConfig,
+        settings: IdentificationSettings = DEFAULT.identification,
+    ) -> HeldOut:
+        """With the floor of a simulator that is near enough for how errors of initial states grow."""
+        return cls(windows, noise_floor(windows, noise, config, settings)[-1], settings.huber_delta)
+
+    def final_error(self, model: SimulatorConfig | PredictiveModel) -> FloatArray:
+        """Errors (S, 6) of a model after the horizon."""
+        return final_errors(SimulatorModel(model) if isinstance(model, SimulatorConfig) else model, self.windows)
+
+    def score(self, error: FloatArray) -> float:
+        """Root mean square over windows and channels of errors (S, 6) in floors."""
+        return float(np.sqrt(np.mean((error / self.floor) ** 2)))
+
+    def summary(self, error: FloatArray) -> FitErrors:
+        """The report's figures of errors (S, 6)."""
+        rms = np.sqrt(np.mean(error**2, axis=0))
+        return FitErrors(
+            position_m=float(np.hypot(rms[0], rms[1])),
+            yaw_rad=float(rms[2]),
+            vx=float(rms[3]),
+            vy=float(rms[4]),
+            yaw_rate=float(rms[5]),
+            score=self.score(error),
+        )
+
+    def floor_summary(self) -> FitErrors:
+        """The floor itself; its score is 1."""
+        return self.summary(np.tile(self.floor, (2, 1)))
+
+    def gain(self, without: FloatArray, with_it: FloatArray) -> tuple[float, float]:
+        """Held-out gain in Huber log-likelihood from errors (S, 6) to errors (S, 6), and its clustered error."""
+        scale = np.maximum(1.4826 * np.median(np.abs(with_it), axis=0), self.floor)
+        before, after = (huber(e / scale, self.huber_delta).sum(axis=1) for e in (without, with_it))
+        return clustered_gain(before, after, self.windows)
+
+    @staticmethod
+    def fingerprint(without: FloatArray, with_it: FloatArray) -> dict[str, float]:
+        """Relative rise of each channel's rms error when an effect is taken out."""
+        before, after = (np.sqrt(np.mean(e**2, axis=0)) for e in (without, with_it))
+        return {name: float(b / max(a, 1e-12) - 1.0) for name, a, b in zip(STATE_NAMES, after, before, strict=True)}
+
+
+def noise_floor(
+    windows: PredictionWindows,
+    noise: Noise,
+    config: SimulatorConfig,
+    settings: IdentificationSettings = DEFAULT.identification,
+) -> FloatArray:
+    """Error (K + 1, 6) that noise alone causes along a window: measurement noise, and the grown initial error."""
+    reference = simulate_windows(windows, config)
+    variance = np.tile(noise.measured**2, (windows.steps + 1, 1))
+    for k in range(6):
+        initial_states = windows.initial_states.copy()
+        initial_states[:, k] += noise.initial_state[k]
+        moved = simulate_windows(replace(windows, initial_states=initial_states), config)
+        grown = prediction_errors(moved - reference + windows.measured[None], windows)[0]
+        squared = grown**2
+        variance += np.mean(np.minimum(squared, np.quantile(squared, settings.max_error_quantile, axis=0)), axis=0)
+    return np.sqrt(variance)

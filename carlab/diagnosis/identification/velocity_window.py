@@ -1,0 +1,80 @@
+"""Window over which a recording's velocities were differentiated: it acts on them like a lag.
+
+A symmetric window of variance s2 gives the velocity ``v + s2 / 2 d2v/dt2`` to fourth order. The difference of the poses
+before and after a tick is such a velocity, of a box as wide as two ticks, whose variance is known. So the difference of
+the velocity columns from it, regressed on d2v/dt2, gives the variance of their window. All of that is measured, so
+physics that the simulator leaves out does not matter; the simulator's own d2v/dt2, free of noise, is the instrument of
+the regression.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
+from carlab.prediction.initial_states import without_curvature_bias
+from carlab.prediction.predict import simulate_windows, velocity_curvature
+from carlab.prediction.windows import PredictionWindows, body_states
+from sim_backends.car_parameters import SimulatorConfig
+
+
+def with_initial_states(
+    windows: Sequence[PredictionWindows],
+    config: SimulatorConfig,
+    settings: IdentificationSettings = DEFAULT.identification,
+) -> tuple[PredictionWindows, PredictionWindows]:
+    """Two sets of windows with their velocity window and initial states estimated.
+
+    Args:
+        windows: those that the velocity window is estimated from, and others of the same recordings.
+        config: a simulator that is roughly right.
+        settings: of the estimate.
+    """
+    variance_s2 = velocity_window_variance_s2(windows[0], config, settings)
+    first, second = (without_curvature_bias(replace(w, velocity_window_s2=variance_s2), config) for w in windows)
+    return first, second
+
+
+def velocity_window_variance_s2(
+    windows: PredictionWindows, config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
+) -> float:
+    """Variance [s2] of the window of the velocity columns; 0 where it is not significant.
+
+    Args:
+        windows: of recordings with velocities of one origin.
+        config: a simulator that is roughly right.
+        settings: of the estimate.
+    """
+    period_s = windows.period_s
+    if period_s > settings.velocity_max_period_s or windows.steps < 6:
+        return 0.0
+    boxed = _box_velocities(windows)
+    difference = (boxed[:, 1:-1] - windows.measured[:, 2:-2])[..., 3:]
+    bend = velocity_curvature(boxed, period_s)[:, 1:-1]
+    instrument = velocity_curvature(simulate_windows(windows, config)[0], period_s)[:, 2:-2]
+    variances, certainties = [], []
+    for channels in ((0, 1), (2,)):
+        z, d, b = (values[..., channels].ravel() for values in (instrument, difference, bend))
+        both = float(z @ b)
+        if len(z) < settings.velocity_min_samples or abs(both) < 1e-9:
+            continue
+        slope = float(z @ d) / both
+        error = float(np.linalg.norm(z * (d - slope * b))) / abs(both)
+        variances.append((2.0 * period_s) ** 2 / 12.0 - 2.0 * slope)
+        certainties.append(1.0 / max(2.0 * error, 1e-9) ** 2)
+    if not variances:
+        return 0.0
+    mean = float(np.average(variances, weights=certainties))
+    certain = mean * float(np.sqrt(np.sum(certainties))) > settings.velocity_z_min
+    return min(mean, settings.velocity_max_width_s**2 / 12.0) if certain else 0.0
+
+
+def _box_velocities(windows: PredictionWindows) -> FloatArray:
+    """States (S, K - 1, 6) of the inner ticks with velocities from the poses before and after."""
+    pose = windows.measured[..., :3]
+    rate = (pose[:, 2:] - pose[:, :-2]) / (2.0 * windows.period_s)
+    return body_states(pose[:, 1:-1].reshape(-1, 3), rate.reshape(-1, 3)).reshape(*rate.shape[:2], 6)

@@ -1,0 +1,257 @@
+"""Causes that may explain errors of a simulator: one effect or one number at a time, tested where not fitted.
+
+Every effect of the catalogue and every number of the car file is screened by itself while the rest stays; those with
+the best scores are fitted. Where none of them explains most of the excess, all numbers are refitted together, and
+effects are added to the refit. The causes are ranked by two-fold cross-validation over alternate blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.fit import (
+    Fit,
+    FitParameter,
+    Fitter,
+    Scale,
+    base_parameters,
+    clustered_gain,
+    effect_parameters,
+    with_effect,
+)
+from carlab.diagnosis.selection.problem import is_applicable
+from carlab.diagnosis.selection.screening import Screen
+from carlab.diagnosis.settings import DEFAULT, QuickSettings
+from carlab.prediction.windows import PredictionWindows
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import CATALOGUE
+from sim_backends.registry import REGISTRY
+
+SCREENED_COORDINATES = ((-3.0, -1.0, 1.0, 3.0), (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0))
+"""Steps of a number at which it is screened: of its size, or of its logarithm."""
+NUMBERS = "numbers"
+
+
+@dataclass(frozen=True, slots=True)
+class FittedNumber:
+    """A fitted number in ``unit``: by all windows, by either half of them, and as the simulator had it."""
+
+    value: float
+    halves: tuple[float, float]
+    before: float | None
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """A guess.
+
+    Attributes:
+        id: an effect of the catalogue, a number by its dotted name, or ``numbers``, all of them together.
+        share: of the excess loss that it explains on windows that it was not fitted to, in [0, 1].
+        own_share: of an effect added to refitted numbers, the share that it explains of the rest.
+        with_refit: whether all numbers of the car file were refitted with it; ``share`` is that of both.
+        ties_with_first: whether the windows do not distinguish it from the first guess (two standard errors).
+        parameters: its numbers; of ``numbers`` those that moved most.
+    """
+
+    id: str
+    share: float
+    own_share: float
+    with_refit: bool
+    ties_with_first: bool
+    parameters: dict[str, FittedNumber] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    id: str
+    config: SimulatorConfig
+    free: tuple[FitParameter, ...]
+    fit: Fit
+    with_refit: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Tested:
+    """A candidate, the loss of every window (S,) by a fit to the other half, and the two fits."""
+
+    candidate: _Candidate
+    loss: FloatArray
+    halves: tuple[Fit, Fit]
+
+
+def find_causes(
+    windows: PredictionWindows, floor: FloatArray, simulator: SimulatorConfig, settings: QuickSettings = DEFAULT.quick
+) -> tuple[Cause, ...]:
+    """The most likely causes, the best first.
+
+    Args:
+        windows: of recordings that the simulator does not explain.
+        floor: noise floor along a window (K + 1, 6).
+        simulator: as it is.
+        settings: amount of work and thresholds.
+    """
+    steps = np.unique(np.linspace(windows.steps / settings.used_steps, windows.steps, settings.used_steps).round())
+    steps = steps.astype(int)
+    fitter = Fitter(windows, Scale(steps, floor[steps]))
+    reference = fitter.loss(simulator, most=settings.max_unseen_error)
+    perfect = 0.5 * len(steps) * 6 * len(windows)
+    excess = max(float(reference.sum()) - perfect, 1e-9)
+    halves = _halves(windows)
+    singles = _fit_singles(fitter, simulator, settings)
+    best = sorted(singles, key=lambda c: c.fit.cost)[: settings.max_tested]
+    tested = [_test(fitter, c, halves, settings) for c in best]
+    before = reference
+    largest = max((float((reference - t.loss).sum()) for t in tested), default=-math.inf)
+    if largest < settings.single_cause_share * excess:
+        refit, added = _fit_with_refit(fitter, simulator, settings)
+        refitted = _test(fitter, refit, halves, settings)
+        before = refitted.loss
+        tested += [refitted, *(_test(fitter, c, halves, settings) for c in added)]
+    tested.sort(key=lambda t: float(t.loss.sum()))
+    causes, seen = list[Cause](), set[str]()
+    for t in tested:
+        share = own_share = min(float((reference - t.loss).sum()) / excess, 1.0)
+        if t.candidate.with_refit:
+            own_share = _own_share(before, t.loss, perfect, windows, settings)
+        min_own_share = settings.min_additional_share if t.candidate.with_refit else settings.min_share
+        relevant = share >= settings.min_share and own_share >= min_own_share
+        if t.candidate.id in seen or not relevant or len(causes) == settings.max_causes:
+            continue
+        difference, error = clustered_gain(t.loss, tested[0].loss, windows)
+        ties = bool(causes) and difference < settings.tie_z * error
+        seen.add(t.candidate.id)
+        numbers = _numbers(t, simulator, settings)
+        causes.append(Cause(t.candidate.id, share, own_share, t.candidate.with_refit, ties, numbers))
+    return tuple(causes)
+
+
+def _own_share(
+    before: FloatArray, after: FloatArray, perfect: float, windows: PredictionWindows, settings: QuickSettings
+) -> float:
+    """Share that an effect explains of the excess that refitted numbers leave; 0 where it is not significant."""
+    gain, error = clustered_gain(before, after, windows)
+    excess = float(before.sum()) - perfect
+    significant = gain > settings.min_additional_z * error
+    return min(gain / excess, 1.0) if excess > 0.0 and significant else 0.0
+
+
+def _fit_singles(fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings) -> list[_Candidate]:
+    """Single causes with the best screening scores, fitted while the rest stays."""
+    screen = Screen(fitter, simulator, fitter.fit(simulator, ()), settings.screened_windows)
+    screened: list[tuple[float, str, SimulatorConfig, tuple[FitParameter, ...], FloatArray]] = []
+    for name in _new_effects(simulator):
+        free = effect_parameters(name, simulator)
+        result = screen.score(name, free)
+        screened.append((result.score, name, with_effect(simulator, name), free, result.starts))
+    for name, free in _own_numbers(simulator):
+        score, start = _screen_number(screen, simulator, free)
+        screened.append((score, name, simulator, free, start[None]))
+    screened.sort(key=lambda p: -p[0])
+    found = []
+    for _, name, config, free, starts in screened[: settings.max_single_fits]:
+        start = fitter.best_point(config, free, starts)
+        fit = fitter.fit(config, free, start, iterations=settings.fit_iterations)
+        found.append(_Candidate(name, config, free, fit))
+    return found
+
+
+def _screen_number(
+    screen: Screen, simulator: SimulatorConfig, free: tuple[FitParameter, ...]
+) -> tuple[float, FloatArray]:
+    """Screening score of numbers that the simulator has, and where to start their fit (n,)."""
+    at = _coordinates(simulator, free)
+    sizes = SCREENED_COORDINATES[not free[0].logarithmic]
+    points = np.array([at + z * axis for axis in np.eye(len(free)) for z in sizes])
+    gains = [screen.gain(moved) for moved in screen.fitter.white(simulator, free, points)]
+    best = int(np.argmax([gain for gain, _ in gains]))
+    low, high = screen.settings.step_range
+    return gains[best][0] / screen.share, at + (points[best] - at) * min(max(gains[best][1], low), high)
+
+
+def _fit_with_refit(
+    fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings
+) -> tuple[_Candidate, list[_Candidate]]:
+    """All numbers refitted, and the effects with the best screening scores added to the refit."""
+    own = [f for name in simulator.effects for f in effect_parameters(name, simulator)]
+    free = (*base_parameters(simulator), *own)
+    refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=settings.fit_iterations)
+    screen = Screen(fitter, simulator, refit, settings.screened_windows)
+    screened = [screen.score(name, effect_parameters(name, simulator)) for name in _new_effects(simulator)]
+    screened.sort(key=lambda result: -result.score)
+    found = []
+    for result in screened[: settings.max_additional_fits]:
+        config = with_effect(simulator, result.effect)
+        all_free = (*free, *effect_parameters(result.effect, simulator))
+        start = np.concatenate([refit.z, result.starts[0]])
+        fit = fitter.fit(config, all_free, start, iterations=settings.fit_iterations)
+        found.append(_Candidate(result.effect, config, all_free, fit, with_refit=True))
+    return _Candidate(NUMBERS, simulator, free, refit), found
+
+
+def _test(
+    fitter: Fitter, candidate: _Candidate, halves: tuple[np.ndarray, np.ndarray], settings: QuickSettings
+) -> _Tested:
+    """Two-fold cross-validation of a candidate."""
+    loss = np.zeros(len(fitter.windows))
+    fits = []
+    start, iterations = candidate.fit.z, settings.half_fit_iterations
+    for mine, others in (halves, halves[::-1]):
+        own = Fitter(fitter.windows.take(mine), fitter.scale)
+        fits.append(own.fit(candidate.config, candidate.free, start, iterations=iterations))
+        unseen = Fitter(fitter.windows.take(others), fitter.scale)
+        loss[others] = unseen.loss(candidate.config, candidate.free, fits[-1].z, most=settings.max_unseen_error)
+    return _Tested(candidate, loss, (fits[0], fits[1]))
+
+
+def _halves(windows: PredictionWindows) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of alternate blocks: episodes, where there are several."""
+    _, index = np.unique(windows.block, return_inverse=True)
+    odd = index % 2 == 1
+    if not odd.any():
+        odd = np.arange(len(windows)) >= len(windows) // 2
+    return np.flatnonzero(~odd), np.flatnonzero(odd)
+
+
+def _new_effects(simulator: SimulatorConfig) -> list[str]:
+    return [name for name in CATALOGUE if name not in simulator.effects and is_applicable(simulator, name)]
+
+
+def _own_numbers(simulator: SimulatorConfig) -> list[tuple[str, tuple[FitParameter, ...]]]:
+    """Numbers that the simulator has: those of the base model one by one, those of each of its effects together."""
+    single = [(f.name, (f,)) for f in base_parameters(simulator)]
+    return [*single, *((f"effects.{name}", effect_parameters(name, simulator)) for name in simulator.effects)]
+
+
+def _coordinates(simulator: SimulatorConfig, free: Sequence[FitParameter]) -> FloatArray:
+    values = simulator.values()
+    return np.array([f.coordinate(values[f.name]) for f in free])
+
+
+def _numbers(tested: _Tested, simulator: SimulatorConfig, settings: QuickSettings) -> dict[str, FittedNumber]:
+    candidate = tested.candidate
+    before = simulator.values()
+    whole, (first, second) = candidate.fit.values(), (half.values() for half in tested.halves)
+    if candidate.id == NUMBERS:
+        moved = sorted(candidate.free, key=lambda f: -_moved(whole[f.name], before[f.name]))
+        names = [f.name for f in moved[: settings.max_causes]]
+    else:
+        own = f"effects.{candidate.id.removeprefix('effects.')}."
+        names = [name for name in whole if name == candidate.id or name.startswith(own)]
+    return {
+        name: FittedNumber(whole[name], (first[name], second[name]), before.get(name), REGISTRY[name].unit)
+        for name in names
+    }
+
+
+def _moved(value: float, before: float) -> float:
+    return abs(math.log(value / before)) if value > 0.0 and before > 0.0 else abs(value - before)
+
+
+__all__ = ["NUMBERS", "Cause", "FittedNumber", "find_causes"]

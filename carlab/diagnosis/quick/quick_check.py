@@ -1,0 +1,211 @@
+"""Quick check: whether, where and how recordings disagree with a simulator, in seconds instead of a minute.
+
+It uses the parts of the diagnosis (prediction windows, noise floors, screening, fits) with a fixed amount of work, so
+that the same recordings give the same answer on any machine. The causes that it names are first guesses, one at a
+time. The diagnosis finds several together, tests their names, and scores them on whole held-out recordings.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.identification.held_out_errors import noise_floor
+from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
+from carlab.diagnosis.own_recordings import as_captured, window_variance_s2, with_known_latency
+from carlab.diagnosis.quick.causes import Cause, find_causes
+from carlab.diagnosis.quick.conditions import Condition, find_conditions
+from carlab.diagnosis.recording_faults import find as data_faults
+from carlab.diagnosis.settings import DEFAULT, QuickSettings
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.initial_states import without_curvature_bias
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import HISTORY_S, PredictionWindows, cut_windows, tracks_of
+from sim_backends.car_parameters import SimulatorConfig
+
+log = logging.getLogger(__name__)
+
+SCHEMA = "carlab.light_diagnosis/1"
+UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+JSON_KEYS = {"windows": "shots", "with_refit": "beside_numbers", "ties_with_first": "like_the_first"}
+"""Keys of the file format that differ from the attributes."""
+Verdict = Literal["explains", "left", "undecided"]
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelError:
+    """Error of one channel at the end of windows: root mean square and noise floor, both in ``unit``."""
+
+    channel: str
+    rms: float
+    floor: float
+    unit: str
+
+    @property
+    def score(self) -> float:
+        """Error in noise floors."""
+        return self.rms / self.floor
+
+
+@dataclass(frozen=True, slots=True)
+class QuickCheck:
+    """Result of a quick check.
+
+    Attributes:
+        verdict: "explains": the simulator explains the recordings; "left": it does not; or "undecided".
+        why: reason of "undecided".
+        score: root mean square over windows and channels of the error after ``horizon_s``, in noise floors.
+        score_std: its standard error; blocks of recordings count as independent.
+        channels: the six, the largest error first.
+        conditions: in which the worst channel has large errors, the clearest first; empty where there are none.
+        causes: at most three guesses, the best first; only with "left".
+        windows, episodes, seconds: how much was checked; seconds of driving.
+    """
+
+    verdict: Verdict
+    why: str = ""
+    score: float = float("nan")
+    score_std: float = float("nan")
+    horizon_s: float = DEFAULT.quick.window_s
+    channels: tuple[ChannelError, ...] = ()
+    conditions: tuple[Condition, ...] = ()
+    causes: tuple[Cause, ...] = ()
+    windows: int = 0
+    episodes: int = 0
+    seconds: float = 0.0
+
+    @property
+    def excess(self) -> float:
+        """Noise floors by which the score is above that of a perfect simulator."""
+        return self.score - 1.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for a file; numbers that are not finite become null."""
+        plain: Any = _plain({"schema": SCHEMA, **asdict(self), "excess": self.excess})
+        return dict(plain)
+
+
+def quick_check(
+    episodes: Sequence[EpisodeData], simulator: SimulatorConfig, settings: QuickSettings = DEFAULT.quick
+) -> QuickCheck:
+    """Check recordings against a simulator.
+
+    Args:
+        episodes: recordings as read; those of carlab are interpolated to the pose age that the simulator states.
+        simulator: with its effects.
+        settings: thresholds and amount of work.
+
+    Returns:
+        The result; "undecided", and no error, where recordings are not sufficient.
+    """
+    seconds = sum(e.ticks * e.period_s for e in episodes if e.ticks > 0)
+    undecided = QuickCheck("undecided", horizon_s=settings.window_s, episodes=len(episodes), seconds=float(seconds))
+    usable = [e for e in episodes if e.ticks >= 2]
+    if not usable:
+        return replace(undecided, why="nothing was driven.")
+    captured = [as_captured(e, simulator.mocap.latency_s) for e in usable]
+    simulator = with_known_latency(simulator, captured)
+    repaired, _, faults = data_faults.check(captured, [], simulator)
+    unusable = [f for f in faults if f.action.startswith("unusable")]
+    if unusable:
+        return replace(undecided, why=f"the recordings are at fault ({unusable[0].id} of {unusable[0].channel}).")
+    try:
+        windows, floor = _windows(repaired, simulator, window_variance_s2(usable), settings)
+    except DataError:
+        length_s = settings.window_s + HISTORY_S
+        return replace(undecided, why=f"no recording has a stretch of {length_s:.1f} s in which the car moves.")
+    if len(windows) < settings.min_windows:
+        return replace(
+            undecided, why=f"the car moved too little: {len(windows)} stretches of {settings.window_s:.1f} s."
+        )
+    return _checked(undecided, windows, floor, simulator, settings)
+
+
+def _checked(
+    undecided: QuickCheck,
+    windows: PredictionWindows,
+    floor: FloatArray,
+    simulator: SimulatorConfig,
+    settings: QuickSettings,
+) -> QuickCheck:
+    """The result of windows with their noise floor (K + 1, 6)."""
+    last = prediction_errors(simulate_windows(windows, simulator), windows)[0, :, -1]
+    limit = settings.max_error
+    final = np.nan_to_num(last / floor[-1], nan=limit).clip(-limit, limit)
+    score, score_std = _score(final, windows)
+    channels = _channels(final, floor[-1])
+    scored = replace(undecided, score=score, score_std=score_std, channels=channels, windows=len(windows))
+    if score <= settings.score_max:
+        return replace(scored, verdict="explains")
+    if _blocks_above(final, windows, settings.score_max) < settings.min_blocks:
+        why = "the errors are larger than the noise in one stretch alone, which may be an accident."
+        return replace(scored, why=why)
+    worst = STATE_NAMES.index(channels[0].channel)
+    return replace(
+        scored,
+        verdict="left",
+        conditions=find_conditions(windows, np.abs(final[:, worst]), settings),
+        causes=find_causes(windows, floor, simulator, settings),
+    )
+
+
+def _windows(
+    episodes: Sequence[EpisodeData], simulator: SimulatorConfig, window_s2: float | None, settings: QuickSettings
+) -> tuple[PredictionWindows, FloatArray]:
+    """Windows of all recordings, and the noise floor along them (K + 1, 6). DataError where there are none."""
+    tracks = tracks_of([e for e in episodes if e.ticks >= 2])
+    if not tracks:
+        raise DataError("No recording has an unbroken stretch of half a second.")
+    few = len({t.recording for t in tracks}) < settings.few_episodes
+    block_s = settings.short_block_s if few else settings.block_s
+    windows = cut_windows(tracks, settings.window_s, settings.stride_s, block_s).thinned(settings.max_windows)
+    variance_s2 = velocity_window_variance_s2(windows, simulator) if window_s2 is None else window_s2
+    windows = without_curvature_bias(replace(windows, velocity_window_s2=variance_s2), simulator)
+    return windows, noise_floor(windows, estimate_noise(tracks, windows.curvature_bias), simulator)
+
+
+def _score(final: FloatArray, windows: PredictionWindows) -> tuple[float, float]:
+    """Score of errors (S, 6) in noise floors, and its jackknife standard error over blocks."""
+    squared = np.mean(final**2, axis=1)
+    blocks, index = np.unique(windows.block, return_inverse=True)
+    if len(blocks) < 2:
+        return float(np.sqrt(squared.mean())), float("inf")
+    sums, counts = np.bincount(index, weights=squared), np.bincount(index)
+    without = np.sqrt((squared.sum() - sums) / (len(squared) - counts))
+    standard_error = np.sqrt((len(blocks) - 1) * without.var())
+    return float(np.sqrt(squared.mean())), float(standard_error)
+
+
+def _blocks_above(final: FloatArray, windows: PredictionWindows, score_max: float) -> int:
+    """Number of blocks whose score is above ``score_max``."""
+    _, index = np.unique(windows.block, return_inverse=True)
+    squared = np.bincount(index, weights=np.mean(final**2, axis=1)) / np.bincount(index)
+    return int(np.sum(np.sqrt(squared) > score_max))
+
+
+def _channels(final: FloatArray, floor: FloatArray) -> tuple[ChannelError, ...]:
+    rms = np.sqrt(np.mean(final**2, axis=0))
+    return tuple(
+        ChannelError(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), UNITS[k]) for k in np.argsort(-rms)
+    )
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {JSON_KEYS.get(str(k), str(k)): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+__all__ = ["SCHEMA", "ChannelError", "QuickCheck", "Verdict", "quick_check"]

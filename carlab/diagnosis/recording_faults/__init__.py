@@ -1,0 +1,1 @@
+"""Faults of the recordings themselves: stamps, pose, velocities, commands."""

@@ -1,0 +1,71 @@
+"""Whether the simulator's own step is fine enough: the nominal car at its step and at a quarter of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.findings import DataFault
+from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from sim_backends.batch.rollout import rollout
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.dynamics.integrate import MAX_STEP_S
+
+WINDOWS = 64
+HORIZON_S = 1.0
+
+
+def check_integration(
+    fit: Sequence[EpisodeData], nominal: SimulatorConfig, max_step_s: float = MAX_STEP_S
+) -> list[DataFault]:
+    """Compare predictions of windows of the recordings at ``max_step_s`` and at a quarter of it, with the noise.
+
+    The root mean square of the difference after a second, per channel; a tenth of the windows that differ most do not
+    count (a car that spins amplifies anything). Returns nothing where there are no windows.
+    """
+    try:
+        tracks = tracks_of(fit)
+        if not tracks:
+            return []
+        windows = cut_windows(tracks, HORIZON_S, 0.5)
+    except DataError:
+        return []
+    windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, WINDOWS).round().astype(np.int64)))
+    noise = estimate_noise(tracks, windows.curvature_bias).measured
+    with np.errstate(all="ignore"):  # a step that is far too coarse overflows, which is what is looked for
+        difference = np.abs(_ends(windows, nominal, max_step_s) - _ends(windows, nominal, 0.25 * max_step_s))
+    difference = np.where(np.isfinite(difference), difference, np.inf)
+    usual = np.sqrt(np.mean(np.sort(difference, axis=0)[: max(round(0.9 * len(windows)), 1)] ** 2, axis=0))
+    return [
+        DataFault(
+            "integration_error",
+            name,
+            len(windows),
+            f"reported: a finer step changes the simulator's {name} after {HORIZON_S:.0f} s by {size:.2g}, more than "
+            f"the noise of the recording ({own:.2g}); no physics is to be read out of that.",
+        )
+        for name, size, own in zip(STATE_NAMES, usual, noise, strict=True)
+        if size > own
+    ]
+
+
+def _ends(windows: PredictionWindows, nominal: SimulatorConfig, max_step_s: float) -> FloatArray:
+    def tensor(values: FloatArray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
+
+    states = rollout(
+        replace(nominal, control_period_s=windows.period_s, priors={}, doubts={}),
+        tensor(windows.initial_states),
+        tensor(windows.commands),
+        history=tensor(windows.past_commands),
+        t0_s=tensor(windows.t0_s),
+        max_step_s=max_step_s,
+    ).states
+    return np.asarray(states[:, -1].numpy(), dtype=np.float64)

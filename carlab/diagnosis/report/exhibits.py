@@ -1,0 +1,113 @@
+"""Material for the report's pictures: traces, scores, regimes and correlations of a scored search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.findings import Exhibits, Trace
+from carlab.diagnosis.selection.evidence import ScoredSearch, score_ladder
+from carlab.diagnosis.settings import ReportSettings
+from carlab.diagnosis.unexplained.description import REGIMES, start_features
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import predicted_at, simulate_windows
+from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS
+
+TRACES_TRIED = 6
+"""Longest held-out recordings that are tried for the traces; those without motion are left out."""
+
+
+def exhibits_of(scored: ScoredSearch, tracks: Sequence[Track]) -> Exhibits:
+    """Material for the pictures; ``tracks`` are held out."""
+    settings, found = scored.problem.settings.report, scored.found
+    correlation = {
+        name: _correlation(scored.problem.windows, found.base.config, EFFECTS[name].command == "throttle", settings)
+        for name in found.effects[: settings.max_correlations]
+    }
+    candidates = tuple(
+        (c.effect, c.standard_errors if math.isfinite(c.unseen_error) else 0.0, float(c.fit.loss.sum()))
+        for c in found.tried
+    )
+    ladder = (*score_ladder(scored), ("noise floor", 1.0))
+    return Exhibits(_traces(scored, tracks), ladder, _regimes(scored), correlation, candidates)
+
+
+def _regimes(scored: ScoredSearch) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
+    """By feature: centres of its bins, and the errors (noise floors) of the refit and with effects."""
+    held_out = scored.held_out
+    seen = start_features(held_out.windows)
+    size = {name: np.sqrt(np.mean((e / held_out.floor) ** 2, axis=1)) for name, e in scored.errors.items()}
+    regimes = {}
+    for name, unit, value in REGIMES:
+        feature = value(seen)
+        edges = np.unique(np.quantile(feature, np.linspace(0, 1, 7)))
+        if len(edges) < 3:
+            continue
+        index = np.clip(np.searchsorted(edges, feature, side="right") - 1, 0, len(edges) - 2)
+        bins = range(len(edges) - 1)
+        centres = np.array([feature[index == k].mean() for k in bins])
+        curves = [
+            np.array([np.sqrt(np.mean(size[which][index == k] ** 2)) for k in bins])
+            for which in ("refit", "with_effects")
+        ]
+        regimes[f"{name} [{unit}]" if unit else name] = (centres, curves[0], curves[1])
+    return regimes
+
+
+def _correlation(
+    windows: PredictionWindows, config: SimulatorConfig, on_throttle: bool, settings: ReportSettings
+) -> tuple[FloatArray, FloatArray, float]:
+    """Correlation of the missing acceleration with the rate of a command at lags [s], and its 99 % bound."""
+    error = prediction_errors(simulate_windows(windows, config), windows)[0]
+    step = min(max(round(settings.correlation_step_s / windows.period_s), 1), windows.steps)
+    column = 3 if on_throttle else 5
+    missing = -error[:, step, column] / (step * windows.period_s)
+    command = windows.past_commands[:, :, 1 if on_throttle else 0]
+    lags = np.arange(0, command.shape[1] - 1)
+    values = []
+    for lag in lags:
+        rate = command[:, -1 - lag] - command[:, -2 - lag]
+        values.append(float(np.corrcoef(rate, missing)[0, 1]) if rate.std() > 1e-9 else 0.0)
+    blocks = len(np.unique(windows.block))
+    return lags * windows.period_s, np.array(values), settings.correlation_z / math.sqrt(max(blocks, 1))
+
+
+def _traces(scored: ScoredSearch, tracks: Sequence[Track]) -> tuple[Trace, ...]:
+    models = {
+        "nominal": scored.problem.nominal,
+        "refit": scored.found.base.config,
+        "with_effects": scored.found.best.config,
+    }
+    settings = scored.problem.settings
+    horizon_s, worst = settings.windows.held_out_window_s, settings.report.worst_stretches
+    longest = sorted(tracks, key=lambda track: -len(track.t_s))[:TRACES_TRIED]
+    traces = [t for track in longest if (t := _trace(track, models, horizon_s, worst)) is not None]
+    return tuple(traces[: settings.report.max_traces])
+
+
+def _trace(track: Track, models: Mapping[str, SimulatorConfig], horizon_s: float, worst_stretches: int) -> Trace | None:
+    """Predictions along a track, restarted every horizon; None where the car does not move long enough."""
+    try:
+        windows = cut_windows([track], horizon_s, horizon_s)
+    except DataError:
+        return None
+    span_s = windows.horizon_s
+    predicted = {}
+    worst: list[tuple[float, float]] = []
+    for name, config in models.items():
+        out = simulate_windows(windows, config)
+        predicted[name] = predicted_at(track.t_s, windows, out[0])
+        if name == "refit":
+            final = np.linalg.norm(prediction_errors(out, windows)[0, :, -1, :2], axis=1)
+            order = np.argsort(-final)[:worst_stretches]
+            worst = [(float(windows.t0_s[k]), float(windows.t0_s[k] + span_s)) for k in order]
+    return Trace(f"recording {track.recording + 1}", track.t_s, track.states, predicted, tuple(sorted(worst)))
+
+
+__all__ = ["exhibits_of"]

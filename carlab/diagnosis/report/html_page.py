@@ -1,0 +1,136 @@
+"""The report as one HTML page: what the template is given, and the template filled."""
+
+from __future__ import annotations
+
+import math
+from importlib import resources
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate, Exhibits
+from carlab.diagnosis.report import figures as figures
+from carlab.diagnosis.report import sentences as text
+from carlab.diagnosis.report.svg import interval_bar
+from carlab.diagnosis.settings import DEFAULT
+
+
+def render_page(diagnosis: Diagnosis, exhibits: Exhibits) -> str:
+    """The page as text: self-contained, without scripts; every text from outside is escaped."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {
+        "num": text.number,
+        "percent": text.percent,
+        "unit": text.unit_text,
+        "words": lambda name: name.replace("_", " "),
+    }
+    source = (resources.files("carlab.diagnosis.report") / "templates" / "report.html").read_text(encoding="utf-8")
+    return environment.from_string(source).render(**page_context(diagnosis, exhibits))
+
+
+def page_context(diagnosis: Diagnosis, exhibits: Exhibits) -> dict[str, Any]:
+    """What the template reads. Pictures show effects only where the verdict names some."""
+    exhibits = exhibits if diagnosis.effects else figures.without_effects(exhibits)
+    drive, why = text.next_drive(diagnosis)
+    rest = diagnosis.unexplained
+    worst = figures.worst_stretch(exhibits.traces)
+    candidates = sorted((c for c in exhibits.candidates if math.isfinite(c[1])), key=lambda c: -c[1])
+    return {
+        "d": diagnosis,
+        "title": text.verdict_title(diagnosis),
+        "sentence": diagnosis.sentence if _has_own_sentence(diagnosis) else text.verdict_sentence(diagnosis),
+        "cards": _cards(diagnosis),
+        "effects": [_effect(effect, exhibits) for effect in diagnosis.effects],
+        "overlay": figures.overlay(*worst, diagnosis.effects) if worst else [],
+        "overlay_trace": worst[0].name if worst else "",
+        "overlay_stretch": worst[1] if worst else (0.0, 0.0),
+        "overlay_models": [m for m in figures.MODELS if worst and m in worst[0].predicted],
+        "labels": figures.LABELS,
+        "in_time": [(t.name, f, t.marked) for t in exhibits.traces if (f := figures.error_in_time(t)) is not None],
+        "regimes": figures.regime_charts(exhibits),
+        "ladder": figures.ladder_chart(exhibits),
+        "attained": text.attained(diagnosis),
+        "known": bool(diagnosis.effects) and math.isfinite(text.attained(diagnosis)),
+        "driven": bool(exhibits.traces),
+        "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: DEFAULT.report.max_candidates]],
+        "tried": len(exhibits.candidates),
+        "rest": rest if rest is not None and rest.share >= DEFAULT.evidence.unexplained_share_min else None,
+        "rest_where": text.listed([text.CHANNEL_WORDS.get(c, c) for c in rest.channels]) if rest else "",
+        "rest_regime": text.regime_words(rest.regime) if rest else "",
+        "drive": text.drive_command(drive),
+        "drive_name": drive,
+        "why": why,
+        "parameters": [(name, e, _bar(e)) for name, e in diagnosis.parameters.items()],
+        "channels": text.CHANNEL_WORDS,
+    }
+
+
+def _has_own_sentence(diagnosis: Diagnosis) -> bool:
+    """Whether the diagnosis brings its own verdict sentence; the reason of an inconclusive diagnosis is framed."""
+    return bool(diagnosis.sentence) and diagnosis.verdict != "inconclusive"
+
+
+def _bar(e: Estimate) -> Any:
+    return interval_bar(e.value, e.low90, e.high90)
+
+
+def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """The figures on top: the score of each stage."""
+    order = ("nominal", "refit", "with_effects", "noise_floor")
+    shown = [k for k in order if k in diagnosis.held_out and (k != "with_effects" or diagnosis.effects)]
+    return [{"label": figures.LABELS[k], "errors": diagnosis.held_out[k], "style": k} for k in shown]
+
+
+def _effect(effect: EffectFinding, exhibits: Exhibits) -> dict[str, Any]:
+    where, evidence = effect.where, effect.evidence
+    places = [f"in {text.listed([text.CHANNEL_WORDS.get(c, c) for c in where.channels])}"] if where.channels else []
+    places.append(text.regime_words(where.regime))
+    if where.lag_s is not None:
+        places.append(f"at a lag of {text.with_unit(where.lag_s, 's')}")
+    if where.time is not None:
+        places.append(f"from {text.with_unit(where.time[0], 's')} to {text.with_unit(where.time[1], 's')}")
+    if where.place is not None:
+        x, y, radius = (text.with_unit(v, "m") for v in where.place)
+        places.append(f"within {radius} of x = {x}, y = {y}")
+    drive = ""
+    if effect.indistinguishable_from:
+        drive = effect.separating_drive or text.separating_drive(effect.id, effect.indistinguishable_from)
+    noun = text.effect_noun(effect.id)
+    return {
+        "id": effect.id,
+        "noun": noun[0].upper() + noun[1:],
+        "sentence": effect.sentence or text.effect_sentence(effect.id, effect.parameters),
+        "confidence": effect.confidence,
+        "confidence_words": text.confidence_words(effect.confidence, len(effect.indistinguishable_from)),
+        "where": ", ".join(places),
+        "evidence": evidence,
+        "evidence_words": _evidence_words(effect),
+        "parameters": [(name, e, _bar(e)) for name, e in effect.parameters.items()],
+        "others": [(other, text.effect_noun(other)) for other in effect.indistinguishable_from],
+        "drive": text.drive_command(drive),
+        "reason": text.separating_reason(effect.id, effect.indistinguishable_from)
+        if effect.indistinguishable_from
+        else "",
+        "wrong": text.wrong_sentence(effect.id),
+        "correlation": figures.correlation_chart(exhibits, effect.id),
+        "fingerprint": figures.fingerprint_chart(effect) if evidence.deletion_fingerprint else None,
+    }
+
+
+def _evidence_words(effect: EffectFinding) -> list[str]:
+    evidence = effect.evidence
+    words = []
+    fall = evidence.held_out_error_reduction
+    if math.isfinite(fall):
+        verb = "lowers" if fall >= 0 else "raises"
+        words.append(f"When it is added last, it {verb} the error on held-out recordings by {text.percent(abs(fall))}.")
+    strength = evidence.standard_errors
+    if math.isfinite(strength):
+        side = "speak against" if strength < 0 else "favour"
+        weak = ", which is weak" if abs(strength) < 3 else ""
+        words.append(f"Held-out recordings {side} it by {text.number(abs(strength))} standard errors{weak}.")
+    visible = evidence.visibility
+    if math.isfinite(visible):
+        hidden = " Most of it is hidden by other numbers." if visible < 0.3 else ""
+        words.append(f"Other numbers cannot imitate {text.percent(visible)} of its influence.{hidden}")
+    return words

@@ -1,0 +1,86 @@
+"""The diagnosis in one picture: the fall of the held-out error, and the worst second before and after."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
+from carlab.diagnosis.settings import DEFAULT
+from carlab.recording.rerun import blueprint as look
+
+ORDER = ("nominal", "refit", "with_effects")
+LABELS = {"nominal": "car file", "refit": "refit", "with_effects": "with effects"}
+
+
+def _plain(words: str) -> str:
+    """Words that a figure shows as they are: names of files may hold anything."""
+    return "".join(c if " " <= c <= "~" else "?" for c in words).replace("$", r"\$")
+
+
+def _color(rgb: tuple[int, int, int]) -> tuple[float, float, float]:
+    return rgb[0] / 255.0, rgb[1] / 255.0, rgb[2] / 255.0
+
+
+COLORS = {"nominal": _color(look.ORANGE), "refit": _color(look.VERMILION), "with_effects": _color(look.BLUE)}
+
+
+def draw_picture(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
+    """Write a PNG; panes without material are left out.
+
+    Args:
+        diagnosis: the answer.
+        exhibits: the ladder and the traces.
+        path: the file, replaced where it is there.
+    """
+    figure = Figure(figsize=(13.0, 4.6), layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    shown = [e for e in exhibits.traces if e.marked]
+    panes = figure.subplots(1, 1 + min(len(shown), 2), squeeze=False)[0]
+    _ladder(panes[0], exhibits)
+    for axes, trace in zip(panes[1:], shown, strict=False):
+        _worst(axes, trace)
+    names = (
+        ", ".join(e.id.replace("_", " ") for e in diagnosis.effects[: DEFAULT.report.max_picture_names])
+        or diagnosis.verdict
+    )
+    if len(diagnosis.effects) > DEFAULT.report.max_picture_names:
+        names += f" and {len(diagnosis.effects) - DEFAULT.report.max_picture_names} more"
+    figure.suptitle(_plain(names), fontsize=11)
+    figure.savefig(path, dpi=110)
+
+
+def _ladder(axes: Axes, exhibits: Exhibits) -> None:
+    labels = [name for name, _ in exhibits.ladder]
+    scores = np.array([score for _, score in exhibits.ladder])
+    places = np.arange(len(labels))[::-1]
+    kinds = [COLORS.get(name, COLORS["with_effects"]) for name in labels]
+    axes.barh(places, scores, color=[_color(look.GREY) if n == "noise floor" else c for n, c in zip(labels, kinds,
+              strict=True)])  # fmt: skip
+    for place, score in zip(places, scores, strict=True):
+        axes.text(score, place, f" {score:.2f}", va="center", fontsize=8)
+    axes.set_yticks(places, [_plain(label.replace("_", " ")) for label in labels], fontsize=8)
+    axes.set_xlabel("held-out error after one second, in noise floors")
+    axes.margins(x=0.15)
+
+
+def _worst(axes: Axes, trace: Trace) -> None:
+    """Plan view of the stretches where the refit is worst."""
+    for number, (begin, end) in enumerate(trace.marked):
+        rows = (trace.times_s >= begin - 1e-6) & (trace.times_s < end - 1e-6)  # at the end the prediction starts anew
+        once = number == 0
+        axes.plot(*trace.recorded[rows, :2].T, color="black", lw=2.2, label="recorded" if once else None)
+        for name in ORDER[1:]:
+            if name in trace.predicted:
+                path = trace.predicted[name][rows, :2]
+                axes.plot(*path.T, color=COLORS[name], lw=1.6, label=LABELS[name] if once else None)
+        axes.plot(*trace.recorded[np.argmax(rows), :2], "o", color="black", ms=5)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.set_title(_plain(f"{trace.name}: its worst seconds"), fontsize=9)
+    axes.legend(fontsize=8, frameon=False)

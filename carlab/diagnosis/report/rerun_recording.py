@@ -1,0 +1,228 @@
+"""The report as a rerun recording: the recorded car, the predictions, the residuals, and their worst stretches.
+
+Each held-out recording has entities of its own under ``/NAME`` and a tab of its own; all lie on the timeline
+``car_time``, the time of each recording [s].
+
+    NAME/map/{recorded,nominal,refit,with_effects}/{base_link,trail}     plan view
+    NAME/map/worst, NAME/map/place                                       located stretches and places
+    NAME/state/{vx,vy,yaw_rate}/{recorded,nominal,refit,with_effects}    series
+    NAME/residual/{position,yaw,vx,vy,yaw_rate}/{nominal,...}            predicted less recorded
+    NAME/marks                                                           what is where, in words
+    verdict                                                              the verdict and each effect
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
+from carlab.diagnosis.report.figures import LABELS, MODELS, residual, restarts
+from carlab.diagnosis.report.sentences import number, verdict_sentence
+from carlab.recording.atomic_files import rerun_file
+from carlab.recording.rerun import blueprint as look
+from carlab.recording.rerun.columns import Columns, entity_part
+
+VERDICT = "verdict"
+COLORS = {"recorded": look.GREY, "nominal": look.ORANGE, "refit": look.VERMILION, "with_effects": look.SKY}
+CHANNELS = {"vx": 3, "vy": 4, "yaw_rate": 5}
+UNITS = {"position": "m", "yaw": "rad", "vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
+
+
+def write_rrd(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
+    """Write the recording; one that is there already is replaced once the new one is whole.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    parts = entity_names(exhibits)
+    with rerun_file(path, blueprint=_blueprint(parts, exhibits)) as stream:
+        stream.send_recording_name("Diagnosis")
+        stream.log(VERDICT, rr.TextDocument(_verdict(diagnosis), media_type=rr.MediaType.MARKDOWN), static=True)
+        for part, trace in zip(parts, exhibits.traces, strict=True):
+            _send_trace(stream, part, trace, diagnosis)
+
+
+def entity_names(exhibits: Exhibits) -> list[str]:
+    """First part of the entity paths of each trace: its name as such, numbered where two are alike."""
+    names: list[str] = []
+    for trace in exhibits.traces:
+        name = base = entity_part(trace.name)
+        count = 2
+        while name in (*names, VERDICT):
+            name, count = f"{base}_{count}", count + 1
+        names.append(name)
+    return names
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
+    lines = [f"# {diagnosis.verdict}", diagnosis.sentence or verdict_sentence(diagnosis)]
+    lines += [f"- {effect.sentence}" for effect in diagnosis.effects]
+    if diagnosis.advice:
+        lines += ["**Next:** " + diagnosis.advice]
+    return "\n\n".join(lines)
+
+
+def _send_trace(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: Diagnosis) -> None:
+    columns = Columns(stream, 0.0)
+    stream.log(f"{part}/map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    models = [m for m in MODELS if m in trace.predicted]
+    indexes = columns.indexes(trace.times_s, range(len(trace.times_s)))
+    for name in ("recorded", *models):
+        states = trace.recorded if name == "recorded" else trace.predicted[name]
+        begins = [] if name == "recorded" else restarts(trace.recorded, states)
+        _send_car(stream, part, name, columns, trace.times_s, states, begins)
+        for channel, column in CHANNELS.items():
+            _send_series(stream, f"{part}/state/{channel}/{name}", name, indexes, states[:, column])
+    for name in models:
+        error = residual(trace, name)
+        values = {"position": np.hypot(error[:, 0], error[:, 1]), "yaw": error[:, 2]}
+        values |= {channel: error[:, column] for channel, column in CHANNELS.items()}
+        for channel, series in values.items():
+            _send_series(stream, f"{part}/residual/{channel}/{name}", name, indexes, series)
+    _send_marks(stream, part, trace, diagnosis)
+
+
+def _send_car(
+    stream: rr.RecordingStream,
+    part: str,
+    name: str,
+    columns: Columns,
+    times_s: FloatArray,
+    states: FloatArray,
+    begins: list[int],
+) -> None:
+    """A car that moves and the trail it leaves, which is interrupted where a prediction starts anew."""
+    car, trail = f"{part}/map/{name}/base_link", f"{part}/map/{name}/trail"
+    color = COLORS[name]
+    half = [0.5 * size for size in look.CAR_SIZE_M]
+    mode = rr.components.FillMode.Solid if name == "recorded" else rr.components.FillMode.MajorWireframe
+    stream.log(f"{car}/body", rr.Boxes3D(half_sizes=[half], colors=color, fill_mode=mode), static=True)
+    width = rr.Radius.ui_points(3.0 if name == "recorded" else 1.5)
+    stream.log(trail, rr.LineStrips3D.from_fields(radii=width, colors=color), static=True)
+    rows = np.flatnonzero(np.isfinite(states[:, :3]).all(axis=1))
+    if not len(rows):
+        return
+    indexes = columns.indexes(times_s[rows], rows.tolist())
+    places = np.column_stack([states[rows, :2], np.zeros(len(rows))])
+    half_rad = 0.5 * states[rows, 2]
+    zeros = np.zeros(len(rows))
+    turns = np.column_stack([zeros, zeros, np.sin(half_rad), np.cos(half_rad)])
+    stream.send_columns(car, indexes, rr.Transform3D.columns(translation=places, quaternion=turns))
+    starts = np.vstack([places[:1], places[:-1]])
+    anew = np.isin(rows, begins)
+    starts[anew] = places[anew]
+    strips = list(np.stack([starts, places], axis=1))
+    stream.send_columns(trail, indexes, rr.LineStrips3D.columns(strips=strips))
+
+
+def _send_series(
+    stream: rr.RecordingStream, path: str, name: str, indexes: list[rr.TimeColumn], values: FloatArray
+) -> None:
+    style = rr.SeriesLines(names=LABELS[name], colors=COLORS[name], widths=2.5 if name == "recorded" else 1.5)
+    stream.log(path, style, static=True)
+    if np.isfinite(values).any():
+        stream.send_columns(path, indexes, rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)))
+
+
+def _send_marks(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: Diagnosis) -> None:
+    strips, marks = [], []
+    for start_s, end_s in trace.marked:
+        inside = (trace.times_s >= start_s) & (trace.times_s <= end_s)
+        places = trace.recorded[inside, :2]
+        places = places[np.isfinite(places).all(axis=1)]
+        if len(places) > 1:
+            strips.append(np.column_stack([places, np.full(len(places), -0.002)]))
+        marks.append((start_s, f"The refit is worst from {number(start_s)} s to {number(end_s)} s", "WARN"))
+    if strips:
+        width = rr.Radius.ui_points(7.0)
+        stream.log(f"{part}/map/worst", rr.LineStrips3D(strips, radii=width, colors=look.YELLOW), static=True)
+    circles = []
+    first_s = float(trace.times_s[0]) if len(trace.times_s) else 0.0
+    for effect in diagnosis.effects:
+        if effect.where.place is not None:
+            x, y, radius = effect.where.place
+            around = [2.0 * math.pi * k / 48 for k in range(49)]
+            circles.append([(x + radius * math.cos(a), y + radius * math.sin(a), 0.0) for a in around])
+        at_s = first_s if effect.where.time is None else max(effect.where.time[0], first_s)
+        marks.append((at_s, f"{effect.id}: {effect.sentence}", "INFO"))
+    if circles:
+        width = rr.Radius.ui_points(2.0)
+        stream.log(f"{part}/map/place", rr.LineStrips3D(circles, radii=width, colors=look.PURPLE), static=True)
+    for at_s, words, level in sorted(marks):
+        step = int(np.searchsorted(trace.times_s, at_s))
+        stream.set_time(look.CAR_TIME, duration=at_s)
+        stream.set_time(look.STEP, sequence=step)
+        stream.log(f"{part}/marks", rr.TextLog(words, level=level))
+
+
+def _blueprint(parts: list[str], exhibits: Exhibits) -> rrb.Blueprint:
+    tabs = [_tab(part, trace) for part, trace in zip(parts, exhibits.traces, strict=True)]
+    verdict = rrb.TextDocumentView(origin=f"/{VERDICT}", name="Verdict")
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, verdict, active_tab=0),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=look.CAR_TIME),
+        auto_views=False,
+    )
+
+
+def _tab(part: str, trace: Trace) -> rrb.Horizontal:
+    """Plan, marks and verdict on the left; series and residuals on the right."""
+    residuals = [
+        rrb.TimeSeriesView(origin=f"/{part}/residual/{channel}", name=f"Error of {channel.replace('_', ' ')} [{unit}]")
+        for channel, unit in UNITS.items()
+        if channel in ("position", "yaw_rate")
+    ]
+    series = [
+        rrb.TimeSeriesView(origin=f"/{part}/state/{channel}", name=f"{channel.replace('_', ' ')} [{UNITS[channel]}]")
+        for channel in CHANNELS
+    ]
+    return rrb.Horizontal(
+        rrb.Vertical(
+            _plan(part, trace),
+            rrb.Horizontal(
+                rrb.TextLogView(origin=f"/{part}/marks", name="What is where"),
+                rrb.TextDocumentView(origin=f"/{VERDICT}", name="Verdict"),
+            ),
+            row_shares=[3, 1],
+        ),
+        rrb.Vertical(*series, *residuals),
+        column_shares=[5, 6],
+        name=trace.name,
+    )
+
+
+def _plan(part: str, trace: Trace) -> rrb.Spatial3DView:
+    places = trace.recorded[np.isfinite(trace.recorded[:, :2]).all(axis=1), :2]
+    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.full(2, -2.0), np.full(2, 2.0))
+    x_m, y_m = (float(v) for v in 0.5 * (low + high))
+    height_m = 1.15 * max(float(high[0] - low[0]), float(high[1] - low[1]), 1.0)
+    so_far = rrb.VisibleTimeRanges(
+        [
+            rrb.VisibleTimeRange(
+                look.CAR_TIME,
+                start=rrb.TimeRangeBoundary.infinite(),
+                end=rrb.TimeRangeBoundary.cursor_relative(),
+            )
+        ]
+    )
+    trails = [f"{part}/map/{name}/trail" for name in ("recorded", *MODELS)]
+    return rrb.Spatial3DView(
+        origin=f"/{part}/map",
+        name="Plan view [m]",
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.5, stroke_width=1.0, color=[128, 128, 128, 50]),
+        eye_controls=rrb.EyeControls3D(
+            kind="orbital",
+            position=[x_m, y_m - 1e-4 * height_m, height_m],
+            look_target=[x_m, y_m, 0.0],
+            eye_up=[0.0, 1.0, 0.0],
+        ),
+        overrides=dict.fromkeys(trails, so_far),
+    )

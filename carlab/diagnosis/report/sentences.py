@@ -1,0 +1,341 @@
+"""Sentences of a diagnosis: of each effect, of the verdict, of its refutation, and of the next drive.
+
+No sentence is more certain than the numbers: a set is named as a set, and an interval across zero is stated.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+
+from carlab.core.manoeuvres import MANOEUVRES
+from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
+from carlab.diagnosis.settings import DEFAULT
+from sim_backends.effects import EFFECTS, Confusable, separation
+
+CHANNEL_WORDS = {
+    "x": "position ahead",
+    "y": "position to the side",
+    "yaw": "heading",
+    "vx": "speed ahead",
+    "vy": "side velocity",
+    "yaw_rate": "yaw rate",
+}
+AT_90 = " at 90 %"
+VERDICT_TITLES = {
+    "mismatch": "Physics is missing, and has a name",
+    "parameters": "Only numbers of the car file are wrong",
+    "none": "Nothing is found missing",
+    "data": "The recording is at fault",
+    "unexplained": "Physics is missing that has no name in the catalogue",
+    "inconclusive": "The recordings are not sufficient",
+}
+
+
+def number(value: float) -> str:
+    """Three significant digits, without an exponent where that reads well; a real minus sign."""
+    if not math.isfinite(value):
+        return "no limit" if value == math.inf else "minus no limit" if value == -math.inf else "unknown"
+    if value == 0.0:
+        return "0"
+    size = abs(value)
+    if size >= 1e6 or size < 1e-6:
+        text = f"{value:.3g}"
+    else:
+        text = f"{value:.{max(2 - math.floor(math.log10(size)), 0)}f}"
+        text = text.rstrip("0").rstrip(".") if "." in text else text
+    return text.replace("-", "−")
+
+
+def percent(share: float) -> str:
+    """A share in per cent: two significant digits, but never a rounded 100 for less, nor a rounded 0 for more."""
+    value = 100.0 * share
+    if not math.isfinite(value):
+        return "an unknown share"
+    text = f"{value:.0f}" if abs(value) >= 9.5 or value == 0.0 else f"{value:.1f}"
+    if text in ("100", "0.0", "-0.0") and value not in (100.0, 0.0):
+        text = f"{value:.2g}" if abs(value) < 1 else "more than 99" if value < 100 else "100"
+    return text.replace("-", "−") + " %"
+
+
+def unit_text(unit: str) -> str:
+    """A unit as people write it: ``N s2/m2`` -> ``N s²/m²``; nothing for 1."""
+    if unit in ("", "1"):
+        return ""
+    return re.sub(r"(?<=[a-z])([23])", lambda m: "²³"[int(m[1]) - 2], unit)
+
+
+def with_unit(value: float, unit: str) -> str:
+    """A number and its unit."""
+    return f"{number(value)} {unit_text(unit)}".strip() if math.isfinite(value) else number(value)
+
+
+class _Filled:
+    """An estimate in the sentence template of an effect (``Effect.sentence``).
+
+    ``{p}`` is the number with unit and interval, ``{p:size}`` its magnitude (with ``{p:left|right}`` for the sign),
+    ``{p:percent}`` and ``{p:size percent}`` the same in per cent, ``{p:each minute}`` a rate [1/s] in per cent a
+    minute,
+    ``{p:choice a|b}`` a word for a choice.
+    """
+
+    def __init__(self, estimate: Estimate | None) -> None:
+        self._estimate = estimate
+
+    def __format__(self, spec: str) -> str:
+        e = self._estimate
+        if spec.startswith("choice "):
+            options = spec.removeprefix("choice ").split("|")
+            index = 0 if e is None or not math.isfinite(e.value) else round(e.value)
+            return options[min(max(index, 0), len(options) - 1)]
+        if e is None:
+            return "" if "|" in spec else "an unknown amount"
+        if "|" in spec:
+            positive, negative = spec.split("|")
+            return positive if e.value >= 0.0 else negative
+        value, low, high = e.value, e.low90, e.high90
+        if "size" in spec and value < 0.0:
+            value, low, high = -value, -high, -low
+        factor, unit = 1.0, unit_text(e.unit)
+        if "percent" in spec:
+            factor, unit = 100.0, "%"
+        if "each minute" in spec:
+            factor, unit = 6000.0, "% of its first value each minute"
+        return f"{_scaled(value, factor, unit)}{_interval(low, high, factor)}"
+
+
+def _scaled(value: float, factor: float, unit: str) -> str:
+    return f"{number(value * factor)} {unit}".strip() if math.isfinite(value) else number(value)
+
+
+def _interval(low: float, high: float, factor: float) -> str:
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return " (interval unknown)" if math.isnan(low) or math.isnan(high) else " (open interval at 90 %)"
+    uncertain_sign = "; its sign is not certain" if low < 0.0 < high else ""
+    return f" ({number(low * factor)} to {number(high * factor)}{AT_90}{uncertain_sign})"
+
+
+class _Fields(dict[str, _Filled]):
+    def __missing__(self, key: str) -> _Filled:
+        return _Filled(None)
+
+
+def effect_noun(effect_id: str) -> str:
+    """An effect as a noun: ``a lag of the steering servo``. An id beyond the catalogue stands for itself."""
+    effect = EFFECTS.get(effect_id)
+    return effect.name if effect is not None and effect.name else effect_id.replace("_", " ")
+
+
+def effect_sentence(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
+    """What was left out, with numbers, units and 90 % intervals: ``Left out: the servo lags by 0.11 s ...``."""
+    effect = EFFECTS.get(effect_id)
+    if effect is None or not effect.sentence:
+        numbers = ", ".join(f"{name} {_Filled(e)}" for name, e in parameters.items())
+        return f"Left out: {effect_noun(effect_id)}" + (f", with {numbers}." if numbers else ".")
+    fields = _Fields({name: _Filled(e) for name, e in parameters.items()})
+    filled = re.sub(r"\s+", " ", effect.sentence.format_map(fields))
+    head, level, tail = filled.partition(AT_90)  # the first interval states the level, which holds for all
+    return f"Left out: {head}{level}{tail.replace(AT_90, '')}."
+
+
+def wrong_sentence(effect_id: str) -> str:
+    """What would refute an effect."""
+    effect = EFFECTS.get(effect_id)
+    if effect is None or not effect.refuted_if:
+        return "This would be wrong if a fit to another recording gave the effect other numbers."
+    return f"This would be wrong if {effect.refuted_if}."
+
+
+def _separations(effect_id: str, others: Sequence[str]) -> list[Confusable]:
+    """How the pairs of a set of confusable effects are separated, those with ``effect_id`` first."""
+    names = [effect_id, *others]
+    pairs = [(effect_id, other) for other in others]
+    pairs += [(a, b) for k, a in enumerate(names[1:]) for b in names[k + 2 :]]
+    return [found for a, b in pairs if (found := separation(a, b)) is not None]
+
+
+def separating_drive(effect_id: str, others: Sequence[str]) -> str:
+    """Name of the manoeuvre that separates an effect from its confusable ones; empty where no drive can.
+
+    Of several confusable effects, the manoeuvre that separates most pairs of the set.
+    """
+    drives = [found.drive for found in _separations(effect_id, others) if found.drive]
+    return max(drives, key=drives.count) if drives else ""
+
+
+def separating_reason(effect_id: str, others: Sequence[str]) -> str:
+    """Why that manoeuvre separates them, or what to do where no manoeuvre can."""
+    drive, found = separating_drive(effect_id, others), _separations(effect_id, others)
+    reasons = [entry.reason for entry in found if entry.drive == drive and entry.reason]
+    if drive:
+        text = "; ".join(dict.fromkeys(reasons))
+        return text[0].upper() + text[1:] + "."
+    if reasons:
+        return reasons[0]
+    return "No known manoeuvre separates them. Another kind of recording is needed."
+
+
+def verdict_title(diagnosis: Diagnosis) -> str:
+    """The verdict in a few words."""
+    if diagnosis.effects and all(effect.indistinguishable_from for effect in diagnosis.effects):
+        return "Physics is missing, with more than one possible name"
+    return VERDICT_TITLES[diagnosis.verdict]
+
+
+def confidence_words(confidence: float, rivals: int = 0) -> str:
+    """A confidence in words; ``rivals`` is the number of effects that share it."""
+    if rivals:
+        return f"one of {rivals + 1} that look alike"
+    levels = ((0.98, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.5, "more likely than not"))
+    return next((words for level, words in levels if confidence >= level), "a guess that needs another recording")
+
+
+def listed(parts: Sequence[str], last: str = "and") -> str:
+    """``a, b and c``."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {last} {parts[-1]}" if parts else ""
+
+
+def set_noun(effect: EffectFinding) -> str:
+    """An effect's noun, with those that are indistinguishable from it."""
+    noun = effect_noun(effect.id)
+    if not effect.indistinguishable_from:
+        return noun
+    others = listed([effect_noun(name) for name in effect.indistinguishable_from], "or")
+    return f"{noun} (or {others}: these recordings cannot tell)"
+
+
+def verdict_sentence(diagnosis: Diagnosis) -> str:
+    """The verdict in one to three sentences, with the figures that carry it."""
+    made = {
+        "mismatch": _mismatch,
+        "parameters": _parameters,
+        "none": _none,
+        "data": _data,
+        "unexplained": _unexplained,
+        "inconclusive": _inconclusive,
+    }[diagnosis.verdict]
+    return made(diagnosis)
+
+
+def _fall(diagnosis: Diagnosis, before: str, after: str) -> str:
+    held = diagnosis.held_out
+    if before not in held or after not in held:
+        return ""
+    return (
+        f"the error on held-out recordings after {with_unit(diagnosis.horizon_s, 's')} goes from "
+        f"{number(held[before].score)} to {number(held[after].score)} noise floors"
+    )
+
+
+def attained(diagnosis: Diagnosis) -> float:
+    """Share of what a refit left above the noise that the effects remove, in [-inf, 1]; NaN where unknown."""
+    held = diagnosis.held_out
+    if "refit" not in held or "with_effects" not in held or not held["refit"].score > 1.0:
+        return math.nan
+    return (held["refit"].score - held["with_effects"].score) / (held["refit"].score - 1.0)
+
+
+def _mismatch(diagnosis: Diagnosis) -> str:
+    effects = diagnosis.effects
+    counted = {1: "one thing", 2: "two things", 3: "three things", 4: "four things"}
+    count = counted.get(len(effects), f"{len(effects)} things")
+    nouns = listed([set_noun(effect) for effect in effects]) or "an effect that this report does not hold"
+    text = f"The simulator leaves out {count}: {nouns}."
+    if fall := _fall(diagnosis, "refit", "with_effects"):
+        removed = min(attained(diagnosis), 1.0)
+        share = f", which removes {percent(removed)} of the error above the noise" if math.isfinite(removed) else ""
+        text += f" With {'it' if len(effects) == 1 else 'them'}, {fall}{share}."
+    if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
+        text += f" {percent(diagnosis.unexplained.share)} of the refit's squared excess stays unexplained."
+    return text
+
+
+def _parameters(diagnosis: Diagnosis) -> str:
+    fall = _fall(diagnosis, "nominal", "refit")
+    tail = f" With fitted numbers, {fall}." if fall else ""
+    text = "No missing physics is found. Numbers of the car file are wrong."
+    return f"{text}{tail}{_warning_above_noise(diagnosis, 'refit')}"
+
+
+def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
+    """A warning where the verdict leaves an error well above the noise."""
+    held = diagnosis.held_out.get(which)
+    if held is None or not held.score > DEFAULT.report.score_above_noise:
+        return ""
+    return " This is still above the noise: something is missing that the diagnosis does not find."
+
+
+def _none(diagnosis: Diagnosis) -> str:
+    held = diagnosis.held_out.get("nominal")
+    text = "Nothing is found missing. Neither other numbers nor a named effect helps on these recordings."
+    if held is None:
+        return text
+    return (
+        f"{text} Its error after {with_unit(diagnosis.horizon_s, 's')} is {number(held.score)} noise floors, "
+        f"where 1 is the noise of the recording itself.{_warning_above_noise(diagnosis, 'nominal')}"
+    )
+
+
+def _data(diagnosis: Diagnosis) -> str:
+    ids = list(dict.fromkeys(fault.id.replace("_", " ") for fault in diagnosis.data_faults))
+    faults = f" ({listed(ids)})" if ids else ""
+    return f"The recording is at fault{faults}. No physics can be identified from it until the fault is corrected."
+
+
+def _unexplained(diagnosis: Diagnosis) -> str:
+    rest = diagnosis.unexplained
+    text = "The simulator lacks physics that no effect of the catalogue explains"
+    if rest is None:
+        return text + "."
+    where = listed([CHANNEL_WORDS.get(c, c) for c in rest.channels])
+    shows = f" It shows in {where}" if where else " It shows"
+    return f"{text}.{shows}, {regime_words(rest.regime)}; its kind: {rest.kind or 'unknown'}."
+
+
+def _inconclusive(diagnosis: Diagnosis) -> str:
+    why = diagnosis.sentence or diagnosis.advice
+    return f"No verdict. {why}" if why else "No verdict. The recordings are not sufficient."
+
+
+def regime_words(regime: str) -> str:
+    """A regime rule in a sentence: ``mostly where speed > 2 m/s``."""
+    if not regime or regime == "everywhere alike":
+        return "everywhere alike"
+    return f"mostly where {regime}"
+
+
+def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
+    """The manoeuvre to drive next, empty where none would help, and the reason."""
+    for effect in diagnosis.effects:
+        if effect.indistinguishable_from:
+            drive = effect.separating_drive
+            drive = drive if drive in MANOEUVRES else separating_drive(effect.id, effect.indistinguishable_from)
+            reason = separating_reason(effect.id, effect.indistinguishable_from)
+            others = listed([effect_noun(name) for name in effect.indistinguishable_from], "or")
+            return drive, f"It is open whether it is {effect_noun(effect.id)} or {others}. {reason}"
+    advice = diagnosis.advice or (diagnosis.sentence if diagnosis.verdict == "inconclusive" else "")
+    if diagnosis.verdict == "data":
+        return "", advice or "Correct the recording or record again. Then diagnose again."
+    if diagnosis.verdict == "inconclusive":
+        drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
+        own = advice if advice != diagnosis.sentence else ""
+        return drive, own or "This drive contains what these recordings lack:"
+    if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
+        channels = diagnosis.unexplained.channels
+        along = bool(channels) and channels[0] in ("x", "vx")
+        what = "the drive" if along else "steering and tyres"
+        return (
+            "coast_down" if along else "steering_chirp",
+            advice or f"The residual shows in {what}. A drive that excites it shows its form.",
+        )
+    if diagnosis.verdict == "mismatch":
+        return "figure_eight", advice or (
+            "The best test of model.toml is a new recording that was neither fitted nor held out here."
+        )
+    return "", advice or "No further drive is needed. Diagnose again when the car, its tyres or the floor change."
+
+
+def drive_command(manoeuvre: str) -> str:
+    """The command line that drives a manoeuvre; empty for none."""
+    return f"carlab drive --policy {manoeuvre}" if manoeuvre else ""

@@ -1,0 +1,132 @@
+"""Writes a diagnosis into a folder: report.json, report.html, report.rrd, summary.png and model.toml."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import tomli_w
+
+from carlab.core.errors import DataError
+from carlab.diagnosis.decisions import to_dict
+from carlab.diagnosis.findings import Diagnosis, Exhibits
+from carlab.diagnosis.report import sentences as text
+from carlab.recording.atomic_files import write_text
+from carlab.recording.sink import describe_os_error, make_folder
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.registry import REGISTRY
+
+JSON_NAME, HTML_NAME, RRD_NAME, MODEL_NAME = "report.json", "report.html", "report.rrd", "model.toml"
+PICTURE_NAME = "summary.png"
+DECISIONS_NAME = "decisions.json"
+COMMENT_CHARACTERS = 110
+
+
+def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: SimulatorConfig) -> None:
+    """Write the whole report; a report that is there already is replaced.
+
+    Each file appears whole or not at all. report.json is written last: where it exists, the others do. A diagnosis
+    without a sentence or advice gets those of ``report.sentences``.
+
+    Args:
+        diagnosis: the answer.
+        exhibits: material for the pictures; may be empty.
+        folder: made where it is missing.
+        model: the simulator with everything found, for model.toml.
+
+    Raises:
+        DataError: the folder cannot be made or written to; the message says why and what to do.
+    """
+    from carlab.diagnosis.report.html_page import render_page
+    from carlab.diagnosis.report.picture import draw_picture
+    from carlab.diagnosis.report.rerun_recording import write_rrd
+
+    folder = Path(folder)
+    complete = completed(diagnosis)
+    report = json.dumps(complete.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    texts = {
+        MODEL_NAME: model_toml(complete, model),
+        HTML_NAME: render_page(diagnosis, exhibits),
+        JSON_NAME: report,
+    }
+    try:
+        make_folder(folder)
+        # An old report.json must not stand next to new pictures.
+        (folder / JSON_NAME).unlink(missing_ok=True)
+        (folder / PICTURE_NAME).unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(describe_os_error(error, folder)) from error
+    write_rrd(complete, exhibits, folder / RRD_NAME)
+    if exhibits.ladder:
+        draw_picture(complete, exhibits, folder / PICTURE_NAME)
+    for name, content in texts.items():
+        write_text(folder / name, content)
+
+
+def write_decisions(exhibits: Exhibits, folder: Path) -> Path:
+    """Write decisions.json into a folder and return its path."""
+    path = folder / DECISIONS_NAME
+    write_text(path, json.dumps(to_dict(exhibits.decisions), indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def completed(diagnosis: Diagnosis) -> Diagnosis:
+    """The diagnosis with sentences and advice in words, where it brings none."""
+    sentence = diagnosis.sentence or text.verdict_sentence(diagnosis)
+    drive, why = text.next_drive(diagnosis)
+    command = text.drive_command(drive)
+    advice = diagnosis.advice or (f"{why} Drive it with: {command}" if command else why)
+    effects = tuple(
+        replace(e, sentence=e.sentence or text.effect_sentence(e.id, e.parameters)) for e in diagnosis.effects
+    )
+    return replace(diagnosis, sentence=sentence, effects=effects, advice=advice)
+
+
+def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
+    """The simulator as a car file, with comments that say where its numbers come from."""
+    fitted = [use.path for use in diagnosis.recordings if use.role == "fit"]
+    found = text.listed([effect.id for effect in diagnosis.effects])
+    held = diagnosis.held_out
+    lines = ["Car file written by carlab diagnose; use it with --car, or diagnose again from it."]
+    lines.append(f"Verdict: {diagnosis.verdict}." + (f" Named effects: {found}." if found else " No named effects."))
+    for effect in diagnosis.effects:
+        lines.append(effect.sentence or text.effect_sentence(effect.id, effect.parameters))
+        if effect.indistinguishable_from:
+            others = text.listed(list(effect.indistinguishable_from), "or")
+            lines.append(f"These recordings cannot tell {effect.id} from {others}.")
+    lines += [f"Fitted to: {path}" for path in fitted] or ["Fitted to no recording: the car file as it was given."]
+    scores = [
+        f"{name} {text.number(held[name].score)}" for name in ("nominal", "refit", "with_effects") if name in held
+    ]
+    if scores:
+        lines.append(f"Held-out error in noise floors: {', '.join(scores)}.")
+    comments = "".join(f"# {row}\n" for line in lines for row in _rows(line))
+    return f"{comments}\n{tomli_w.dumps(with_doubts(diagnosis, model).to_tables())}"
+
+
+def with_doubts(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:
+    """The simulator with the standard deviation of every estimated number, which becomes a prior of learning."""
+    estimates = dict(diagnosis.parameters)
+    for effect in diagnosis.effects:
+        estimates |= {f"effects.{effect.id}.{name}": found for name, found in effect.parameters.items()}
+    known = model.values()
+    doubts = {
+        name: found.std
+        for name, found in estimates.items()
+        if name in known and not REGISTRY[name].choices and 0.0 < found.std < math.inf and math.isfinite(known[name])
+    }
+    return replace(model, doubts=doubts)
+
+
+def _rows(line: str) -> list[str]:
+    """A comment in rows; characters that TOML forbids in comments are shown as question marks."""
+    words = "".join(c if c.isprintable() else "?" for c in line).split(" ")
+    rows = [words[0]]
+    for word in words[1:]:
+        if len(rows[-1]) + 1 + len(word) <= COMMENT_CHARACTERS:
+            rows[-1] += f" {word}"
+        else:
+            rows.append(f"  {word}")
+    return rows

@@ -1,0 +1,164 @@
+"""Prediction errors of a simulator on a recording, by the same steps as the held-out errors of a diagnosis.
+
+Faults of the recording are repaired, the window of its velocities is estimated, and so are the initial states. So a
+``model.toml`` has here the error that its report states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.findings import DataFault
+from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.identification.velocity_window import with_initial_states
+from carlab.diagnosis.recording_faults import find as recording_faults
+from carlab.diagnosis.recordings import check_held_out_share
+from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.unexplained.vibration import find_vibration
+from carlab.prediction.predict import ConstantVelocity, NoChange, PredictiveModel, SimulatorModel, predicted_at
+from carlab.prediction.windows import Track, cut_windows, split_tracks, tracks_of
+from sim_backends.car_parameters import SimulatorConfig
+
+MODEL, CONSTANT_VELOCITY, NO_CHANGE = "model", "constant velocity", "no change"
+
+
+@dataclass(frozen=True, slots=True)
+class PartScore:
+    """Errors after the horizon in one part of a recording.
+
+    Attributes:
+        part: "whole recording" or "last 30 %".
+        held_out: its S windows and their noise floor.
+        errors: (S, 6) of the model and of the baselines, by name.
+    """
+
+    part: str
+    held_out: HeldOut
+    errors: Mapping[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingScore:
+    """Errors of a simulator on a recording.
+
+    Attributes:
+        horizon_s: that was predicted: a whole number of steps.
+        whole: errors in the whole recording.
+        last: errors in the part that a diagnosis of this recording alone holds out; None where that is too short.
+        episodes: the recording, repaired.
+        overlays: predictions (T + 1, 6) at the stamps of each episode, restarted every horizon; NaN where there is
+            none.
+        faults: what was found and repaired.
+    """
+
+    horizon_s: float
+    whole: PartScore
+    last: PartScore | None
+    episodes: tuple[EpisodeData, ...]
+    overlays: tuple[FloatArray, ...]
+    faults: tuple[DataFault, ...]
+
+
+def score_recording(
+    episodes: Sequence[EpisodeData],
+    config: SimulatorConfig,
+    *,
+    horizon_s: float = DEFAULT.windows.held_out_window_s,
+    stride_s: float = DEFAULT.windows.held_out_stride_s,
+    holdout_share: float = DEFAULT.windows.default_held_out_share,
+) -> RecordingScore:
+    """Predict a recording from many initial states along it.
+
+    Args:
+        episodes: the recording, as a diagnosis reads it.
+        config: the simulator, observation effects included.
+        horizon_s: how far to predict.
+        stride_s: from one start to the next.
+        holdout_share: the last part that is scored by itself, above 0 and at most 0.5.
+
+    Raises:
+        DataError: the recording holds no window of that length in which the car moves.
+        ConfigError: the share is impossible.
+    """
+    check_held_out_share(holdout_share, DEFAULT.windows)
+    if not (horizon_s > 0 and stride_s > 0):
+        raise DataError(f"Horizon {horizon_s:g} s and stride {stride_s:g} s must be positive.")
+    if not any(episode.ticks for episode in episodes):
+        raise DataError("The recording holds no command; there is nothing to predict.")
+    repaired, _, faults = recording_faults.check(episodes, [], config)
+    tracks = tracks_of(repaired)
+    if not tracks:
+        raise DataError("The recording has no unbroken stretch of half a second; record without gaps.")
+    whole = _score("whole recording", tracks, tracks, config, horizon_s, stride_s)
+    early, late = split_tracks(tracks, holdout_share, DEFAULT.windows.held_out_window_s + DEFAULT.windows.split_guard_s)
+    try:
+        last = _score(f"last {100.0 * holdout_share:g} %", early, late, config, horizon_s, stride_s)
+    except DataError:
+        last = None
+    return RecordingScore(
+        whole.held_out.windows.horizon_s,
+        whole,
+        last,
+        tuple(repaired),
+        _overlays(repaired, tracks, config, horizon_s),
+        tuple(faults),
+    )
+
+
+def _score(
+    part: str, fit_tracks: list[Track], tracks: list[Track], config: SimulatorConfig, horizon_s: float, stride_s: float
+) -> PartScore:
+    """Errors on ``tracks``, with the velocity window and the noise of ``fit_tracks``. DataError without windows."""
+    if not fit_tracks or not tracks:
+        raise DataError("Too little is left.")
+    settings = DEFAULT.windows
+    fit_windows = cut_windows(fit_tracks, min(settings.fit_window_s, horizon_s), settings.fit_stride_s)
+    fit_windows = fit_windows.thinned(settings.max_fit_windows)
+    windows = cut_windows(tracks, horizon_s, stride_s).thinned(settings.max_held_out_windows)
+    fit_windows, windows = with_initial_states((fit_windows, windows), config)
+    shakes = find_vibration(fit_tracks) is not None
+    noise = estimate_noise(fit_tracks, fit_windows.curvature_bias, slowest=shakes)
+    held_out = HeldOut.of(windows, noise, config)
+    models: dict[str, PredictiveModel] = {
+        MODEL: SimulatorModel(config),
+        CONSTANT_VELOCITY: ConstantVelocity(),
+        NO_CHANGE: NoChange(),
+    }
+    return PartScore(part, held_out, {name: held_out.final_error(model) for name, model in models.items()})
+
+
+def _overlays(
+    episodes: Sequence[EpisodeData], tracks: Sequence[Track], config: SimulatorConfig, horizon_s: float
+) -> tuple[FloatArray, ...]:
+    windows = cut_windows(tracks, horizon_s, horizon_s)
+    predicted = SimulatorModel(config).predict(windows)
+    found = []
+    for index, episode in enumerate(episodes):
+        own = windows.recording == index
+        found.append(predicted_at(episode.times_s - episode.times_s[0], windows.take(own), predicted[own]))
+    return tuple(found)
+
+
+def describe_windows(score: PartScore) -> str:
+    """The part with its number of windows and where they lie."""
+    windows = score.held_out.windows
+    first_s, last_s = float(np.min(windows.t0_s)), float(np.max(windows.t0_s)) + windows.horizon_s
+    return f"{score.part} ({len(windows)} windows from {first_s:.1f} to {last_s:.1f} s)"
+
+
+__all__ = [
+    "CONSTANT_VELOCITY",
+    "MODEL",
+    "NO_CHANGE",
+    "PartScore",
+    "RecordingScore",
+    "describe_windows",
+    "score_recording",
+]

@@ -1,0 +1,1 @@
+"""Model selection: screening, forward search, pairwise tests, elimination, rival physics."""

@@ -1,0 +1,141 @@
+"""Candidates for the next effect: screened, refitted, tested on unseen blocks, and accepted or not.
+
+A gain in likelihood is divided by its design effect, the ratio of the sandwich covariance to the naive one (Kent 1982),
+because neighbouring errors are dependent. It must hold on blocks of the recording that are not fitted.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.identification.fit import Fitter, clustered_gain, design_effect_of
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.refit import refit_candidate
+from carlab.diagnosis.selection.screening import ScreeningResult, screen_candidates
+
+log = logging.getLogger(__name__)
+
+
+def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -> tuple[Candidate, ...]:
+    """Candidates refitted together with ``model``: those tested on unseen blocks first, the best of them first."""
+    names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
+    screened = screen_candidates(problem, model, names)
+    refitted = []
+    chosen = _to_refit(problem, model, screened)
+    done, steps = len(model.effects), problem.settings.selection.max_effects
+    for k, result in enumerate(chosen):
+        control.progress(f"refitting with {result.effect}", (done + 0.5 * k / len(chosen)) / steps)
+        if control.stop():
+            break
+        refitted.append(refit_candidate(problem, model, result))
+    refitted.sort(key=lambda c: -c.gain)
+    return _tested(problem, model, refitted, control) if refitted else ()
+
+
+def _to_refit(
+    problem: SearchProblem, model: Model, screened: tuple[ScreeningResult, ...]
+) -> tuple[ScreeningResult, ...]:
+    """Candidates with the best screening scores, and the confusable effects of the leading ones."""
+    if not screened:
+        return ()
+    settings = problem.settings.selection
+    by_name = {result.effect: result for result in screened}
+    highest = max(result.score for result in screened)
+    design_effect = problem.fitter(model.scale).with_covariance(model.fit).design_effect
+    lowest = max(settings.min_score_share * highest, 0.5 * settings.min_score_chi2 * design_effect)
+    names = [result.effect for result in screened if result.score > lowest][: settings.max_refits]
+    for name in names[: settings.confusable_leaders]:
+        names += [n for n in problem.confusable.get(name, ()) if n in by_name and n not in names]
+    return tuple(by_name[name] for name in names)
+
+
+def _tested(
+    problem: SearchProblem, model: Model, refitted: list[Candidate], control: RunControl
+) -> tuple[Candidate, ...]:
+    """Test the candidates with the largest gains on unseen blocks."""
+    settings = problem.settings.selection
+    fitter = problem.fitter(model.scale)
+    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_unseen_error)
+    found = []
+    for k, candidate in enumerate(refitted):
+        if control.stop() or (candidate.gain < settings.min_gain_share * refitted[0].gain and k >= 2):
+            found.append(candidate)
+            continue
+        share = (len(model.effects) + 0.7) / settings.max_effects
+        control.progress(f"testing {candidate.effect} on unseen blocks", share)
+        found.append(with_unseen_gain(problem, fitter, candidate, reference))
+    found.sort(key=lambda c: (not c.is_tested, -(c.gain + c.unseen_gain)))
+    for c in found:
+        if c.is_tested:
+            _log(problem, model, c)
+    return tuple(found)
+
+
+def with_unseen_gain(problem: SearchProblem, fitter: Fitter, candidate: Candidate, reference: FloatArray) -> Candidate:
+    """The candidate with its chi2 and with its gain over ``reference`` (S,) on blocks that are not fitted."""
+    fit = fitter.with_covariance(candidate.fit)
+    loss = fitter.leave_fold_out_loss(fit, problem.folds(), problem.settings.selection.max_unseen_error)
+    gain, error = clustered_gain(reference, loss, problem.windows)
+    chi2 = 2.0 * candidate.gain / design_effect_of(fit, candidate.effect)
+    return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)
+
+
+def acceptance(problem: SearchProblem, candidate: Candidate) -> tuple[tuple[Condition, ...], ...]:
+    """Alternatives of which one must hold for a candidate to be accepted."""
+    settings = problem.settings.selection
+    share = candidate.unseen_gain / problem.perfect_loss()
+    ratio = candidate.unseen_gain / candidate.gain if candidate.gain > 0.0 else -math.inf
+    extra = problem.required_chi2(candidate.effect) - settings.accept_chi2_min
+    holds_unseen = Condition("selection.accept_unseen_ratio", ratio, settings.accept_unseen_ratio)
+    return (
+        (
+            holds_unseen,
+            Condition("selection.accept_chi2_min", candidate.chi2 - extra, settings.accept_chi2_min),
+            Condition("selection.accept_unseen_share", share, settings.accept_unseen_share),
+        ),
+        (
+            holds_unseen,
+            Condition("selection.steady_z_min", candidate.standard_errors, settings.steady_z_min),
+            Condition("selection.steady_unseen_share", share, settings.steady_unseen_share),
+        ),
+    )
+
+
+def is_accepted(problem: SearchProblem, candidate: Candidate) -> bool:
+    """Whether the candidate is accepted as the next effect."""
+    settings = problem.settings.selection
+    if not candidate.is_tested or candidate.unseen_gain < settings.accept_unseen_ratio * candidate.gain:
+        return False
+    share = candidate.unseen_gain / problem.perfect_loss()
+    strong = candidate.chi2 > problem.required_chi2(candidate.effect) and share > settings.accept_unseen_share
+    steady = candidate.standard_errors > settings.steady_z_min and share > settings.steady_unseen_share
+    return strong or steady
+
+
+def accept(
+    problem: SearchProblem, model: Model, candidates: tuple[Candidate, ...], control: RunControl
+) -> Candidate | None:
+    """The first acceptable candidate; None where there is none."""
+    for c in candidates:
+        if c.is_tested:
+            conditions = acceptance(problem, c)
+            control.record(Decision("accept", c.effect, conditions, is_accepted(problem, c), len(model.effects)))
+    leader = next((c for c in candidates if is_accepted(problem, c)), None)
+    if leader is not None:
+        log.info("accepted %s", leader.effect)
+    return leader
+
+
+def _log(problem: SearchProblem, model: Model, c: Candidate) -> None:
+    numbers = {k: round(v, 4) for k, v in c.fit.values().items() if k.startswith("effects." + c.effect)}
+    log.info(
+        "candidate %d %s: gain %.1f, chi2 %.1f (required %.0f), unseen gain %.1f (%.1f standard errors, share %.3f) %s",
+        len(model.effects), c.effect, c.gain, c.chi2, problem.required_chi2(c.effect), c.unseen_gain,
+        c.standard_errors, c.unseen_gain / problem.perfect_loss(), numbers,
+    )  # fmt: skip
+
+
+__all__ = ["accept", "is_accepted", "next_candidates"]

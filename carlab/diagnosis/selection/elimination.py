@@ -1,0 +1,67 @@
+"""Backward elimination: effects that unseen blocks do not miss are removed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.identification.fit import Fit, clustered_gain
+from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.refit import refit
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Deletion:
+    """A model without one of its effects, refitted, and the rise of the loss on unseen blocks in standard errors."""
+
+    without: Fit
+    standard_errors: float
+
+
+@dataclass(frozen=True, slots=True)
+class EliminationResult:
+    """A model whose effects unseen blocks miss, and the deletion of each of them."""
+
+    model: Model
+    deletions: Mapping[str, Deletion]
+
+
+def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> dict[str, Deletion]:
+    """Each effect of the model removed, everything else refitted."""
+    if not model.effects:
+        return {}
+    fitter = problem.fitter(model.scale)
+    folds, limit = problem.folds(), problem.settings.selection.max_unseen_error
+    with_all = fitter.leave_fold_out_loss(model.fit, folds, limit)
+    found = {}
+    for name in model.effects:
+        control.progress(f"without {name}", 0.93)
+        without = refit(problem, tuple(e for e in model.effects if e != name), model.fit, model.scale).fit
+        rise, error = clustered_gain(fitter.leave_fold_out_loss(without, folds, limit), with_all, problem.windows)
+        found[name] = Deletion(without, rise / error)
+    return found
+
+
+def eliminate(problem: SearchProblem, model: Model, control: RunControl) -> EliminationResult:
+    """Remove the effect that unseen blocks miss least, until they miss all that are left."""
+    keep_z_min = problem.settings.selection.keep_z_min
+    deletions = delete_each(problem, model, control)
+    while len(model.effects) > 1 and not control.stop():
+        weakest = min(deletions, key=lambda name: deletions[name].standard_errors)
+        z = deletions[weakest].standard_errors
+        kept = z >= keep_z_min
+        condition = Condition("selection.keep_z_min", z, keep_z_min)
+        control.record(Decision("keep", weakest, ((condition,),), kept, len(model.effects)))
+        if kept:
+            break
+        log.info("unseen blocks do not miss %s (%.1f standard errors)", weakest, z)
+        model = Model(tuple(e for e in model.effects if e != weakest), deletions[weakest].without, model.scale)
+        deletions = delete_each(problem, model, control)
+    return EliminationResult(model, deletions)
+
+
+__all__ = ["Deletion", "EliminationResult", "delete_each", "eliminate"]

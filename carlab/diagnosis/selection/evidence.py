@@ -1,0 +1,212 @@
+"""Evidence for the accepted effects on held-out windows: strength, place, intervals, confidence, and the verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.findings import DataFault, EffectFinding, Estimate, Evidence, Verdict, Where
+from carlab.diagnosis.identification.fit import Fit, clustered_gain
+from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
+from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.unexplained.description import start_features, worst_regime
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from sim_backends.effects import EFFECTS
+from sim_backends.registry import REGISTRY
+
+
+@dataclass(frozen=True, slots=True)
+class Texts:
+    """Functions that phrase the report.
+
+    effect             sentence of an effect with its numbers
+    separating_drive   manoeuvre that separates an effect from its confusable ones
+    look_alikes        confusable effects by effect id
+    """
+
+    effect: Callable[[str, Mapping[str, Estimate]], str]
+    separating_drive: Callable[[str, Sequence[str]], str]
+    look_alikes: Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class ScoredSearch:
+    """A search with the held-out errors of its models.
+
+    fit      with the accepted effects and its covariance
+    errors   held-out errors (S, 6) of the models nominal, refit and with_effects
+    """
+
+    problem: SearchProblem
+    found: SearchResult
+    held_out: HeldOut
+    fit: Fit
+    errors: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, problem: SearchProblem, found: SearchResult, held_out: HeldOut) -> ScoredSearch:
+        """Predict the held-out windows with each model."""
+        errors_of = {
+            "nominal": held_out.final_error(problem.nominal),
+            "refit": held_out.final_error(found.base.config),
+            "with_effects": held_out.final_error(found.best.config),
+        }
+        fit = problem.fitter(found.scale).with_covariance(found.best)
+        return cls(problem, found, held_out, fit, errors_of)
+
+    def scores(self) -> dict[str, float]:
+        """Held-out score of each model, in noise floors."""
+        return {name: self.held_out.score(error) for name, error in self.errors.items()}
+
+
+def effect_findings(
+    scored: ScoredSearch, texts: Texts, progress: Callable[[float], None] = lambda share: None
+) -> tuple[EffectFinding, ...]:
+    """Each accepted effect with its evidence, the strongest first."""
+    found = []
+    for k, name in enumerate(scored.found.effects):
+        progress(k / len(scored.found.effects))
+        found.append(_finding(scored, name, texts))
+    return tuple(found)
+
+
+def score_ladder(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
+    """Held-out scores of the nominal simulator, the refit, each step of the search, and the accepted effects."""
+    held_out, found, scores = scored.held_out, scored.found, scored.scores()
+    ladder = [("nominal", scores["nominal"]), ("refit", scores["refit"])]
+    for name, fit in found.history:
+        ladder.append((f"+ {name}", held_out.score(held_out.final_error(fit.config))))
+    if found.history and found.history[-1][1] is not found.best:
+        ladder.append(("accepted effects", scores["with_effects"]))
+    return tuple(ladder)
+
+
+def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
+    found, held_out, full = scored.found, scored.held_out, scored.errors["with_effects"]
+    others = tuple(e for e in found.effects if e != name)
+    without = refit(scored.problem, others, scored.fit, found.scale).fit
+    error = held_out.final_error(without.config)
+    gain, spread = held_out.gain(error, full)
+    parameters = {p.name: estimate(scored, f"effects.{name}.{p.name}") for p in EFFECTS[name].parameters}
+    rivals = found.rivals.get(name, ())
+    evidence = Evidence(
+        held_out_error_reduction=1.0 - held_out.score(full) / max(held_out.score(error), 1e-12),
+        standard_errors=gain / spread,
+        visibility=visibility(scored, name),
+        deletion_fingerprint=HeldOut.fingerprint(error, full),
+    )
+    return EffectFinding(
+        id=name,
+        confidence=_confidence(scored, name) / (1 + len(rivals)),
+        parameters=parameters,
+        where=_where(scored, name, parameters, error, without),
+        evidence=evidence,
+        sentence=texts.effect(name, parameters),
+        indistinguishable_from=rivals,
+        separating_drive=texts.separating_drive(name, rivals) if rivals else "",
+    )
+
+
+def _confidence(scored: ScoredSearch, name: str) -> float:
+    """Probability that the name is right, by the logistic regression of the settings on the root of chi2."""
+    settings = scored.problem.settings.evidence
+    root = math.sqrt(max(scored.found.chi2[name], 1e-3))
+    return float(1.0 / (1.0 + (settings.confidence_half / root) ** settings.confidence_slope))
+
+
+def _where(
+    scored: ScoredSearch, name: str, parameters: Mapping[str, Estimate], error: FloatArray, without: Fit
+) -> Where:
+    """Channels by how much of the squared score the effect removes; regime, lag, time and place."""
+    floor, windows = scored.held_out.floor, scored.problem.windows
+    removed = np.mean((error / floor) ** 2, axis=0) - np.mean((scored.errors["with_effects"] / floor) ** 2, axis=0)
+    main = removed >= min(0.5 * removed.max(), removed.max())
+    channels = tuple(STATE_NAMES[k] for k in np.argsort(-removed) if main[k])
+    effect = EFFECTS[name]
+    lag = parameters[effect.lag_parameter].value if effect.lag_parameter else None
+    place = None
+    if effect.disc_parameters:
+        x, y, radius = (parameters[p].value for p in effect.disc_parameters)
+        place = (x, y, radius)
+    time = (0.0, float(windows.t0_s.max())) if "time" in effect.depends_on else None
+    final = prediction_errors(simulate_windows(windows, without.config), windows)[0, :, -1]
+    size = np.abs(final[:, STATE_NAMES.index(channels[0])])
+    return Where(channels, worst_regime(start_features(windows), size), lag, time, place)
+
+
+def estimate(scored: ScoredSearch, name: str) -> Estimate:
+    """A fitted number with its 90 % interval."""
+    settings, fit = scored.problem.settings.evidence, scored.fit
+    index = [f.name for f in fit.free].index(name)
+    free, z = fit.free[index], float(fit.z[index])
+    assert fit.covariance is not None
+    z90 = settings.interval_z
+    std_z = settings.interval_factor * math.sqrt(max(float(fit.covariance[index, index]), 0.0))
+    low, value, high = (float(free.value(np.array(z + k * std_z))) for k in (-z90, 0.0, z90))
+    margin = z90 * settings.min_relative_std * abs(value)
+    low = max(value - math.hypot(value - min(low, high), margin), free.low)
+    high = min(value + math.hypot(max(low, high) - value, margin), free.high)
+    return Estimate(value, (high - low) / (2 * z90), low, high, REGISTRY[name].unit)
+
+
+def base_estimates(scored: ScoredSearch) -> dict[str, Estimate]:
+    """Base parameters, fitted together with the accepted effects."""
+    return {f.name: estimate(scored, f.name) for f in scored.fit.free if not f.name.startswith("effects.")}
+
+
+def visibility(scored: ScoredSearch, effect: str) -> float:
+    """Share of an effect's influence on the errors that other parameters cannot imitate, in [0, 1]."""
+    free = scored.fit.free
+    fitter = scored.problem.fitter(scored.found.scale)
+    jacobian = fitter.linearised(scored.fit)[0].reshape(len(free), -1)
+    own = [k for k, f in enumerate(free) if f.name.startswith(f"effects.{effect}.")]
+    other = [k for k in range(len(free)) if k not in own]
+    basis, _ = np.linalg.qr(jacobian[other].T)
+    columns = jacobian[own]
+    projected = columns - (columns @ basis) @ basis.T
+    return float(np.linalg.norm(projected) / max(float(np.linalg.norm(columns)), 1e-12))
+
+
+def verdict_of(scored: ScoredSearch, has_unnamed: bool, data_faults: Sequence[DataFault]) -> Verdict:
+    """The verdict; ``has_unnamed``: whether anything is missing that has no name."""
+    if any(f.action.startswith("unusable") for f in data_faults):
+        return "data"
+    if scored.found.effects:
+        return "mismatch"
+    settings, problem = scored.problem.settings.evidence, scored.problem
+    score = scored.scores()
+    best = min(score["refit"], score["nominal"])  # with few recordings a refit may be worse than the car file
+    if (has_unnamed and best > settings.unexplained_score_min) or best > settings.unexplained_score_min_without_term:
+        return "unexplained"
+    nominal_loss = problem.fitter(scored.found.scale).loss(problem.nominal)
+    gain, spread = clustered_gain(nominal_loss, scored.found.base.loss, problem.windows)
+    is_significant = gain / spread > settings.parameter_z_min
+    is_large = gain > settings.parameter_gain_share * float(nominal_loss.sum())
+    lowers_score = score["refit"] < settings.parameter_score_ratio * score["nominal"]
+    return "parameters" if is_significant and is_large and lowers_score else "none"
+
+
+def unexplained_share(scored: ScoredSearch) -> float:
+    """Share of the refit's squared excess that stays with the accepted effects."""
+    score = scored.scores()
+    excess = score["refit"] ** 2 - 1.0
+    if excess <= scored.problem.settings.evidence.min_explained_excess:
+        return 0.0
+    return max(score["with_effects"] ** 2 - 1.0, 0.0) / excess
+
+
+__all__ = [
+    "ScoredSearch",
+    "Texts",
+    "base_estimates",
+    "effect_findings",
+    "score_ladder",
+    "unexplained_share",
+    "verdict_of",
+]

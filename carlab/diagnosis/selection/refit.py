@@ -1,0 +1,79 @@
+"""Joint refits: an effect is fitted together with the base parameters, which absorb most of any effect."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.fit import Fit, FitParameter, Scale
+from carlab.diagnosis.selection.problem import Candidate, Model, SearchProblem
+from carlab.diagnosis.selection.screening import ScreeningResult
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from sim_backends.car_parameters import SimulatorConfig
+
+
+def refit(problem: SearchProblem, effects: tuple[str, ...], initial: Fit, scale: Scale) -> Model:
+    """Fit with ``effects``, starting from the numbers that ``initial`` has of them."""
+    free = problem.free_parameters(effects)
+    known = {f.name: float(z) for f, z in zip(initial.free, initial.z, strict=True)}
+    start = np.array([known.get(f.name, 0.0) for f in free])
+    return Model(effects, problem.fitter(scale).fit(problem.config_with(effects), free, start), scale)
+
+
+def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningResult) -> Candidate:
+    """Fit the candidate together with ``model``, from the initial points of its screening."""
+    fitter = problem.fitter(model.scale)
+    effects = (*model.effects, screened.effect)
+    config, free = problem.config_with(effects), problem.free_parameters(effects)
+    starts = [np.concatenate([model.fit.z, s]) for s in screened.starts]
+    if len(starts) > 1:
+        iterations = problem.settings.selection.start_iterations
+        tries = [fitter.fit(config, free, s, iterations=iterations) for s in starts]
+        starts = [min(tries, key=lambda f: f.cost).z]
+    fit = fitter.fit(config, free, starts[0])
+    return Candidate(screened.effect, fit, model.fit.cost - fit.cost)
+
+
+def fit_with_scale(
+    problem: SearchProblem,
+    effects: tuple[str, ...],
+    config: SimulatorConfig,
+    free: tuple[FitParameter, ...],
+    start: FloatArray,
+) -> Model:
+    """Fit until the scale of the errors has converged with it."""
+    settings, identification = problem.settings.selection, problem.settings.identification
+    windows, floor = problem.windows, problem.floor
+    scale = Scale.of(
+        prediction_errors(simulate_windows(windows, config, _values(free, start)), windows)[0],
+        floor,
+        settings=identification,
+    )
+    for _ in range(settings.scale_iterations):
+        fit = problem.fitter(scale).fit(config, free, start)
+        start = fit.z
+        before, scale = (
+            scale,
+            Scale.of(
+                prediction_errors(simulate_windows(windows, fit.config), windows)[0], floor, settings=identification
+            ),
+        )
+        if np.abs(scale.sigma / before.sigma - 1.0).max() < settings.scale_change_max:
+            return Model(effects, fit, before)
+    return Model(effects, problem.fitter(scale).fit(config, free, start), scale)
+
+
+def fit_base(problem: SearchProblem) -> Model:
+    """Fit the base parameters alone."""
+    free = problem.free_parameters(())
+    return fit_with_scale(problem, (), problem.nominal, free, problem.nominal_coordinates(free))
+
+
+def _values(free: Sequence[FitParameter], z: FloatArray) -> dict[str, FloatArray]:
+    return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
+
+
+__all__ = ["fit_base", "fit_with_scale", "refit", "refit_candidate"]

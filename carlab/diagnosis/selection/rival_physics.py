@@ -1,0 +1,91 @@
+"""Uncatalogued physics as a rival of the names: a name is not given to what a rival explains as well.
+
+Rivals are fitted like any effect (``sim_backends.effects.uncatalogued``) but are never named. Where the recordings call
+for one of them, its class statement describes the residual.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+from carlab.diagnosis.identification.fit import Fit
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, SearchResult
+from carlab.diagnosis.selection.refit import refit, refit_candidate
+from carlab.diagnosis.selection.screening import screen_candidates
+from sim_backends.effects import EFFECTS
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RivalPhysics:
+    """Uncatalogued physics that a fit calls for.
+
+    effect   its id among the uncatalogued effects
+    fit      with it and with ``names`` of the catalogue
+    gain     fall of the cost by it
+    """
+
+    effect: str
+    fit: Fit
+    gain: float
+    names: tuple[str, ...] = ()
+
+    def class_statement(self) -> str:
+        """What kind of physics it is."""
+        return EFFECTS[self.effect].class_statement
+
+    def formula(self) -> str:
+        """Its numbers."""
+        values = self.fit.values()
+        numbers = ((p.name, values[f"effects.{self.effect}.{p.name}"], p.unit) for p in EFFECTS[self.effect].parameters)
+        return f"{self.effect}: " + ", ".join(f"{name} {value:.3g} {unit}".strip() for name, value, unit in numbers)
+
+
+def replacing_physics(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
+    """A rival that explains as much as all names together, or as one of two names; None where there is none."""
+    settings = problem.settings.rivals
+    names = found.effects
+    if not names or len(names) > 2 * settings.max_single_names or control.stop():
+        return None
+    design_effect = problem.fitter(found.scale).with_covariance(found.best).design_effect
+    single = names if 1 < len(names) <= settings.max_single_names else ()
+    for replaced in (names, *((name,) for name in single)):
+        kept = tuple(n for n in names if n not in replaced)
+        reduced = refit(problem, kept, found.best, found.scale)
+        numbers = sum(len(EFFECTS[n].parameters) for n in replaced)
+        min_score = settings.min_score_share * (reduced.fit.cost - found.best.cost)
+        for rival in _fitted_rivals(problem, reduced, min_score):
+            more_numbers = len(EFFECTS[rival.effect].parameters) - numbers
+            penalty = 0.5 * settings.chi2_per_number * design_effect * more_numbers
+            lead = found.best.cost - rival.fit.cost - penalty
+            log.info("%s replacing %s: leads by %.1f", rival.effect, ", ".join(replaced), lead)
+            if lead > 0.0:
+                return RivalPhysics(rival.effect, rival.fit, rival.gain, kept)
+    return None
+
+
+def additional_physics(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
+    """The rival that the fit with all names still calls for; None where there is none."""
+    if control.stop():
+        return None
+    chi2_min = problem.settings.rivals.additional_chi2_min
+    design_effect = problem.fitter(found.scale).with_covariance(found.best).design_effect
+    min_gain = 0.5 * chi2_min * design_effect
+    model = found.model if found.effects else refit(problem, (), found.base, found.scale)
+    best = max(_fitted_rivals(problem, model, min_gain), key=lambda c: c.gain, default=None)
+    if best is None or best.gain < min_gain:
+        return None
+    log.info("%s in addition: gain %.1f", best.effect, best.gain)
+    return RivalPhysics(best.effect, best.fit, best.gain, found.effects)
+
+
+def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float) -> list[Candidate]:
+    """Rivals added to ``model`` whose screening scores are above ``min_score``, fitted, the best first."""
+    names = [e.id for e in EFFECTS.values() if not e.catalogued and e.id not in problem.nominal.effects]
+    screened = [result for result in screen_candidates(problem, model, names) if result.score > min_score]
+    return [refit_candidate(problem, model, result) for result in screened[: problem.settings.rivals.max_refits]]
+
+
+__all__ = ["RivalPhysics", "additional_physics", "replacing_physics"]

@@ -1,0 +1,193 @@
+"""Score test of every candidate effect before it is fitted, with the present parameters projected out.
+
+The error changes by a secant g when a candidate is switched on at some size. The Jacobian of the parameters that are
+already free is projected out of it, as in a score test (Rao 1948). The sizes are finite because a dead band or a
+clipped force has no slope at its identity. They are chosen by the change of the errors that they cause, so that
+nothing depends on a guess of an effect's usual size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.fit import Fit, FitParameter, Fitter, effect_parameters, with_effect
+from carlab.diagnosis.selection.problem import Model, SearchProblem
+from carlab.diagnosis.settings import DEFAULT, ScreeningSettings
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS
+
+
+@dataclass(frozen=True, slots=True)
+class ScreeningResult:
+    """A candidate's screening score and initial points.
+
+    score           predicted fall of the loss over all windows
+    starts  (k, n)  coordinates to start its fit from, the best first
+    """
+
+    effect: str
+    score: float
+    starts: FloatArray
+
+
+class Screen:
+    """Screens candidates that are added to the fit ``best`` of ``config``.
+
+    Args:
+        fitter: windows and scale.
+        config: simulator with the effects of ``best`` switched on.
+        best: the present fit.
+        max_windows: windows that are used, evenly taken; scores refer to all windows. All unless given.
+        settings: of the screening.
+    """
+
+    def __init__(
+        self,
+        fitter: Fitter,
+        config: SimulatorConfig,
+        best: Fit,
+        max_windows: int | None = None,
+        settings: ScreeningSettings = DEFAULT.screening,
+    ) -> None:
+        count = len(fitter.windows)
+        if max_windows is not None:
+            fitter = Fitter(fitter.windows.thinned(max_windows), fitter.scale, fitter.settings)
+        self.settings = settings
+        self.share = len(fitter.windows) / count
+        self.fitter = fitter
+        self.config = config
+        self.best = best
+        slopes, white = fitter.linearised(best)
+        self.white = white.reshape(-1)
+        self.weight = np.sqrt(np.minimum(1.0, fitter.settings.huber_delta / np.maximum(np.abs(self.white), 1e-12)))
+        jacobian = (slopes.reshape(len(best.free), len(self.white)) * self.weight).T
+        prior = np.diag([1.0 / f.prior_z for f in best.free])
+        basis, _ = np.linalg.qr(np.vstack([jacobian, prior]))
+        self._inside = basis[: len(self.white)]
+        self.residual = self.projected(self.white)
+
+    def projected(self, change: FloatArray) -> FloatArray:
+        """A change of the whitened errors (S, U, 6), flat, with the span of the free parameters projected out."""
+        weighted = self.weight * change.reshape(-1)
+        return np.asarray(weighted - self._inside @ (self._inside.T @ weighted))
+
+    def score(self, effect: str, free: Sequence[FitParameter]) -> ScreeningResult:
+        """Score of a candidate, the largest over its sizes, signs and places."""
+        settings = self.settings
+        config = with_effect(self.config, effect)
+        points = self._points(config, effect, tuple(free))
+        gains = np.full(len(points), -math.inf)
+        along = np.zeros(len(points))
+        for part in np.array_split(np.arange(len(points)), max(1, math.ceil(len(points) / settings.batch_size))):
+            for k, moved in zip(part, self._moved(config, tuple(free), points[part]), strict=True):
+                gains[k], along[k] = self.gain(moved)
+        order = np.argsort(-gains)[: settings.max_starts]
+        order = order[gains[order] >= settings.min_start_score_share * gains[order[0]]]
+        scalable = np.array([not f.logarithmic and not f.choice for f in free])
+        if (scaled := EFFECTS[effect].screening_scaled) is not None:
+            scalable = np.array([f.name.rpartition(".")[2] in scaled for f in free])
+        factor = np.clip(along[order], *settings.step_range)[:, None]
+        starts = np.where(scalable, points[order] * factor, points[order])
+        return ScreeningResult(effect, float(gains[order[0]]) / self.share, starts)
+
+    def gain(self, moved: FloatArray) -> tuple[float, float]:
+        """Fall of the loss along the secant to the whitened errors ``moved`` (S, U, 6), and the best step along it."""
+        limit = self.settings.max_whitened_change
+        secant = self.projected(np.clip(moved.reshape(-1) - self.white, -limit, limit))
+        size = float(secant @ secant)
+        slope = -float(secant @ self.residual)
+        along = min(max(slope / max(size, 1e-12), 0.0), self.settings.max_step)
+        return along * slope - 0.5 * along**2 * size, along
+
+    def _moved(self, config: SimulatorConfig, free: tuple[FitParameter, ...], points: FloatArray) -> FloatArray:
+        full = np.hstack([np.tile(self.best.z, (len(points), 1)), points])
+        return self.fitter.white(config, (*self.best.free, *free), full)
+
+    def _points(self, config: SimulatorConfig, effect: str, free: tuple[FitParameter, ...]) -> FloatArray:
+        """Coordinates (P, n) at which the candidate is tried."""
+        own = EFFECTS[effect].screening_points(_Probe(self, config, free))
+        if own is not None:
+            return own
+        if len(free) == 1 and not free[0].logarithmic:
+            return self.sized(config, free, np.array([[1.0], [-1.0]] if free[0].low < free[0].origin else [[1.0]]))
+        grids = np.meshgrid(*(_grid(f, self.settings) for f in free), indexing="ij")
+        return np.stack([g.ravel() for g in grids], axis=1)
+
+    def sized(
+        self,
+        config: SimulatorConfig,
+        free: tuple[FitParameter, ...],
+        directions: FloatArray,
+        held: tuple[int, ...] = (),
+    ) -> FloatArray:
+        """Directions (D, n) scaled to the settings' changes of the errors; coordinates in ``held`` are not scaled."""
+        settings = self.settings
+        scale = np.ones(len(free))
+        moving = [k for k in range(len(free)) if k not in held]
+        probe = directions.copy()
+        probe[:, moving] *= settings.probe_size
+        points = []
+        for direction, moved in zip(directions, self._moved(config, free, probe), strict=True):
+            limit = settings.max_whitened_change
+            change = np.clip(moved.reshape(-1) - self.white, -limit, limit)
+            unit = settings.probe_size / max(float(np.sqrt(np.mean(change**2))), 1e-3 * settings.probe_size)
+            for size in settings.error_rms_changes:
+                point = direction * scale
+                point[moving] *= size * unit
+                low = np.array([f.coordinate(f.low) for f in free])
+                high = np.array([f.coordinate(f.high) for f in free])
+                points.append(np.clip(point, np.minimum(low, high), np.maximum(low, high)))
+        return np.array(points)
+
+
+def _grid(free: FitParameter, settings: ScreeningSettings) -> FloatArray:
+    if free.logarithmic:
+        return np.array([math.log(r) / free.size for r in settings.typical_size_ratios])
+    if free.choice:
+        return np.arange(free.low, free.high + 1.0)
+    signs = (1.0, -1.0) if free.low < free.origin else (1.0,)
+    return np.array([s * sign for s in (0.3, 1.0, 3.0) for sign in signs])
+
+
+class _Probe:
+    """A screen as effects see it (``ScreeningProbe``): in the effect's own numbers instead of coordinates."""
+
+    def __init__(self, screen: Screen, config: SimulatorConfig, free: tuple[FitParameter, ...]) -> None:
+        self._screen, self._config, self._free = screen, config, free
+        self._names = [f.name.rpartition(".")[2] for f in free]
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        return self._screen.best.config.values()
+
+    @property
+    def path_m(self) -> FloatArray:
+        return self._screen.fitter.windows.measured[:, :, :2].reshape(-1, 2)
+
+    def points(self, rows: Iterable[Mapping[str, float]]) -> FloatArray:
+        pairs = list(zip(self._names, self._free, strict=True))
+        return np.array([[f.coordinate(float(row[name])) for name, f in pairs] for row in rows])
+
+    def sized(self, directions: Iterable[Mapping[str, float]], held: Sequence[str] = ()) -> list[dict[str, float]]:
+        pairs = list(zip(self._names, self._free, strict=True))
+        steps = [[f.coordinate(row[name]) if name in held else row[name] for name, f in pairs] for row in directions]
+        still = tuple(k for k, name in enumerate(self._names) if name in held)
+        sized = self._screen.sized(self._config, self._free, np.array(steps), still)
+        return [{name: float(f.value(np.array(z))) for (name, f), z in zip(pairs, p, strict=True)} for p in sized]
+
+
+def screen_candidates(problem: SearchProblem, model: Model, names: Sequence[str]) -> tuple[ScreeningResult, ...]:
+    """Screening scores of effects added to a model, the highest first."""
+    settings = problem.settings.screening
+    fitter = problem.fitter(model.scale)
+    screen = Screen(fitter, problem.config_with(model.effects), model.fit, settings.max_windows, settings)
+    scored = [screen.score(name, effect_parameters(name, problem.nominal)) for name in names]
+    return tuple(sorted(scored, key=lambda result: -result.score))
+
+
+__all__ = ["Screen", "ScreeningResult", "screen_candidates"]

@@ -1,0 +1,1 @@
+"""Description of the residual that no effect of the catalogue explains."""

@@ -1,0 +1,244 @@
+"""The residual when every accepted effect is in: its channel, its regime, its class, and a formula.
+
+Terms of a library with physical meaning are added one by one to the acceleration of a channel, each by its effect on
+the errors of whole windows with the free parameters following (forward selection, as in discrepancy modelling with
+sparse regression; Brunton et al. 2016, Kaheman et al. 2019). The inputs of the chosen terms make the class statement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.findings import Unexplained
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.selection.screening import Screen
+from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
+from carlab.diagnosis.unexplained.residual_terms import TERMS, Term, responses
+from carlab.prediction.windows import PredictionWindows
+from sim_backends.car_parameters import SimulatorConfig
+
+_ACTS_ON = (
+    ("vx", "dvx/dt"),
+    ("vy", "dvy/dt"),
+    ("yaw_rate", "dr/dt"),
+    ("vy and yaw_rate, like a side force of the front axle", "F_front/m"),
+    ("vy and yaw_rate, like a side force of the rear axle", "F_rear/m"),
+)
+"""What a term may act on, in words and symbols; forces are in m/s2 of the whole car's mass."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenTerm:
+    """One term with what it acts on (its number in ``_ACTS_ON``), its coefficient and its gain in likelihood."""
+
+    term: Term
+    channel: int
+    coefficient: float
+    gain: float
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualModel:
+    """Terms without a name that a fit calls for.
+
+    fall  (6,)  fall of the mean squared error at the ends of windows that they predict, in squared units
+    """
+
+    chosen: tuple[ChosenTerm, ...]
+    fall: FloatArray = field(default_factory=lambda: np.zeros(6))
+
+    @property
+    def gain(self) -> float:
+        """Fall of the loss by all terms."""
+        return sum(c.gain for c in self.chosen)
+
+    def class_statement(self) -> str:
+        """What kind of physics is missing."""
+        if not self.chosen:
+            return "no term of the library explains it: like noise, vibration (oscillating), or a hidden state"
+        parts: list[str] = []
+        for c in self.chosen:
+            text = f"{c.term.statement}; acts on {_ACTS_ON[c.channel][0]}"
+            if text not in parts:
+                parts.append(text)
+        return ". ".join(parts)
+
+    def formula(self) -> str:
+        """Missing accelerations in SI units; steering d and throttle u in [-1, 1] as they act, r the yaw rate."""
+        rows = []
+        for channel, (_, symbol) in enumerate(_ACTS_ON):
+            own = [c for c in self.chosen if c.channel == channel]
+            if own:
+                rows.append(f"{symbol} += " + " ".join(f"{c.coefficient:+.3g} {c.term.formula}" for c in own))
+        return "; ".join(rows)
+
+
+@dataclass(frozen=True, slots=True)
+class _Library:
+    """Unit columns (N, S U 6) of the terms by what they act on, projected, with their terms, channels and lengths."""
+
+    columns: FloatArray
+    labels: tuple[tuple[Term, int, float], ...]
+
+
+def fit_residual_terms(
+    windows: PredictionWindows,
+    fit: Fit,
+    scale: Scale,
+    term_chi2_min: float | None = None,
+    settings: UnexplainedSettings = DEFAULT.unexplained,
+) -> ResidualModel:
+    """Forward selection of unnamed terms in addition to everything that ``fit`` has.
+
+    Args:
+        windows: that were fitted.
+        fit: with its accepted effects.
+        scale: of the errors.
+        term_chi2_min: least chi2 of a term; that of the settings unless given.
+        settings: of the selection.
+    """
+    fitter = Fitter(windows, scale)
+    screen = Screen(fitter, fit.config, fit)
+    design_effect = fitter.with_covariance(fit).design_effect
+    library = _library(windows, fit, scale, screen, settings)
+    if library is None:
+        return ResidualModel(())
+    min_gain = settings.term_chi2_min if term_chi2_min is None else term_chi2_min
+    picked, gains = _select(library, screen.residual, min_gain, design_effect, settings)
+    if not picked:
+        return ResidualModel(())
+    columns, labels = library.columns, library.labels
+    numbers = -np.linalg.lstsq(columns[picked].T, screen.residual, rcond=None)[0]
+    chosen = tuple(
+        ChosenTerm(labels[k][0], labels[k][1], float(n / labels[k][2]), g)
+        for k, n, g in zip(picked, numbers, gains, strict=True)
+    )
+    shape = (len(windows), -1, 6)
+    before, change = screen.residual.reshape(shape)[:, -1], (numbers @ columns[picked]).reshape(shape)[:, -1]
+    return ResidualModel(chosen, np.mean(before**2 - (before + change) ** 2, axis=0) * scale.sigma[-1] ** 2)
+
+
+def _library(
+    windows: PredictionWindows, fit: Fit, scale: Scale, screen: Screen, settings: UnexplainedSettings
+) -> _Library | None:
+    """Columns of all terms that change the errors; None where there are none."""
+    response = responses(windows, fit.config, scale, settings)
+    arms = _arms(fit.config)
+    columns, labels = [], []
+    for term in TERMS:
+        vx, vy, rate = (screen.projected(response.of(term, k)) for k in range(3))
+        for channel, column in enumerate((vx, vy, rate, *(vy + arm * rate for arm in arms))):
+            size = float(np.linalg.norm(column))
+            if size > 1e-6:
+                columns.append(column / size)
+                labels.append((term, channel, size))
+    return _Library(np.stack(columns), tuple(labels)) if columns else None
+
+
+def _select(
+    library: _Library, residual: FloatArray, chi2_min: float, design_effect: float, settings: UnexplainedSettings
+) -> tuple[list[int], list[float]]:
+    """Columns that are chosen one after the other by orthogonal projection, and their gains."""
+    design, labels = library.columns, library.labels
+    picked: list[int] = []
+    gains: list[float] = []
+    basis = np.zeros((0, design.shape[1]))
+    for _ in range(settings.max_terms):
+        projected = design - (design @ basis.T) @ basis
+        length = np.linalg.norm(projected, axis=1)
+        score = np.where(length > 0.1, 0.5 * (projected @ residual / np.maximum(length, 0.1)) ** 2, 0.0)
+        best = float(score.max())
+        if 2.0 * best / design_effect < chi2_min or (gains and best < settings.next_term_share * gains[0]):
+            break
+        nearly_best = np.flatnonzero(score > settings.simplest_gain_share * best)
+        k = int(min(nearly_best, key=lambda i: (len(labels[i][0].inputs), i)))
+        axis = projected[k] / length[k]
+        basis = np.vstack([basis, axis])
+        residual = residual - axis * float(axis @ residual)
+        picked.append(k)
+        gains.append(float(score[k]))
+    return picked, gains
+
+
+def _arms(config: SimulatorConfig) -> tuple[float, float]:
+    """Yaw acceleration [rad/s2] by a side force of the front and of the rear axle that gives 1 m/s2."""
+    values = config.values()
+    per_inertia = values["vehicle.mass"] / values["vehicle.yaw_inertia"]
+    return per_inertia * values["vehicle.front_axle"], -per_inertia * values["vehicle.rear_axle"]
+
+
+def describe(
+    share: float, statement: str, formula: str, of_channel: FloatArray, size: FloatArray, seen: dict[str, FloatArray]
+) -> Unexplained:
+    """The report's entry of what stays unexplained.
+
+    Args:
+        share: of the squared excess.
+        statement: what kind of physics is missing.
+        formula: of the missing accelerations.
+        of_channel: how much is missing in each channel (6,), in squared noise floors.
+        size: of each held-out window's error (S,).
+        seen: features at the starts of the held-out windows, each (S,).
+    """
+    order = np.argsort(-of_channel)
+    channels = tuple(STATE_NAMES[k] for k in order if of_channel[k] > 0.5 * of_channel[order[0]])
+    return Unexplained(share, channels, worst_regime(seen, size), statement, formula)
+
+
+def start_features(windows: PredictionWindows) -> dict[str, FloatArray]:
+    """Speeds, yaw rate, commands and their rates, place and time at the start of each window (S,)."""
+    past = windows.past_commands[:, -max(round(0.1 / windows.period_s), 2) :]
+    span = past.shape[1] * windows.period_s
+    return {
+        "v": windows.initial_states[:, 3],
+        "w": windows.initial_states[:, 4],
+        "r": windows.initial_states[:, 5],
+        "d": past[:, :, 0].mean(axis=1),
+        "u": past[:, :, 1].mean(axis=1),
+        "dd": (past[:, -1, 0] - past[:, 0, 0]) / span,
+        "du": (past[:, -1, 1] - past[:, 0, 1]) / span,
+        "t": windows.t0_s / max(float(windows.t0_s.max()), 1.0),
+    }
+
+
+REGIMES: tuple[tuple[str, str, Callable[[dict[str, FloatArray]], FloatArray]], ...] = (
+    ("speed", "m/s", lambda f: np.abs(f["v"])),
+    ("|steering|", "", lambda f: np.abs(f["d"])),
+    ("|steering rate|", "/s", lambda f: np.abs(f["dd"])),
+    ("|throttle|", "", lambda f: np.abs(f["u"])),
+    ("|throttle rate|", "/s", lambda f: np.abs(f["du"])),
+    ("lateral acceleration", "m/s2", lambda f: np.abs(f["v"] * f["r"])),
+    ("time", "of the recording", lambda f: f["t"]),
+)
+
+
+def worst_regime(
+    seen: dict[str, FloatArray], size: FloatArray, settings: UnexplainedSettings = DEFAULT.unexplained
+) -> str:
+    """The feature whose upper third has the largest errors, as a rule such as ``speed > 2 m/s``."""
+    best, text = 1.0, "everywhere alike"
+    for name, unit, value in REGIMES:
+        feature = value(seen)
+        limit = float(np.quantile(feature, settings.regime_quantile))
+        high, low = size[feature > limit], size[feature <= limit]
+        if min(len(high), len(low)) < settings.regime_windows_min:
+            continue
+        ratio = float(np.sqrt(np.mean(high**2)) / (np.sqrt(np.mean(low**2)) + 1e-9))
+        if ratio > max(best, settings.regime_ratio_min):
+            best, text = ratio, f"{name} > {limit:.2g} {unit}".strip()
+    return text
+
+
+__all__ = [
+    "REGIMES",
+    "ChosenTerm",
+    "ResidualModel",
+    "describe",
+    "fit_residual_terms",
+    "start_features",
+    "worst_regime",
+]

@@ -1,0 +1,224 @@
+"""A library of accelerations without a name, and the change of the errors of whole windows by each of them.
+
+A missing acceleration g(t) on a channel changes the error at the end of a window by the sum of its impulses, each
+carried on by the simulator. Impulse responses are computed by restarts of the simulator within the windows. Each term
+then costs a matrix product (a linear response, as in the adjoint method of discrepancy modelling).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.fit import Scale
+from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import PredictionWindows
+from sim_backends.car_parameters import SimulatorConfig
+
+Features = dict[str, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A term of the library: formula in plain symbols, its class statement, what it depends on, and its value."""
+
+    formula: str
+    statement: str
+    inputs: tuple[str, ...]
+    value: Callable[[Features], FloatArray]
+
+
+def _harmonic(axis: str, length_m: float, phase: str) -> Term:
+    wave = np.cos if phase == "cos" else np.sin
+    return Term(
+        f"{phase}(2 pi {axis} / {length_m:g} m)",
+        f"depends on the place (position), repeating every {length_m:g} m",
+        ("place",),
+        lambda f: np.asarray(wave(2.0 * np.pi * f[axis] / length_m)),
+    )
+
+
+def _stepped(name: str, symbol: str, period: float) -> Term:
+    return Term(
+        f"sin(2 pi {symbol} / {period:.3g})",
+        f"repeats with the {name} in steps of about {period:.2g} of its range, as if the {name} were quantised",
+        (name, "steps"),
+        lambda f: np.asarray(np.sin(2.0 * np.pi * f[symbol] / period)),
+    )
+
+
+STEP_SHARES = tuple(float(p) for p in np.geomspace(0.05, 0.8, 22))
+"""Steps of quantised commands, as shares of their range."""
+WAVELENGTHS_M = (0.4, 0.5, 0.64, 0.8, 1.0, 1.3, 1.7, 2.2)
+"""Wavelengths [m] of terms that repeat with the place."""
+TERMS: tuple[Term, ...] = (
+    Term("1", "constant: a bias whatever the car does", ("bias",), lambda f: np.ones_like(f["v"])),
+    Term("sign(v)", "odd in speed and independent of its size, like dry friction", ("speed",),
+         lambda f: np.tanh(f["v"] / 0.05)),
+    Term("v", "odd in speed, proportional to it", ("speed",), lambda f: f["v"]),
+    Term("v |v|", "odd in speed, grows with speed squared", ("speed",), lambda f: f["v"] * np.abs(f["v"])),
+    Term("v^2", "even in speed, grows with speed squared", ("speed",), lambda f: f["v"] ** 2),
+    Term("u", "odd in throttle: a gain of the drive", ("throttle",), lambda f: f["u"]),
+    Term("|u|", "even in throttle", ("throttle",), lambda f: np.abs(f["u"])),
+    Term("u |u|", "odd in throttle, grows faster than it", ("throttle",), lambda f: f["u"] * np.abs(f["u"])),
+    Term("u |v|", "odd in throttle, grows with speed", ("throttle", "speed"), lambda f: f["u"] * np.abs(f["v"])),
+    Term("d", "odd in steering", ("steering",), lambda f: f["d"]),
+    Term("|d|", "even in steering", ("steering",), lambda f: np.abs(f["d"])),
+    Term("d^3", "odd in steering, grows faster than it", ("steering",), lambda f: f["d"] ** 3),
+    Term("d |v|", "odd in steering, grows with speed", ("steering", "speed"), lambda f: f["d"] * np.abs(f["v"])),
+    Term("d v^2", "odd in steering, grows with speed squared", ("steering", "speed"), lambda f: f["d"] * f["v"] ** 2),
+    Term("|d| v", "even in steering, grows with speed", ("steering", "speed"), lambda f: np.abs(f["d"]) * f["v"]),
+    Term("|d| v^2", "even in steering, grows with speed squared", ("steering", "speed"),
+         lambda f: np.abs(f["d"]) * f["v"] * np.abs(f["v"])),
+    Term("d u", "odd in steering and in throttle", ("steering", "throttle"), lambda f: f["d"] * f["u"]),
+    Term("r", "odd in the yaw rate", ("yaw rate",), lambda f: f["r"]),
+    Term("|r| v", "even in turning, grows with lateral acceleration", ("lateral acceleration",),
+         lambda f: np.abs(f["r"]) * f["v"]),
+    Term("r v", "odd in turning, grows with lateral acceleration", ("lateral acceleration",),
+         lambda f: f["r"] * f["v"]),
+    Term("(r v)^3", "odd in turning, grows fast with lateral acceleration", ("lateral acceleration",),
+         lambda f: (f["r"] * f["v"] / 5.0) ** 3),
+    Term("r / v", "odd in the path's curvature and independent of speed", ("yaw rate", "curvature"),
+         lambda f: np.tanh(f["r"] / np.maximum(np.abs(f["v"]), 0.3))),
+    Term("w", "odd in side slip (lateral velocity)", ("side slip",), lambda f: f["w"]),
+    Term("w |w|", "odd in side slip (lateral velocity), grows faster than it", ("side slip",),
+         lambda f: f["w"] * np.abs(f["w"])),
+    Term("cos(yaw)", "depends on the heading, a direction of the world", ("heading",), lambda f: np.cos(f["yaw"])),
+    Term("sin(yaw)", "depends on the heading, a direction of the world", ("heading",), lambda f: np.sin(f["yaw"])),
+    Term("v cos(yaw)", "depends on the heading, a direction of the world, and grows with speed",
+         ("heading", "speed"), lambda f: np.abs(f["v"]) * np.cos(f["yaw"])),
+    Term("v sin(yaw)", "depends on the heading, a direction of the world, and grows with speed",
+         ("heading", "speed"), lambda f: np.abs(f["v"]) * np.sin(f["yaw"])),
+    Term("x", "depends on the place (position)", ("place",), lambda f: f["x"]),
+    Term("y", "depends on the place (position)", ("place",), lambda f: f["y"]),
+    Term("x cos(yaw) + y sin(yaw)", "pulls towards a place (position)", ("place", "heading"),
+         lambda f: f["x"] * np.cos(f["yaw"]) + f["y"] * np.sin(f["yaw"])),
+    Term("y cos(yaw) - x sin(yaw)", "pulls towards a place (position)", ("place", "heading"),
+         lambda f: f["y"] * np.cos(f["yaw"]) - f["x"] * np.sin(f["yaw"])),
+    *(_harmonic(axis, length, phase) for length in WAVELENGTHS_M for axis in ("x", "y") for phase in ("cos", "sin")),
+    Term("t", "drifts with time", ("time",), lambda f: f["t"]),
+    Term("t v", "a resistance that drifts with time", ("time", "speed"), lambda f: f["t"] * f["v"]),
+    Term("t u", "a throttle whose effect drifts with time", ("time", "throttle"), lambda f: f["t"] * f["u"]),
+    Term("t d", "a steering whose effect drifts with time", ("time", "steering"), lambda f: f["t"] * f["d"]),
+    Term("t r v", "a lateral grip that drifts with time", ("time", "lateral acceleration"),
+         lambda f: f["t"] * f["r"] * f["v"]),
+    Term("du/dt", "follows the rate of throttle: a lag, delay or hysteresis (a state with history)",
+         ("throttle", "history"), lambda f: f["du"]),
+    Term("du/dt |u|", "follows the rate of throttle and its size: a state with history", ("throttle", "history"),
+         lambda f: f["du"] * np.abs(f["u"])),
+    Term("u - u before", "depends on where the throttle was: a lag or hysteresis (a state with history)",
+         ("throttle", "history"), lambda f: f["u"] - f["u before"]),
+    Term("dd/dt", "follows the rate of steering: a lag, delay or hysteresis (a state with history)",
+         ("steering", "history"), lambda f: f["dd"]),
+    Term("v dd/dt", "follows the rate of steering times speed: a lag, delay or hysteresis (a state with history)",
+         ("steering", "speed", "history"), lambda f: f["dd"] * f["v"]),
+    Term("d - d before", "depends on where the steering was: a lag or hysteresis (a state with history)",
+         ("steering", "history"), lambda f: f["d"] - f["d before"]),
+    Term("|u| dd/dt", "follows the rate of steering where there is throttle: a lag (a state with history)",
+         ("steering", "throttle", "history"), lambda f: f["dd"] * np.abs(f["u"])),
+    *(_stepped("steering", "d", p) for p in STEP_SHARES),
+    *(_stepped("throttle", "u", p) for p in STEP_SHARES),
+    Term("grip work", "depends on the work that the tyres have done before: a slow state (history), like warming",
+         ("history", "lateral acceleration"), lambda f: f["work"] * f["r"] * f["v"]),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Responses:
+    """Changes of the whitened errors by impulses: matrix (3, J, S, U, 6) per unit of velocity; features (S, J) each.
+
+    ``span_s`` is the time that each impulse stands for.
+    """
+
+    matrix: FloatArray
+    features: Features
+    span_s: float
+
+    def of(self, term: Term, channel: int) -> FloatArray:
+        """Change of the whitened errors (S, U, 6) by one unit of a term as acceleration on vx, vy or yaw rate."""
+        value = term.value(self.features) * self.span_s
+        return np.asarray(np.einsum("sj,jsuc->suc", value, self.matrix[channel]))
+
+
+def responses(
+    windows: PredictionWindows,
+    config: SimulatorConfig,
+    scale: Scale,
+    settings: UnexplainedSettings = DEFAULT.unexplained,
+) -> Responses:
+    """Impulse responses of ``config`` along its own predictions of windows, from the middle of each span of time."""
+    predicted = simulate_windows(windows, config)[0]
+    impulses = settings.impulse_sizes
+    every = max(windows.steps // settings.impulses, 1)
+    begins = np.arange(every // 2, windows.steps, every)
+    sin, cos = np.sin(windows.initial_states[:, 2]), np.cos(windows.initial_states[:, 2])
+    matrix = np.zeros((3, len(begins), len(windows), len(scale.steps), 6))
+    for j, begin in enumerate(begins):
+        outs = []
+        for which in (None, 0, 1, 2):
+            start = predicted[:, begin].copy()
+            if which is not None:
+                start[:, 3 + which] += impulses[which]
+            outs.append(simulate_windows(_remainder(windows, predicted, int(begin), start), config)[0])
+        later = scale.steps > begin
+        for which in range(3):
+            change = (outs[1 + which] - outs[0])[:, scale.steps[later] - begin] / impulses[which]
+            dx, dy = change[..., 0].copy(), change[..., 1].copy()
+            change[..., 0] = cos[:, None] * dx + sin[:, None] * dy
+            change[..., 1] = cos[:, None] * dy - sin[:, None] * dx
+            matrix[which, j][:, later] = change / scale.sigma[later]
+    matrix = np.nan_to_num(matrix.clip(-1e3, 1e3))
+    return Responses(matrix, features(windows, predicted, config, begins), every * windows.period_s)
+
+
+def _remainder(windows: PredictionWindows, predicted: FloatArray, begin: int, start: FloatArray) -> PredictionWindows:
+    """The windows from step ``begin`` on, from the states ``start`` (S, 6)."""
+    past = windows.past_commands.shape[1]
+    commands = np.concatenate([windows.past_commands, windows.commands], axis=1)
+    before = np.concatenate([windows.past_states, predicted[:, :begin]], axis=1)
+    return replace(
+        windows,
+        initial_states=start,
+        past_commands=commands[:, begin : begin + past],
+        commands=windows.commands[:, begin:],
+        measured=windows.measured[:, begin:],
+        past_states=before[:, -past:],
+        t0_s=windows.t0_s + begin * windows.period_s,
+    )
+
+
+def features(windows: PredictionWindows, predicted: FloatArray, config: SimulatorConfig, at: np.ndarray) -> Features:
+    """Inputs of the terms, each (S, J) at steps ``at`` (J,): commands as they act, motion, place and time."""
+    period_s, past = windows.period_s, windows.past_commands.shape[1]
+    commands = np.concatenate([windows.past_commands, windows.commands], axis=1)
+    age_s = config.command_delay_s + config.mocap.latency_s
+    now = past + at - round(age_s / period_s)
+    back = max(round(0.1 / period_s), 1)
+    earlier = np.clip(now - back, 0, None)
+    long_ago = np.clip(now - 3 * back, 0, None)
+    state = predicted[:, at]
+    span = (np.clip(now, 0, None) - earlier) * period_s
+    work = np.abs(windows.past_states[:, :, 5] * windows.past_states[:, :, 3]).mean(axis=1) / 3.0
+    return {
+        "v": state[:, :, 3],
+        "w": state[:, :, 4],
+        "r": state[:, :, 5],
+        "d": commands[:, np.clip(now, 0, None), 0],
+        "u": commands[:, np.clip(now, 0, None), 1],
+        "d before": commands[:, long_ago, 0],
+        "u before": commands[:, long_ago, 1],
+        "dd": (commands[:, np.clip(now, 0, None), 0] - commands[:, earlier, 0]) / np.maximum(span, period_s),
+        "du": (commands[:, np.clip(now, 0, None), 1] - commands[:, earlier, 1]) / np.maximum(span, period_s),
+        "yaw": state[:, :, 2],
+        "x": state[:, :, 0],
+        "y": state[:, :, 1],
+        "t": (windows.t0_s[:, None] + at * period_s) / max(float(windows.t0_s.max()), 1.0),
+        "work": np.tile(work[:, None], (1, len(at))),
+    }
+
+
+__all__ = ["TERMS", "Responses", "Term", "features", "responses"]

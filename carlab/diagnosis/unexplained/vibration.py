@@ -1,0 +1,99 @@
+"""Vibration that turns with the wheels: a spectral line of the local cubic's residual over the distance travelled.
+
+An unbalanced or bent wheel shakes the car once per turn, harder the faster it turns. Its frequency varies with the
+speed in time; over the distance travelled it is one line (order tracking of rotating machines). The line must be
+stronger than any line over time: vibration of a fixed frequency is no wheel. The powers of blocks of a few seconds are
+added without phase, because the distance over a whole recording is not known to a fraction of a turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import gamma
+
+from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
+from carlab.prediction.windows import Track
+
+PERIODS_PER_M = np.arange(1.0, 12.0, 0.05)
+"""Lines over the distance travelled [1/m]: wheels of 13 to 160 mm radius."""
+FREQUENCIES_HZ = np.arange(1.0, 25.0, 0.1)
+"""Lines over time [Hz] that a wheel's line must exceed, up to half the rate of the recording."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vibration:
+    """A line in x, y, yaw, vx, vy, yaw rate.
+
+    periods_per_m     its position
+    amplitude   (6,)  at the median speed, in the channel's unit; a lower bound
+    ratio       (6,)  power over the mean power of all lines
+    min_ratio         ratio at which a channel counts as vibrating
+    """
+
+    periods_per_m: float
+    amplitude: FloatArray
+    ratio: FloatArray
+    min_ratio: float
+
+    def class_statement(self) -> str:
+        """What kind of physics it is."""
+        radius_mm = 1e3 / (2.0 * np.pi * self.periods_per_m)
+        channels = [STATE_NAMES[k] for k in (5, 4, 3, 2) if self.ratio[k] > self.min_ratio]
+        return (
+            f"vibration in {', '.join(channels)}: {self.periods_per_m:.3g} periods per metre travelled, and harder "
+            f"at speed, as an unbalanced or bent wheel of {radius_mm:.0f} mm radius would shake the car"
+        )
+
+    def formula(self) -> str:
+        """The strongest line in SI units; s is the distance travelled."""
+        k = 3 + int(np.argmax(self.ratio[3:]))
+        return f"{STATE_NAMES[k]} += {self.amplitude[k]:.2g} sin(2 pi s / {1.0 / self.periods_per_m:.3g} m)"
+
+
+def find_vibration(tracks: Sequence[Track], settings: UnexplainedSettings = DEFAULT.unexplained) -> Vibration | None:
+    """The strongest line in yaw, vx, vy or yaw rate; None where none is significant."""
+    power, strength, by_time = (np.zeros((6, n)) for n in (len(PERIODS_PER_M), len(PERIODS_PER_M), len(FREQUENCIES_HZ)))
+    blocks = 0
+    for track in tracks:
+        spread = 1.4826 * np.median(np.abs(track.residual), axis=0)
+        residual = np.clip(track.residual, -settings.vibration_max_z * spread, settings.vibration_max_z * spread)
+        distance_m = np.cumsum(track.speed) * track.sampled_s
+        length = max(round(settings.vibration_block_s / track.sampled_s), 2)
+        in_time = _lines(
+            np.where(0.5 / track.sampled_s > FREQUENCIES_HZ, FREQUENCIES_HZ, 0.0),
+            track.sampled_s * np.arange(float(length)),
+        )
+        for first in range(0, len(distance_m) - length + 1, length):
+            block = slice(first, first + length)
+            if track.speed[block].mean() < settings.vibration_speed_min_mps:
+                continue
+            weighted = residual[block] * track.speed[block, None]
+            own = np.maximum(np.sum(weighted**2, axis=0), 1e-30)[:, None]
+            of_line = np.abs(_lines(PERIODS_PER_M, distance_m[block]) @ weighted).T ** 2
+            power += of_line / own
+            strength += of_line / np.sum(track.speed[block] ** 2) ** 2
+            by_time += np.abs(in_time @ weighted).T ** 2 / own
+            blocks += 1
+    if blocks == 0:
+        return None
+    channel = 2 + int(np.argmax(power[2:].max(axis=1)))
+    line = int(np.argmax(power[channel]))
+    highest = float(power[channel, line])
+    if highest < settings.vibration_ratio_min * blocks or highest < by_time[channel].max():
+        return None
+    if gamma.sf(highest, blocks) > settings.vibration_p_max:
+        return None
+    median_mps = float(np.median(np.concatenate([track.speed for track in tracks])))
+    amplitude = 2.0 * np.sqrt(strength[:, line] / blocks) * median_mps
+    return Vibration(float(PERIODS_PER_M[line]), amplitude, power[:, line] / blocks, settings.vibration_ratio_min)
+
+
+def _lines(frequencies: FloatArray, at: FloatArray) -> NDArray[np.complex128]:
+    """Waves (F, n) of so many periods per unit of ``at`` (n,)."""
+    waves: NDArray[np.complex128] = np.exp(2j * np.pi * np.outer(frequencies, at))
+    return waves

@@ -1,0 +1,140 @@
+"""Figures of an episode of learning, and the model's predictions of a recorded episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.quantities import FloatArray
+from carlab.experiment.campaign.quick_check import QuickCheck
+from carlab.experiment.episodes.session import EpisodeResult
+from carlab.prediction.learned import sample_paths
+from learning.world.car_dynamics import OneStep
+
+HORIZON_S = 1.0
+STRICT_POSITION_M, STRICT_YAW_RAD = 0.05, 0.2
+"""Largest errors of the final pose by which the authors of Sim-FSVGD call an episode successful."""
+_EARLIER_NAMES = {"foretold": "predicted_return", "reality": "verdict"}
+"""Keys of learn.json, version 1, that have another name since."""
+_TYPES: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "bool": bool, "str": str}
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeFigures:
+    """One row of the learning curve.
+
+    Attributes:
+        episode: from 1.
+        total_reward: return on the car.
+        predicted_return: mean return of the same policy in the learned car.
+        parked: whether the car ended within 0.2 m and 0.35 rad of the goal and slower than 0.3 m/s (``ParkingTask``).
+        distance_m, yaw_error_rad, speed_mps: errors of the final pose, and the final speed.
+        rows: number of recorded transitions that the model was fitted to.
+        last_episode_nll: negative log-likelihood of the episode before under the model that had not seen it [nat a
+            step]; NaN for the first.
+        last_episode_calibration_error: calibration error of the same predictions.
+        model_seconds, policy_seconds: durations of the fit and of the training [s].
+        updates: gradient steps of SAC.
+        end: why the episode ended.
+        verdict: verdict of the quick check of all episodes so far (explains, left, undecided, failed); empty
+            where there is none.
+        excess: errors of the simulator beyond the noise floor, in noise floors; NaN where not known.
+        excess_std: its standard error.
+        diagnosis: what the quick check says, in words.
+    """
+
+    episode: int
+    total_reward: float
+    predicted_return: float
+    parked: bool
+    distance_m: float
+    yaw_error_rad: float
+    speed_mps: float
+    rows: int
+    last_episode_nll: float
+    last_episode_calibration_error: float
+    model_seconds: float
+    policy_seconds: float
+    updates: int
+    end: str
+    verdict: str = ""
+    excess: float = float("nan")
+    excess_std: float = float("nan")
+    diagnosis: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Values for a JSON file; NaN becomes null."""
+        return {k: None if isinstance(v, float) and v != v else v for k, v in asdict(self).items()}
+
+    def with_check(self, check: QuickCheck) -> EpisodeFigures:
+        """The same with what a quick check says."""
+        text = " ".join(check.sentences)
+        return replace(self, verdict=check.verdict, excess=check.excess, excess_std=check.excess_std, diagnosis=text)
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> EpisodeFigures:
+        """Read what ``to_dict`` of any version gave. Raises TypeError or ValueError for anything else."""
+        named: dict[str, Any] = {_EARLIER_NAMES.get(k, k): float("nan") if v is None else v for k, v in row.items()}
+        types = {f.name: _TYPES[str(f.type)] for f in fields(cls)}
+        return cls(**{k: types[k](v) if k in types else v for k, v in named.items()})
+
+    @property
+    def is_strictly_parked(self) -> bool:
+        """Whether the final pose meets the criterion of the authors: within 0.05 m and 0.2 rad of the goal."""
+        return self.distance_m < STRICT_POSITION_M and self.yaw_error_rad < STRICT_YAW_RAD
+
+
+def figures_of(result: EpisodeResult, training: Mapping[str, Any]) -> EpisodeFigures:
+    """Combine the result of an episode with the figures of the training before it."""
+    summary = result.summary
+    return EpisodeFigures(
+        episode=int(training["episode"]),
+        total_reward=result.total_reward,
+        predicted_return=float(training["return_in_model"]),
+        parked=bool(summary["parked"]),
+        distance_m=summary["distance_m"],
+        yaw_error_rad=summary["yaw_error_rad"],
+        speed_mps=summary["speed_mps"],
+        rows=int(training["rows"]),
+        last_episode_nll=float(training.get("last_episode_nll", float("nan"))),
+        last_episode_calibration_error=float(training.get("last_episode_calibration_error", float("nan"))),
+        model_seconds=float(training["model_seconds"]),
+        policy_seconds=float(training["policy_seconds"]),
+        updates=int(training["updates"]),
+        end=result.reason.name,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WindowPredictions:
+    """Predicted states of prediction windows, from recorded initial states and by recorded commands.
+
+    Attributes:
+        ticks: ticks of the recording (S, T); the first of each window is its initial state.
+        mean, std: mean and standard deviation of x, y [m], yaw [rad], vx, vy [m/s] and yaw rate [rad/s] (S, T, 6).
+    """
+
+    ticks: np.ndarray
+    mean: FloatArray
+    std: FloatArray
+
+
+def predict_windows(dynamics: OneStep, episode: EpisodeData, seed: int = 0) -> WindowPredictions:
+    """Predict consecutive windows of one second by draws of particles and noise; none of a shorter episode."""
+    history = dynamics.history
+    length = max(round(HORIZON_S / episode.period_s), 1)
+    starts = np.arange(history, episode.ticks - length + 1, length)
+    if not len(starts):
+        none = np.zeros((0, length + 1, 6))
+        return WindowPredictions(np.zeros((0, length + 1), dtype=np.int64), none, none)
+    past = episode.sent[starts[:, None] - np.arange(history, 0, -1)]
+    commands = episode.sent[starts[:, None] + np.arange(length)]
+    paths = sample_paths(dynamics, episode.states[starts], past, commands, seed=seed)
+    return WindowPredictions(starts[:, None] + np.arange(length + 1), paths.mean(axis=2), paths.std(axis=2))
+
+
+__all__ = ["EpisodeFigures", "WindowPredictions", "figures_of", "predict_windows"]

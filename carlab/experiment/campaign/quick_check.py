@@ -1,0 +1,150 @@
+"""The quick check after each episode: whether the simulator still explains the recordings, in another process.
+
+The result is a file beside the model of the episode (``models/0003/diagnosis.json``). An error of the check is part of
+the result and ends no run.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+import os
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from carlab.core.errors import CarlabError
+from carlab.recording.run_folder import RunDirectory
+from sim_backends.car_parameters import SimulatorConfig
+
+log = logging.getLogger(__name__)
+
+CHECK_FILE = "diagnosis.json"
+SIMULATOR_FILE = "simulator.toml"
+POLL_S = 0.1
+MIN_DIAGNOSIS_EPISODES = 4
+"""Number of recordings that a full diagnosis needs, some to fit and some held out."""
+
+
+@dataclass(frozen=True, slots=True)
+class QuickCheck:
+    """Result of a quick check: verdict, excess over the noise floor with its standard error, and messages."""
+
+    episode: int
+    verdict: str
+    excess: float
+    excess_std: float
+    sentences: tuple[str, ...]
+    short: str
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> QuickCheck:
+        """Read the content of a file. Raises KeyError, TypeError or ValueError for anything else."""
+        excess, excess_std = (
+            float("nan") if content[k] is None else float(content[k]) for k in ("excess", "score_std")
+        )
+        lines = tuple(str(s) for s in content["sentences"])
+        return cls(int(content["episode"]), str(content["verdict"]), excess, excess_std, lines, str(content["short"]))
+
+
+def check_path(run: RunDirectory, episode: int) -> Path:
+    """File of the check of an episode."""
+    return run.models / f"{episode:04d}" / CHECK_FILE
+
+
+def run_check_subprocess(
+    run: RunDirectory, simulator: SimulatorConfig, stop: Callable[[], bool] = lambda: False
+) -> QuickCheck | None:
+    """Check all recordings so far against the simulator, in another process; None where it was stopped.
+
+    The check of the last episode is written into its model's folder, the simulator into ``simulator.toml`` of the run.
+    """
+    import tomli_w
+
+    recordings = run.recordings()
+    number = len(recordings)
+    path = check_path(run, number)
+    text = tomli_w.dumps(simulator.to_tables())
+    context = multiprocessing.get_context("spawn")
+    child = context.Process(target=_child, args=(path, run.path, recordings, text), daemon=True, name="quick check")
+    try:
+        (run.path / SIMULATOR_FILE).write_text(text, encoding="utf-8")
+        child.start()
+        while child.is_alive():
+            if stop():
+                child.terminate()
+                child.join()
+                return None
+            child.join(POLL_S)
+        return QuickCheck.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        code = f"exit code {child.exitcode}" if child.exitcode else str(error)
+        log.warning("The quick check of episode %d failed: %s", number, error)
+        return QuickCheck.from_dict(_kept(path, number, _failed(f"its process failed ({code})")))
+
+
+def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict[str, Any]:
+    """Make the content of the file: the quick check of recordings, with its messages.
+
+    Raises:
+        CarlabError: a recording cannot be read.
+    """
+    from carlab.diagnosis.quick.quick_check import quick_check
+    from carlab.diagnosis.quick.sentences import sentences, short
+    from carlab.experiment.campaign.training import has_ticks
+    from carlab.recording.mcap.source import read_episode
+
+    driven = [path for path in recordings if has_ticks(path)]
+    result = quick_check([read_episode(path) for path in driven], simulator)
+    decide = f"carlab diagnose decides, from {MIN_DIAGNOSIS_EPISODES} episodes on"
+    command = next_step(run)
+    if len(driven) >= MIN_DIAGNOSIS_EPISODES:
+        decide = f"what decides: {command}"
+    return {
+        **result.to_dict(), "sentences": sentences(result, decide), "short": short(result), "next": command,
+        "recordings": [path.name for path in driven],
+    }  # fmt: skip
+
+
+def next_step(run: Path) -> str:
+    """The command of the full diagnosis of a run."""
+    return f"carlab diagnose {run} --car {run / SIMULATOR_FILE} --out {run / 'diagnosis'}"
+
+
+def _child(path: Path, run: Path, recordings: list[Path], simulator_toml: str) -> None:
+    import signal
+
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the process that drives; it ends this one.
+    torch.set_num_threads(1)
+    try:
+        result = check(run, recordings, SimulatorConfig.from_tables(tomllib.loads(simulator_toml)))
+    except CarlabError as error:
+        result = _failed(str(error))
+    except Exception as error:
+        log.exception("The quick check failed")
+        result = _failed(f"{type(error).__name__}: {error}")
+    _kept(path, len(recordings), result)
+
+
+def _failed(why: str) -> dict[str, Any]:
+    text = f"The quick check of this episode failed, learning goes on: {why.rstrip('.')}."
+    return {"verdict": "failed", "why": why, "excess": None, "score_std": None, "sentences": [text], "short": ""}
+
+
+def _kept(path: Path, episode: int, result: dict[str, Any]) -> dict[str, Any]:
+    content = {"episode": episode, **result}
+    unfinished = path.with_name(f"{path.name}.partial")
+    try:
+        unfinished.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        os.replace(unfinished, path)
+    except OSError as error:
+        log.warning("%s cannot be written: %s", path, error)
+    return content
+
+
+__all__ = ["CHECK_FILE", "SIMULATOR_FILE", "QuickCheck", "check", "check_path", "next_step", "run_check_subprocess"]

@@ -1,0 +1,370 @@
+"""Training between two episodes: fit the car to all recordings, then train a policy in the learned car.
+
+The result appears in the run's folder (``models/0003``) complete, or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
+
+from carlab.core.clock import MonotonicClock
+from carlab.core.documents import EpisodeEnded, Tick
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError, DivergedError
+from carlab.core.observation import encode
+from carlab.core.quantities import FloatArray
+from carlab.core.safety import SafetyEnvelope
+from carlab.core.state_estimator import StateEstimator
+from carlab.core.task import ParkingTask
+from carlab.recording.episode_builder import VELOCITY_DELAY
+from learning.priors.simulator_model import CarModel, known_ranges
+from learning.world.car_fit import LearnedCar, Method
+from learning.world.history import find_history
+from learning.world.transitions import Transitions, has_whole_step, transitions_of
+from sim_backends.car_parameters import SimulatorConfig
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from learning.policy.sac_agent import SacAgent
+    from learning.world.model_env import ModelEnv
+
+log = logging.getLogger(__name__)
+
+DYNAMICS_FILE = "dynamics.pt"
+FIGURES_FILE = "training.json"
+N_EVALUATION_CARS = 64
+PARKED_BONUS, PARKED_SCORE = 0.3, 10.0
+"""Reward for each tick at which the learned car is parked, in addition to the task's reward; and score of a policy that
+always parks, in addition to its return. The paper's reward is only 2 % lower 0.2 m from the goal."""
+EXTRA_REACTION_S = 0.12
+"""Additional reaction time of the safety gate of the learned car: a margin to the real gate of 0.24 m at 2 m/s."""
+EPISODES_BEFORE_HISTORY_CHOICE = 3
+"""Number of episodes after which the number of past commands that matter is estimated."""
+SMALLER_STEP_FACTOR = 0.25
+"""Factor of the learning rate after a divergence."""
+Progress = Callable[[str, int, int], None]
+Learned = TypeVar("Learned")
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingPlan:
+    """Settings of model and policy training, the same before every episode of a run.
+
+    Attributes:
+        prior_toml: car file of the simulator that is the prior, with ranges and effects.
+        history: number of past commands that model and policy observe.
+        method: ``sim-fsvgd`` has the simulator as prior; ``fsvgd`` has none; ``fsvgd-authors`` has the settings of the
+            authors of Sim-FSVGD.
+        model_steps: steps of the particles' optimiser; the default of the method where None.
+        updates: gradient steps of SAC (``updates_before``).
+        ticks: ticks of an episode; those of the task where None.
+        seed: seed of all random numbers.
+        threads: number of threads of torch.
+        device: device of the training; the policy drives on the CPU.
+    """
+
+    prior_toml: str
+    history: int = 3
+    method: Method = "sim-fsvgd"
+    model_steps: int | None = None
+    updates: int = 30_000
+    ticks: int | None = None
+    seed: int = 0
+    threads: int = 1
+    device: str = "cpu"
+
+    @property
+    def task(self) -> ParkingTask:
+        """The task, with the history of the model and the ticks of this run."""
+        task = ParkingTask(history_length=self.history)
+        return task if self.ticks is None else replace(task, max_ticks=self.ticks)
+
+    def updates_before(self, episode: int) -> int:
+        """Gradient steps of SAC before an episode: 1.5 times ``updates`` before the first, 3 / episode after the third.
+
+        The policy goes on from the earlier one, and the share of new rows shrinks.
+        """
+        if episode == 1:
+            return self.updates * 3 // 2
+        return self.updates * 3 // max(episode, 3)
+
+
+def model_folder(models: Path, episode: int) -> Path:
+    """Folder of the model and policy that were trained before an episode."""
+    return models / f"{episode:04d}"
+
+
+def train(
+    plan: TrainingPlan, models: Path, recordings: list[Path], envelope: SafetyEnvelope, progress: Progress
+) -> dict[str, Any]:
+    """Fit the car and train the policy before the episode that follows the recordings.
+
+    Args:
+        plan: settings of the run.
+        models: folder that receives the result.
+        recordings: MCAP files of all episodes so far, in order.
+        envelope: limits of the car's safety gate.
+        progress: called with the name of the stage, the steps done and the number of steps.
+
+    Returns:
+        Figures, which are also written beside the result.
+
+    Raises:
+        DataError: the recordings hold no row, or something diverged. Nothing is left behind.
+    """
+    import torch
+
+    from learning.world.car_fit import load_car, save_car
+
+    torch.set_num_threads(plan.threads)
+    number = len(recordings) + 1
+    progress("reading the recordings", 0, 1)
+    usable, newest = _usable_episodes(recordings, plan.history)
+    earlier = model_folder(models, number - 1)
+    earlier_car = load_car(earlier / DYNAMICS_FILE, plan.device) if earlier.is_dir() else None
+    rows = transitions_of(usable, plan.history) if usable else None
+    figures: dict[str, Any] = {"episode": number, "rows": 0 if rows is None else len(rows)}
+    if earlier_car is not None and newest is not None:
+        nll, calibration_error = earlier_car.score_episode(newest)
+        figures |= {"last_episode_nll": nll, "last_episode_calibration_error": calibration_error}
+
+    clock = MonotonicClock()
+    began_s = clock.now_s()
+    if len(recordings) == EPISODES_BEFORE_HISTORY_CHOICE:
+        figures |= _history_figures(usable, progress)
+    seed = plan.seed + 1000 * number
+    dynamics = _fitted(plan, _prior_model(plan, usable), usable, rows, earlier_car, seed, progress)
+    figures["model_seconds"] = clock.now_s() - began_s
+
+    began_s = clock.now_s()
+    worlds = _worlds(plan, dynamics, usable, envelope, seed)
+    agent, policy_figures = _trained_policy(
+        plan, *worlds, None if earlier_car is None else earlier, plan.updates_before(number), progress
+    )
+    figures |= {**policy_figures, "policy_seconds": clock.now_s() - began_s}
+
+    def write(folder: Path) -> None:
+        save_car(dynamics, folder / DYNAMICS_FILE)
+        agent.save(folder)
+
+    _publish(model_folder(models, number), figures, write)
+    return figures
+
+
+def _usable_episodes(recordings: list[Path], history: int) -> tuple[list[EpisodeData], EpisodeData | None]:
+    """Recorded episodes with at least one row to learn from, and the newest recording where it is one of them."""
+    from carlab.recording.mcap.source import read_episode
+
+    episodes = [read_episode(path) if has_ticks(path) else None for path in recordings]
+    usable = [e for e in episodes if e is not None and has_whole_step(e, history)]
+    newest = usable[-1] if usable and usable[-1] is episodes[-1] else None
+    return usable, newest
+
+
+def _prior_model(plan: TrainingPlan, episodes: list[EpisodeData]) -> CarModel:
+    """The simulator that is the prior, with the velocity delay of the recordings."""
+    simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+    return CarModel(simulator, plan.history, known_ranges(simulator), velocity_delay_s=velocity_delay_s(episodes))
+
+
+def _history_figures(episodes: list[EpisodeData], progress: Progress) -> dict[str, Any]:
+    """The number of past commands that the recordings ask for, and its message; empty where they do not say."""
+    progress("how many past commands count", 0, 1)
+    choice = find_history(episodes)
+    return {} if choice is None else {"history_asked": choice.history, "history_words": choice.message()}
+
+
+def _worlds(
+    plan: TrainingPlan, dynamics: LearnedCar, episodes: list[EpisodeData], envelope: SafetyEnvelope, seed: int
+) -> tuple[ModelEnv, ModelEnv]:
+    """The learned car as a world to train in and as one to evaluate in, which has the task's reward alone."""
+    from learning.policy.sac_agent import SacSettings
+    from learning.world import model_env
+
+    task = plan.task
+    period_s = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml)).control_period_s
+    slow_gate = replace(envelope, reaction_s=envelope.reaction_s + EXTRA_REACTION_S)
+    gate: dict[str, Any] = {"envelope": slow_gate, "period_s": period_s, "device": plan.device}
+    recorded = recorded_features(episodes, plan.history) if episodes else None
+
+    def bonus(features: Tensor) -> Tensor:
+        parked: Tensor = PARKED_BONUS * task.parked(features).to(features)
+        return parked
+
+    training = model_env.ModelEnv(dynamics, task, SacSettings().cars, recorded=recorded, bonus=bonus, seed=seed, **gate)
+    return training, model_env.ModelEnv(dynamics, task, N_EVALUATION_CARS, seed=seed + 1, **gate)
+
+
+def _trained_policy(
+    plan: TrainingPlan, world: ModelEnv, evaluation: ModelEnv, earlier: Path | None, updates: int, progress: Progress
+) -> tuple[SacAgent, dict[str, Any]]:
+    """A policy trained in a world, from the earlier one where there is one, and its figures.
+
+    Args:
+        plan: settings of the run.
+        world: world to train in.
+        evaluation: world to select the best policy in.
+        earlier: folder of the earlier policy.
+        updates: gradient steps.
+        progress: as for ``train``.
+    """
+    from learning.policy.sac_agent import SacAgent, SacSettings
+
+    task, sac = plan.task, SacSettings()
+    figures: dict[str, Any] = {}
+
+    def evaluate(candidate: SacAgent) -> float:
+        total, ends = evaluation.rolled_out(candidate.act)
+        return float(total.mean() + PARKED_SCORE * task.parked(ends).float().mean())
+
+    def trained(slower: float) -> SacAgent:
+        settings = replace(sac, learning_rate=slower * sac.learning_rate)
+        agent = SacAgent(settings, plan.seed, plan.device)
+        if earlier is not None:
+            agent = SacAgent.load(earlier, settings, plan.seed, plan.device)
+        progress("learning to drive", 0, updates)
+        figures.update(agent.train(world, updates, lambda done: progress("learning to drive", done, updates), evaluate))
+        return agent
+
+    agent = _with_smaller_steps(trained, "policy")
+    total, ends = evaluation.rolled_out(agent.act)
+    figures |= {"updates": updates, "return_in_model": float(total.mean())}
+    return agent, figures | {"parked_in_model": float(task.parked(ends).float().mean())}
+
+
+def _fitted(
+    plan: TrainingPlan,
+    model: CarModel,
+    episodes: list[EpisodeData],
+    rows: Transitions | None,
+    before: LearnedCar | None,
+    seed: int,
+    progress: Progress,
+) -> LearnedCar:
+    """Fit the car by the method of the plan."""
+    from learning.functional_svgd.authors_fsvgd import STEPS, fit_authors_fsvgd
+    from learning.world.car_dynamics import CarDynamics
+    from learning.world.car_fit import CarFitSettings, fit_car
+
+    ours = plan.method != "fsvgd-authors"
+    steps = plan.model_steps or (CarFitSettings().steps if ours else STEPS)
+
+    def at(done: int) -> None:
+        progress("learning the car", done, steps)
+
+    at(0)
+    if not ours:
+        return fit_authors_fsvgd(episodes, plan.history, steps, seed, at, plan.device)
+    settings = CarFitSettings(plan.method, steps, seed=seed)
+    earlier = before if isinstance(before, CarDynamics) else None
+
+    def fitted(slower: float) -> LearnedCar:
+        own = replace(settings, learning_rate=slower * settings.learning_rate)
+        return fit_car(rows, model, own, before=earlier, progress=at, device=plan.device)
+
+    return _with_smaller_steps(fitted, "model")
+
+
+def _with_smaller_steps(learn: Callable[[float], Learned], what: str) -> Learned:
+    """Learn with the usual learning rate, or with a smaller one after a divergence.
+
+    Raises:
+        DivergedError: both diverged.
+    """
+    try:
+        return learn(1.0)
+    except DivergedError as error:
+        log.warning("The %s diverged (%s); it is learned again with steps of %g.", what, error, SMALLER_STEP_FACTOR)
+    try:
+        return learn(SMALLER_STEP_FACTOR)
+    except DivergedError as error:
+        raise DivergedError(
+            f"The {what} diverged, with smaller steps as well; what was recorded is kept: if the last recording shows "
+            "what no car does (carlab replay), take it out of the run's folder, or start a run with another --prior."
+        ) from error
+
+
+def velocity_delay_s(episodes: Sequence[EpisodeData]) -> float:
+    """Median delay of measured velocities in recordings [s]; that of the state estimator where they have none."""
+    import numpy as np
+
+    delays = [np.asarray(e.extra[VELOCITY_DELAY], dtype=np.float64) for e in episodes if VELOCITY_DELAY in e.extra]
+    known = np.concatenate([d[np.isfinite(d)] for d in delays]) if delays else np.zeros(0)
+    return float(np.median(known)) if len(known) else 0.5 * StateEstimator().window_s
+
+
+def has_ticks(recording: Path) -> bool:
+    """Whether a recording has a completed tick; the safety gate or a hang may end an episode before it."""
+    from carlab.recording.mcap.source import read_documents
+
+    documents = read_documents(recording)
+    steps = [document.step for document in documents if isinstance(document, Tick)]
+    seen = [d.steps for d in documents if isinstance(d, EpisodeEnded) and d.last is not None]
+    return len(steps) > 1 or bool(steps and seen and seen[0] > steps[-1])
+
+
+def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
+    """Features (R, 7 + 2 H) of recorded states with the commands before them."""
+    import numpy as np
+
+    found = []
+    for episode in episodes:
+        rows = np.arange(history, episode.ticks)
+        found.append(encode(episode.states[rows], episode.sent[rows[:, None] - np.arange(history, 0, -1)]))
+    features: FloatArray = np.concatenate(found)
+    return features[np.isfinite(features).all(axis=1)]
+
+
+def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None]) -> None:
+    from carlab.recording.sink import describe_os_error
+
+    unfinished = folder.with_name(f"{folder.name}.partial")
+    try:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        write(unfinished)
+        (unfinished / FIGURES_FILE).write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+        os.replace(unfinished, folder)
+    except OSError as error:
+        raise DataError(describe_os_error(error, folder)) from error
+
+
+def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
+    """The plan for a file."""
+    return asdict(plan)
+
+
+def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
+    """Read what ``plan_as_json`` gave. Raises TypeError or ValueError for other names, types or ranges."""
+    plan = TrainingPlan(**content)
+    if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
+        raise ValueError("prior, method or device of the plan")
+    for name, least in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():
+        value = getattr(plan, name)
+        if value is None and name in ("model_steps", "ticks"):
+            continue
+        if type(value) is not int or value < least:
+            raise ValueError(f"{name} of the plan is {value!r}")
+    return plan
+
+
+__all__ = [
+    "DYNAMICS_FILE",
+    "FIGURES_FILE",
+    "TrainingPlan",
+    "has_ticks",
+    "model_folder",
+    "plan_as_json",
+    "plan_from_json",
+    "recorded_features",
+    "train",
+]

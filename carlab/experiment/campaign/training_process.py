@@ -1,0 +1,100 @@
+"""Training in another process, so that the process that drives keeps its timing."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import shutil
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from carlab.core.errors import CarlabError, DataError
+from carlab.core.safety import SafetyEnvelope
+from carlab.experiment.campaign.training import Progress, TrainingPlan, train
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.1
+
+
+def train_in_subprocess(
+    plan: TrainingPlan,
+    models: Path,
+    recordings: list[Path],
+    envelope: SafetyEnvelope,
+    progress: Progress,
+    stop: Callable[[], bool] = lambda: False,
+) -> dict[str, Any] | None:
+    """Run ``train`` in another process and wait for it.
+
+    Args:
+        plan: as for ``train``.
+        models: as for ``train``.
+        recordings: as for ``train``.
+        envelope: as for ``train``.
+        progress: as for ``train``.
+        stop: polled; once true, the process is ended and nothing is left behind.
+
+    Returns:
+        The figures; None where it was stopped.
+
+    Raises:
+        DataError: what ``train`` says, or that its process died.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(
+        target=_child, args=(sender, plan, models, recordings, envelope), daemon=True, name="training"
+    )
+    child.start()
+    sender.close()
+    try:
+        while True:
+            if stop():
+                return None
+            if receiver.poll(POLL_S):
+                try:
+                    kind, content = receiver.recv()
+                except EOFError:
+                    child.join()
+                    raise DataError(
+                        f"The training process died (exit code {child.exitcode}; -9 is often too little memory); "
+                        "what was recorded is kept; go on with --resume."
+                    ) from None
+                if kind == "done":
+                    figures: dict[str, Any] = content
+                    return figures
+                if kind == "failed":
+                    raise DataError(str(content))
+                progress(*content)
+    finally:
+        if child.is_alive():
+            child.terminate()
+        child.join()
+        receiver.close()
+        for unfinished in models.glob("*.partial"):
+            shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _child(
+    pipe: Connection, plan: TrainingPlan, models: Path, recordings: list[Path], envelope: SafetyEnvelope
+) -> None:
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the process that drives; it ends this one.
+    try:
+        pipe.send(("done", train(plan, models, recordings, envelope, lambda *what: pipe.send(("at", what)))))
+    except CarlabError as error:
+        pipe.send(("failed", str(error)))
+    except BrokenPipeError:
+        pass
+    except Exception as error:
+        log.exception("Training failed")
+        pipe.send(("failed", f"Training failed: {type(error).__name__}: {error}; what was recorded is kept."))
+    finally:
+        pipe.close()
+
+
+__all__ = ["train_in_subprocess"]

@@ -1,0 +1,1 @@
+"""Run episodes on any car: the control loop, sessions of several episodes, policies, interrupts."""

@@ -1,0 +1,324 @@
+"""One episode: observe, decide, pass the gate, send, wait; and always neutral at the end.
+
+observe ──> encode ──> policy ──> SafeCar (the gate) ──> Car.command ──> wait for the next deadline ─┐
+^                                                                                                 │
+└──────────────── emit Tick, Transition (recorders listen; the loop knows none of them) <─────────┘
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from carlab.core.car import Car
+from carlab.core.clock import Pacer, TickTiming, wall_clock_ns
+from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, HealthReading, Tick, Transition
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ActuatorFaultError, CarlabError, NotReadyError, PoseLostError
+from carlab.core.observation import ActionHistory, encode
+from carlab.core.outcome import EndReason
+from carlab.core.policy import Policy, PolicyInput
+from carlab.core.quantities import Action, FloatArray, Observation
+from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyState, SafetyStop
+from carlab.core.task import Task
+
+log = logging.getLogger(__name__)
+
+FIRST_POSE_TIMEOUT_S = 2.0
+HEALTH_PERIOD_S = 1.0
+LATE_WINDOW_TICKS = 30
+
+
+@dataclass(slots=True)
+class EpisodeHooks:
+    """Callbacks of an episode; the defaults do nothing.
+
+    Attributes:
+        emit: receives each document.
+        stop_requested: the reason for which the episode is to end, asked before each tick.
+        recorder_failed: why the recording failed, asked before each tick.
+        heartbeat: called with the name of the next stage before it begins.
+    """
+
+    emit: Callable[[Document], None] = lambda document: None
+    stop_requested: Callable[[], EndReason | None] = lambda: None
+    recorder_failed: Callable[[], str | None] = lambda: None
+    heartbeat: Callable[[str], None] = lambda where: None
+
+
+@dataclass(slots=True)
+class _Rows:
+    """The arrays of an episode while they grow, and the newest observation."""
+
+    times_s: list[float] = field(default_factory=list)
+    states: list[FloatArray] = field(default_factory=list)
+    requested: list[FloatArray] = field(default_factory=list)
+    sent: list[FloatArray] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    poses: list[tuple[float, float, float, float]] = field(default_factory=list)
+    newest: Observation | None = None
+
+    def add_observation(self, now_s: float, observation: Observation) -> None:
+        self.times_s.append(now_s)
+        self.states.append(observation.state.to_array())
+        self.poses.extend((p.t_capture_s, p.x_m, p.y_m, p.yaw_rad) for p in observation.poses if p.tracked)
+
+    def add_step(self, requested: Action, sent: Action, reward: float) -> None:
+        self.requested.append(requested.to_array())
+        self.sent.append(sent.to_array())
+        self.rewards.append(reward)
+
+    def finish(self, metadata: Mapping[str, str]) -> EpisodeData:
+        ticks = len(self.rewards)
+        return EpisodeData(
+            times_s=np.array(self.times_s[: ticks + 1]),
+            states=np.array(self.states[: ticks + 1]).reshape(-1, 6),
+            requested=np.array(self.requested[:ticks]).reshape(-1, 2),
+            sent=np.array(self.sent[:ticks]).reshape(-1, 2),
+            rewards=np.array(self.rewards),
+            poses=np.array(self.poses).reshape(-1, 4),
+            metadata=metadata,
+        )
+
+
+class _LateTicks:
+    """Ends an episode when more than half of the last ticks woke later than half a period."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._late: deque[bool] = deque(maxlen=LATE_WINDOW_TICKS)
+
+    def add(self, timing: TickTiming) -> bool:
+        self._late.append(timing.late_s > 0.5 * self._period_s or timing.skipped > 0)
+        return len(self._late) == LATE_WINDOW_TICKS and sum(self._late) > LATE_WINDOW_TICKS // 2
+
+
+class _End(Exception):
+    """Leaves the loop with a reason."""
+
+    def __init__(self, reason: EndReason, detail: str = "") -> None:
+        self.reason, self.detail = reason, detail
+        super().__init__(reason.name)
+
+
+def first_observation(car: Car, heartbeat: Callable[[str], None] = lambda where: None) -> Observation:
+    """Wait for the first pose with a speed. Raises PoseLostError after two seconds of the car's clock."""
+    give_up_s = car.clock.now_s() + FIRST_POSE_TIMEOUT_S
+    while True:
+        heartbeat("waiting for the first pose")
+        try:
+            observation = car.observe()
+            if observation.tracked and observation.velocity_valid:
+                return observation
+        except PoseLostError:
+            if car.clock.now_s() > give_up_s:
+                raise
+        else:
+            if car.clock.now_s() > give_up_s:
+                raise PoseLostError(
+                    "Motion capture comes too rarely to know the car's speed; raise its frame rate."
+                    if observation.tracked
+                    else "Motion capture runs but does not see the car; check its markers and the volume."
+                )
+        car.clock.sleep_until(car.clock.now_s() + 0.01)
+
+
+def run_episode(
+    car: Car,
+    policy: Policy,
+    task: Task,
+    envelope: SafetyEnvelope,
+    *,
+    period_s: float,
+    max_ticks: int | None = None,
+    hooks: EpisodeHooks | None = None,
+    episode: int = 1,
+    seed: int = 0,
+    config_toml: str = "",
+    metadata: Mapping[str, str] | None = None,
+) -> EpisodeData:
+    """Drive one episode on an open car and return it as arrays.
+
+    Args:
+        car: an open car; it is armed here and left stopped and disarmed.
+        policy: decides each tick; None from ``act`` ends the episode.
+        task: gives reward, end, goal and length of the action history.
+        envelope: limits of the safety gate.
+        period_s: control period [s].
+        max_ticks: ticks to drive; the task's number where None.
+        hooks: where documents go and who may stop the episode.
+        episode: number of this episode, from 1.
+        seed: written into the recording.
+        config_toml: configuration as text, written into the recording.
+        metadata: further texts for the recording.
+
+    Returns:
+        The episode, also one that ended early; ``metadata`` has ``end_reason``, ``end_sentence`` and ``end_detail``.
+
+    Raises:
+        NotReadyError, ActuatorFaultError, PoseLostError: nothing has moved. Any other error: the car was stopped.
+    """
+    hooks = hooks or EpisodeHooks()
+    safe, rows, pacer = SafeCar(car, envelope, hooks.emit), _Rows(), Pacer(car.clock, period_s)
+    hooks.emit(EpisodeStarted(
+        episode=episode, t_s=car.clock.now_s(), wall_ns=wall_clock_ns(), car=car.name, reality=car.reality,
+        policy=policy.name, task=task.name, seed=seed, period_s=period_s, history_length=task.history_length,
+        goal=task.goal, arena_m=envelope.arena_m, path_m=task.path_m, config_toml=config_toml,
+        metadata=dict(metadata or {}),
+    ))  # fmt: skip
+    reason, detail = EndReason.CRASHED, ""
+    try:
+        encode(np.zeros(6), ActionHistory(task.history_length).rows)  # Imports for seconds: before any heartbeat.
+        policy.reset()
+        first_observation(car, hooks.heartbeat)
+        hooks.heartbeat("arming")
+        safe.arm()
+        reason = _drive(safe, policy, task, pacer, rows, hooks, task.max_ticks if max_ticks is None else max_ticks)
+    except BaseException as error:
+        reason, detail, is_expected = _end_of(error, safe.state, driven=bool(rows.rewards))
+        if not is_expected:
+            raise
+    finally:
+        _stop(safe, pacer, rows, hooks, reason, detail)
+    texts = {"car": car.name, "reality": car.reality.value, "policy": policy.name, "task": task.name, "seed": str(seed)}
+    texts |= {**(metadata or {}), "end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
+    return rows.finish(texts)
+
+
+def _drive(
+    safe: SafeCar,
+    policy: Policy,
+    task: Task,
+    pacer: Pacer,
+    rows: _Rows,
+    hooks: EpisodeHooks,
+    ticks: int,
+) -> EndReason:
+    """Drive the ticks of an episode on an armed car into ``rows``. Any early end but the task's is raised."""
+    car, period_s = safe.car, pacer.period_s
+    history, late = ActionHistory(task.history_length), _LateTicks(period_s)
+    next_health_s = -math.inf
+    start_s = pacer.start()
+    now_s, observation = _observe(car, rows, hooks)
+    rows.add_observation(now_s, observation)
+    features = encode(observation.state.to_array(), history.rows)
+    timing = TickTiming(now_s, 0.0, 0)
+    for step in range(ticks):
+        _raise_requested_end(hooks)
+        view = PolicyInput(features, observation, step, now_s - start_s)
+        requested, policy_s = _ask(policy, view, car, hooks, safe.envelope.lost_pose_s)
+        hooks.heartbeat("commanding")
+        sent = safe.command(requested, observation, period_s)
+        history.push(sent)
+        hooks.emit(Tick(step, now_s, timing.late_s, observation, features, requested, sent, policy_s, safe.state.value))
+        if now_s >= next_health_s:
+            hooks.emit(HealthReading(now_s, car.health()))
+            next_health_s = now_s + HEALTH_PERIOD_S
+        hooks.heartbeat("waiting for the next tick")
+        timing = pacer.wait()
+        now_s, observation = _observe(car, rows, hooks)
+        next_features = encode(observation.state.to_array(), history.rows)
+        reward = float(task.reward(features, sent.to_array(), next_features))
+        terminated = bool(task.terminated(next_features))
+        rows.add_step(requested, sent, reward)
+        rows.add_observation(now_s, observation)
+        truncated = step + 1 == ticks and not terminated
+        hooks.emit(Transition(step, now_s, features, sent, reward, next_features, terminated, truncated))
+        features = next_features
+        if terminated:
+            return EndReason.GOAL_REACHED if task.goal is not None else EndReason.COMPLETED
+        if late.add(timing):
+            raise _End(EndReason.LATE_LOOP, f"{pacer.skipped} ticks were skipped.")
+    return EndReason.COMPLETED
+
+
+def _observe(car: Car, rows: _Rows, hooks: EpisodeHooks) -> tuple[float, Observation]:
+    """The time [s] and the newest observation."""
+    hooks.heartbeat("observing")
+    seen = car.observe()
+    now_s = car.clock.now_s()
+    rows.newest = seen
+    return now_s, seen
+
+
+def _raise_requested_end(hooks: EpisodeHooks) -> None:
+    """Raise _End where someone asked for the end, or where the recording failed."""
+    requested_end = hooks.stop_requested()
+    if requested_end is not None:
+        raise _End(requested_end)
+    failed = hooks.recorder_failed()
+    if failed is not None:
+        raise _End(EndReason.RECORDER_ERROR, failed)
+
+
+def _ask(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeout_s: float) -> tuple[Action, float]:
+    """The policy's action and the time it took [s]. Raises _End where it has none, fails or takes longer."""
+    hooks.heartbeat(f"inside the policy '{policy.name}'")
+    began_s = car.clock.now_s()
+    try:
+        action = policy.act(view)
+    except CarlabError:
+        raise
+    except Exception as error:
+        log.exception("The policy '%s' raised an error at tick %d", policy.name, view.step)
+        raise _End(EndReason.POLICY_ERROR, f"{type(error).__name__}: {error}") from error
+    if action is None:
+        raise _End(EndReason.POLICY_FINISHED)
+    if not isinstance(action, Action):
+        raise _End(EndReason.POLICY_ERROR, f"It returned a {type(action).__name__} where an Action is wanted.")
+    policy_s = car.clock.now_s() - began_s
+    if policy_s > timeout_s:
+        raise _End(EndReason.LATE_LOOP, f"The policy '{policy.name}' took {policy_s:.1f} s for one tick.")
+    return action, policy_s
+
+
+def _end_of(error: BaseException, state: SafetyState, *, driven: bool) -> tuple[EndReason, str, bool]:
+    """Reason and detail of an episode that an error ended, and whether the episode is returned despite it.
+
+    Args:
+        error: what left the loop.
+        state: of the safety gate.
+        driven: whether a tick was completed.
+    """
+    match error:
+        case _End() | SafetyStop():
+            return error.reason, error.detail, True
+        case PoseLostError():
+            return EndReason.POSE_STALE, str(error), driven
+        case ActuatorFaultError():
+            return EndReason.ACTUATOR_FAULT, str(error), driven
+        case NotReadyError():
+            reason = EndReason.NOT_READY if state is SafetyState.DISARMED else EndReason.CRASHED
+            return reason, str(error), False
+        case _:
+            return EndReason.CRASHED, f"{type(error).__name__}: {error}", False
+
+
+def _stop(safe: SafeCar, pacer: Pacer, rows: _Rows, hooks: EpisodeHooks, reason: EndReason, detail: str) -> None:
+    """Stop the car, then emit the end of the episode; each whatever becomes of the other."""
+    # A car that was never armed has done nothing that a fault would have to remember.
+    planned = safe.state is SafetyState.DISARMED or not reason.is_safety_stop
+
+    def emit_end() -> None:
+        hooks.emit(
+            EpisodeEnded(
+                t_s=safe.car.clock.now_s(),
+                reason=reason,
+                detail=detail,
+                steps=len(rows.rewards),
+                total_reward=float(np.sum(rows.rewards)),
+                last=rows.newest,
+                statistics=pacer.statistics_ms(),
+            )
+        )
+
+    with contextlib.ExitStack() as stack:  # Runs from the last entry to the first.
+        stack.callback(emit_end)
+        stack.callback(safe.stop, planned=planned)
+        stack.callback(hooks.heartbeat, "stopping the car")

@@ -1,0 +1,17 @@
+"""Importing this module makes the environments known to Gymnasium: ``carlab/Parking-v0`` and ``carlab/Path-v0``.
+
+    import gymnasium
+    import carlab.experiment.episodes.gym_registration
+    env = gymnasium.make("carlab/Parking-v0")
+
+or, in one, ``gymnasium.make("carlab.experiment.episodes.gym_registration:carlab/Parking-v0")``.
+"""
+
+from __future__ import annotations
+
+from gymnasium.envs.registration import register, registry
+
+for _task in ("parking", "path"):
+    _id = f"carlab/{_task.capitalize()}-v0"
+    if _id not in registry:
+        register(id=_id, entry_point="carlab.experiment.episodes.gym_env:make_env", kwargs={"task": _task})

@@ -1,0 +1,229 @@
+"""Several recorded episodes on one car.
+
+The car is opened once; each episode has a recorder of its own. Signals ask the loop to end. Where the loop does not
+end, a watch thread stops the car, writes the reason into the recording, finishes the files and calls ``on_abandon``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from carlab.core.car import Car
+from carlab.core.clock import wall_clock_ns
+from carlab.core.documents import Document, EpisodeEnded, Tick
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import PoseLostError
+from carlab.core.outcome import EndReason
+from carlab.core.policy import Policy
+from carlab.core.quantities import CarState
+from carlab.core.safety import SafetyEnvelope
+from carlab.core.task import Task
+from carlab.experiment.episodes.episode import EpisodeHooks, run_episode
+from carlab.experiment.episodes.interrupts import Interrupts, LoopWatch
+from carlab.recording.mcap.sink import McapSink
+from carlab.recording.recorder import Recorder
+from carlab.recording.rerun.sink import RerunSink
+from carlab.recording.run_folder import RunDirectory
+from carlab.recording.sink import LogLine
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeResult:
+    """An episode that was driven. ``summary`` are the task's figures of the final state."""
+
+    episode: int
+    data: EpisodeData
+    reason: EndReason
+    summary: Mapping[str, float]
+    path: Path
+
+    @property
+    def total_reward(self) -> float:
+        """Sum of rewards."""
+        return float(np.sum(self.data.rewards))
+
+
+def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
+    """The result of a recorded episode."""
+    final = CarState.from_array(data.states[-1])
+    return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], task.summary(final), path)
+
+
+@dataclass(slots=True)
+class SessionHooks:
+    """Callbacks of a session.
+
+    ``place_by_hand`` is called where the car cannot put itself at its start; it returns when it stands there.
+    ``on_tick`` sees each tick, for a progress bar. ``stop_reason`` may end an episode (a dead-man, say).
+    ``on_abandon`` is called last when the loop hung: reason, detail; the process must end there.
+    """
+
+    place_by_hand: Callable[[CarState], None] = lambda start: None
+    on_episode: Callable[[int, int], None] = lambda episode, ticks: None
+    on_tick: Callable[[Tick], None] = lambda tick: None
+    on_result: Callable[[EpisodeResult], None] = lambda result: None
+    stop_reason: Callable[[], EndReason | None] = lambda: None
+    on_abandon: Callable[[EndReason, str], None] = lambda reason, detail: None
+
+
+@dataclass(slots=True)
+class Session:
+    """Drives ``episodes`` of a task with a policy on an open car into a run directory."""
+
+    car: Car
+    policy: Policy
+    task: Task
+    envelope: SafetyEnvelope
+    run: RunDirectory
+    period_s: float
+    seed: int = 0
+    max_ticks: int | None = None
+    config_toml: str = ""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    hooks: SessionHooks = field(default_factory=SessionHooks)
+    hang_timeout_s: float = 2.0
+    place: bool = True
+    record_rerun: bool = True
+
+    def drive(self, episodes: int) -> list[EpisodeResult]:
+        """Drive; ends early when asked to stop or when an episode ended for safety. Raises what run_episode raises."""
+        results: list[EpisodeResult] = []
+        starts = np.random.SeedSequence(self.seed).spawn(episodes)
+        with Interrupts() as interrupts:
+            for index in range(episodes):
+                start = self.task.sample_start(np.random.default_rng(starts[index]))
+                if not (self.place and self.car.place(start)):
+                    if self.place:
+                        interrupts.ask(functools.partial(self.hooks.place_by_hand, start))
+                    if not interrupts.requested.is_set():
+                        wait_until_still(self.car)
+                if interrupts.requested.is_set():
+                    break
+                result = self._drive_one(self.run.next_episode(), interrupts)
+                results.append(result)
+                self.hooks.on_result(result)
+                if result.reason.is_safety_stop or result.reason is EndReason.STOP_REQUESTED:
+                    break
+        return results
+
+    def _drive_one(self, number: int, interrupts: Interrupts) -> EpisodeResult:
+        path = self.run.episode_path(number, ".mcap")
+        sinks: list[McapSink | RerunSink] = [McapSink(path, self.metadata)]
+        if self.record_rerun:
+            sinks.append(RerunSink(self.run.episode_path(number, ".rrd")))
+        recorder = Recorder(sinks)
+        emitter = _Emitter(recorder, self.hooks.on_tick)
+        abandon = functools.partial(self._abandon, recorder, emitter, interrupts)
+        watch = LoopWatch(abandon, timeout_s=self.hang_timeout_s, urgent=interrupts.urgent)
+        hooks = EpisodeHooks(
+            emit=emitter.emit,
+            stop_requested=lambda: interrupts.reason() or self.hooks.stop_reason(),
+            recorder_failed=lambda: recorder.failed,
+            heartbeat=watch.beat,
+        )
+        self.hooks.on_episode(number, self.task.max_ticks if self.max_ticks is None else self.max_ticks)
+        with recorder, _logged(recorder), watch:
+            data = run_episode(
+                self.car,
+                self.policy,
+                self.task,
+                self.envelope,
+                period_s=self.period_s,
+                max_ticks=self.max_ticks,
+                hooks=hooks,
+                episode=number,
+                seed=self.seed,
+                config_toml=self.config_toml,
+                metadata=self.metadata,
+            )
+            watch.rest()
+        return result_of(number, _with_recorder_error(data, recorder.failed), self.task, path)
+
+    def _abandon(self, recorder: Recorder, emitter: _Emitter, interrupts: Interrupts, where: str, stack: str) -> None:
+        """Stop the car and finish the recording in place of a loop that hangs; called from the watch thread."""
+        reason = EndReason.STOP_REQUESTED if interrupts.urgent.is_set() else EndReason.LOOP_HUNG
+        detail = f"The loop hung while {where}."
+        log_text = f"The control loop hangs while {where}:\n{stack}"
+        ends_episode = emitter.claim_end()
+        with contextlib.suppress(Exception):
+            self.car.stop(planned=False)
+        tick = emitter.last_tick
+        t_s = tick.t_s if tick is not None else self.car.clock.now_s()
+        if ends_episode:
+            recorder.emit(LogLine(wall_clock_ns(), logging.CRITICAL, __name__, log_text))
+            recorder.emit(EpisodeEnded(t_s, reason, detail, tick.step if tick is not None else 0, float("nan")))
+        recorder.close()
+        with contextlib.suppress(Exception):
+            self.car.close()
+        log.critical("%s", log_text)
+        self.hooks.on_abandon(reason, detail)
+
+
+class _Emitter:
+    """Hands documents to a recorder until the episode has ended.
+
+    The loop and the watch thread may both end the episode. The first of them does; the loop is silent from then on.
+    """
+
+    def __init__(self, recorder: Recorder, on_tick: Callable[[Tick], None]) -> None:
+        self._recorder, self._on_tick = recorder, on_tick
+        self._lock = threading.Lock()
+        self._ended = False
+        self.last_tick: Tick | None = None
+
+    def claim_end(self) -> bool:
+        """Whether the caller is the first to end the episode."""
+        with self._lock:
+            is_first, self._ended = not self._ended, True
+        return is_first
+
+    def emit(self, document: Document) -> None:
+        """Record a document of the loop."""
+        if self.claim_end() if isinstance(document, EpisodeEnded) else not self._ended:
+            self._recorder.emit(document)
+        if isinstance(document, Tick):
+            self.last_tick = document
+            self._on_tick(document)
+
+
+def _with_recorder_error(data: EpisodeData, failed: str | None) -> EpisodeData:
+    """An episode whose recording could not be finished has not been completed, whatever its driving ended with."""
+    if failed is None or EndReason[data.metadata["end_reason"]].is_safety_stop:
+        return data
+    reason = EndReason.RECORDER_ERROR
+    end = {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": failed}
+    return replace(data, metadata={**data.metadata, **end})
+
+
+@contextlib.contextmanager
+def _logged(recorder: Recorder) -> Iterator[None]:
+    """Write the program's log into the recording meanwhile."""
+    handler = recorder.log_handler()
+    root = logging.getLogger()
+    root.addHandler(handler)
+    try:
+        yield
+    finally:
+        root.removeHandler(handler)
+
+
+def wait_until_still(car: Car, timeout_s: float = 3.0, speed_mps: float = 0.05) -> bool:
+    """Wait, in neutral, until the car is seen to stand; False where it is not within ``timeout_s`` of its clock."""
+    give_up_s = car.clock.now_s() + timeout_s
+    while car.clock.now_s() <= give_up_s:
+        with contextlib.suppress(PoseLostError):
+            seen = car.observe()
+            if seen.velocity_valid and seen.state.speed_mps <= speed_mps:
+                return True
+        car.clock.sleep_until(car.clock.now_s() + 0.02)
+    return False

@@ -1,0 +1,1 @@
+"""Predictions of recordings by a simulator: prediction windows, initial states, predictions, errors."""

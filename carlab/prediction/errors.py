@@ -1,0 +1,70 @@
+"""Prediction errors by channel and horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
+from carlab.prediction.predict import PredictiveModel
+from carlab.prediction.windows import PredictionWindows
+
+MAX_ERROR = 1e3
+"""Bound of a final error, and what stands for one that is not finite: a diverged simulator."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelError:
+    """Errors of one channel after the horizon over all windows, in ``unit``.
+
+    Root mean square, median and 90th percentile of the absolute error, and mean (predicted minus measured).
+    """
+
+    channel: str
+    unit: str
+    rms: float
+    median: float
+    p90: float
+    bias: float
+
+
+def prediction_errors(predicted: FloatArray, windows: PredictionWindows) -> FloatArray:
+    """Predicted minus measured (..., S, K + 1, 6).
+
+    Args:
+        predicted: measurements (..., S, K + 1, 6).
+        windows: what they predict.
+
+    Returns:
+        x and y in the body frame of each window's initial state (ahead, left), the other channels as they are.
+    """
+    error = predicted - windows.measured
+    yaw = windows.initial_states[:, 2, None]
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    dx, dy = error[..., 0].copy(), error[..., 1].copy()
+    error[..., 0] = cos * dx + sin * dy
+    error[..., 1] = cos * dy - sin * dx
+    return error
+
+
+def final_errors(model: PredictiveModel, windows: PredictionWindows) -> FloatArray:
+    """Errors (S, 6) after the horizon, as ``prediction_errors``, finite and within ``MAX_ERROR``."""
+    error = prediction_errors(model.predict(windows), windows)[:, -1]
+    return np.nan_to_num(error, nan=MAX_ERROR, posinf=MAX_ERROR, neginf=-MAX_ERROR).clip(-MAX_ERROR, MAX_ERROR)
+
+
+def channel_errors(errors: FloatArray) -> tuple[ChannelError, ...]:
+    """Statistics by channel of errors (S, 6)."""
+    size = np.abs(errors)
+    return tuple(
+        ChannelError(
+            name,
+            unit,
+            float(np.sqrt(np.mean(errors[:, k] ** 2))),
+            float(np.median(size[:, k])),
+            float(np.percentile(size[:, k], 90)),
+            float(np.mean(errors[:, k])),
+        )
+        for k, (name, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True))
+    )

@@ -1,0 +1,180 @@
+"""Predictions of windows by any model; by the simulator for many parameter sets at once.
+
+Time is that of the recording. Motion capture has a latency, so every command acts that much later in the recording.
+Measurements are inverted at the initial state of a window and applied along it by ``sim_backends.measurement``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from carlab.core.quantities import FloatArray
+from carlab.prediction.windows import PredictionWindows
+from sim_backends.batch.inputs import with_effects_of
+from sim_backends.batch.rollout import rollout
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.dynamics.array_ops import ARRAYS
+from sim_backends.effects import EFFECTS
+from sim_backends.measurement import (
+    COMMAND_DELAY,
+    MeasurementModel,
+    State,
+    delay_as_recorded_s,
+    is_measured,
+)
+from sim_backends.measurement import velocity_curvature as state_curvature
+
+MAX_STEP_S = 0.017
+"""Longest step of the integration: at 30 Hz its error stays within a hundredth of a noise floor."""
+
+
+class PredictiveModel(Protocol):
+    """Anything that predicts what is measured in windows."""
+
+    def predict(self, windows: PredictionWindows) -> FloatArray:
+        """Predicted measurements (S, K + 1, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatorModel:
+    """A simulator as a predictive model."""
+
+    config: SimulatorConfig
+
+    def predict(self, windows: PredictionWindows) -> FloatArray:
+        """As ``PredictiveModel``."""
+        return np.asarray(simulate_windows(windows, self.config)[0])
+
+
+@dataclass(frozen=True, slots=True)
+class ConstantVelocity:
+    """A car that keeps its body velocities: it drives on circular arcs."""
+
+    def predict(self, windows: PredictionWindows) -> FloatArray:
+        """As ``PredictiveModel``, from the initial state of each window."""
+        time_s = windows.period_s * np.arange(windows.steps + 1)
+        x, y, yaw, vx, vy, yaw_rate = (column[:, None] for column in windows.initial_states.T)
+        turn = yaw_rate * time_s
+        along, across = np.sinc(turn / np.pi), np.sin(turn / 2) * np.sinc(turn / (2 * np.pi))
+        ahead, left = time_s * (along * vx - across * vy), time_s * (across * vx + along * vy)
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        columns = (x + cos * ahead - sin * left, y + sin * ahead + cos * left, yaw + turn, vx, vy, yaw_rate)
+        return np.stack(np.broadcast_arrays(*columns), axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class NoChange:
+    """A car that stays as it is."""
+
+    def predict(self, windows: PredictionWindows) -> FloatArray:
+        """As ``PredictiveModel``."""
+        return np.repeat(windows.initial_states[:, None], windows.steps + 1, axis=1)
+
+
+def predicted_at(times_s: FloatArray, windows: PredictionWindows, predicted: FloatArray) -> FloatArray:
+    """Predictions (T, 6) at times (T,) of one recording, NaN outside of the windows.
+
+    Args:
+        times_s: since the first row of the recording.
+        windows: of that recording, none overlapping another.
+        predicted: (S, K + 1, 6).
+    """
+    found = np.full((len(times_s), 6), np.nan)
+    grid = windows.period_s * np.arange(windows.steps + 1)
+    for start_s, states in zip(windows.t0_s, predicted, strict=True):
+        rows = np.flatnonzero((times_s > start_s - 1e-6) & (times_s < start_s + windows.horizon_s - 1e-6))
+        for channel in range(6):
+            found[rows, channel] = np.interp(times_s[rows] - start_s, grid, states[:, channel])
+    return found
+
+
+def simulate_windows(
+    windows: PredictionWindows,
+    config: SimulatorConfig,
+    values: Mapping[str, FloatArray] | None = None,
+    *,
+    max_step_s: float = MAX_STEP_S,
+) -> FloatArray:
+    """Predict windows by a simulator with P parameter sets.
+
+    Args:
+        windows: S of them.
+        config: the simulator, observation effects included.
+        values: parameters by dotted name, each (P,); the others are those of the simulator.
+        max_step_s: longest step of the integration.
+
+    Returns:
+        Predicted measurements (P, S, K + 1, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate.
+    """
+    given = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in (values or {}).items()}
+    sets = max((len(v) for v in given.values()), default=1)
+    whole = with_effects_of(config, given)
+    numbers: dict[str, float | FloatArray] = {**whole.values(), **given}
+    shaped = {name: _broadcast(value, sets)[:, None] for name, value in numbers.items()}
+    measurement = MeasurementModel(ARRAYS, shaped, whole.effects)
+    inner = {n: _broadcast(v, sets) for n, v in given.items() if not is_measured(n)}
+    effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
+    delay_s = delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s)
+    inner[COMMAND_DELAY] = np.asarray(delay_s)[:, 0]
+    unmeasured = replace(whole, effects=effects, control_period_s=windows.period_s, priors={}, doubts={})
+    count = len(windows)
+
+    def tensor(array: FloatArray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+    invert = measurement.invert_poses if windows.velocities_from_poses else measurement.invert
+    start = _stacked([invert(tuple(windows.initial_states.T))], sets)[:, :, 0]
+    states = rollout(
+        unmeasured,
+        tensor(start.reshape(-1, 6)),
+        tensor(np.tile(windows.commands, (sets, 1, 1))),
+        history=tensor(np.tile(windows.past_commands, (sets, 1, 1))),
+        values={name: tensor(np.repeat(v, count)) for name, v in inner.items()},
+        t0_s=tensor(np.tile(windows.t0_s, sets)),
+        max_step_s=max_step_s,
+    ).states
+    out = states.numpy().astype(np.float64).reshape(sets, count, windows.steps + 1, 6)
+    measured = measurement.measure(
+        [tuple(out[:, :, k, i] for i in range(6)) for k in range(windows.steps + 1)],
+        windows.period_s,
+        window_s2=windows.velocity_window_s2,
+        velocities_before=[tuple(windows.past_states[:, k, 3:].T) for k in range(windows.past_states.shape[1])],
+    )
+    return _stacked(measured, sets)
+
+
+def velocity_curvature(states: FloatArray, period_s: float) -> FloatArray:
+    """Second time derivative of velocities, in the body frame.
+
+    Args:
+        states: (..., K + 1, 6).
+        period_s: from one state to the next.
+
+    Returns:
+        (..., K + 1, 3) by central differences of the velocities in the world; 0 at both ends.
+    """
+    rows = tuple(np.moveaxis(states, -1, 0))
+    before, now, after = (tuple(r[..., part] for r in rows) for part in (np.s_[:-2], np.s_[1:-1], np.s_[2:]))
+    second = np.zeros((*states.shape[:-1], 3))
+    second[..., 1:-1, :] = np.stack(state_curvature(ARRAYS, before, now, after, period_s), axis=-1)
+    return second
+
+
+def _broadcast(value: float | FloatArray, sets: int) -> FloatArray:
+    return np.broadcast_to(np.asarray(value, dtype=np.float64).reshape(-1), (sets,)).copy()
+
+
+def _stacked(states: Sequence[State], sets: int) -> FloatArray:
+    """States, one (P or 1, S) row of six for each tick, as one array (P, S, ticks, 6)."""
+    count = states[0][0].shape[-1]
+    stacked = np.empty((len(states), 6, sets, count))
+    for k, state in enumerate(states):
+        for i, row in enumerate(state):
+            stacked[k, i] = row
+    return stacked.transpose(2, 3, 0, 1)

@@ -1,0 +1,304 @@
+"""Recordings cut into prediction windows: short stretches that a model predicts from an estimated initial state.
+
+The initial state of a window is a local cubic through the poses around it (Savitzky and Golay 1964), not the noisy
+velocity columns. Each window carries the commands before it, so that delays and the states of servo and motor are
+right at its start.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import savgol_filter
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+
+IndexArray = NDArray[np.int64]
+
+SMOOTHING_SPAN_S = 0.27
+"""Span of the poses that the initial state of a window is estimated from: nine poses at 30 Hz."""
+HISTORY_S = 0.6
+"""Length of the commands before a window: six time constants of a slow (0.1 s) servo or motor."""
+MIN_QUINTIC_WIDTH = 7
+"""Fewest poses under the quintic that the local cubic is compared with."""
+MAX_PERIOD_S = 0.034
+"""Longest period to which a faster recording is thinned."""
+MIN_SPEED_MPS = 0.15
+"""Windows in which the car stays slower are left out: any model predicts a parked car."""
+BLOCK_S = 5.0
+"""Windows that start within one such stretch count as dependent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """One unbroken stretch of a recording on an even grid of n rows.
+
+    Attributes:
+        recording: index of the recording.
+        period_s: of the grid.
+        t_s: (n,) since the first row of the recording.
+        states: (n, 6) as measured, yaw unwrapped.
+        smooth: (n, 6) pose of a local cubic through the poses, and the body velocities of that cubic.
+        commands: (n, 2) mean over each cell of the commands, each held from its stamp on.
+        residual: (m, 6) states minus their local cubic while the car moves, at the period ``sampled_s``.
+        speed: (m,) at the rows of ``residual`` [m/s].
+        curvature_bias: (n, 6) states of a local quintic minus ``smooth``.
+        sampled_s: period before thinning.
+    """
+
+    recording: int
+    period_s: float
+    t_s: FloatArray
+    states: FloatArray
+    smooth: FloatArray
+    commands: FloatArray
+    residual: FloatArray
+    speed: FloatArray
+    curvature_bias: FloatArray
+    sampled_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """Rows times period."""
+        return len(self.t_s) * self.period_s
+
+    def part(self, rows: slice) -> Track:
+        """Some rows of the track; ``residual`` and ``speed`` stay those of the whole."""
+        return replace(
+            self,
+            t_s=self.t_s[rows],
+            states=self.states[rows],
+            smooth=self.smooth[rows],
+            curvature_bias=self.curvature_bias[rows],
+            commands=self.commands[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PredictionWindows:
+    """S prediction windows of K steps with H commands before them.
+
+    Attributes:
+        period_s: length of a step.
+        initial_states: (S, 6) x, y, yaw in the recording's frame, vx, vy in the body frame, yaw rate.
+        past_commands: (S, H, 2) before the window.
+        commands: (S, K, 2) in the window.
+        measured: (S, K + 1, 6) states as recorded, yaw unwrapped.
+        past_states: (S, H, 6) smoothed states before the window.
+        curvature_bias: (S, 6) initial state by a local quintic minus that by the local cubic.
+        t0_s: (S,) start of the window since the first row of its recording.
+        recording: (S,) index of the recording.
+        block: (S,) number of the stretch of a few seconds; blocks count as independent of each other.
+        velocity_window_s2: variance [s2] of the window over which the recording's velocities were differentiated; 0
+            where they count as instantaneous.
+        velocities_from_poses: whether the initial velocities are differentiated poses, not recorded velocities.
+    """
+
+    period_s: float
+    initial_states: FloatArray
+    past_commands: FloatArray
+    commands: FloatArray
+    measured: FloatArray
+    past_states: FloatArray
+    curvature_bias: FloatArray
+    t0_s: FloatArray
+    recording: IndexArray
+    block: IndexArray
+    velocity_window_s2: float = 0.0
+    velocities_from_poses: bool = True
+
+    def __len__(self) -> int:
+        return len(self.initial_states)
+
+    @property
+    def steps(self) -> int:
+        """Steps K of each window."""
+        return int(self.commands.shape[1])
+
+    @property
+    def horizon_s(self) -> float:
+        """Length of each window."""
+        return self.steps * self.period_s
+
+    def take(self, which: NDArray[np.bool_] | IndexArray) -> Self:
+        """Some of the windows."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        chosen: dict[str, Any] = {name: v[which] for name, v in values.items() if isinstance(v, np.ndarray)}
+        return replace(self, **chosen)
+
+    def thinned(self, most: int) -> Self:
+        """At most ``most`` windows, evenly taken."""
+        if len(self) <= most:
+            return self
+        return self.take(np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)))
+
+
+def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) -> list[Track]:
+    """Put recordings onto an even grid, cut at gaps and where a value is missing.
+
+    Faster recordings are thinned to ``MAX_PERIOD_S`` after smoothing; commands become means over the cells.
+
+    Args:
+        episodes: recordings; the column ``segment`` in ``extra`` numbers stretches that must not be joined.
+        period_s: of the grid; that of the first recording where None.
+
+    Raises:
+        DataError: a recording has no two rows.
+    """
+    found = []
+    for index, episode in enumerate(episodes):
+        if episode.ticks < 2:
+            raise DataError(f"Recording {index + 1} has {episode.ticks} commands; record at least some seconds.")
+        if period_s is None:
+            period_s = episode.period_s * max(int(MAX_PERIOD_S / episode.period_s + 1e-6), 1)
+        every = max(round(period_s / episode.period_s), 1)
+        for rows in _unbroken(episode, episode.period_s):
+            track = _track(index, episode, rows, period_s / every, every)
+            if track is not None:
+                found.append(track)
+    return found
+
+
+def _unbroken(episode: EpisodeData, period_s: float) -> Iterable[slice]:
+    t = episode.times_s
+    whole = np.asarray(np.isfinite(episode.states).all(axis=1))
+    broken = np.asarray(np.diff(t) > max(3.0 * period_s, 0.1)) | ~(whole[1:] & whole[:-1])
+    if "segment" in episode.extra:
+        broken = broken | np.asarray(np.diff(episode.extra["segment"]) != 0)
+    edges = [0, *(np.flatnonzero(broken) + 1), len(t)]
+    for first, last in itertools.pairwise(edges):
+        if last - first > 2:
+            yield slice(int(first), int(last))
+
+
+def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every: int) -> Track | None:
+    t = episode.times_s[rows]
+    states = episode.states[rows].copy()
+    states[:, 2] = np.unwrap(states[:, 2])
+    commands = np.vstack([episode.sent, episode.sent[-1:]])[rows]
+    count = int(np.floor((t[-1] - t[0]) / period_s + 1e-6)) + 1
+    grid = t[0] + period_s * np.arange(count)
+    width = smoothing_width(period_s)
+    if count < max(width, MIN_QUINTIC_WIDTH) + 2:
+        return None
+    if np.abs(np.diff(t) - period_s).max() > 0.02 * period_s or count != len(t):
+        states = np.stack([np.interp(grid, t, column) for column in states.T], axis=1)
+        commands = _cell_means(t, commands, grid, period_s)
+    smooth = _smoothed(states, width, 3, period_s)
+    speed = np.hypot(smooth[:, 3], smooth[:, 4])
+    moving = speed > MIN_SPEED_MPS
+    moving = moving if moving.sum() >= 20 else np.ones_like(moving)
+    residual = (states - savgol_filter(states, width, 3, axis=0))[moving]
+    speed = speed[moving]
+    curvature_bias = _smoothed(states, max(width, MIN_QUINTIC_WIDTH), 5, period_s) - smooth
+    if every > 1:
+        whole = len(grid) // every * every
+        commands = commands[:whole].reshape(-1, every, 2).mean(axis=1)
+        grid, states, smooth, curvature_bias = (v[:whole:every] for v in (grid, states, smooth, curvature_bias))
+    return Track(
+        recording=index,
+        period_s=every * period_s,
+        t_s=grid - episode.times_s[0],
+        states=states,
+        smooth=smooth,
+        commands=commands,
+        residual=residual,
+        speed=speed,
+        curvature_bias=curvature_bias,
+        sampled_s=period_s,
+    )
+
+
+def _smoothed(states: FloatArray, width: int, order: int, period_s: float) -> FloatArray:
+    """Pose and body velocities (n, 6) by a local polynomial through the poses of (n, 6)."""
+    pose = savgol_filter(states[:, :3], width, order, axis=0)
+    return body_states(pose, savgol_filter(states[:, :3], width, order, deriv=1, delta=period_s, axis=0))
+
+
+def body_states(pose: FloatArray, rate: FloatArray) -> FloatArray:
+    """States (n, 6) of poses (n, 3) and their rates in the world (n, 3)."""
+    sin, cos = np.sin(pose[:, 2]), np.cos(pose[:, 2])
+    forward, left = cos * rate[:, 0] + sin * rate[:, 1], cos * rate[:, 1] - sin * rate[:, 0]
+    return np.column_stack([pose, forward, left, rate[:, 2]])
+
+
+def _cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: float) -> FloatArray:
+    """Mean over [grid, grid + period) of values held from each t on."""
+    integral = np.vstack([np.zeros(2), np.cumsum(held[:-1] * np.diff(t)[:, None], axis=0)])
+
+    def upto(moments: FloatArray) -> FloatArray:
+        inside = np.clip(moments, t[0], t[-1])
+        index = np.clip(np.searchsorted(t, inside, side="right") - 1, 0, len(t) - 1)
+        past = np.clip(moments - t[-1], 0.0, None)[:, None] * held[-1]
+        return np.asarray(integral[index] + (inside - t[index])[:, None] * held[index] + past)
+
+    return (upto(grid + period_s) - upto(grid)) / period_s
+
+
+def smoothing_width(period_s: float) -> int:
+    """Number of poses, odd and at least 5, that an initial state is estimated from."""
+    return max(2 * round((SMOOTHING_SPAN_S / period_s - 1) / 2) + 1, 5)
+
+
+def cut_windows(
+    tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: float = BLOCK_S
+) -> PredictionWindows:
+    """Cut tracks into windows in which the car moves.
+
+    Args:
+        tracks: at least one, all of one period.
+        horizon_s: length of a window.
+        stride_s: from one start to the next.
+        block_s: length of the stretches that count as independent.
+
+    Raises:
+        DataError: there is no such window.
+    """
+    period_s = tracks[0].period_s
+    steps = max(round(horizon_s / period_s), 1)
+    stride = max(round(stride_s / period_s), 1)
+    past = max(round(HISTORY_S / period_s), 1)
+    starts = [
+        (track, row)
+        for track in tracks
+        for row in range(past, len(track.t_s) - steps, stride)
+        if np.hypot(*track.smooth[row : row + steps + 1, 3:5].T).max() >= MIN_SPEED_MPS
+    ]
+    if not starts:
+        raise DataError(
+            f"The recording holds no moving stretch of {horizon_s + HISTORY_S:.1f} s; record a longer drive, or choose "
+            "a shorter horizon."
+        )
+    return PredictionWindows(
+        period_s=period_s,
+        initial_states=np.stack([track.smooth[row] for track, row in starts]),
+        past_commands=np.stack([track.commands[row - past : row] for track, row in starts]),
+        commands=np.stack([track.commands[row : row + steps] for track, row in starts]),
+        measured=np.stack([track.states[row : row + steps + 1] for track, row in starts]),
+        past_states=np.stack([track.smooth[row - past : row] for track, row in starts]),
+        curvature_bias=np.stack([track.curvature_bias[row] for track, row in starts]),
+        t0_s=np.array([track.t_s[row] for track, row in starts]),
+        recording=np.array([track.recording for track, _ in starts]),
+        block=np.array([track.recording * 1_000_000 + int(track.t_s[row] / block_s) for track, row in starts]),
+    )
+
+
+def split_tracks(tracks: Sequence[Track], share: float, guard_s: float) -> tuple[list[Track], list[Track]]:
+    """Split each track into its first part and its last ``share``, with ``guard_s`` in between left out.
+
+    Parts that are no longer than the guard are left out.
+    """
+    early, late = [], []
+    guard = round(guard_s / tracks[0].period_s) if tracks else 0
+    for track in tracks:
+        cut_at = round((1.0 - share) * len(track.t_s))
+        early.append(track.part(slice(0, max(cut_at - guard, 0))))
+        late.append(track.part(slice(cut_at, len(track.t_s))))
+    return [t for t in early if len(t.t_s) > guard], [t for t in late if len(t.t_s) > guard]

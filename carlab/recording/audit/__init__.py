@@ -1,0 +1,1 @@
+"""Audit of a foreign recording: stamps, units, frames, signs, spikes, delays."""

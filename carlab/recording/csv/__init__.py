@@ -1,0 +1,1 @@
+"""CSV files: import of foreign layouts, and export."""

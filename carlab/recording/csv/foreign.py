@@ -1,0 +1,325 @@
+"""Foreign CSV to EpisodeData: converts what the mapping declares, audits the rest, refuses what cannot be meant."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+from carlab.recording.audit.audit import Channels, audit_channels
+from carlab.recording.audit.comparison import held_at
+from carlab.recording.audit.heading import check_heading
+from carlab.recording.audit.report import AuditReport, Finding, Severity, raise_errors
+from carlab.recording.audit.stamps import check_jumps, check_missing, check_order, check_stamps, gap_rows, segments
+from carlab.recording.csv.clocks import even_clock, rebuilt_clock
+from carlab.recording.csv.mapping import CHANNELS, VELOCITY_CHANNELS, ColumnMapping, missing_columns, recognise_layout
+from carlab.recording.csv.table import CsvTable, read_csv
+from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedRecording:
+    """What came of a file: one episode, or several where it was split, and everything found out about it.
+
+    ``announcement`` says in one sentence which layout was recognised or declared and what was converted.
+    """
+
+    episodes: tuple[EpisodeData, ...]
+    report: AuditReport
+    mapping: ColumnMapping
+    announcement: str
+
+    @property
+    def episode(self) -> EpisodeData:
+        """The episode of a recording that was not split. Raises DataError where there are several."""
+        if len(self.episodes) != 1:
+            raise DataError(f"{self.report.source} was split into {len(self.episodes)} episodes; choose one of them.")
+        return self.episodes[0]
+
+
+def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
+    """Import a .csv or .csv.gz. Without ``mapping`` the layout is recognised by its header.
+
+    Commands are taken as issued at their row's time and held until the next row, so N rows become N - 1 commands and N
+    states: the last row's command is left out. Times count from the first row. Native row rate is kept.
+
+    Raises DataError, in one sentence with the remedy, for what cannot be imported as declared: a file that is not a
+    CSV, a missing column, a cell that is not a number, time that does not increase, gaps, units that plainly are not
+    SI and not declared, commands beyond [-1, 1]. All else that looks wrong is imported as it is and reported.
+    """
+    table = read_csv(path)
+    source = table.path.name
+    mapping, how = _layout(table, mapping)
+    values, extra, findings = _usable_rows(table, mapping)
+    origin_s = float(values["t"][0])
+    t_s = values["t"] - origin_s
+    findings += check_stamps(t_s, mapping)
+    if mapping.clock == "even":
+        t_s, found = even_clock(t_s)
+        findings += found
+    if not mapping.dead_reckoning:
+        findings += check_heading(t_s, values, mapping)
+    raise_errors(source, findings)
+
+    channels, found = _segmented(t_s, values, extra, mapping)
+    findings += found
+    found, spikes = audit_channels(channels, mapping)
+    findings += found
+    raise_errors(source, findings)
+    states, notes = _states(channels, mapping, spikes)
+    if mapping.clock == "velocity":
+        t_s, note = rebuilt_clock(channels)
+        notes["clock"] = note
+    metadata = {
+        "source": str(table.path),
+        "source_sha256": hashlib.sha256(table.path.read_bytes()).hexdigest(),
+        "layout": mapping.layout,
+        "task": "recorded",
+        "time_origin_s": repr(origin_s),
+        "units": "s, m, rad, m/s, rad/s; velocities in the body frame; commands in [-1, 1] held from their row on",
+        **notes,
+    }
+    episodes, found = _episodes(t_s, states, channels, mapping, metadata)
+    findings += found
+    announcement = f"{how}; {_conversions(mapping)}."
+    return ImportedRecording(episodes, AuditReport(source, mapping.layout, tuple(findings)), mapping, announcement)
+
+
+def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMapping, str]:
+    """The mapping to read the table with, and how it was chosen. Raises DataError where columns are missing."""
+    source = table.path.name
+    if mapping is None:
+        mapping = recognise_layout(table.header, source)
+        return mapping, f"{source}: recognised the {mapping.layout} layout by its header"
+    lacking = missing_columns(mapping, table.header)
+    if lacking:
+        raise DataError(
+            f"{source} has no column {', '.join(lacking)}; it holds {', '.join(table.header)}; correct the mapping."
+        )
+    return mapping, f"{source}: read with mapping '{mapping.layout}'"
+
+
+def _usable_rows(
+    table: CsvTable, mapping: ColumnMapping
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray], list[Finding]]:
+    """Channels and other columns on the rows with a number in each channel and a stamp that increases."""
+    source = table.path.name
+    findings = _text_columns(table, mapping)
+    values, extra = _declared(table, mapping)
+    gate = {mapping.throttle_gate: extra[mapping.throttle_gate]} if mapping.throttle_gate in extra else {}
+    found, whole = check_missing({**values, **gate}, mapping)
+    findings += found
+    raise_errors(source, findings)
+    found, advances = check_order(values["t"][whole], mapping)
+    findings += found
+    raise_errors(source, findings)
+    kept = np.flatnonzero(whole)[advances]
+    if len(kept) < 3:
+        raise DataError(f"{source} has {len(kept)} usable rows; a recording needs at least three.")
+    usable, others = ({name: column[kept] for name, column in columns.items()} for columns in (values, extra))
+    return usable, others, findings
+
+
+def _declared(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Channels in SI by units, signs, axes and offset as declared, and all other columns of numbers."""
+    values: dict[str, FloatArray] = {}
+    if mapping.rate_hz is not None:
+        values["t"] = np.arange(table.rows) / mapping.rate_hz
+    for channel in CHANNELS:
+        source = mapping.columns.get(channel)
+        if source is not None and source.name in table.header and channel not in values:
+            values[channel] = table.column(source.name) * source.factor(channel)
+    if mapping.swap_xy:
+        values["x"], values["y"] = values["y"], values["x"]
+        if mapping.velocity_frame == "world" and "vx" in values and "vy" in values:
+            values["vx"], values["vy"] = values["vy"], values["vx"]
+    if "yaw" in values:
+        values["yaw"] = values["yaw"] + mapping.yaw_offset_rad
+    ignored = VELOCITY_CHANNELS if mapping.velocities == "pose" else ()
+    used = {source.name for channel, source in mapping.columns.items() if channel not in ignored}
+    extra = {name: column for name, column in table.columns.items() if name not in used}
+    return values, extra
+
+
+def _text_columns(table: CsvTable, mapping: ColumnMapping) -> list[Finding]:
+    used = {source.name for source in mapping.columns.values()}
+    return [
+        Finding(
+            "text_column",
+            name,
+            Severity.INFO,
+            f"Column '{name}' holds text ({cell!r} in row {row}) and is not kept: extra columns are numbers.",
+            1,
+            (row,),
+        )
+        for name, (row, cell) in table.texts.items()
+        if name not in used
+    ]
+
+
+def _segmented(
+    t_s: FloatArray, values: Mapping[str, FloatArray], extra: Mapping[str, FloatArray], mapping: ColumnMapping
+) -> tuple[Channels, list[Finding]]:
+    gaps = gap_rows(t_s)
+    if mapping.dead_reckoning:
+        return Channels(t_s, values, extra, segments(len(t_s), gaps), None), []
+    pose = (values["x"], values["y"], values["yaw"])
+    jumps = np.setdiff1d(pose_jumps(t_s, *pose), gaps)
+    segment = segments(len(t_s), np.union1d(gaps, jumps))
+    motion = pose_motion(t_s, *pose, segment)
+    return Channels(t_s, values, extra, segment, motion), check_jumps(t_s, values, jumps, mapping)
+
+
+def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tuple[FloatArray, dict[str, str]]:
+    """States (N, 6) with body velocities, and notes on how they came about."""
+    t_s, values, motion = channels.t_s, channels.values, channels.motion
+    if motion is None:
+        return _dead_reckoned(t_s, values["vx"], values["yaw_rate"]), {
+            "pose_source": "dead reckoning from the vx and yaw_rate columns with vy = 0: not measured",
+            "velocity_source": "columns",
+        }
+    pose = [values["x"], values["y"], values["yaw"]]
+    columns = mapping.velocities == "columns"
+    lag = mapping.velocity_lag_s
+    sources, vx, vy, yaw_rate = [], motion.vx, motion.vy, motion.yaw_rate
+    if columns and "vx" in values and "vy" in values:
+        vx, vy = values["vx"], values["vy"]
+        sources.append(f"vx, vy: columns in the {mapping.velocity_frame} frame")
+        if mapping.velocity_frame == "world":
+            yaw_then = np.interp(t_s - lag, t_s, motion.yaw_unwrapped)
+            c, s = np.cos(yaw_then), np.sin(yaw_then)
+            vx, vy = c * vx + s * vy, c * vy - s * vx
+            sources[-1] += f", rotated by the yaw of {lag * 1e3:.1f} ms before"
+    else:
+        sources.append(f"vx, vy: {motion.method()}")
+    if columns and "yaw_rate" in values:
+        yaw_rate = values["yaw_rate"]
+        sources.append("yaw_rate: column")
+        if mapping.repair_yaw_rate and spikes.any():
+            yaw_rate = np.where(spikes, np.interp(t_s - lag, t_s, motion.yaw_rate), yaw_rate)
+            sources[-1] += f", {int(spikes.sum())} rows of wrap spikes taken from the pose"
+    else:
+        sources.append(f"yaw_rate: {motion.method()}")
+    used_columns = columns and any(name in values for name in ("vx", "yaw_rate"))
+    notes = {"velocity_source": "; ".join(sources), "velocity_delay_s": f"{lag if used_columns else 0.0:.6g}"}
+    return np.column_stack([*pose, vx, vy, yaw_rate]), notes
+
+
+def _dead_reckoned(t_s: FloatArray, vx: FloatArray, yaw_rate: FloatArray) -> FloatArray:
+    """Integrate speed and turn rate, held over each period, by the midpoint heading. Returns states (N, 6)."""
+    step = np.diff(t_s)
+    yaw = np.concatenate([[0.0], np.cumsum(yaw_rate[:-1] * step)])
+    middle = 0.5 * (yaw[1:] + yaw[:-1])
+    x = np.concatenate([[0.0], np.cumsum(vx[:-1] * step * np.cos(middle))])
+    y = np.concatenate([[0.0], np.cumsum(vx[:-1] * step * np.sin(middle))])
+    return np.column_stack([x, y, yaw, vx, np.zeros_like(vx), yaw_rate])
+
+
+def _episodes(
+    t_s: FloatArray, states: FloatArray, channels: Channels, mapping: ColumnMapping, metadata: Mapping[str, str]
+) -> tuple[tuple[EpisodeData, ...], list[Finding]]:
+    requested, sent, findings = _commands(t_s, channels, mapping)
+    parts, found = _parts(channels.segment, mapping)
+    extra = dict(channels.extra)
+    if mapping.gaps != "split" and np.ptp(channels.segment) > 0:
+        extra["segment"] = channels.segment
+    episodes = []
+    for part in parts:
+        times = t_s[part]
+        poses = np.zeros((0, 4)) if channels.motion is None else np.column_stack([times, states[part, :3]])
+        last = slice(part.start, part.stop - 1)
+        episodes.append(
+            EpisodeData(
+                times_s=times,
+                states=states[part],
+                requested=requested[last],
+                sent=sent[last],
+                rewards=np.full(len(times) - 1, np.nan),
+                poses=poses,
+                metadata={**metadata, "rows": f"{part.start + 1} to {part.stop}"},
+                extra={name: column[part] for name, column in extra.items()},
+            )
+        )
+    return tuple(episodes), findings + found
+
+
+def _commands(
+    t_s: FloatArray, channels: Channels, mapping: ColumnMapping
+) -> tuple[FloatArray, FloatArray, list[Finding]]:
+    """Commands (N, 2) as requested and as sent, and what was done to them."""
+    requested = np.column_stack([channels.values["steering"], channels.values["throttle"]])
+    sent = requested.copy()
+    if mapping.throttle_gate:
+        sent[:, 1] *= channels.extra[mapping.throttle_gate]
+    if not mapping.command_lag_s:
+        return requested, sent, []
+    requested, sent = (
+        np.column_stack([held_at(t_s, column, -mapping.command_lag_s) for column in table.T])
+        for table in (requested, sent)
+    )
+    finding = Finding(
+        "column_shift",
+        "steering, throttle",
+        Severity.REPAIRED,
+        f"Commands were logged {mapping.command_lag_s * 1e3:.0f} ms after they were sent, by what the mapping "
+        "declares; they were taken that much earlier.",
+        len(t_s),
+        evidence={"lag_s": mapping.command_lag_s},
+    )
+    return requested, sent, [finding]
+
+
+def _parts(segment: FloatArray, mapping: ColumnMapping) -> tuple[list[slice], list[Finding]]:
+    """Rows of each episode: all, or the stretches of ``segment`` (N,) where the mapping splits at gaps."""
+    numbers = np.unique(segment)
+    if mapping.gaps != "split" or len(numbers) == 1:
+        return [slice(0, len(segment))], []
+    bounds = [*(int(np.argmax(segment == n)) for n in numbers), len(segment)]
+    stretches = [slice(first, end) for first, end in pairwise(bounds)]
+    parts = [part for part in stretches if part.stop - part.start >= 2]
+    short = [part for part in stretches if part.stop - part.start < 2]
+    if not parts:
+        raise DataError("No two rows belong together: every row is a gap or a jump away from the next.")
+    if not short:
+        return parts, []
+    finding = Finding(
+        "short_part",
+        "t",
+        Severity.INFO,
+        f"{len(short)} rows stand alone between two breaks and hold no transition; they are left out.",
+        len(short),
+        tuple(part.start + 1 for part in short[:20]),
+    )
+    return parts, [finding]
+
+
+def _conversions(mapping: ColumnMapping) -> str:
+    done = []
+    for channel, source in mapping.columns.items():
+        factor = source.factor(channel)
+        if factor != 1.0 or source.name != channel:
+            done.append(f"{channel} from '{source.name}'" + ("" if factor == 1.0 else f" times {factor:.6g}"))
+    if mapping.velocity_frame == "world":
+        done.append("velocities rotated from the world into the body frame")
+    if mapping.swap_xy:
+        done.append("x and y exchanged")
+    if mapping.yaw_offset_rad:
+        done.append(f"yaw plus {mapping.yaw_offset_rad:.4f} rad")
+    if mapping.repair_yaw_rate:
+        done.append("wrap spikes of yaw_rate repaired from the pose")
+    if mapping.throttle_gate:
+        done.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
+    if mapping.command_lag_s:
+        done.append(f"commands taken {mapping.command_lag_s * 1e3:.0f} ms earlier")
+    if mapping.clock == "even":
+        done.append("rows put on an even clock")
+    if mapping.dead_reckoning:
+        done.append("pose integrated from speed and turn rate")
+    return ", ".join(done) if done else "nothing needed conversion"

@@ -1,0 +1,1 @@
+"""MCAP files: schemas, messages, writer and reader."""

@@ -1,0 +1,335 @@
+"""Documents to MCAP messages and back: pure, and exact to the last bit in our own messages."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+
+from carlab.core.documents import EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import Action, CarState, Health, Observation, PoseSample, Reality
+from carlab.recording.mcap import schemas as schemas
+from carlab.recording.sink import Item, LogLine
+
+MAX_UNIX_NS = 253_402_300_799 * 10**9
+_LEVELS = ((logging.CRITICAL, 5), (logging.ERROR, 4), (logging.WARNING, 3), (logging.INFO, 2), (logging.DEBUG, 1))
+_NUMBERS = {number: level for level, number in _LEVELS}
+
+
+@dataclass(frozen=True, slots=True)
+class Stamped:
+    """One message for the file; the times are on the car's clock [s]."""
+
+    topic: str
+    message: Any
+    t_s: float
+    publish_s: float
+    sequence: int = 0
+
+
+class UnixMapping:
+    """Car clock [s] to Unix time [ns], by the two origins in the EpisodeStarted."""
+
+    def __init__(self, t_s: float, wall_ns: int) -> None:
+        self._t_s = t_s
+        self._wall_ns = wall_ns
+
+    def to_ns(self, t_s: float) -> int:
+        """Unix time [ns] of a moment of the car's clock; the origin where it is not a number."""
+        offset_s = t_s - self._t_s
+        if not math.isfinite(offset_s):
+            offset_s = 0.0
+        return min(max(self._wall_ns + round(offset_s * 1e9), 0), MAX_UNIX_NS)
+
+
+def text(value: str) -> str:
+    """A text as UTF-8 can hold it: stray surrogates (file names in another encoding) become question marks."""
+    return value.encode("utf-8", "replace").decode("utf-8")
+
+
+def encode(item: Item, unix: UnixMapping, now_s: float) -> Iterator[Stamped]:
+    """Yield the messages of a document, in the order in which they belong into the file.
+
+    ``now_s`` is when the newest document was made; log lines, which know wall-clock time only, take their place
+    there. EpisodeStarted yields nothing and EpisodeEnded its last observation: the rest of them is metadata.
+    """
+    match item:
+        case Tick():
+            yield from _tick(item, unix)
+        case Transition():
+            yield _transition(item)
+        case SafetyEvent():
+            event = schemas.CLASSES["SafetyEvent"](t_s=item.t_s, kind=text(item.kind), text=text(item.text))
+            yield Stamped(schemas.EVENT_TOPIC, event, item.t_s, item.t_s)
+            line = LogLine(unix.to_ns(item.t_s), logging.WARNING, "safety", f"{item.kind}: {item.text}")
+            yield _log(line, item.t_s)
+        case HealthReading():
+            health = schemas.CLASSES["Health"](
+                t_s=item.t_s,
+                ready=item.health.ready,
+                problems=[text(problem) for problem in item.health.problems],
+                reading_names=list(item.health.readings),
+                reading_values=list(item.health.readings.values()),
+            )
+            yield Stamped(schemas.HEALTH_TOPIC, health, item.t_s, item.t_s)
+        case EpisodeEnded():
+            if item.last is not None:
+                yield from _observation(item.last, item.steps, item.t_s, unix)
+            level = logging.WARNING if item.reason.is_safety_stop else logging.INFO
+            sentence = f"{item.reason.name}: {item.reason.value} {item.detail}".rstrip()
+            yield _log(LogLine(unix.to_ns(item.t_s), level, "episode", sentence), item.t_s)
+        case LogLine():
+            yield _log(item, now_s)
+        case EpisodeStarted():
+            return
+
+
+def _tick(item: Tick, unix: UnixMapping) -> Iterator[Stamped]:
+    yield from _observation(item.observation, item.step, item.t_s, unix)
+    capture_s = item.observation.t_capture_s
+    for topic, action in ((schemas.REQUESTED_TOPIC, item.requested), (schemas.SENT_TOPIC, item.sent)):
+        message = schemas.CLASSES["Action"](
+            t_s=item.t_s, step=item.step, steering=action.steering, throttle=action.throttle
+        )
+        yield Stamped(topic, message, item.t_s, item.t_s, item.step)
+    tick = schemas.CLASSES["Tick"](
+        t_s=item.t_s,
+        step=item.step,
+        late_s=item.late_s,
+        policy_s=item.policy_s,
+        safety_state=text(item.safety_state),
+        features=np.asarray(item.features).tolist(),
+    )
+    yield Stamped(schemas.TICK_TOPIC, tick, item.t_s, capture_s, item.step)
+
+
+def _transition(item: Transition) -> Stamped:
+    transition = schemas.CLASSES["Transition"](
+        t_s=item.t_s,
+        step=item.step,
+        features=np.asarray(item.features).tolist(),
+        steering=item.action.steering,
+        throttle=item.action.throttle,
+        reward=item.reward,
+        next_features=np.asarray(item.next_features).tolist(),
+        terminated=item.terminated,
+        truncated=item.truncated,
+    )
+    return Stamped(schemas.TRANSITION_TOPIC, transition, item.t_s, item.t_s, item.step)
+
+
+def _observation(seen: Observation, step: int, t_s: float, unix: UnixMapping) -> Iterator[Stamped]:
+    for pose in seen.poses:
+        sample = schemas.CLASSES["PoseSample"](
+            t_capture_s=pose.t_capture_s,
+            t_receive_s=pose.t_receive_s,
+            sequence=pose.sequence,
+            x_m=pose.x_m,
+            y_m=pose.y_m,
+            z_m=pose.z_m,
+            yaw_rad=pose.yaw_rad,
+            tracked=pose.tracked,
+        )
+        yield Stamped(schemas.SAMPLE_TOPIC, sample, t_s, pose.t_capture_s, step)
+        if pose.tracked:
+            in_frame = PoseInFrame(frame_id="map")
+            in_frame.timestamp.FromNanoseconds(unix.to_ns(pose.t_capture_s))
+            position = in_frame.pose.position
+            position.x, position.y, position.z = pose.x_m, pose.y_m, pose.z_m
+            _turn(in_frame.pose.orientation, pose.yaw_rad)
+            yield Stamped(schemas.POSE_TOPIC, in_frame, t_s, pose.t_capture_s, step)
+    state = seen.state
+    message = schemas.CLASSES["CarState"](
+        t_s=t_s,
+        step=step,
+        x_m=state.x_m,
+        y_m=state.y_m,
+        yaw_rad=state.yaw_rad,
+        vx_mps=state.vx_mps,
+        vy_mps=state.vy_mps,
+        yaw_rate_radps=state.yaw_rate_radps,
+        age_s=t_s - seen.t_capture_s,
+        t_capture_s=seen.t_capture_s,
+        t_receive_s=seen.t_receive_s,
+        sequence=seen.sequence,
+        tracked=seen.tracked,
+        velocity_delay_s=seen.velocity_delay_s,
+    )
+    yield Stamped(schemas.STATE_TOPIC, message, t_s, seen.t_capture_s, step)
+    transform = FrameTransform(parent_frame_id="map", child_frame_id="base_link")
+    transform.timestamp.FromNanoseconds(unix.to_ns(seen.t_capture_s))
+    transform.translation.x, transform.translation.y = state.x_m, state.y_m
+    _turn(transform.rotation, state.yaw_rad)
+    yield Stamped(schemas.TRANSFORM_TOPIC, transform, t_s, seen.t_capture_s, step)
+
+
+def _turn(quaternion: Any, yaw_rad: float) -> None:
+    half_rad = 0.5 * yaw_rad if math.isfinite(yaw_rad) else 0.0
+    quaternion.z, quaternion.w = math.sin(half_rad), math.cos(half_rad)
+
+
+def _log(line: LogLine, t_s: float) -> Stamped:
+    number = next((number for level, number in _LEVELS if line.level >= level), 0)
+    message = Log(level=Log.Level.ValueType(number), message=text(line.message), name=text(line.name))
+    message.timestamp.FromNanoseconds(min(max(line.wall_ns, 0), MAX_UNIX_NS))
+    return Stamped(schemas.LOG_TOPIC, message, t_s, t_s)
+
+
+def started_to_metadata(started: EpisodeStarted) -> dict[str, str]:
+    """Everything of an EpisodeStarted except the configuration, which is an attachment; numbers are exact."""
+    return {
+        "episode": str(started.episode),
+        "start_t_s": repr(started.t_s),
+        "start_wall_ns": str(started.wall_ns),
+        "car": text(started.car),
+        "reality": started.reality.value,
+        "policy": text(started.policy),
+        "task": text(started.task),
+        "seed": str(started.seed),
+        "period_s": repr(started.period_s),
+        "history_length": str(started.history_length),
+        "goal": json.dumps(started.goal),
+        "arena_m": json.dumps(started.arena_m),
+        "path_m": json.dumps(started.path_m),
+        **{f"metadata.{text(key)}": text(value) for key, value in started.metadata.items()},
+    }
+
+
+def ended_to_metadata(ended: EpisodeEnded) -> dict[str, str]:
+    """Everything of an EpisodeEnded except its last observation, which is a message."""
+    return {
+        "end_t_s": repr(ended.t_s),
+        "end_reason": ended.reason.name,
+        "end_sentence": ended.reason.value,
+        "end_detail": text(ended.detail),
+        "steps": str(ended.steps),
+        "total_reward": repr(ended.total_reward),
+        "statistics": json.dumps(dict(ended.statistics)),
+    }
+
+
+def started_from_metadata(record: Mapping[str, str], config_toml: str) -> EpisodeStarted:
+    """The EpisodeStarted written by ``started_to_metadata``. Raises KeyError or ValueError for another record."""
+    goal = _json_value(record, "goal")
+    prefix = "metadata."
+    return EpisodeStarted(
+        episode=int(record["episode"]),
+        t_s=float(record["start_t_s"]),
+        wall_ns=int(record["start_wall_ns"]),
+        car=record["car"],
+        reality=Reality(record["reality"]),
+        policy=record["policy"],
+        task=record["task"],
+        seed=int(record["seed"]),
+        period_s=float(record["period_s"]),
+        history_length=int(record["history_length"]),
+        goal=None if goal is None else _numbers(goal, 3),
+        arena_m=tuple(_numbers(point, 2) for point in _json_list(record, "arena_m")),
+        path_m=tuple(_numbers(point, 2) for point in _json_list(record, "path_m")),
+        config_toml=config_toml,
+        metadata={key.removeprefix(prefix): value for key, value in record.items() if key.startswith(prefix)},
+    )
+
+
+def _json_value(record: Mapping[str, str], key: str) -> Any:
+    """The JSON value under ``key``. Raises KeyError or ValueError where there is none."""
+    try:
+        return json.loads(record[key])
+    except RecursionError as error:
+        raise ValueError(f"{key} is nested too deeply") from error
+
+
+def _json_list(record: Mapping[str, str], key: str) -> list[Any]:
+    value = _json_value(record, key)
+    if not isinstance(value, list):
+        raise ValueError(f"{key} is not a list")
+    return value
+
+
+def _numbers(value: Any, count: int) -> tuple[Any, ...]:
+    """``value`` as a tuple of ``count`` numbers; a whole number stays one. Raises ValueError for anything else."""
+    if not isinstance(value, list) or len(value) != count or not all(_is_number(number) for number in value):
+        raise ValueError(f"{count} numbers are expected")
+    return tuple(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def ended_from_metadata(record: Mapping[str, str], last: Observation | None) -> EpisodeEnded:
+    """The EpisodeEnded written by ``ended_to_metadata``. Raises KeyError or ValueError for another record."""
+    statistics = _json_value(record, "statistics")
+    if not isinstance(statistics, dict) or not all(_is_number(value) for value in statistics.values()):
+        raise ValueError("statistics are not numbers by name")
+    return EpisodeEnded(
+        t_s=float(record["end_t_s"]),
+        reason=EndReason[record["end_reason"]],
+        detail=record["end_detail"],
+        steps=int(record["steps"]),
+        total_reward=float(record["total_reward"]),
+        last=last,
+        statistics=statistics,
+    )
+
+
+def decode_pose(m: Any) -> PoseSample:
+    """A PoseSample message as the sample it was made from."""
+    return PoseSample(m.sequence, m.t_capture_s, m.t_receive_s, m.x_m, m.y_m, m.yaw_rad, m.z_m, m.tracked)
+
+
+def decode_observation(m: Any, poses: tuple[PoseSample, ...]) -> Observation:
+    """A CarState message, with the poses that came before it, as the observation it was made from."""
+    state = CarState(m.x_m, m.y_m, m.yaw_rad, m.vx_mps, m.vy_mps, m.yaw_rate_radps)
+    return Observation(state, m.t_capture_s, m.t_receive_s, m.sequence, m.tracked, m.velocity_delay_s, poses)
+
+
+def decode_action(m: Any) -> Action:
+    """An Action or Transition message as its action."""
+    return Action(m.steering, m.throttle)
+
+
+def decode_transition(m: Any) -> Transition:
+    """A Transition message as the document it was made from."""
+    return Transition(
+        step=m.step,
+        t_s=m.t_s,
+        features=np.array(m.features, dtype=np.float64),
+        action=decode_action(m),
+        reward=m.reward,
+        next_features=np.array(m.next_features, dtype=np.float64),
+        terminated=m.terminated,
+        truncated=m.truncated,
+    )
+
+
+def decode_health(m: Any) -> HealthReading:
+    """A Health message as the document it was made from."""
+    readings = dict(zip(m.reading_names, m.reading_values, strict=False))
+    return HealthReading(m.t_s, Health(m.ready, tuple(m.problems), readings))
+
+
+def decode_event(m: Any) -> SafetyEvent:
+    """A SafetyEvent message as the document it was made from."""
+    return SafetyEvent(m.t_s, m.kind, m.text)
+
+
+def decode_log(m: Any) -> LogLine:
+    """A Log message as the line it was made from; the level as the standard library counts it."""
+    return LogLine(m.timestamp.ToNanoseconds(), _NUMBERS.get(m.level, logging.NOTSET), m.name, m.message)
+
+
+DECODERS: dict[str, Callable[[Any], Transition | HealthReading | SafetyEvent]] = {
+    schemas.TRANSITION_TOPIC: decode_transition,
+    schemas.HEALTH_TOPIC: decode_health,
+    schemas.EVENT_TOPIC: decode_event,
+}

@@ -1,0 +1,210 @@
+"""Reads recordings back, finished or not: whatever is complete before the first damaged byte."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.records import Attachment, Channel, Header, Message, Metadata
+from mcap.stream_reader import StreamReader
+
+from carlab.core.documents import Document, EpisodeEnded, EpisodeStarted, Tick
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import Action, Observation, PoseSample
+from carlab.recording.episode_builder import episode_from_documents
+from carlab.recording.mcap import messages as messages
+from carlab.recording.mcap import schemas as schemas
+from carlab.recording.sink import LogLine, partial_path
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Everything that one file holds.
+
+    ``documents`` are those that were emitted, in order; an EpisodeEnded is missing where the writer was killed.
+    ``recovered`` tells that the file is not complete; ``extra`` holds further columns of an imported recording.
+    """
+
+    path: Path
+    documents: tuple[Document, ...]
+    run_metadata: Mapping[str, str]
+    log: tuple[LogLine, ...]
+    recovered: bool
+    extra: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
+
+
+def read_episode(path: Path | str) -> EpisodeData:
+    """Read a recording as arrays; times are on the car's clock.
+
+    A file that was not finished gives what is complete in it, with ``recovered`` = ``true`` in the metadata and
+    ``end_reason`` = ``CRASHED``. Metadata of the run, of the episode and of its end are one flat mapping.
+
+    Raises:
+        DataError: The file is not a carlab recording, or holds no complete tick.
+    """
+    recording = read_recording(path)
+    try:
+        episode = episode_from_documents(recording.documents, recording.extra, recording.run_metadata)
+    except DataError as error:
+        raise DataError(str(error).replace("The recording", str(recording.path), 1)) from error
+    if recording.recovered:
+        return dataclasses.replace(episode, metadata={**episode.metadata, "recovered": "true"})
+    return episode
+
+
+def read_documents(path: Path | str) -> tuple[Document, ...]:
+    """Read the documents that were emitted, in order. Raises DataError like ``read_episode``."""
+    return read_recording(path).documents
+
+
+def read_recording(path: Path | str) -> Recording:
+    """Read everything in a recording. Raises DataError where it is none, or ends before its episode began."""
+    path = Path(path)
+    collector = _Collector()
+    complete = False
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(MAGIC))
+            if head != MAGIC and (head != MAGIC[: len(head)] or not head):
+                raise DataError(_not_an_mcap(path, head))
+            file.seek(0)
+            size = path.stat().st_size
+            try:
+                for record in StreamReader(file, validate_crcs=True, record_size_limit=size).records:
+                    collector.take(record)
+                complete = True
+            except OSError:
+                raise
+            except Exception:
+                # Cut short or damaged: the readers of mcap, zstandard and protobuf each raise errors of their own.
+                # What came before is whole (chunks carry checksums), and the caller is told by `recovered`.
+                complete = False
+    except FileNotFoundError as error:
+        raise DataError(_missing(path)) from error
+    except IsADirectoryError as error:
+        raise DataError(f"{path} is a folder; name one of the .mcap files in it (episodes/0001.mcap).") from error
+    except OSError as error:
+        raise DataError(f"{path} could not be read: {error.strerror}; check its permissions.") from error
+    return collector.recording(path, complete)
+
+
+def _not_an_mcap(path: Path, head: bytes) -> str:
+    found = f"it begins with {head!r}" if head else "it is empty"
+    return f"{path} is not an MCAP file ({found}); name an .mcap recording, or read a table with carlab import."
+
+
+def _short(error: Exception) -> str:
+    """What is wrong with a record, cut to a length that fits into a sentence: the record may be of any size."""
+    reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+    return reason if len(reason) <= 120 else f"{reason[:120]}..."
+
+
+def _missing(path: Path) -> str:
+    unfinished = partial_path(path)
+    if unfinished.exists():
+        return f"{path} was never finished; read {unfinished.name} in the same folder instead."
+    return f"{path} is not there; check the name (recordings lie in runs/<run>/episodes/)."
+
+
+class _Collector:
+    """Puts messages together again into the documents they were made from."""
+
+    def __init__(self) -> None:
+        self._topics: dict[int, str] = {}
+        self._library = ""
+        self._config = ""
+        self._run: dict[str, str] = {}
+        self._episode: dict[str, str] = {}
+        self._documents: list[Document] = []
+        self._log: list[LogLine] = []
+        self._extra: dict[int, dict[str, float]] = {}
+        self._poses: list[PoseSample] = []
+        self._state: tuple[int, Observation] | None = None
+        self._actions: dict[str, tuple[int, Action]] = {}
+        self._handlers: dict[str, Callable[[Any], None]] = {
+            schemas.SAMPLE_TOPIC: lambda m: self._poses.append(messages.decode_pose(m)),
+            schemas.STATE_TOPIC: self._take_state,
+            schemas.REQUESTED_TOPIC: lambda m: self._take_action("requested", m),
+            schemas.SENT_TOPIC: lambda m: self._take_action("sent", m),
+            schemas.TICK_TOPIC: self._take_tick,
+            schemas.LOG_TOPIC: lambda m: self._log.append(messages.decode_log(m)),
+            schemas.EXTRA_TOPIC: lambda m: self._extra.__setitem__(m.step, dict(zip(m.names, m.values, strict=False))),
+        }
+
+    def take(self, record: object) -> None:
+        match record:
+            case Message():
+                self._take_message(self._topics.get(record.channel_id, ""), record.data)
+            case Channel():
+                self._topics[record.id] = record.topic
+            case Metadata(name=schemas.RUN_RECORD):
+                self._run = dict(record.metadata)
+            case Metadata(name=schemas.EPISODE_RECORD):
+                self._episode = dict(record.metadata)
+            case Attachment(name=schemas.CONFIG_ATTACHMENT):
+                self._config = record.data.decode()
+            case Header():
+                self._library = record.library
+
+    def _take_message(self, topic: str, data: bytes) -> None:
+        if topic not in self._handlers and topic not in messages.DECODERS:
+            return
+        message = schemas.TOPIC_CLASSES[topic]()
+        message.ParseFromString(data)
+        if topic in self._handlers:
+            self._handlers[topic](message)
+        else:
+            self._documents.append(messages.DECODERS[topic](message))
+
+    def _take_state(self, m: Any) -> None:
+        self._state = (m.step, messages.decode_observation(m, tuple(self._poses)))
+        self._poses.clear()
+
+    def _take_action(self, which: str, m: Any) -> None:
+        self._actions[which] = (m.step, messages.decode_action(m))
+
+    def _take_tick(self, m: Any) -> None:
+        parts = (self._state, self._actions.get("requested"), self._actions.get("sent"))
+        if any(part is None or part[0] != m.step for part in parts):
+            return
+        (_, seen), (_, requested), (_, sent) = parts  # type: ignore[misc]
+        features = np.array(m.features, dtype=np.float64)
+        self._documents.append(
+            Tick(m.step, m.t_s, m.late_s, seen, features, requested, sent, m.policy_s, m.safety_state)
+        )
+        self._state = None
+
+    def recording(self, path: Path, complete: bool) -> Recording:
+        ours = self._library.startswith("carlab ")
+        if not ours and (complete or self._topics):
+            raise DataError(
+                f"{path} is an MCAP file but not a recording of carlab (written by "
+                f"{self._library or 'an unknown program'}); export it as CSV there and use carlab import."
+            )
+        if not self._episode:
+            raise DataError(
+                f"{path} holds no complete tick (its writer was stopped before the episode began); record it anew."
+            )
+        try:
+            documents = list(self._assemble())
+        except (KeyError, ValueError) as error:
+            raise DataError(
+                f"{path} has a record {schemas.EPISODE_RECORD} that this version cannot read ({_short(error)}); "
+                "read it with the version that wrote it."
+            ) from error
+        has_end = isinstance(documents[-1], EpisodeEnded)
+        return Recording(path, tuple(documents), self._run, tuple(self._log), not (complete and has_end), self._extra)
+
+    def _assemble(self) -> Iterator[Document]:
+        started: EpisodeStarted = messages.started_from_metadata(self._episode, self._config)
+        yield started
+        yield from self._documents
+        if "end_t_s" in self._episode:
+            yield messages.ended_from_metadata(self._episode, self._state[1] if self._state else None)

@@ -1,0 +1,1 @@
+"""rerun recordings: entities, layout, writer, learning curve, screenshot."""

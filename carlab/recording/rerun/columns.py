@@ -1,0 +1,136 @@
+"""Rows of an episode as columns of a rerun recording: the entities that a live and a later recording share."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from carlab.core.documents import Tick, Transition
+from carlab.core.quantities import ACTION_NAMES, FloatArray, Observation
+from carlab.recording.rerun import blueprint as look
+
+Row = tuple[int, float, Observation]
+"""Step, time on the car's clock [s] and what was seen then."""
+
+
+def entity_part(name: str) -> str:
+    """A text as one part of an entity path."""
+    return re.sub(r"[^\w-]+", "_", name, flags=re.ASCII) or "_"
+
+
+class Columns:
+    """Sends columns to ``stream``; ``origin_s`` is the car's clock at the start of the episode."""
+
+    def __init__(self, stream: rr.RecordingStream, origin_s: float) -> None:
+        self._stream = stream
+        self._origin_s = origin_s
+        self._previous: FloatArray | None = None
+
+    def indexes(self, times_s: Sequence[float] | FloatArray, steps: Sequence[int]) -> list[rr.TimeColumn]:
+        """Both timelines of some rows."""
+        return [
+            rr.TimeColumn(look.CAR_TIME, duration=np.asarray(times_s, dtype=np.float64) - self._origin_s),
+            rr.TimeColumn(look.STEP, sequence=np.asarray(steps, dtype=np.int64)),
+        ]
+
+    def states(self, rows: Sequence[Row]) -> None:
+        """Pose, trail, velocities and age of the pose of some observations, and the raw poses that came with them."""
+        if not rows:
+            return
+        indexes = self.indexes([t_s for _, t_s, _ in rows], [step for step, _, _ in rows])
+        states = np.array([seen.state.to_array() for _, _, seen in rows])
+        self._previous = self._car(look.CAR, look.TRAIL, indexes, states, self._previous)
+        speed = np.hypot(states[:, 3], states[:, 4])
+        for name, values in zip(
+            ("speed_mps", "vx_mps", "vy_mps", "yaw_rate_radps"), (speed, *states[:, 3:].T), strict=True
+        ):
+            self._scalars(f"car/state/{name}", indexes, values)
+        self._scalars("car/state/age_ms", indexes, [1e3 * (t_s - seen.t_capture_s) for _, t_s, seen in rows])
+        lengths = [sum(pose.tracked for pose in seen.poses) for _, _, seen in rows]
+        if any(lengths):
+            points = [(pose.x_m, pose.y_m, 0.0) for _, _, seen in rows for pose in seen.poses if pose.tracked]
+            columns = rr.Points3D.columns(positions=np.array(points)).partition(lengths)
+            self._stream.send_columns(look.POSES, indexes, columns)
+
+    def ticks(self, ticks: Sequence[Tick]) -> None:
+        """Commands asked for and sent, lateness and time of the policy."""
+        if not ticks:
+            return
+        indexes = self.indexes([tick.t_s for tick in ticks], [tick.step for tick in ticks])
+        for channel in ACTION_NAMES:
+            for which in ("requested", "sent"):
+                values = [getattr(getattr(tick, which), channel) for tick in ticks]
+                self._scalars(f"car/action_{which}/{channel}", indexes, values)
+        self._scalars("episode/tick/late_ms", indexes, [1e3 * tick.late_s for tick in ticks])
+        self._scalars("episode/tick/policy_ms", indexes, [1e3 * tick.policy_s for tick in ticks])
+
+    def rewards(self, transitions: Sequence[Transition]) -> None:
+        """The reward of each transition, at the time of its arrival."""
+        if transitions:
+            indexes = self.indexes([row.t_s for row in transitions], [row.step + 1 for row in transitions])
+            self._scalars("episode/transition/reward", indexes, [row.reward for row in transitions])
+
+    def overlay(self, name: str, times_s: Sequence[float], steps: Sequence[int], states: FloatArray) -> None:
+        """Another car beside the recorded one; rows that are NaN are left out."""
+        count = min(len(times_s), len(states))
+        whole = np.isfinite(states[:count]).all(axis=1)
+        states = states[:count][whole]
+        if not len(states):
+            return
+        indexes = self.indexes(np.asarray(times_s)[:count][whole], np.asarray(steps)[:count][whole].tolist())
+        self._car(look.overlay_car(name), look.overlay_trail(name), indexes, states, None)
+        for path, values in zip(look.overlay_series(name).values(), states[:, 3:].T, strict=True):
+            self._scalars(path, indexes, values)
+
+    def _car(
+        self, car: str, trail: str, indexes: list[rr.TimeColumn], states: FloatArray, previous: FloatArray | None
+    ) -> FloatArray:
+        places = np.column_stack([states[:, :2], np.zeros(len(states))])
+        half_rad = 0.5 * states[:, 2]
+        zeros = np.zeros(len(states))
+        turns = np.column_stack([zeros, zeros, np.sin(half_rad), np.cos(half_rad)])
+        self._stream.send_columns(car, indexes, rr.Transform3D.columns(translation=places, quaternion=turns))
+        # One piece of the trail a row, from the place before: the view shows all pieces up to its time.
+        starts = np.vstack([places[:1] if previous is None else previous, places[:-1]])
+        strips = list(np.stack([starts, places], axis=1))
+        self._stream.send_columns(trail, indexes, rr.LineStrips3D.columns(strips=strips))
+        return places[-1:]
+
+    def _scalars(self, path: str, indexes: list[rr.TimeColumn], values: Sequence[float] | FloatArray) -> None:
+        numbers = np.asarray(values, dtype=np.float64)
+        if not np.isnan(numbers).all():
+            self._stream.send_columns(path, indexes, rr.Scalars.columns(scalars=numbers))
+
+
+def closed(points_m: Sequence[tuple[float, float]]) -> list[tuple[float, float, float]]:
+    """Corners as a closed line on the ground."""
+    return [(x, y, 0.0) for x, y in (*points_m, points_m[0])]
+
+
+def log_surroundings(
+    stream: rr.RecordingStream,
+    arena_m: Sequence[tuple[float, float]],
+    path_m: Sequence[tuple[float, float]],
+    goal: tuple[float, float, float] | None,
+) -> None:
+    """Arena, reference path and goal of the plan view."""
+    width = rr.Radius.ui_points(1.5)
+    if arena_m:
+        line = rr.LineStrips3D([closed(arena_m)], radii=width, colors=look.VERMILION, labels="arena", show_labels=False)
+        stream.log(look.ARENA, line, static=True)
+    if len(path_m) > 1:
+        line = rr.LineStrips3D([[(x, y, 0.0) for x, y in path_m]], radii=width, colors=look.GREY)
+        stream.log(look.PATH, line, static=True)
+    if goal is not None:
+        length_m, width_m, height_m = look.CAR_SIZE_M
+        turn = rr.Quaternion(xyzw=[0.0, 0.0, math.sin(0.5 * goal[2]), math.cos(0.5 * goal[2])])
+        stream.log(look.GOAL, rr.Transform3D(translation=[goal[0], goal[1], 0.0], quaternion=turn), static=True)
+        half = [[0.5 * length_m, 0.5 * width_m, 0.01 * height_m]]
+        box = rr.Boxes3D(half_sizes=half, radii=rr.Radius.ui_points(1.5), colors=look.GREEN)
+        stream.log(f"{look.GOAL}/pose", box, static=True)
+        arrow = rr.Arrows3D(vectors=[[0.75 * length_m, 0.0, 0.0]], radii=0.05 * width_m, colors=look.GREEN)
+        stream.log(f"{look.GOAL}/heading", arrow, static=True)

@@ -1,0 +1,257 @@
+"""Writes one episode into one .rrd file for the rerun viewer, which is called .partial until it is finished.
+
+Documents are gathered and sent as columns at every flush: a tick costs microseconds, and the live recording and one
+made afterwards from arrays (``episode_to_rrd``) have the same entities.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from carlab.core.documents import EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.outcome import EndReason
+from carlab.core.quantities import FloatArray
+from carlab.recording.drained_file import DrainedFile
+from carlab.recording.episode_builder import documents_from_episode
+from carlab.recording.rerun import blueprint as look
+from carlab.recording.rerun.columns import Columns, Row, entity_part, log_surroundings
+from carlab.recording.sink import Item, LogLine, Sink, claim, describe_os_error, partial_path
+
+APPLICATION = "carlab"
+_FLUSH_TIMEOUT_S = 10.0
+_ROWS_BEFORE_FLUSH = 512
+
+
+class RerunSink(Sink):
+    """One episode in one .rrd file, with its layout.
+
+    Args:
+        path: The finished file, ``.../0001.rrd``; must not be there yet.
+        title: Name of the recording in the viewer; made from the EpisodeStarted unless given.
+        overlays: Further cars to draw beside the recorded one: name -> states (T + 1, 6) at the times of the ticks.
+        extent_m: Points that the plan view must show beside arena, goal and path, shape (n, 2) [m].
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        title: str = "",
+        overlays: Mapping[str, FloatArray] | None = None,
+        extent_m: FloatArray | None = None,
+    ) -> None:
+        super().__init__()
+        self.path = Path(path)
+        self._title = title
+        self._overlays = {entity_part(name): states for name, states in (overlays or {}).items()}
+        self._extent_m = np.zeros((0, 2)) if extent_m is None else extent_m
+        self._stream: rr.RecordingStream | None = None
+        self._file = DrainedFile(partial_path(self.path))
+        self._opened = False
+        self._origin_s = 0.0
+        self._columns: Columns | None = None
+        self._seen: list[Row] = []
+        self._ticks: list[Tick] = []
+        self._transitions: list[Transition] = []
+        self._rows: list[tuple[int, float]] = []
+        self._state = ""
+        self._arrival_s: float | None = None
+        self._step = 0
+
+    def open(self) -> None:
+        """Claim the file. Raises DataError in one sentence where it cannot be made."""
+        if self._opened or self._finished:
+            return
+        try:
+            claim(self.path)
+            self._file.open()
+        except OSError as error:
+            raise DataError(describe_os_error(error, self.path)) from error
+        self._opened = True
+
+    def flush(self) -> None:
+        """Send the rows gathered so far and wait until rerun has handed them to the operating system."""
+        if self._stream is not None and self._columns is not None:
+            self._send_rows(self._columns)
+            self._flush_stream(self._stream)
+
+    def abandon(self) -> None:
+        """Let go of the stream; what is written stays ``.partial``. A file without any document is removed."""
+        self._finished = True
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            with contextlib.suppress(Exception):
+                stream.disconnect()
+        self._file.close()
+        if self._opened and self._started is None:
+            with contextlib.suppress(OSError):
+                partial_path(self.path).unlink()
+        self._opened = False
+
+    def _write(self, item: Item) -> None:
+        if not self._opened:
+            raise DataError(f"{self.path} is not open; use the sink in a recorder.")
+        if isinstance(item, EpisodeStarted):
+            self._stream = self._begin(item)
+            self._columns = Columns(self._stream, item.t_s)
+            return
+        stream, columns = self._stream, self._columns
+        if stream is None or columns is None:
+            raise DataError(f"{self.path} has no stream; its start was not written.")
+        match item:
+            case Tick():
+                self._step = item.step
+                self._seen.append((item.step, item.t_s, item.observation))
+                self._ticks.append(item)
+                if item.safety_state != self._state:
+                    self._state = item.safety_state
+                    self._at(stream, item.t_s)
+                    stream.log(look.SAFETY_STATE, rr.StateChange(state=item.safety_state))
+                if len(self._ticks) >= _ROWS_BEFORE_FLUSH:
+                    self._send_rows(columns)
+            case Transition():
+                self._transitions.append(item)
+                self._arrival_s = item.t_s
+            case SafetyEvent():
+                self._text(stream, look.SAFETY_EVENT, f"{item.kind}: {item.text}", "WARN")
+            case HealthReading():
+                self._at(stream, item.t_s)
+                for name, value in item.health.readings.items():
+                    stream.log(f"{look.HEALTH}/{entity_part(name)}", rr.Scalars(value))
+                for problem in item.health.problems:
+                    self._text(stream, look.LOG, f"health: {problem}", "WARN")
+            case LogLine():
+                level = logging.getLevelName(item.level).replace("WARNING", "WARN")
+                self._text(stream, look.LOG, f"{item.name}: {item.message}", level)
+            case EpisodeEnded():
+                self._end(stream, columns, item)
+
+    def _begin(self, started: EpisodeStarted) -> rr.RecordingStream:
+        self._origin_s = started.t_s
+        outline = [*started.arena_m, *started.path_m, *([started.goal[:2]] if started.goal else [])]
+        points_m = np.array([*outline, *self._extent_m.tolist()], dtype=np.float64).reshape(-1, 2)
+        overlays = tuple(self._overlays)
+        stream = rr.RecordingStream(APPLICATION)
+        # From here on the stream is known to abandon(), which has to disconnect it.
+        self._stream = stream
+        stream.save(self._file.start(), default_blueprint=look.drive_blueprint(points_m, overlays))
+        reality = started.reality.value
+        title = self._title or f"Episode {started.episode}: {started.policy} on {started.car}, {reality.upper()}"
+        stream.send_recording_name(title)
+        properties: dict[str, Any] = {
+            **{name: value for name, value in started.metadata.items() if name.isidentifier() and value},
+            "episode": started.episode,
+            "reality": reality,
+            "car": started.car,
+            "policy": started.policy,
+            "task": started.task,
+            "seed": str(started.seed),
+            "period_s": started.period_s,
+        }
+        stream.send_property(
+            "episode",
+            rr.AnyValues(**properties),
+        )
+        _send_end(stream, EndReason.CRASHED, "", 0, math.nan)
+        if started.config_toml:
+            stream.log("episode/config", rr.TextDocument(started.config_toml), static=True)
+        look.log_look(stream, overlays)
+        log_surroundings(stream, started.arena_m, started.path_m, started.goal)
+        return stream
+
+    def _end(self, stream: rr.RecordingStream, columns: Columns, ended: EpisodeEnded) -> None:
+        if ended.last is not None and ended.steps > self._step:
+            self._seen.append((ended.steps, ended.t_s if self._arrival_s is None else self._arrival_s, ended.last))
+        self._send_rows(columns)
+        for name, states in self._overlays.items():
+            columns.overlay(name, [t_s for _, t_s in self._rows], [step for step, _ in self._rows], states)
+        self._step = ended.steps
+        level = "WARN" if ended.reason.is_safety_stop else "INFO"
+        sentence = f"{ended.reason.name}: {ended.reason.value} {ended.detail}".rstrip()
+        self._text(stream, look.END, sentence, level)
+        _send_end(stream, ended.reason, ended.detail, ended.steps, ended.total_reward)
+
+    def _finish(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is None:
+            return
+        stream.disconnect()
+        self._file.close()
+        self._file.check()
+        if self.path.exists():
+            raise FileExistsError(str(self.path))
+        os.rename(partial_path(self.path), self.path)
+        self._opened = False
+
+    def _flush_stream(self, stream: rr.RecordingStream) -> None:
+        try:
+            stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+        except (RuntimeError, TimeoutError) as error:
+            raise OSError(errno.EIO, f"rerun's writer failed ({error})") from error
+        self._file.check()
+
+    def _at(self, stream: rr.RecordingStream, t_s: float) -> None:
+        stream.set_time(look.CAR_TIME, duration=t_s - self._origin_s)
+        stream.set_time(look.STEP, sequence=self._step)
+
+    def _text(self, stream: rr.RecordingStream, path: str, text: str, level: str) -> None:
+        self._at(stream, self._last_t_s)
+        stream.log(path, rr.TextLog(text, level=level))
+
+    def _send_rows(self, columns: Columns) -> None:
+        columns.states(self._seen)
+        columns.ticks(self._ticks)
+        columns.rewards(self._transitions)
+        if self._overlays:
+            self._rows.extend((step, t_s) for step, t_s, _ in self._seen)
+        self._seen, self._ticks, self._transitions = [], [], []
+
+
+def _send_end(stream: rr.RecordingStream, reason: EndReason, detail: str, steps: int, total_reward: float) -> None:
+    stream.send_property(
+        "end",
+        rr.AnyValues(
+            reason=reason.name, sentence=reason.value, detail=detail, steps=steps, total_reward=float(total_reward)
+        ),
+    )
+
+
+def episode_to_rrd(
+    episode: EpisodeData, path: Path | str, title: str = "", overlays: Mapping[str, FloatArray] | None = None
+) -> None:
+    """Write an episode of arrays, imported ones included, as an .rrd with the entities and the layout of a live one.
+
+    Args:
+        episode: What to draw.
+        path: The new file, ``.rrd``.
+        title: Name of the recording in the viewer; made from the metadata unless given.
+        overlays: Further cars to draw beside the recorded one, ``{"predicted": states}``, states (T + 1, 6) at the
+            times of ``episode``; NaN rows are left out.
+
+    Raises:
+        DataError: The file is already there or cannot be written, or an overlay has another number of rows.
+    """
+    for name, states in (overlays or {}).items():
+        if states.shape != episode.states.shape:
+            raise DataError(f"Overlay '{name}' has shape {states.shape}; the recording needs {episode.states.shape}.")
+    extent_m = episode.states[np.isfinite(episode.states[:, :2]).all(axis=1), :2]
+    sink = RerunSink(path, title, overlays, extent_m)
+    sink.open()
+    try:
+        for document in documents_from_episode(episode):
+            sink.write(document)
+    except OSError as error:
+        raise DataError(describe_os_error(error, path)) from error
+    finally:
+        sink.abandon()

@@ -1,0 +1,245 @@
+"""The folder of one run: what is in it, where, and in which surroundings it was made.
+
+runs/2026-11-21_134500_<name>/
+    config.toml          the resolved configuration
+    environment.json     program, git, packages, host, start
+    episodes/0001.mcap   one recording an episode, with 0001.rrd beside it
+    episodes/stopped/    those of a learning run that a person ended; they are driven again
+    models/  policy/     what was learned
+    log.jsonl            the program's log, one JSON object a line
+    result.json          how the run ended
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import json
+import logging
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Self
+
+import carlab
+from carlab.core.clock import wall_clock_ns
+from carlab.core.errors import DataError
+from carlab.recording.sink import describe_os_error
+
+_PACKAGES = (
+    *("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "rerun-sdk", "mcap", "protobuf", "pyarrow"),
+    *("python-can", "pyserial", "cantools"),
+)
+RESULT_FILE = "result.json"
+_EPISODE_FILE = re.compile(r"(\d+)\.(?:mcap|rrd)(?:\.partial)?")
+
+
+@dataclass(frozen=True, slots=True)
+class RunDirectory:
+    """A run's folder. Make one with ``create`` or take one up again with ``open_existing``."""
+
+    path: Path
+
+    @classmethod
+    def create(
+        cls, root: Path | str, name: str, *, config_toml: str = "", metadata: Mapping[str, str] | None = None
+    ) -> Self:
+        """Make ``root/<date>_<time>_<name>`` with its folders, configuration and environment.
+
+        Args:
+            root: Where runs are kept, usually ``runs``.
+            name: What the run is called; characters that do not belong into a file name become ``-``.
+            config_toml: The resolved configuration.
+            metadata: Further facts for environment.json.
+
+        Raises:
+            DataError: The folder cannot be written, in one sentence.
+        """
+        stamp = datetime.fromtimestamp(wall_clock_ns() * 1e-9).strftime("%Y-%m-%d_%H%M%S")
+        slug = re.sub(r"[^\w.-]+", "-", name, flags=re.ASCII).strip("-.") or "run"
+        base = Path(root) / f"{stamp}_{slug}"
+        if base.parent.exists() and not base.parent.is_dir():
+            raise DataError(f"{base.parent} is a file, not a folder for runs; choose another one.")
+        try:
+            base.parent.mkdir(parents=True, exist_ok=True)
+            path, number = base, 1
+            while not _made(path):
+                number += 1
+                path = base.with_name(f"{base.name}-{number}")
+            run = cls(path)
+            for folder in (run.episodes, run.models, run.policy):
+                folder.mkdir()
+            (path / "config.toml").write_text(config_toml, encoding="utf-8")
+            run.write_json("environment.json", {**environment(), **(metadata or {})})
+        except OSError as error:
+            raise DataError(describe_os_error(error, base)) from error
+        return run
+
+    @classmethod
+    def open_existing(cls, path: Path | str) -> Self:
+        """Take up a run again. Raises DataError where ``path`` is no run's folder."""
+        path = Path(path)
+        if not (path / "environment.json").is_file():
+            raise DataError(f"{path} is not a run's folder (no environment.json in it); name one such as runs/2026-...")
+        run = cls(path)
+        try:
+            for folder in (run.episodes, run.models, run.policy):
+                folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise DataError(describe_os_error(error, path)) from error
+        return run
+
+    @property
+    def episodes(self) -> Path:
+        """Folder of the recordings."""
+        return self.path / "episodes"
+
+    @property
+    def stopped(self) -> Path:
+        """Folder of recordings that are no episodes of the run, because a person ended them; it may be absent."""
+        return self.episodes / "stopped"
+
+    @property
+    def models(self) -> Path:
+        """Folder of the dynamics models."""
+        return self.path / "models"
+
+    @property
+    def policy(self) -> Path:
+        """Folder of the policies."""
+        return self.path / "policy"
+
+    @property
+    def config_toml(self) -> str:
+        """The resolved configuration as text."""
+        return (self.path / "config.toml").read_text(encoding="utf-8")
+
+    def next_episode(self) -> int:
+        """The number after the highest that any file has, finished or not; numbers start at 1."""
+        folders = (folder for folder in (self.episodes, self.stopped) if folder.is_dir())
+        names = (_EPISODE_FILE.fullmatch(entry.name) for folder in folders for entry in folder.iterdir())
+        return 1 + max((int(match[1]) for match in names if match), default=0)
+
+    def episode_path(self, number: int, suffix: str = ".mcap") -> Path:
+        """Where a file of an episode lies: ``episodes/0001.mcap``."""
+        return self.episodes / f"{number:04d}{suffix}"
+
+    def set_aside(self, recording: Path) -> None:
+        """Move an episode's files into ``stopped``. Raises DataError where that fails."""
+        try:
+            self.stopped.mkdir(exist_ok=True)
+            for file in (recording.with_suffix(".rrd"), recording):
+                if file.is_file():
+                    os.replace(file, self.stopped / file.name)
+        except OSError as error:
+            raise DataError(describe_os_error(error, self.stopped)) from error
+
+    def recordings(self, *, partial: bool = False) -> list[Path]:
+        """The finished MCAP recordings in order; with ``partial`` the unfinished ones too."""
+        ends = (".mcap", ".mcap.partial") if partial else (".mcap",)
+        return sorted(entry for entry in self.episodes.iterdir() if entry.name.endswith(ends))
+
+    def log_handler(self, level: int = logging.INFO) -> logging.Handler:
+        """A logging handler that appends to log.jsonl; the caller adds, removes and closes it."""
+        try:
+            handler = _LogFile(self.path / "log.jsonl", encoding="utf-8", errors="backslashreplace")
+        except OSError as error:
+            raise DataError(describe_os_error(error, self.path / "log.jsonl")) from error
+        handler.setLevel(level)
+        handler.setFormatter(JsonFormatter())
+        return handler
+
+    def write_result(self, result: Mapping[str, Any]) -> None:
+        """Write result.json: how the run ended. Raises DataError where that fails."""
+        self.write_json(RESULT_FILE, result)
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a JSON file whole or not at all. Raises DataError where that fails."""
+        path = self.path / name
+        unfinished = path.with_name(f"{name}.partial")
+        try:
+            unfinished.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
+            os.replace(unfinished, path)
+        except OSError as error:
+            unfinished.unlink(missing_ok=True)
+            raise DataError(describe_os_error(error, path)) from error
+
+
+def _made(path: Path) -> bool:
+    try:
+        path.mkdir()
+    except FileExistsError:
+        return False
+    return True
+
+
+class _LogFile(logging.FileHandler):
+    """A log file that loses lines, silently, while its disk is full: the recording says so."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Leave out a line that cannot be written; print the traceback of any other error."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handleError(record)
+
+    def close(self) -> None:
+        """Close the file, without what cannot be written any more."""
+        with contextlib.suppress(OSError):
+            super().close()
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: time, level, logger, message, and the traceback where there is one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as one line of JSON."""
+        line: dict[str, object] = {
+            "time": datetime.fromtimestamp(record.created).astimezone().isoformat(timespec="milliseconds"),
+            "level": record.levelname,
+            "logger": record.name,
+            "message": record.getMessage(),
+            "thread": record.threadName,
+        }
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+def environment() -> dict[str, Any]:
+    """What a run depends on beside its configuration: versions, host, and the state of the sources in git."""
+    packages = {}
+    for name in _PACKAGES:
+        try:
+            packages[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "carlab": carlab.__version__,
+        "python": platform.python_version(),
+        "host": platform.node(),
+        "platform": platform.platform(),
+        "cpu_count": os.cpu_count(),
+        "command": sys.argv,
+        "start": datetime.fromtimestamp(wall_clock_ns() * 1e-9).astimezone().isoformat(),
+        "git": git_state(Path(carlab.__file__).parent),
+        "packages": packages,
+    }
+
+
+def git_state(folder: Path) -> dict[str, Any] | None:
+    """Commit and whether tracked files differ from it (``dirty``); None outside a repository or without git."""
+
+    def git(*arguments: str) -> str:
+        command = ("git", "-C", str(folder), *arguments)
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+        return done.stdout.strip()
+
+    try:
+        return {"sha": git("rev-parse", "HEAD"), "dirty": bool(git("status", "--porcelain", "--untracked-files=no"))}
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -1,0 +1,1 @@
+"""Experiments that produce tables and pictures."""

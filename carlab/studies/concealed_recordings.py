@@ -1,0 +1,48 @@
+"""Recordings of a simulated race car with two concealed effects, by the generator of ``carlab prove``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from carlab.benchmark.cases.case import make_case
+from carlab.benchmark.cases.effect_pairs import PAIRS, ConcealedPair
+from carlab.benchmark.world.measurement import write_csv
+from carlab.core.errors import ConfigError
+
+EXCESS_NOISE_FLOORS = 4.0
+"""Excess of the held-out error that each effect is sized for, in noise floors: the largest of the proof."""
+TRAINING_NAME, HELD_OUT_NAME, CAR_NAME = "1_training.csv", "2_held_out.csv", "car.toml"
+
+
+def record_pair(number: int, folder: Path, training_s: float, held_out_s: float) -> ConcealedPair:
+    """Write a pair's two recordings and the nominal car's file into a folder, and return the concealed effects.
+
+    Args:
+        number: of the pair, from 1.
+        folder: for the files.
+        training_s: length of the recording to learn from [s].
+        held_out_s: length of the other [s].
+
+    Raises:
+        ConfigError: there is no such pair.
+    """
+    if not 1 <= number <= len(PAIRS):
+        raise ConfigError(f"There is no pair {number}; choose 1 to {len(PAIRS)}.")
+    pair = PAIRS[number - 1]
+    case = make_case(
+        "pair",
+        pair.seed,
+        effects=pair.effects,
+        form=pair.form,
+        excess=EXCESS_NOISE_FLOORS,
+        fit_s=training_s,
+        hold_s=held_out_s,
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    case.nominal.write(folder / CAR_NAME)
+    write_csv(folder / TRAINING_NAME, dict(case.fit))
+    write_csv(folder / HELD_OUT_NAME, dict(case.hold))
+    return pair
+
+
+__all__ = ["CAR_NAME", "HELD_OUT_NAME", "PAIRS", "TRAINING_NAME", "ConcealedPair", "record_pair"]

@@ -1,0 +1,240 @@
+"""Learning to park: runs of ``carlab learn`` by method, with several seeds, as curves with bands."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlab.core.errors import ConfigError, DataError
+from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
+from carlab.experiment.campaign.figures import EpisodeFigures
+from carlab.experiment.campaign.report import CURVE_FILE
+
+FINAL_EPISODES = 5
+"""Last episodes of a run, over which the share of parked ones is taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One run.
+
+    Attributes:
+        method: of learning the car.
+        seed: of everything.
+        updates: requested gradient steps of SAC before an episode.
+        episodes: its figures, in order.
+    """
+
+    method: str
+    seed: int
+    updates: int
+    episodes: tuple[EpisodeFigures, ...]
+
+    @property
+    def first_parked(self) -> int | None:
+        """The first episode that ended parked."""
+        return next((e.episode for e in self.episodes if e.parked), None)
+
+
+@dataclass(frozen=True, slots=True)
+class MethodFigures:
+    """The runs of one method.
+
+    Attributes:
+        method: which.
+        seeds: how many runs.
+        episodes: of the shortest.
+        first_parked: first episode of each run that ended parked; None where none did.
+        median_first_parked: over runs, where a run that never parked counts as infinite.
+        parked_at_last: share of parked episodes among the last ``FINAL_EPISODES``.
+        mean_return: of each episode over the runs (E,).
+        return_standard_error: of those means (E,); NaN for a single run.
+        seconds_an_episode: mean duration of learning before an episode.
+        minutes: mean duration of learning in a run.
+    """
+
+    method: str
+    seeds: int
+    episodes: int
+    first_parked: tuple[int | None, ...]
+    median_first_parked: float
+    parked_at_last: float
+    mean_return: tuple[float, ...]
+    return_standard_error: tuple[float, ...]
+    seconds_an_episode: float
+    minutes: float
+
+
+def run_folder(runs: Path, method: str, seed: int) -> Path | None:
+    """The folder of an earlier run. Raises DataError where there are several."""
+    found = sorted(p for p in runs.glob(f"*_{run_name(method, seed)}") if p.is_dir())
+    if len(found) > 1:
+        raise DataError(f"{runs} has {len(found)} runs named {run_name(method, seed)}; remove all but one.")
+    return found[0] if found else None
+
+
+def run_name(method: str, seed: int) -> str:
+    """Last part of the name of a run's folder."""
+    return f"{method}-seed{seed}"
+
+
+def check_run(folder: Path, options: Mapping[str, tuple[str, int | None]]) -> None:
+    """Check that a run was started with the options that are given now.
+
+    Args:
+        folder: of the run.
+        options: by name in the plan, the option and its value; None where it is not given.
+
+    Raises:
+        ConfigError: an option differs.
+    """
+    plan = _plan(folder)
+    for name, (option, value) in options.items():
+        earlier = plan.get(name)
+        if earlier != value:
+            started = f"without {option}" if earlier is None else f"with {option} {earlier}"
+            raise ConfigError(f"{folder} was started {started}; start this study so too, or give it another --runs.")
+
+
+def _plan(folder: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]
+        return found
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{folder} is no run of carlab learn ({error}); remove it.") from error
+
+
+def read_curve(folder: Path) -> Curve:
+    """A run's figures. Raises DataError where the folder is no run of learning."""
+    plan = _plan(folder)
+    try:
+        rows = json.loads((folder / CURVE_FILE).read_text(encoding="utf-8"))["episodes"]
+        episodes = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
+        return Curve(plan["method"], int(plan["seed"]), int(plan["updates"]), tuple(episodes))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{folder} is no run of carlab learn with figures ({error}); remove it.") from error
+
+
+def _by_number(curve: Curve, name: str, count: int) -> list[float]:
+    """A figure of episodes 1 to ``count``; NaN for an episode without a row."""
+    rows = {e.episode: float(getattr(e, name)) for e in curve.episodes}
+    return [rows.get(number, float("nan")) for number in range(1, count + 1)]
+
+
+def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
+    """One row a method, in the order in which they come."""
+    found = []
+    for method in dict.fromkeys(c.method for c in curves):
+        own = [c for c in curves if c.method == method and c.episodes]
+        if not own:
+            continue
+        count = min(c.episodes[-1].episode for c in own)
+        returns = np.array([_by_number(c, "total_reward", count) for c in own])
+        known = np.isfinite(returns).sum(axis=0)
+        several, spread = known > 1, np.full(count, np.nan)
+        spread[several] = np.nanstd(returns[:, several], axis=0, ddof=1) / np.sqrt(known[several])
+        mean = np.full(count, np.nan)
+        mean[known > 0] = np.nanmean(returns[:, known > 0], axis=0)
+        first = tuple(c.first_parked for c in own)
+        parked = [[e.parked for e in c.episodes[-FINAL_EPISODES:]] for c in own]
+        seconds = [[e.model_seconds + e.policy_seconds for e in c.episodes] for c in own]
+        found.append(
+            MethodFigures(
+                method, len(own), count, first,
+                float(np.median([np.inf if f is None else f for f in first])),
+                float(np.mean([np.mean(p) for p in parked])),
+                tuple(mean.tolist()), tuple(spread.tolist()),
+                float(np.mean([np.mean(s) for s in seconds])), float(np.mean([np.sum(s) for s in seconds])) / 60.0,
+            )
+        )  # fmt: skip
+    return found
+
+
+def as_json(curves: Sequence[Curve], command: str) -> dict[str, Any]:
+    """All figures and the command that made them; numbers that are not finite are null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {k: plain(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not np.isfinite(value) else value
+
+    runs = [
+        {"method": c.method, "seed": c.seed, "updates": c.updates, "episodes": [e.to_dict() for e in c.episodes]}
+        for c in curves
+    ]
+    return {
+        "schema": "carlab.parking/1",
+        "command": command,
+        "methods": [plain(asdict(row)) for row in summarised(curves)],
+        "runs": runs,
+    }
+
+
+def draw(curves: Sequence[Curve], path: Path) -> None:
+    """Write a PNG: return and distance from the goal against the episode, and the episodes that ended parked.
+
+    Args:
+        curves: of all runs.
+        path: to write to.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (reward, distance, parked) = pyplot.subplots(1, 3, figsize=(15, 4.4), layout="constrained")
+    rows = summarised(curves)
+    ticks: list[int] = []
+    labels: list[str] = []
+    for row in rows:
+        own = [c for c in curves if c.method == row.method and c.episodes]
+        numbers = np.arange(1, row.episodes + 1)
+        mean, error = np.array(row.mean_return), np.array(row.return_standard_error)
+        (line,) = reward.plot(numbers, mean, marker="o", markersize=3, label=f"{row.method}, {row.seeds} seeds")
+        colour = line.get_color()
+        reward.fill_between(numbers, mean - error, mean + error, alpha=0.25, color=colour, linewidth=0)
+        metres = np.array([_by_number(c, "distance_m", row.episodes) for c in own])
+        known = np.isfinite(metres).any(axis=0)
+        metres, driven = metres[:, known], numbers[known]
+        distance.plot(driven, np.nanmedian(metres, axis=0), color=colour, marker="o", markersize=3)
+        lowest, highest = np.nanmin(metres, axis=0), np.nanmax(metres, axis=0)
+        distance.fill_between(driven, lowest, highest, alpha=0.15, color=colour, linewidth=0)
+        for curve in own:
+            height = -len(ticks)
+            ticks.append(height)
+            labels.append(f"{curve.method}, seed {curve.seed}")
+            for ended_parked in (True, False):
+                at = [e.episode for e in curve.episodes if e.parked is ended_parked]
+                marker, size = ("s", 5) if ended_parked else ("x", 4)
+                parked.plot(at, [height] * len(at), marker, color=colour, markersize=size)
+    reward.set(xlabel="episode", ylabel="return on the car (mean, standard error)")
+    reward.legend(fontsize=8)
+    distance.set(xlabel="episode", ylabel="distance from the goal at the end [m]\n(median, all seeds)", ylim=(0.0, 3.0))
+    parked.set(xlabel="episode", title="squares: parked")
+    parked.set_yticks(ticks, labels, fontsize=7)
+    for axis in (reward, distance, parked):
+        axis.grid(alpha=0.3)
+        axis.xaxis.get_major_locator().set_params(integer=True)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+__all__ = [
+    "FINAL_EPISODES",
+    "Curve",
+    "MethodFigures",
+    "as_json",
+    "check_run",
+    "draw",
+    "read_curve",
+    "run_folder",
+    "run_name",
+    "summarised",
+]

@@ -1,0 +1,133 @@
+"""Value of a better simulator as a prior: held-out likelihood against the number of rows, by prior.
+
+Four priors with the same rows, seeds, discrepancy, particles and measurement points: none (a zero mean), the car's file
+with wheels that do not slip, the car's file, and the diagnosed simulator with its effects. Every simulator uses the
+velocity delay that is estimated from the rows and the time at which drifting effects are evaluated.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from carlab.experiment.campaign.campaign import check_period, prior_simulator
+from carlab.studies.regression.recordings import DELAY_S, RecordedCase, check_periods
+from carlab.studies.regression.scores import Score
+from carlab.studies.regression.study import Progress, scored
+from learning.priors.domain_models import DomainModel
+from learning.priors.simulator_model import DELAY, CarModel, known_ranges
+from learning.world.transitions import velocity_delay_s
+from sim_backends.car_parameters import SimulatorConfig
+
+NONE, KINEMATIC, NOMINAL, DIAGNOSED = "none (FSVGD)", "kinematic", "nominal", "diagnosed"
+
+
+@dataclass(frozen=True, slots=True)
+class InDomain:
+    """A simulator with the domain of another, so that all priors are compared at the same inputs."""
+
+    model: DomainModel
+    domain: DomainModel
+
+    @property
+    def size(self) -> int:
+        """Of the simulator."""
+        return self.model.size
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """Of the domain."""
+        return self.domain.inputs(count, generator)
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """Of the simulator."""
+        return self.model.parameters(normal)
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """The simulator's."""
+        return self.model(inputs, parameters)
+
+
+def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorConfig) -> dict[str, DomainModel | None]:
+    """The four priors by name; None is no simulator.
+
+    Args:
+        case: recordings, with the history that was found.
+        car: simulator of the car's file.
+        diagnosed: simulator diagnosed from the recordings that are not held out, with its standard deviations.
+
+    Raises:
+        ConfigError: the diagnosed car has another control period than the rows.
+    """
+    assert case.rows is not None
+    period_s = car.control_period_s
+    check_period(diagnosed, period_s, "the car's file")
+    velocity_delay = velocity_delay_s(case.rows, period_s)
+    at_s = float(case.rows.tick.mean()) * period_s
+    history = case.rows.history
+
+    def model(simulator: SimulatorConfig, ranges: Mapping[str, tuple[float, float]]) -> CarModel:
+        return CarModel(simulator, history, ranges, at_s=at_s, velocity_delay_s=velocity_delay)
+
+    nominal_car = prior_simulator(car, "nominal")
+    priors: dict[str, DomainModel | None] = {NONE: None}
+    nominal = model(nominal_car, {DELAY: DELAY_S, **known_ranges(nominal_car)})
+    kinematic_car = prior_simulator(car, "kinematic")
+    priors[KINEMATIC] = InDomain(model(kinematic_car, {DELAY: DELAY_S, **kinematic_car.priors}), nominal)
+    priors[NOMINAL] = nominal
+    diagnosed_car = prior_simulator(diagnosed, "nominal")
+    half_s, delay_s = 0.5 * period_s, diagnosed_car.command_delay_s
+    delay_range_s = max(delay_s - half_s, 0.0), delay_s + half_s
+    ranges = {DELAY: delay_range_s, **known_ranges(diagnosed_car)}
+    priors[DIAGNOSED] = InDomain(model(diagnosed_car, ranges), nominal)
+    return priors
+
+
+def run_prior_study(
+    case: RecordedCase,
+    priors: Mapping[str, DomainModel | None],
+    *,
+    rows: Sequence[int] = (),
+    seeds: int = 3,
+    steps: int | None = None,
+    device: str = "cpu",
+    progress: Progress = lambda what, done, total: None,
+) -> Iterator[Score]:
+    """Fit under every prior to every number of rows with every seed; yield each score with the prior as its method.
+
+    A fit that fails gives a score with the reason, and the study goes on.
+
+    Args:
+        case: the recordings.
+        priors: by name, as of ``prior_models``.
+        rows: numbers of rows; those of the case unless given.
+        seeds: how many; rows and fit have the same one.
+        steps: of the particles' optimiser; the method's unless given.
+        device: where models are fitted and judged.
+        progress: called before each fit and at the end.
+
+    Raises:
+        DataError: the recordings have too few rows.
+    """
+    assert case.rows is not None
+    counts = tuple(rows) or case.counts
+    if max(counts) > len(case.rows):
+        raise DataError(f"The recordings have {len(case.rows)} rows, not {max(counts)}; ask for fewer with --rows.")
+    domain = priors.get(NOMINAL) or case.prior
+    plan = list(itertools.product(counts, range(seeds), priors))
+    for done, (count, seed, name) in enumerate(plan):
+        progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
+        data = case.recorded(Path(), count, seed).to(device)
+        prior = priors[name]
+        own = replace(case, prior=domain if prior is None else prior)
+        score = scored(own, data, count, seed, "FSVGD" if prior is None else "Sim-FSVGD", steps=steps)
+        yield replace(score, method=name)
+    progress("", len(plan), len(plan))
+
+
+__all__ = ["DIAGNOSED", "KINEMATIC", "NOMINAL", "NONE", "InDomain", "check_periods", "prior_models", "run_prior_study"]

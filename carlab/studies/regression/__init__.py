@@ -1,0 +1,1 @@
+"""Regression study: methods fitted to few rows and scored on held-out rows."""

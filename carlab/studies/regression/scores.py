@@ -1,0 +1,103 @@
+"""Scores of the regression study, their summary over seeds, and their JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+
+from learning.devices import described
+
+FIGURES = ("nll", "rmse", "calibration", "seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One method, fitted once.
+
+    Attributes:
+        case, method, rows, seed: what was fitted.
+        nll: mean joint negative log density of all outputs [nat].
+        rmse: root of the squared error summed over outputs, in mixed units.
+        calibration: mean absolute difference of empirical and nominal coverage.
+        seconds: duration of the fit.
+        nll_in_world: negative log density of the seven outputs that the authors score, for a real car [nat].
+        failed: why there is no model; its figures are NaN then.
+    """
+
+    case: str
+    method: str
+    rows: int
+    seed: int
+    nll: float
+    rmse: float
+    calibration: float
+    seconds: float
+    nll_in_world: float | None = None
+    failed: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One method at one number of rows: means over the seeds, and their standard errors.
+
+    Means are over the ``seeds`` fits that succeeded, NaN where there is none; standard errors need two.
+    """
+
+    method: str
+    rows: int
+    seeds: int
+    nll: float
+    nll_standard_error: float
+    rmse: float
+    calibration: float
+    seconds: float
+    nll_in_world: float | None = None
+    rmse_standard_error: float = math.nan
+    calibration_standard_error: float = math.nan
+    seconds_standard_error: float = math.nan
+    failed: int = 0
+
+
+def summarised(scores: Sequence[Score]) -> list[Row]:
+    """One row for each method and number of rows, in the order in which they were fitted."""
+    groups: dict[tuple[int, str], list[Score]] = {}
+    for score in scores:
+        groups.setdefault((score.rows, score.method), []).append(score)
+    rows = []
+    for (count, method), group in groups.items():
+        own = [s for s in group if s.failed is None]
+        mean, error = {}, {}
+        for name in FIGURES:
+            values = np.array([getattr(s, name) for s in own])
+            mean[name] = float(values.mean()) if own else math.nan
+            error[f"{name}_standard_error"] = (
+                float(values.std(ddof=1) / np.sqrt(len(own))) if len(own) > 1 else math.nan
+            )
+        worlds = [s.nll_in_world for s in own if s.nll_in_world is not None]
+        in_world = float(np.mean(worlds)) if worlds else None
+        failed = len(group) - len(own)
+        rows.append(Row(method, count, len(own), nll_in_world=in_world, failed=failed, **mean, **error))
+    return rows
+
+
+def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[str, object]:
+    """All scores, their summary and the command that made them; numbers that are not finite are null."""
+
+    def plain(row: Row | Score) -> dict[str, object]:
+        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(row).items()}
+
+    return {
+        "schema": "carlab.regression/1",
+        "command": command,
+        "device": described(device),
+        "torch_threads": torch.get_num_threads(),
+        "rows": [plain(row) for row in summarised(scores)],
+        "scores": [plain(score) for score in scores],
+    }
+
+
+__all__ = ["FIGURES", "Row", "Score", "as_json", "summarised"]

@@ -1,0 +1,78 @@
+"""MkDocs hooks: fill generated sections (command line help, effects, decisions) when the site is built."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).resolve().parent
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Replace each ``<!-- generated: NAME -->`` by its text; hide the markers that tests read."""
+    for name, section in SECTIONS.items():
+        marker = f"<!-- generated: {name} -->"
+        if marker in markdown:
+            markdown = markdown.replace(marker, section())
+    return re.sub(r"<!-- test: [^>]*-->\n", "", markdown)
+
+
+def _command_line() -> str:
+    return "\n".join(f"## carlab {verb}\n\n```text\n{_help(verb)}\n```\n" for verb in _verbs())
+
+
+def _verbs() -> list[str]:
+    from carlab.cli import _verbs
+
+    return list(_verbs())
+
+
+def _help(verb: str) -> str:
+    from carlab.cli import run
+
+    os.environ["COLUMNS"] = "110"
+    captured = io.StringIO()
+    with contextlib.redirect_stdout(captured), contextlib.suppress(SystemExit):
+        run([verb, "--help"])
+    return re.sub(r"\x1b\[[0-9;]*m", "", captured.getvalue()).strip()
+
+
+def _decisions() -> str:
+    records = sorted(path for path in (DOCS / "decisions").glob("[0-9]*.md"))
+    titles = [path.read_text(encoding="utf-8").split("\n", 1)[0].lstrip("# ") for path in records]
+    return "\n".join(f"* [{title}]({path.name})" for path, title in zip(records, titles, strict=True))
+
+
+def _effects() -> str:
+    from sim_backends.effects import CATALOGUE, EFFECTS
+
+    return "\n".join(_effect(EFFECTS[name]) for name in CATALOGUE)
+
+
+def _effect(effect: Any) -> str:
+    from sim_backends.effects import confusable_effects
+
+    rows = "\n".join(
+        f"| `{p.name}` | {p.unit} | {p.same_as or p.identity} | {p.low:g} to {p.high:g} | {p.typical:g} |"
+        for p in effect.parameters
+    )
+    picture = DOCS / "images" / "effects" / f"{effect.id}.png"
+    shown = (
+        f"![{effect.id}: drive with and without the effect](../images/effects/{effect.id}.png)\n"
+        if picture.is_file()
+        else ""
+    )
+    others = confusable_effects()[effect.id]
+    links = ", ".join(f"[`{name}`](#{name})" for name in others) or "none"
+    return (
+        f"## `{effect.id}` {{ #{effect.id} }}\n\n{effect.summary}\n\n"
+        f"| parameter | unit | identity | range | typical |\n| --- | --- | --- | --- | --- |\n{rows}\n\n"
+        f"Kind: {effect.kind}. Confusable: {links}.\n\n{shown}"
+    )
+
+
+SECTIONS = {"cli": _command_line, "effects": _effects, "decisions": _decisions}

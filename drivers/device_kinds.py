@@ -1,0 +1,49 @@
+"""Registry of the motor controllers that ``kind`` in ``[hardware.actuator]`` can name."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+from drivers.device import Device
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceKind:
+    """A protocol over a kind of link.
+
+    ``factory`` is the import path ``module:function`` of a function from an ActuatorConfig to a Device: the sender
+    process imports it, the main process does not. ``name`` stands in messages and, in lower case, in names of readings.
+    ``silent_hint`` is the remedy where nothing answers and ``garbage_hint`` the one where only garbage does.
+    """
+
+    factory: str
+    name: str
+    silent_hint: str
+    garbage_hint: str = ""
+    is_bus: bool = False
+
+    def load(self) -> Callable[[Any], Device]:
+        """Import the factory."""
+        module, _, function = self.factory.partition(":")
+        return cast("Callable[[Any], Device]", getattr(importlib.import_module(module), function))
+
+
+DEVICE_KINDS: dict[str, DeviceKind] = {
+    "vesc_serial": DeviceKind(
+        factory="drivers.vesc.serial_device:make_device",
+        name="VESC",
+        silent_hint="the port opens but nothing answers; switch the VESC on and check that 'port' is the VESC's.",
+        garbage_hint="check 'port' and 'baud' in [hardware.actuator].",
+    ),
+    "vesc_can": DeviceKind(
+        factory="drivers.vesc.can_device:make_device",
+        name="VESC",
+        silent_hint="nothing answers there; check power, termination, the bitrate, and that controller_id in "
+        "[hardware.actuator] is the VESC's id and its CAN mode is VESC.",
+        is_bus=True,
+    ),
+}
+"""Device kinds by the name that a car file gives them; add a protocol here."""

@@ -1,0 +1,1 @@
+"""Links that carry bytes or frames: serial ports and CAN buses."""

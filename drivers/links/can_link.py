@@ -1,0 +1,148 @@
+"""A CAN bus as a frame link (python-can, any of its interfaces)."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+from pathlib import Path
+from typing import Final
+
+import can
+
+from carlab.core.errors import ActuatorFaultError, NotReadyError
+from drivers.links.link import CanFrame, LinkStatistics
+
+BUS_OFF: Final = 0x40
+"""Bit of a Linux CAN error frame's identifier (CAN_ERR_BUSOFF)."""
+MAX_FRAMES_A_READ: Final = 256
+BITRATE_INTERFACES: Final = frozenset({"slcan", "pcan", "kvaser", "vector", "ixxat", "gs_usb", "usb2can", "canalystii"})
+
+
+def open_bus(interface: str, channel: str, bitrate: int) -> can.BusABC:
+    """Open a python-can bus without reading the user's python-can configuration files.
+
+    ``udp_multicast`` with an IPv4 group stays on this host's loopback interface; its channel is GROUP or GROUP:PORT.
+    """
+    if interface == "udp_multicast" and _is_ipv4(channel):
+        from drivers.links.loopback_multicast import LoopbackMulticastBus
+
+        return LoopbackMulticastBus(channel)
+    if interface in BITRATE_INTERFACES:
+        return can.Bus(channel, interface=interface, ignore_config=True, bitrate=bitrate)
+    return can.Bus(channel, interface=interface, ignore_config=True)
+
+
+def _is_ipv4(channel: str) -> bool:
+    try:
+        ipaddress.IPv4Address(channel.partition(":")[0])
+    except ValueError:
+        return False
+    return True
+
+
+class CanLink:
+    """Frames sent at once or not at all; an error of the bus closes nothing but is raised as a fault.
+
+    A frame that the controller cannot send now must not be sent later: each send has a time-out of zero, and after an
+    error the device closes the link, which drops what the adapter still holds, and opens it anew.
+    """
+
+    def __init__(self, interface: str, channel: str, bitrate: int = 500_000) -> None:
+        self.interface = interface
+        self.channel = channel
+        self.bitrate = bitrate
+        self.statistics = LinkStatistics()
+        self._bus: can.BusABC | None = None
+        self._descriptor: int | None = None
+
+    def open(self) -> None:
+        """Open the bus; raises NotReadyError with the next step."""
+        if self._bus is not None:
+            return
+        try:
+            self._bus = self._open_bus()
+        except (can.CanError, OSError, ValueError, ImportError) as error:
+            raise NotReadyError(
+                f"CAN bus {self.interface} {self.channel} does not open", (self._reason(error),)
+            ) from error
+        try:
+            self._descriptor = self._bus.fileno()
+        except NotImplementedError:
+            self._descriptor = None
+        if self._descriptor is not None and self._descriptor < 0:
+            self._descriptor = None
+        self.statistics.opens += 1
+
+    def write(self, frame: CanFrame) -> None:
+        """Send a data frame with a 29-bit identifier; raises ActuatorFaultError where the bus does not take it."""
+        message = can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=True)
+        try:
+            self._opened().send(message, timeout=0)
+        except (can.CanError, OSError) as error:
+            self._flush()
+            raise self._failed(error) from error
+        self.statistics.frames_out += 1
+        self.statistics.bytes_out += len(frame.data)
+
+    def read(self) -> list[CanFrame]:
+        """Frames that have arrived; raises ActuatorFaultError on bus-off or a lost adapter."""
+        bus = self._opened()
+        frames: list[CanFrame] = []
+        for _ in range(MAX_FRAMES_A_READ):
+            try:
+                message = bus.recv(0)
+            except (can.CanError, OSError, ValueError) as error:
+                raise self._failed(error) from error
+            if message is None:
+                break
+            if message.is_error_frame:
+                self.statistics.error_frames += 1
+                if message.arbitration_id & BUS_OFF:
+                    self._flush()
+                    raise self._failed("the controller went bus-off")
+            elif message.is_extended_id and not message.is_remote_frame:
+                frames.append(CanFrame(message.arbitration_id, bytes(message.data)))
+                self.statistics.bytes_in += len(message.data)
+        self.statistics.frames_in += len(frames)
+        return frames
+
+    def fileno(self) -> int | None:
+        """The bus's descriptor, where its interface has one."""
+        return self._descriptor
+
+    def close(self) -> None:
+        """Shut the bus down; what it has not sent is dropped."""
+        bus, self._bus, self._descriptor = self._bus, None, None
+        if bus is not None:
+            bus.shutdown()
+
+    def _open_bus(self) -> can.BusABC:
+        return open_bus(self.interface, self.channel, self.bitrate)
+
+    def _opened(self) -> can.BusABC:
+        if self._bus is None:
+            raise ActuatorFaultError(f"CAN bus {self.interface} {self.channel} is not open.")
+        return self._bus
+
+    def _flush(self) -> None:
+        if self._bus is None:
+            return
+        with contextlib.suppress(NotImplementedError, can.CanError, OSError):  # no queue, or gone with its queue
+            self._bus.flush_tx_buffer()
+
+    def _failed(self, error: object) -> ActuatorFaultError:
+        return ActuatorFaultError(
+            f"CAN bus {self.interface} {self.channel} failed ({error}); check wiring, termination and power, "
+            "then reset the fault."
+        )
+
+    def _reason(self, error: BaseException) -> str:
+        cause = error.__cause__ or error
+        if self.interface == "socketcan":
+            found = sorted(path.name for path in Path("/sys/class/net").glob("*can*"))
+            there = f"the CAN interfaces that exist are {', '.join(found)}" if found else "there is no CAN interface"
+            return (
+                f"{cause}; {there}. Bring it up with 'ip link set {self.channel} up type can bitrate {self.bitrate} "
+                "restart-ms 100' and set 'channel' in [hardware.actuator]."
+            )
+        return f"{cause}. Check 'interface' and 'channel' in [hardware.actuator]."

@@ -1,0 +1,129 @@
+"""A serial port as a byte link (pyserial)."""
+
+from __future__ import annotations
+
+import errno
+import os
+import termios
+import time
+from typing import Final
+
+import serial
+from serial.tools import list_ports
+
+from carlab.core.errors import ActuatorFaultError, NotReadyError
+from drivers.links.link import LinkStatistics
+
+WRITE_TIMEOUT_S: Final = 0.04
+DRAIN_S: Final = 0.02
+BACKLOG_LIMIT_BYTES: Final = 96
+"""More than this still unsent means that the device has stopped taking bytes (about two ticks' worth)."""
+
+
+def serial_ports() -> list[str]:
+    """Serial ports that exist, each with what it calls itself."""
+    return sorted(
+        port.device if port.description in ("n/a", "", None) else f"{port.device} ({port.description})"
+        for port in list_ports.comports()
+    )
+
+
+class SerialLink:
+    """Exclusive use of a serial port, read without blocking and written with a time-out."""
+
+    def __init__(self, port: str, baud: int = 115200, write_timeout_s: float = WRITE_TIMEOUT_S) -> None:
+        self.port = port
+        self.baud = baud
+        self.write_timeout_s = write_timeout_s
+        self.statistics = LinkStatistics()
+        self._serial: serial.Serial | None = None
+
+    def open(self) -> None:
+        """Open the port; raises NotReadyError that lists the ports that exist."""
+        if self._serial is not None:
+            return
+        try:
+            self._serial = serial.Serial(
+                self.port, self.baud, timeout=0, write_timeout=self.write_timeout_s, exclusive=True
+            )
+        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
+            raise NotReadyError(f"Serial port {self.port} does not open", (self._reason(error),)) from error
+        self.statistics.opens += 1
+
+    def write(self, data: bytes) -> None:
+        """Write all of ``data``; raises ActuatorFaultError on a time-out or a lost port.
+
+        Where the device has stopped taking bytes, those that wait are thrown away: they are commands of the past.
+        """
+        port = self._opened()
+        try:
+            backlog = port.out_waiting
+            if backlog > BACKLOG_LIMIT_BYTES:
+                port.reset_output_buffer()
+                self.statistics.discarded_bytes += backlog
+            port.write(data)
+        except serial.SerialTimeoutException as error:
+            self._discard_output()
+            raise ActuatorFaultError(
+                f"{self.port} takes no more bytes; check that the device is powered, then reset the fault."
+            ) from error
+        except (OSError, termios.error) as error:
+            raise self._lost(error) from error
+        self.statistics.bytes_out += len(data)
+        self.statistics.writes += 1
+
+    def read(self) -> bytes:
+        """Bytes that have arrived; raises ActuatorFaultError where the port is gone."""
+        port = self._opened()
+        try:
+            waiting = port.in_waiting
+            data: bytes = port.read(waiting) if waiting else b""
+        except (OSError, termios.error, TypeError) as error:
+            raise self._lost(error) from error
+        self.statistics.bytes_in += len(data)
+        return data
+
+    def fileno(self) -> int | None:
+        """The port's descriptor while it is open."""
+        return None if self._serial is None else self._serial.fileno()
+
+    def close(self) -> None:
+        """Close, throwing away what a device that does not listen has left unsent: the kernel would wait for it."""
+        port, self._serial = self._serial, None
+        if port is None:
+            return
+        try:
+            if port.out_waiting:
+                time.sleep(DRAIN_S)
+            if port.out_waiting:
+                port.reset_output_buffer()
+        except (OSError, termios.error):
+            return  # the port is gone, and its bytes with it
+        finally:
+            port.close()
+
+    def _opened(self) -> serial.Serial:
+        if self._serial is None:
+            raise ActuatorFaultError(f"{self.port} is not open.")
+        return self._serial
+
+    def _discard_output(self) -> None:
+        if self._serial is not None:
+            try:
+                self._serial.reset_output_buffer()
+            except (OSError, termios.error) as error:
+                raise self._lost(error) from error
+
+    def _lost(self, error: BaseException) -> ActuatorFaultError:
+        return ActuatorFaultError(f"{self.port} was lost ({error}); check cable and power, then reset the fault.")
+
+    def _reason(self, error: BaseException) -> str:
+        if not os.path.exists(self.port):
+            found = serial_ports()
+            there = f"the ports that exist are {', '.join(found)}" if found else "there is no serial port at all"
+            return f"it does not exist; {there}. Plug the motor controller in and set 'port' in [hardware.actuator]."
+        if (isinstance(error, OSError) and error.errno == errno.EACCES) or "Permission" in str(error):
+            return "permission is denied; add yourself to its group (often 'dialout') and log in again."
+        if "exclusively lock" in str(error) or "Resource temporarily unavailable" in str(error):
+            return "another program uses it; close that program."
+        return f"{error}. Check that 'port' in [hardware.actuator] names the motor controller."

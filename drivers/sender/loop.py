@@ -1,0 +1,289 @@
+"""The sender: one loop that owns the device, sends at absolute deadlines and never shares an interpreter's lock.
+
+It runs in a process of its own (``sender_process``); only a bus that exists within one process needs it in a thread.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from carlab.core.errors import ActuatorFaultError, NotReadyError
+from drivers.calibration import ActuatorCalibration, DeviceCommand
+from drivers.config import ActuatorConfig
+from drivers.device import Device, FirmwareIdentity
+from drivers.sender.logic import Order, SenderLogic, SenderState
+from drivers.sender.slots import Slot
+from drivers.sender.status import SenderStatus
+
+MAX_RATE_FACTOR = 4
+"""However often the main process wakes the sender, it sends at most this many times its rate."""
+MAX_DECISION_AGE_S = 0.01
+"""Oldest decision [s] that may be written. If it is older, the process was stopped between decision and write."""
+MAX_DECISIONS = 3
+"""Decisions in one tick before neutral is written instead."""
+HANDSHAKE_PERIOD_S = 0.1
+RECONNECT_PERIODS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
+LATENESS_KEPT = 4096
+LATENESS_EVERY_DEADLINES = 50
+
+
+class SenderLoop:
+    """Sends what ``SenderLogic`` says, over a device, until it is told to leave or its main process is gone."""
+
+    def __init__(
+        self,
+        device: Device,
+        config: ActuatorConfig,
+        calibration: ActuatorCalibration,
+        orders: Slot,
+        statuses: Slot,
+        wake: socket.socket,
+        is_main_alive: Callable[[], bool],
+        *,
+        is_realtime: bool = False,
+    ) -> None:
+        self.device = device
+        self.config = config
+        self.logic = SenderLogic(config, calibration)
+        self._orders = orders
+        self._statuses = statuses
+        self._wake = wake
+        self._is_main_alive = is_main_alive
+        self._is_realtime = is_realtime
+        self._period_s = 1.0 / config.rate_hz
+        self._is_link_open = False
+        self._is_wake_open = True
+        self._is_woken = False
+        self._next_poll_s = 0.0
+        self._next_connect_s = 0.0
+        self._failed_connects = 0
+        self._t_written_s = float("nan")
+        self._late_s = np.zeros(LATENESS_KEPT)
+        self._late_ms = (0.0, 0.0, 0.0)
+        self._ticks = 0
+        self._deadlines = 0
+        self._skipped = 0
+        self._needs_version = False
+
+    def run(self) -> None:
+        """Connect and send until done; the device is closed and the last status published on every way out."""
+        try:
+            self._run()
+        except Exception as error:
+            self.logic.link_failed(
+                f"the sender failed ({type(error).__name__}: {error}); close the car, open it again."
+            )
+            raise
+        finally:
+            self.device.close()
+            self._publish(is_ended=True)
+
+    def _run(self) -> None:
+        try:
+            self.device.open()
+        except NotReadyError as error:
+            self.logic.link_failed(str(error))
+            return
+        self._is_link_open = True
+        self.logic.link_up()
+        deadline_s = time.monotonic()
+        while not self.logic.is_finished:
+            is_deadline = self._wait(deadline_s)
+            now_s = time.monotonic()
+            self._tick(now_s)
+            if is_deadline:
+                self._note_lateness(now_s - deadline_s)
+            # A deadline closer than the shortest gap has just been served; missed ones are skipped, never made up.
+            if is_deadline or deadline_s - now_s < self._period_s / MAX_RATE_FACTOR:
+                missed = max(0, int((now_s - deadline_s) / self._period_s))
+                self._skipped += missed
+                deadline_s += (missed + 1) * self._period_s
+
+    def _wait(self, deadline_s: float) -> bool:
+        """Sleep to the deadline, True, or to an order that may be sent before it, False; replies are read meanwhile."""
+        earliest_s = time.monotonic() + self._period_s / MAX_RATE_FACTOR
+        while (now_s := time.monotonic()) < deadline_s:
+            if self._is_woken and now_s >= earliest_s:
+                self._is_woken = False
+                return False
+            until_s = min(deadline_s, earliest_s) if self._is_woken else deadline_s
+            watched: list[int] = []
+            if self._is_wake_open and not self._is_woken:
+                watched.append(self._wake.fileno())
+            link = self.device.fileno() if self._is_link_open else None
+            if link is not None:
+                watched.append(link)
+            readable, _, _ = select.select(watched, [], [], max(0.0, until_s - now_s))
+            if self._is_wake_open and self._wake.fileno() in readable:
+                self._drain_wake()
+            if link in readable:
+                self._receive(time.monotonic())
+        self._is_woken = False
+        return True
+
+    def _drain_wake(self) -> None:
+        try:
+            data = self._wake.recv(4096)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        self._is_woken = True
+        if not data:
+            self._is_wake_open = False
+            self.logic.main_lost()
+
+    def _tick(self, now_s: float) -> None:
+        self._ticks += 1
+        if self._is_wake_open and not self._is_main_alive():
+            self._is_wake_open = False
+            self.logic.main_lost()
+        self._take_order(now_s)
+        self._receive(now_s)
+        self._reconnect(now_s)
+        before = self.logic.sent_number
+        command, decided_s = self._decide()
+        try:
+            if command is not None and self._is_link_open:
+                self.device.send(command)
+                self.logic.written(decided_s, command)
+                if self.logic.sent_number != before:
+                    self._t_written_s = decided_s
+            self._poll(now_s)
+        except ActuatorFaultError as error:
+            self._link_failed(str(error))
+        self._publish()
+
+    def _take_order(self, now_s: float) -> None:
+        newest = self._orders.read()
+        if newest is not None:
+            self.logic.order(now_s, Order.unpack(newest[1]))
+
+    def _decide(self) -> tuple[DeviceCommand | None, float]:
+        """Return what to write and the time just before the write.
+
+        The process may be stopped between decision and write (SIGSTOP, a busy host). The command may then be too old,
+        and the main process may have latched a fault. A new decision from the newest order replaces an old one.
+        """
+        for _ in range(MAX_DECISIONS):
+            decided_s = time.monotonic()
+            self._take_order(decided_s)
+            command = self.logic.decide(decided_s)
+            write_s = time.monotonic()
+            if write_s - decided_s <= MAX_DECISION_AGE_S:
+                return command, write_s
+        return (None if command is None else self.logic.neutral), write_s
+
+    def _poll(self, now_s: float) -> None:
+        if not self._is_link_open or now_s < self._next_poll_s - 0.25 * self._period_s:
+            return
+        version = self.logic.version
+        if version is None or self._needs_version:
+            self._next_poll_s = now_s + HANDSHAKE_PERIOD_S
+            self.device.request_firmware()
+        elif version.refusal() is None:
+            self._next_poll_s = now_s + 1.0 / self.config.telemetry_rate_hz
+            self.device.request_telemetry()
+
+    def _receive(self, now_s: float) -> None:
+        if not self._is_link_open:
+            return
+        try:
+            for reply in self.device.receive(now_s):
+                if isinstance(reply, FirmwareIdentity):
+                    self._needs_version = False
+                    self._next_poll_s = now_s
+                    self.logic.link_up()
+                    self.logic.firmware(reply)
+                else:
+                    self.logic.telemetry(now_s, reply)
+        except ActuatorFaultError as error:
+            self._link_failed(str(error))
+
+    def _link_failed(self, text: str) -> None:
+        self._is_link_open = False
+        self.device.close()
+        self.logic.link_failed(text)
+        self._failed_connects = 0
+        self._next_connect_s = time.monotonic() + RECONNECT_PERIODS_S[0]
+
+    def _reconnect(self, now_s: float) -> None:
+        """Look for a lost link again; the fault stays latched, and nothing but a version request is sent at first."""
+        if self._is_link_open or now_s < self._next_connect_s or self.logic.is_finished:
+            return
+        try:
+            self.device.open()
+        except NotReadyError:
+            wait = RECONNECT_PERIODS_S[min(self._failed_connects, len(RECONNECT_PERIODS_S) - 1)]
+            self._failed_connects += 1
+            self._next_connect_s = now_s + wait
+            return
+        self._is_link_open = True
+        self._needs_version = True
+        self._next_poll_s = now_s
+
+    def _note_lateness(self, late_s: float) -> None:
+        """Keep how late a deadline was met; the percentiles are renewed now and then, right after a deadline."""
+        self._late_s[self._deadlines % LATENESS_KEPT] = late_s
+        self._deadlines += 1
+        if self._deadlines % LATENESS_EVERY_DEADLINES == 1:
+            kept = self._late_s[: min(self._deadlines, LATENESS_KEPT)]
+            p50, p99, top = (float(v) * 1e3 for v in np.percentile(kept, (50, 99, 100)))
+            self._late_ms = (p50, p99, top)
+
+    def _publish(self, *, is_ended: bool = False) -> None:
+        logic, counters = self.logic, self.device.counters
+        late = self._late_ms
+        version, values = logic.version, logic.values
+        status = SenderStatus(
+            t_published_s=time.monotonic(),
+            state=SenderState.DISCONNECTED if is_ended and not logic.fault else logic.state,
+            epoch=logic.epoch,
+            is_neutral_settled=logic.is_neutral_settled,
+            is_sending=logic.is_ready_to_send,
+            is_realtime=self._is_realtime,
+            is_ended=is_ended,
+            firmware_major=version.major if version else 0,
+            firmware_minor=version.minor if version else 0,
+            t_telemetry_s=_known(logic.t_values_s),
+            erpm=_known(None if values is None else values.erpm),
+            input_v=_known(None if values is None else values.input_v),
+            tachometer_steps=_known(None if values is None else values.tachometer_steps),
+            fault_code=0 if values is None else values.fault_code or 0,
+            is_motor_released=values is not None and values.motor_timeout_active,
+            sent_number=logic.sent_number,
+            t_issued_s=logic.t_sent_issued_s,
+            t_written_s=self._t_written_s,
+            late_p50_ms=late[0],
+            late_p99_ms=late[1],
+            late_max_ms=late[2],
+            ticks=self._ticks,
+            skipped_ticks=self._skipped,
+            frames=logic.frames,
+            neutral_frames=logic.neutral_frames,
+            watchdog_trips=logic.watchdog_trips,
+            crc_errors=counters.crc_errors,
+            garbage_bytes=counters.garbage_bytes,
+            partial_timeouts=counters.partial_timeouts,
+            link_opens=counters.link_opens,
+            hardware=version.hardware[:60] if version else "",
+            fault=logic.fault[:600],
+            refusal=logic.refusal[:600],
+        )
+        self._statuses.write(status.pack())
+
+
+def _known(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def parent_watch() -> Callable[[], bool]:
+    """A check that this process still has the parent it was started by (a forked sibling may hold its pipe open)."""
+    parent = os.getppid()
+    return lambda: os.getppid() == parent

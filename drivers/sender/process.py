@@ -1,0 +1,246 @@
+"""The sender in a process of its own: a fresh interpreter in a session of its own, fed by newest-value slots.
+
+It is started as ``python -m drivers.sender.process`` rather than by ``multiprocessing``: nothing of the main program is
+imported again, no shared name can leak, and a terminal's ^C does not reach it. It ignores SIGINT, SIGTERM and SIGHUP;
+it leaves when told to, or when the main process is gone, and in both cases only after neutral has been sent at least
+three times over at least 60 ms.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import gc
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Protocol
+
+from carlab.core.tables import from_table
+from drivers.calibration import ActuatorCalibration
+from drivers.config import ActuatorConfig
+from drivers.device import Device
+from drivers.device_kinds import DEVICE_KINDS, DeviceKind
+from drivers.sender.logic import ORDER_SIZE, Order
+from drivers.sender.loop import SenderLoop, parent_watch
+from drivers.sender.slots import Slot
+from drivers.sender.status import STATUS_SIZE, SenderStatus
+
+REALTIME_PRIORITY = 20
+
+
+class Sender(Protocol):
+    """A started sender as the main process sees it."""
+
+    def post(self, order: Order) -> None:
+        """Publish the newest order and wake the sender; never blocks."""
+
+    def status(self) -> SenderStatus:
+        """The newest status; never blocks."""
+
+    def is_alive(self) -> bool:
+        """Whether the sender still runs."""
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the sender to end by itself; False where it has not."""
+
+    def close(self) -> None:
+        """Cut the sender's line, which makes it send neutral and leave, wait for it in bounded time, free all."""
+
+
+class _Channel:
+    """Slots and wake line, main side."""
+
+    def __init__(self) -> None:
+        self.orders = Slot.create(ORDER_SIZE)
+        self.statuses = Slot.create(STATUS_SIZE)
+        self.wake, self.sender_wake = socket.socketpair()
+        self.wake.setblocking(False)
+        self._last = SenderStatus()
+
+    def post(self, order: Order) -> None:
+        """Write, then wake; a full line, a sender that is gone or a channel closed meanwhile is noticed elsewhere."""
+        with contextlib.suppress(OSError, ValueError):
+            self.orders.write(order.pack())
+            self.wake.send(b"\1")
+
+    def status(self) -> SenderStatus:
+        """Newest status, or the last one read where the slot is being written or was closed by another thread."""
+        with contextlib.suppress(ValueError):
+            newest = self.statuses.read()
+            if newest is not None:
+                self._last = SenderStatus.unpack(newest[1])
+        return self._last
+
+    def hang_up(self) -> None:
+        """Close the wake line: the sender takes it as the end of the main process."""
+        self.wake.close()
+
+    def close(self) -> None:
+        """Free everything."""
+        self.wake.close()
+        self.sender_wake.close()
+        self.orders.close()
+        self.statuses.close()
+
+
+class SenderProcess:
+    """Starts the sender's process on construction; owned by ``Actuator``, which closes it."""
+
+    def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> None:
+        self._channel = _Channel()
+        try:
+            self._process = self._start(config, calibration)
+        except BaseException:
+            self._channel.close()
+            raise
+        self._channel.sender_wake.close()
+        self.pid = self._process.pid
+
+    def _start(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> subprocess.Popen[bytes]:
+        channel = self._channel
+        descriptors = (channel.orders.descriptor, channel.statuses.descriptor, channel.sender_wake.fileno())
+        settings = json.dumps(
+            {
+                "device_kind": dataclasses.asdict(config.device_kind),
+                "actuator": dataclasses.asdict(config),
+                "calibration": dataclasses.asdict(calibration),
+            }
+        )
+        root = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join(p for p in (root, os.environ.get("PYTHONPATH", "")) if p)
+        return subprocess.Popen(
+            [sys.executable, "-P", "-m", "drivers.sender.process", *map(str, descriptors), settings],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            pass_fds=descriptors,
+            start_new_session=True,
+            env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )
+
+    def post(self, order: Order) -> None:
+        """Publish the newest order and wake the sender."""
+        self._channel.post(order)
+
+    def status(self) -> SenderStatus:
+        """The newest status."""
+        return self._channel.status()
+
+    def is_alive(self) -> bool:
+        """Whether the process still runs."""
+        return self._process.poll() is None
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the process to end."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Hang up, wait, and kill only a process that does not react: then the firmware's time-out stops the motor."""
+        self._channel.hang_up()
+        if not self.join(2.0):
+            self._process.kill()
+            self._process.wait()
+        self._channel.close()
+
+
+class SenderThread:
+    """The sender as a thread, for buses that exist only within one process (python-can's ``virtual``)."""
+
+    def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration, device: Device | None = None) -> None:
+        self._channel = _Channel()
+        channel = self._channel
+        self.loop = SenderLoop(
+            config.device_kind.load()(config) if device is None else device,
+            config,
+            calibration,
+            channel.orders,
+            channel.statuses,
+            channel.sender_wake,
+            lambda: True,
+        )
+        self._thread = threading.Thread(target=self.loop.run, name="sender", daemon=True)
+        self._thread.start()
+        self.pid = os.getpid()
+
+    def post(self, order: Order) -> None:
+        """Publish the newest order and wake the sender."""
+        self._channel.post(order)
+
+    def status(self) -> SenderStatus:
+        """The newest status."""
+        return self._channel.status()
+
+    def is_alive(self) -> bool:
+        """Whether the thread still runs."""
+        return self._thread.is_alive()
+
+    def join(self, timeout_s: float) -> bool:
+        """Wait for the thread to end."""
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def close(self) -> None:
+        """Hang up and wait; the memory of a thread that does not end is left to it."""
+        self._channel.hang_up()
+        if self.join(5.0):
+            self._channel.close()
+
+
+def start_sender(config: ActuatorConfig, calibration: ActuatorCalibration) -> Sender:
+    """Start a sender: a process, or a thread for the ``virtual`` bus, which no other process could reach."""
+    if config.device_kind.is_bus and config.interface == "virtual":
+        return SenderThread(config, calibration)
+    return SenderProcess(config, calibration)
+
+
+def _try_realtime() -> bool:
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REALTIME_PRIORITY))
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def main(arguments: list[str]) -> int:
+    """Entry of the sender's process: descriptors of orders, statuses and wake line, then the settings as JSON."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    is_main_alive = parent_watch()
+    orders_fd, statuses_fd, wake_fd = (int(a) for a in arguments[:3])
+    settings = json.loads(arguments[3])
+    DEVICE_KINDS[settings["actuator"]["kind"]] = DeviceKind(**settings["device_kind"])
+    config = from_table(ActuatorConfig, settings["actuator"], "the sender's settings")
+    calibration = from_table(ActuatorCalibration, settings["calibration"], "the sender's settings")
+    orders, statuses = Slot.attach(orders_fd, ORDER_SIZE), Slot.attach(statuses_fd, STATUS_SIZE)
+    is_realtime = config.realtime_priority and _try_realtime()
+    with socket.socket(fileno=wake_fd) as wake:
+        wake.setblocking(False)
+        loop = SenderLoop(
+            config.device_kind.load()(config),
+            config,
+            calibration,
+            orders,
+            statuses,
+            wake,
+            is_main_alive,
+            is_realtime=is_realtime,
+        )
+        gc.collect()
+        gc.freeze()
+        loop.run()
+    orders.close()
+    statuses.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,1 @@
+"""VESC motor controllers: payloads, serial and CAN codecs (pure), devices."""

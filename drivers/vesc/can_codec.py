@@ -1,0 +1,243 @@
+"""VESC over CAN: commands to frames and frames back to telemetry and payloads. Pure.
+
+Facts (vedderb/bldc comm/comm_can.c, documentation/comm_can.md): 29-bit identifiers, ``(packet << 8) | controller``;
+messages of fixed layout are in ``dbc/vesc.dbc``; every other command goes through a small transport: up to 6 bytes in
+one PROCESS_SHORT_BUFFER, more in FILL_RX_BUFFER pieces and a PROCESS_RX_BUFFER with length and CRC-16/XMODEM.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import importlib.resources
+import math
+import struct
+from dataclasses import dataclass, field, fields
+from typing import Any, cast
+
+import cantools
+
+from carlab.core.errors import ProtocolError
+from drivers.links.link import CanFrame
+from drivers.vesc import payloads as vesc_payloads
+from drivers.vesc.payloads import MotorValues
+from drivers.vesc.serial_codec import MAX_PAYLOAD, crc16
+
+BROADCAST_ID = 255
+CONTROLLER_MASK = 0xFF
+MESSAGE_MASK = 0x1FFFFF00
+
+
+class Packet(enum.IntEnum):
+    """Packet numbers, bits 8 and up of the identifier."""
+
+    SET_DUTY = 0
+    SET_CURRENT = 1
+    SET_CURRENT_BRAKE = 2
+    SET_RPM = 3
+    FILL_RX_BUFFER = 5
+    FILL_RX_BUFFER_LONG = 6
+    PROCESS_RX_BUFFER = 7
+    PROCESS_SHORT_BUFFER = 8
+    STATUS_1 = 9
+    STATUS_2 = 14
+    STATUS_3 = 15
+    STATUS_4 = 16
+    PING = 17
+    PONG = 18
+    STATUS_5 = 27
+    STATUS_6 = 58
+
+
+STATUS_PACKETS = frozenset(p for p in Packet if p.name.startswith("STATUS"))
+
+
+class Send(enum.IntEnum):
+    """What the receiver of a transported payload does with it."""
+
+    REPLY_TO_SENDER = 0
+    IS_REPLY = 1
+    NO_REPLY = 2
+
+
+def packet_of(frame: CanFrame) -> int:
+    """Packet number of a frame."""
+    return frame.identifier >> 8
+
+
+def controller_of(frame: CanFrame) -> int:
+    """The controller that is addressed, or that a status comes from."""
+    return frame.identifier & CONTROLLER_MASK
+
+
+@functools.cache
+def database() -> cantools.database.Database:
+    """The messages of ``dbc/vesc.dbc``, found by identifier whatever the controller id."""
+    text = importlib.resources.files("drivers").joinpath("dbc/vesc.dbc").read_text(encoding="utf-8")
+    loaded = cantools.database.load_string(text, "dbc", frame_id_mask=MESSAGE_MASK)
+    return cast("cantools.database.Database", loaded)
+
+
+def _identifier(packet: int, controller_id: int) -> int:
+    if not 0 <= controller_id <= BROADCAST_ID:
+        raise ProtocolError(f"controller id {controller_id} is outside 0 ... 255.")
+    return packet << 8 | controller_id
+
+
+def _simple(packet: Packet, controller_id: int, signal: str, value: float) -> CanFrame:
+    if not math.isfinite(value):
+        raise ProtocolError(f"{signal} is {value}, which is not a number that can be sent.")
+    message = database().get_message_by_name(f"VESC_{packet.name}")
+    try:
+        data = message.encode({signal: value})
+    except (cantools.database.EncodeError, OverflowError) as error:
+        raise ProtocolError(f"{signal} {value:g} cannot be sent: {error}") from error
+    return CanFrame(_identifier(packet, controller_id), bytes(data))
+
+
+def set_duty(controller_id: int, duty: float) -> CanFrame:
+    """Duty cycle in [-1, 1]."""
+    return _simple(Packet.SET_DUTY, controller_id, "duty", duty)
+
+
+def set_current(controller_id: int, current_a: float) -> CanFrame:
+    """Motor current [A]; always four bytes."""
+    return _simple(Packet.SET_CURRENT, controller_id, "current_a", current_a)
+
+
+def set_current_brake(controller_id: int, current_a: float) -> CanFrame:
+    """Brake current [A]."""
+    return _simple(Packet.SET_CURRENT_BRAKE, controller_id, "current_a", current_a)
+
+
+def set_rpm(controller_id: int, erpm: float) -> CanFrame:
+    """Electrical revolutions per minute."""
+    return _simple(Packet.SET_RPM, controller_id, "erpm", erpm)
+
+
+def set_servo_position(controller_id: int, host_id: int, position: float) -> CanFrame:
+    """Servo position in [0, 1]; there is no simple message for it, so it travels in a short buffer without reply."""
+    (frame,) = encode_payload(controller_id, host_id, vesc_payloads.set_servo_position(position), Send.NO_REPLY)
+    return frame
+
+
+def ping(controller_id: int, host_id: int) -> CanFrame:
+    """Ask a controller to answer with PONG."""
+    return CanFrame(_identifier(Packet.PING, controller_id), bytes((host_id,)))
+
+
+def pong(host_id: int, controller_id: int, hardware_type: int = 0) -> CanFrame:
+    """A controller's answer to PING; hardware type 0 is a motor controller."""
+    return CanFrame(_identifier(Packet.PONG, host_id), bytes((controller_id, hardware_type)))
+
+
+def encode_payload(receiver_id: int, sender_id: int, payload: bytes, send: Send) -> list[CanFrame]:
+    """Transport a payload of 1 to 512 bytes from ``sender_id`` to ``receiver_id``."""
+    if not 1 <= len(payload) <= MAX_PAYLOAD:
+        raise ProtocolError(f"A payload has 1 to {MAX_PAYLOAD} bytes, not {len(payload)}.")
+    if len(payload) <= 6:
+        data = bytes((sender_id, send)) + payload
+        return [CanFrame(_identifier(Packet.PROCESS_SHORT_BUFFER, receiver_id), data)]
+    frames = []
+    offset = 0
+    while offset < len(payload) and offset <= 255:
+        piece = bytes((offset,)) + payload[offset : offset + 7]
+        frames.append(CanFrame(_identifier(Packet.FILL_RX_BUFFER, receiver_id), piece))
+        offset += 7
+    while offset < len(payload):
+        piece = offset.to_bytes(2, "big") + payload[offset : offset + 6]
+        frames.append(CanFrame(_identifier(Packet.FILL_RX_BUFFER_LONG, receiver_id), piece))
+        offset += 6
+    end = struct.pack(">BBHH", sender_id, send, len(payload), crc16(payload))
+    frames.append(CanFrame(_identifier(Packet.PROCESS_RX_BUFFER, receiver_id), end))
+    return frames
+
+
+@dataclass(frozen=True, slots=True)
+class TransportedPayload:
+    """A payload that came through the transport, from whom, and what is to be done with it."""
+
+    sender_id: int
+    send: int
+    payload: bytes
+
+
+@dataclass(slots=True)
+class CanReassembler:
+    """Collects transport frames addressed to ``own_id``; ``errors`` counts packets that were dropped."""
+
+    own_id: int
+    errors: int = 0
+    _buffer: bytearray = field(default_factory=lambda: bytearray(MAX_PAYLOAD))
+    _filled: int = 0
+
+    def feed(self, frame: CanFrame) -> TransportedPayload | None:
+        """Take a frame; return a payload where it completes one. Frames for others are ignored."""
+        if controller_of(frame) != self.own_id:
+            return None
+        if packet_of(frame) == Packet.PROCESS_SHORT_BUFFER:
+            if len(frame.data) < 3:
+                self.errors += 1
+                return None
+            return TransportedPayload(frame.data[0], frame.data[1], frame.data[2:])
+        if packet_of(frame) == Packet.FILL_RX_BUFFER and len(frame.data) >= 2:
+            self._fill(frame.data[0], frame.data[1:])
+        elif packet_of(frame) == Packet.FILL_RX_BUFFER_LONG and len(frame.data) >= 3:
+            self._fill(int.from_bytes(frame.data[:2], "big"), frame.data[2:])
+        elif packet_of(frame) == Packet.PROCESS_RX_BUFFER:
+            return self._finish(frame.data)
+        return None
+
+    def _fill(self, offset: int, piece: bytes) -> None:
+        if offset == 0:
+            self._filled = 0
+        if offset != self._filled or offset + len(piece) > MAX_PAYLOAD:
+            self._filled = -1  # a piece is missing: nothing fits until the next packet starts
+            return
+        self._buffer[offset : offset + len(piece)] = piece
+        self._filled = offset + len(piece)
+
+    def _finish(self, data: bytes) -> TransportedPayload | None:
+        filled, self._filled = self._filled, 0
+        if len(data) < 6:
+            self.errors += 1
+            return None
+        sender_id, send, length, crc = struct.unpack_from(">BBHH", data)
+        payload = bytes(self._buffer[:length])
+        if length != filled or crc16(payload) != crc:
+            self.errors += 1
+            return None
+        return TransportedPayload(sender_id, send, payload)
+
+
+_VALUE_NAMES = frozenset(f.name for f in fields(MotorValues))
+
+
+def decode_status(frame: CanFrame) -> MotorValues | None:
+    """Telemetry of a STATUS_1 ... 6 broadcast; None for another frame (STATUS_6 holds inputs only: no field is set).
+
+    Raises ProtocolError for a status of the wrong length.
+    """
+    signals = decode_status_signals(frame)
+    if signals is None:
+        return None
+    return MotorValues(**{name: value for name, value in signals.items() if name in _VALUE_NAMES})  # type: ignore[arg-type]
+
+
+def decode_status_signals(frame: CanFrame) -> dict[str, float] | None:
+    """All signals of a STATUS_1 ... 6 broadcast by their name in the DBC; None for another frame."""
+    if packet_of(frame) not in STATUS_PACKETS:
+        return None
+    message = database().get_message_by_frame_id(frame.identifier)
+    if len(frame.data) < message.length:
+        raise ProtocolError(f"{message.name} has {len(frame.data)} bytes where {message.length} belong.")
+    decoded = cast("dict[str, Any]", message.decode(frame.data[: message.length], decode_choices=False))
+    return {name: float(value) for name, value in decoded.items()}
+
+
+def encode_status(packet: Packet, controller_id: int, values: MotorValues) -> CanFrame:
+    """A status broadcast as the firmware sends it; fields that are None go out as zero."""
+    message = database().get_message_by_name(f"VESC_{packet.name}")
+    signals = {s.name: getattr(values, s.name, None) or 0 for s in message.signals}
+    data = bytes(message.encode(signals, strict=False)).ljust(8, b"\0")
+    return CanFrame(_identifier(packet, controller_id), data)

@@ -1,0 +1,99 @@
+"""A VESC on a CAN bus."""
+
+from __future__ import annotations
+
+from carlab.core.errors import ProtocolError
+from drivers.calibration import DeviceCommand, MotorKind
+from drivers.config import ActuatorConfig
+from drivers.device import DeviceCounters, Reply
+from drivers.links.can_link import CanLink
+from drivers.links.link import CanFrame, FrameLink
+from drivers.vesc import can_codec as vesc_can_codec
+from drivers.vesc import payloads as vesc_payloads
+from drivers.vesc.can_codec import CanReassembler, Send
+from drivers.vesc.payloads import FirmwareVersion, MotorValues
+
+
+class VescCanDevice:
+    """A VESC on a CAN bus: simple commands, short buffers, status broadcasts and polled telemetry."""
+
+    def __init__(self, link: FrameLink, controller_id: int, host_id: int) -> None:
+        self.link = link
+        self.controller_id = controller_id
+        self.host_id = host_id
+        self.status_frames = 0
+        self._reassembler = CanReassembler(host_id)
+        self._version: FirmwareVersion | None = None
+        self._garbage_bytes = 0
+
+    @property
+    def counters(self) -> DeviceCounters:
+        """Counts since construction."""
+        return DeviceCounters(self._reassembler.errors, self._garbage_bytes, 0, self.link.statistics.opens)
+
+    def open(self) -> None:
+        """Open the bus."""
+        self._reassembler = CanReassembler(self.host_id, self._reassembler.errors)
+        self.link.open()
+
+    def send(self, command: DeviceCommand) -> None:
+        """A motor frame and a servo frame."""
+        encode = {
+            MotorKind.CURRENT: vesc_can_codec.set_current,
+            MotorKind.BRAKE: vesc_can_codec.set_current_brake,
+            MotorKind.DUTY: vesc_can_codec.set_duty,
+        }[command.motor_kind]
+        self.link.write(encode(self.controller_id, command.motor_value))
+        self.link.write(vesc_can_codec.set_servo_position(self.controller_id, self.host_id, command.servo_position))
+
+    def request_firmware(self) -> None:
+        """FW_VERSION in a short buffer."""
+        self._ask(vesc_payloads.get_firmware_version())
+
+    def request_telemetry(self) -> None:
+        """GET_VALUES_SELECTIVE (5 bytes) or GET_VALUES in a short buffer: broadcasts carry no fault code."""
+        self._ask(vesc_payloads.telemetry_request(self._version))
+
+    def receive(self, now_s: float) -> list[Reply]:
+        """Decode status broadcasts and transported replies; ``now_s`` is not needed for whole frames."""
+        replies: list[Reply] = []
+        for frame in self.link.read():
+            try:
+                reply = self._decode(frame)
+            except ProtocolError:
+                self._garbage_bytes += len(frame.data)
+                continue
+            if isinstance(reply, FirmwareVersion):
+                self._version = reply
+            if reply is not None:
+                replies.append(reply)
+        return replies
+
+    def fileno(self) -> int | None:
+        """The bus's descriptor."""
+        return self.link.fileno()
+
+    def close(self) -> None:
+        """Close the bus."""
+        self.link.close()
+
+    def _ask(self, payload: bytes) -> None:
+        for frame in vesc_can_codec.encode_payload(self.controller_id, self.host_id, payload, Send.REPLY_TO_SENDER):
+            self.link.write(frame)
+
+    def _decode(self, frame: CanFrame) -> FirmwareVersion | MotorValues | None:
+        is_ours = vesc_can_codec.controller_of(frame) == self.controller_id
+        if is_ours and (values := vesc_can_codec.decode_status(frame)) is not None:
+            self.status_frames += 1
+            return values
+        packet = self._reassembler.feed(frame)
+        if packet is None or packet.send != Send.IS_REPLY or packet.sender_id != self.controller_id:
+            return None
+        return vesc_payloads.decode_reply(packet.payload)
+
+
+def make_device(config: ActuatorConfig) -> VescCanDevice:
+    """The VESC on the bus that a configuration names; nothing is opened."""
+    return VescCanDevice(
+        CanLink(config.interface, config.channel, config.bitrate), config.controller_id, config.host_id
+    )

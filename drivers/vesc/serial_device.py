@@ -1,0 +1,89 @@
+"""A VESC on a serial line or USB."""
+
+from __future__ import annotations
+
+from carlab.core.errors import ProtocolError
+from drivers.calibration import DeviceCommand, MotorKind
+from drivers.config import ActuatorConfig
+from drivers.device import DeviceCounters, Reply
+from drivers.links.link import ByteLink
+from drivers.links.serial_link import SerialLink
+from drivers.vesc import payloads as vesc_payloads
+from drivers.vesc.payloads import FirmwareVersion
+from drivers.vesc.serial_codec import VescFrameDecoder, encode_frame
+
+
+def _motor_payload(command: DeviceCommand) -> bytes:
+    encode = {
+        MotorKind.CURRENT: vesc_payloads.set_current,
+        MotorKind.BRAKE: vesc_payloads.set_current_brake,
+        MotorKind.DUTY: vesc_payloads.set_duty,
+    }[command.motor_kind]
+    return encode(command.motor_value)
+
+
+class VescSerialDevice:
+    """A VESC on a serial line or USB."""
+
+    def __init__(self, link: ByteLink) -> None:
+        self.link = link
+        self._decoder = VescFrameDecoder()
+        self._version: FirmwareVersion | None = None
+        self._garbage_bytes = 0
+
+    @property
+    def counters(self) -> DeviceCounters:
+        """Counts since construction."""
+        decoder = self._decoder
+        return DeviceCounters(
+            decoder.crc_errors,
+            decoder.garbage_bytes + self._garbage_bytes,
+            decoder.timeouts,
+            self.link.statistics.opens,
+        )
+
+    def open(self) -> None:
+        """Open the port and forget what an earlier connection left half said."""
+        self._decoder.clear()
+        self.link.open()
+
+    def send(self, command: DeviceCommand) -> None:
+        """Motor and servo frame in one write."""
+        servo = vesc_payloads.set_servo_position(command.servo_position)
+        self.link.write(encode_frame(_motor_payload(command)) + encode_frame(servo))
+
+    def request_firmware(self) -> None:
+        """FW_VERSION."""
+        self.link.write(encode_frame(vesc_payloads.get_firmware_version()))
+
+    def request_telemetry(self) -> None:
+        """GET_VALUES_SELECTIVE (22 bytes back) or GET_VALUES."""
+        self.link.write(encode_frame(vesc_payloads.telemetry_request(self._version)))
+
+    def receive(self, now_s: float) -> list[Reply]:
+        """Decode what has arrived."""
+        replies: list[Reply] = []
+        for payload in self._decoder.feed(self.link.read(), now_s):
+            try:
+                reply = vesc_payloads.decode_reply(payload)
+            except ProtocolError:
+                self._garbage_bytes += len(payload)
+                continue
+            if isinstance(reply, FirmwareVersion):
+                self._version = reply
+            if reply is not None:
+                replies.append(reply)
+        return replies
+
+    def fileno(self) -> int | None:
+        """The port's descriptor."""
+        return self.link.fileno()
+
+    def close(self) -> None:
+        """Close the port."""
+        self.link.close()
+
+
+def make_device(config: ActuatorConfig) -> VescSerialDevice:
+    """The VESC at the port that a configuration names; nothing is opened."""
+    return VescSerialDevice(SerialLink(config.port, config.baud))

@@ -1,0 +1,1 @@
+"""Baselines: deep ensemble, ridge regression, SysID and GreyBox."""

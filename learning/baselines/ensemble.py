@@ -1,0 +1,132 @@
+"""Deep ensemble: networks that differ by their initial weights (Lakshminarayanan et al. 2017).
+
+Each network also leaves out one fold of the rows, so that errors on held-out rows determine the noise and the weight of
+the networks' disagreement.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from learning.baselines.ridge import Ridge
+from learning.evaluation import Mixture
+from learning.functional_svgd.fsvgd import FsvgdSettings, check_rows, fit_fsvgd
+from learning.networks.normaliser import Normaliser
+from learning.posterior.outliers import decorrelation_of, output_correlation
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.posterior.residuals import ResidualDistribution, fit_residuals
+
+N_FOLDS = 5
+MIN_ROWS = 5
+"""With fewer rows or fewer than four networks no rows are held out, and the noise is the networks' own."""
+DISAGREEMENT_WEIGHTS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
+"""Candidate factors on the networks' variance in the predictive variance."""
+N_NOISE_ITERATIONS = 40
+MIN_NOISE_SHARE = 1e-3
+"""Lower bound of the noise variance, relative to the errors' mean square."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ensemble:
+    """Networks and the distribution of their mean's errors.
+
+    Attributes:
+        networks: fitted one by one, in decorrelated outputs.
+        noise_std: of these (O,); None where no rows were held out.
+        disagreement_weight: factor on the networks' variance, which is added to the noise's.
+        residuals: distribution of errors in units of both; None where no rows were held out.
+    """
+
+    networks: ParticlePosterior
+    noise_std: Tensor | None = None
+    disagreement_weight: float = 1.0
+    residuals: ResidualDistribution | None = None
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Prediction at raw inputs (N, D), in raw units."""
+        components = self.networks.predict(inputs)
+        if self.noise_std is None or self.residuals is None:
+            return components.smoothed()
+        disagreement = self._decorrelate(components.means).var(dim=0)
+        std = (self.noise_std**2 + self.disagreement_weight * disagreement).sqrt() * self.residuals.scale
+        scale = self.residuals.scale
+        correlation = self.residuals.factor @ self.residuals.factor.T / (scale[:, None] * scale)
+        decorrelation = self.networks.normaliser.error_decorrelation
+        return Mixture(components.mean[None], std[None], self.residuals.dof, decorrelation, correlation)
+
+    def errors(self, inputs: Tensor, outputs: Tensor) -> Tensor:
+        """Decorrelated errors (L, n, O) of the networks at raw rows, double precision."""
+        return self._decorrelate(outputs - self.networks.predict(inputs).means).double()
+
+    def _decorrelate(self, errors: Tensor) -> Tensor:
+        decorrelation = self.networks.normaliser.error_decorrelation
+        return errors if decorrelation is None else errors @ decorrelation.T
+
+
+def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, settings: FsvgdSettings) -> Ensemble:
+    """Fit every network by itself to the likelihood, with weight decay as the only prior.
+
+    Args:
+        inputs: (n, D), n > 0.
+        outputs: (n, O).
+        normaliser: of both.
+        settings: of the fit; kernel and preconditioning are not used.
+
+    Raises:
+        DataError: there is no data, rows of inputs and outputs differ in number, or numbers are missing or infinite.
+        DivergedError: the networks diverged.
+    """
+    check_rows(inputs, outputs)
+    settings, count = replace(settings, interacting=False), len(inputs)
+    folds = min(N_FOLDS, settings.particles // 2)
+    if count < MIN_ROWS or folds < 2:
+        return Ensemble(fit_fsvgd(inputs, outputs, inputs, None, normaliser, settings))
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(settings.seed))
+    held_out = (torch.arange(settings.particles)[:, None] % folds == order % folds).to(inputs.device)
+    decorrelated = _decorrelated(normaliser, inputs, outputs)
+    networks = fit_fsvgd(inputs, outputs, inputs, None, decorrelated, settings, row_mask=~held_out)
+    errors = Ensemble(networks).errors(inputs, outputs)
+    mask = held_out.to(errors)[..., None]
+    mean = (mask * errors).sum(dim=0) / mask.sum(dim=0)
+    disagreement = (mask * (errors - mean) ** 2).sum(dim=0) / (mask.sum(dim=0) - 1.0).clamp_min(1.0)
+    candidates = [(*_noise(mean, weight * disagreement), weight) for weight in DISAGREEMENT_WEIGHTS]
+    _, noise_std, weight = max(candidates, key=lambda each: each[0])
+    residuals = fit_residuals(mean / (noise_std**2 + weight * disagreement).sqrt())
+    return Ensemble(networks, noise_std.to(outputs), weight, residuals.to(outputs))
+
+
+def _decorrelated(normaliser: Normaliser, inputs: Tensor, outputs: Tensor) -> Normaliser:
+    """With outputs in which the errors of a ridge regression are uncorrelated."""
+    ridge = Ridge.fit(*(v.cpu().double().numpy() for v in (inputs, normaliser.outputs(outputs))))
+    correlation, width = output_correlation(torch.from_numpy(ridge.errors))
+    return normaliser.decorrelated(decorrelation_of(correlation, width).to(outputs))
+
+
+def _noise(errors: Tensor, known_variance: Tensor) -> tuple[float, Tensor]:
+    """Maximum-likelihood noise in addition to known variances, by Fisher scoring.
+
+    Errors are clipped at three standard deviations, because heavy tails would inflate the noise.
+
+    Args:
+        errors: (n, O).
+        known_variance: (n, O).
+
+    Returns:
+        The log-likelihood, and the noise's standard deviation (O,).
+    """
+    variance = errors.square().mean(dim=0).clamp_min(1e-18)
+    least = MIN_NOISE_SHARE * variance
+    for _ in range(N_NOISE_ITERATIONS):
+        square = torch.minimum(errors**2, 9.0 * (variance + known_variance))
+        weight = (variance + known_variance) ** -2
+        variance = torch.maximum((weight * (square - known_variance)).sum(dim=0) / weight.sum(dim=0), least)
+    total = variance + known_variance
+    log_likelihood = -0.5 * (total.log() + (errors**2 / total).clamp_max(9.0) + math.log(2.0 * math.pi)).sum()
+    return float(log_likelihood), variance.sqrt()
+
+
+__all__ = ["Ensemble", "deep_ensemble"]

@@ -1,0 +1,176 @@
+"""FSVGD of the online-learning experiment with the settings of the authors' public code, for comparison.
+
+Settings and state are those of lasgroup/simulation_transfer at 547fa14 (``bnn_fsvgd.py`` and ``online_rl_loop.py``). A
+network sees the car's pose and velocities in the world and predicts their changes, with sine and cosine of the yaw as
+independent numbers. The Gaussian-process prior has a weight of ``1 / (L (batch + points))``, because the authors
+average its score over particles and points and sum the likelihood. There is no simulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.observation import STATE_FEATURES, decode_history, encode, push_action
+from learning.evaluation import calibration_error, negative_log_likelihood
+from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.posterior.draws import Draws
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.priors.function_prior import RbfCovariance
+from learning.world.transitions import transitions_of
+
+STATE_STD = (3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0)
+CHANGE_STD = (0.127, 0.123, 0.060, 0.056, 2.86, 2.86, 5.65)
+"""Units of the world's x, y [m], sin, cos, vx, vy [m/s], yaw rate [rad/s] and of their changes."""
+NOISE_STD = (0.0222, 0.0222, 0.0366, 0.0366, 0.1642, 0.1642, 0.7358)
+PARTICLES, BATCH, POINTS, STEPS = 10, 32, 16, 40_000
+MAX_PLACE_M, MAX_SPEED_MPS, MAX_YAW_RATE_RADPS = 4.0, 6.0, 8.0
+POOL_POINTS = 4096
+HELD_OUT_SHARE = 0.2
+LENGTHSCALE = 0.2
+PATIENCE = 3
+"""Evaluations without improvement that end a fit. The authors' fit goes on and keeps the same networks in the end."""
+
+
+def authors_settings(steps: int, seed: int) -> FsvgdSettings:
+    """The authors' settings, for the direction and prior weight of their code."""
+    noise = tuple(s / o for s, o in zip(NOISE_STD, CHANGE_STD, strict=True))
+    return FsvgdSettings(
+        particles=PARTICLES, steps=steps, batch=BATCH, measurement_points=POINTS, bandwidth=0.2, natural=False,
+        noise_std=noise, noise_rate=1.0, likelihood_exponent=0.5, prior_exponent=1.0 / (PARTICLES * (BATCH + POINTS)),
+        anneal_rate=False, validation_period=min(2000, steps), patience=PATIENCE, seed=seed,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class WorldDynamics:
+    """Particles that predict changes in the world frame.
+
+    Attributes:
+        posterior: particles and noise.
+        history: H, commands before the last one that the networks see.
+    """
+
+    posterior: ParticlePosterior
+    history: int
+    _draws: Draws = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_draws", Draws.of(self.posterior))
+
+    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
+        """Features (N, 7 + 2 H) a step later; sine and cosine are projected onto the unit circle."""
+        now = in_world(features)
+        after = now + self._draws(_inputs(now, features, action), generator)
+        yaw = torch.atan2(after[:, 2:3], after[:, 3:4])
+        ahead, left = _in_body(after[:, 4], after[:, 5], yaw[:, 0])
+        state = torch.cat([after[:, :2], yaw, ahead[:, None], left[:, None], after[:, 6:7]], dim=1)
+        found: Tensor = encode(state, push_action(decode_history(features), action))
+        return found
+
+    def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
+        """Negative log-likelihood of an episode's steps, seven outputs [nat per step], and calibration error."""
+        inputs, changes = (v.to(self.posterior.parameters) for v in world_rows([episode], self.history))
+        predicted = self.posterior.predict(inputs)
+        return negative_log_likelihood(predicted, changes), calibration_error(predicted, changes)
+
+
+def in_world(features: Tensor) -> Tensor:
+    """x, y, sin, cos, vx, vy in the world, yaw rate (N, 7) of features with body-frame velocities (N, 7 + 2 H)."""
+    sin, cos, ahead, left = features[:, 2], features[:, 3], features[:, 4], features[:, 5]
+    velocity = torch.stack([cos * ahead - sin * left, sin * ahead + cos * left], dim=1)
+    return torch.cat([features[:, :4], velocity, features[:, 6:STATE_FEATURES]], dim=1)
+
+
+def world_rows(episodes: Sequence[EpisodeData], history: int) -> tuple[Tensor, Tensor]:
+    """Inputs (n, 7 + 2 (H + 1)) and changes (n, 7) of every complete step. Raises DataError where there is none."""
+    rows = transitions_of(episodes, history)
+    inputs, changes = [], []
+    for number, episode in enumerate(episodes):
+        ticks = rows.tick[rows.episode == number]
+        past = episode.sent[ticks[:, None] - np.arange(history, 0, -1)]
+        before, after = (torch.from_numpy(encode(episode.states[t], past)).float() for t in (ticks, ticks + 1))
+        inputs.append(_inputs(in_world(before), before, torch.from_numpy(episode.sent[ticks]).float()))
+        changes.append(in_world(after) - in_world(before))
+    return torch.cat(inputs), torch.cat(changes)
+
+
+def fit_authors_fsvgd(
+    episodes: Sequence[EpisodeData],
+    history: int,
+    steps: int = STEPS,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda step: None,
+    device: torch.device | str = "cpu",
+) -> WorldDynamics:
+    """Fit from scratch to all episodes; without episodes, networks with their initial weights as in the authors' code.
+
+    Args:
+        episodes: recordings.
+        history: H, commands before the last one that the networks see.
+        steps: of the optimiser.
+        seed: of all draws.
+        progress: called with the number of steps done.
+        device: of the fit; random numbers are drawn on the CPU.
+
+    Raises:
+        DataError: the episodes hold too few rows.
+    """
+    settings = authors_settings(steps, seed)
+    width = STATE_FEATURES + 2 * (history + 1)
+    input_std = torch.tensor([*STATE_STD, *(1.0,) * (2 * history + 2)])
+    units = Normaliser(torch.zeros(width), input_std, torch.zeros(STATE_FEATURES), torch.tensor(CHANGE_STD))
+    generator = torch.Generator().manual_seed(seed)
+    if not episodes:
+        network = Network(width, STATE_FEATURES, settings.hidden)
+        noise = torch.as_tensor(settings.noise_std)
+        unfitted = ParticlePosterior(network, network.initial(PARTICLES, generator), noise, units)
+        return WorldDynamics(unfitted.to(device), history)
+    inputs, changes = world_rows(episodes, history)
+    held_out_count = int(HELD_OUT_SHARE * len(inputs))
+    if held_out_count == 0:
+        raise DataError(f"{len(inputs)} rows are too few to hold some out; record a longer episode.")
+    order = torch.randperm(len(inputs), generator=generator).to(device)
+    rows, held_out = order[held_out_count:], order[:held_out_count]
+    pool = _domain_points(history, generator).to(device)
+    units = units.to(device)
+    inputs, changes = inputs.to(device), changes.to(device)
+    prior_inputs = units.inputs(torch.cat([inputs[rows], pool]))
+    prior = GaussianProcessPrior(prior_inputs, RbfCovariance((1.0,) * STATE_FEATURES, (LENGTHSCALE,)))
+    posterior = fit_fsvgd(
+        inputs[rows], changes[rows], pool, prior, units, settings, progress, (inputs[held_out], changes[held_out])
+    )
+    return WorldDynamics(posterior, history)
+
+
+def _domain_points(history: int, generator: torch.Generator) -> Tensor:
+    """Inputs (``POOL_POINTS``, 7 + 2 (H + 1)), uniform in the domain."""
+    half_width = torch.tensor(
+        [MAX_PLACE_M, MAX_PLACE_M, np.pi, 0.0, MAX_SPEED_MPS, MAX_SPEED_MPS, MAX_YAW_RATE_RADPS]
+        + [1.0] * (2 * history + 2)
+    )
+    pool = half_width * (2.0 * torch.rand((POOL_POINTS, len(half_width)), generator=generator) - 1.0)
+    yaw = pool[:, 2].clone()
+    pool[:, 2], pool[:, 3] = yaw.sin(), yaw.cos()
+    return pool
+
+
+def _inputs(now: Tensor, features: Tensor, action: Tensor) -> Tensor:
+    return torch.cat([now, features[:, STATE_FEATURES:], action], dim=1)
+
+
+def _in_body(x: Tensor, y: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
+    """Components of a world vector along the axes of a body at some yaw."""
+    sin, cos = yaw.sin(), yaw.cos()
+    return cos * x + sin * y, cos * y - sin * x
+
+
+__all__ = ["WorldDynamics", "authors_settings", "fit_authors_fsvgd", "in_world", "world_rows"]

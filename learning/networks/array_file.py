@@ -1,0 +1,76 @@
+"""Named arrays in one file that holds numbers only: NumPy's ``.npz``, read without pickle.
+
+A file of a stranger is data. ``torch.load`` and the files of stable-baselines3 run an unpickler, which may run code.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from carlab.core.errors import DataError
+
+MAX_BYTES = 256_000_000
+"""Size of the arrays of one file; a policy or a learned car has some hundred kilobytes."""
+_UNREADABLE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, NotImplementedError, RuntimeError),
+    *(zipfile.BadZipFile, zipfile.LargeZipFile, SyntaxError, RecursionError),
+)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Tensor | int]) -> None:
+    """Write tensors, from any device, and whole numbers. Raises OSError where the disk is full."""
+    content = io.BytesIO()
+    np.savez(content, **{k: v.detach().cpu().numpy() if isinstance(v, Tensor) else v for k, v in arrays.items()})  # type: ignore[arg-type]
+    path.write_bytes(content.getvalue())
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
+    """Read all arrays of a file.
+
+    Raises:
+        DataError: the file cannot be read, or holds more than ``MAX_BYTES`` or anything but numbers. The message is
+            a clause without a remedy.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
+                raise DataError(f"it holds more than {MAX_BYTES / 1e6:.0f} MB")
+        with np.load(path, allow_pickle=False) as opened:
+            arrays = {name: opened[name] for name in opened.files}
+    except _UNREADABLE as error:
+        raise DataError(next(iter(str(error).splitlines()), "") or type(error).__name__) from error
+    for name, array in arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+            raise DataError(f"{name} holds no numbers")
+    return arrays
+
+
+def checked_tensor(arrays: Mapping[str, NDArray[np.generic]], name: str, shape: tuple[int, ...]) -> Tensor:
+    """One array as a float32 tensor. Raises DataError where it is missing, not finite or of another shape or type."""
+    if name not in arrays:
+        raise DataError(f"{name} is missing")
+    array = arrays[name]
+    if array.dtype != np.float32 or array.shape != shape:
+        raise DataError(f"{name} is {array.dtype} of shape {array.shape}, not float32 of shape {shape}")
+    if not np.isfinite(array).all():
+        raise DataError(f"{name} holds numbers that are not finite")
+    return torch.from_numpy(array.copy())
+
+
+def whole_number(arrays: Mapping[str, NDArray[np.generic]], name: str) -> int:
+    """One whole number. Raises DataError where it is missing, negative or no whole number."""
+    array = arrays.get(name)
+    if array is None or array.shape != () or array.dtype.kind not in "iu" or int(array) < 0:
+        raise DataError(f"{name} is no whole number")
+    return int(array)
+
+
+__all__ = ["checked_tensor", "read_arrays", "whole_number", "write_arrays"]

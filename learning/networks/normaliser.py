@@ -1,0 +1,71 @@
+"""Affine normalisation of inputs and outputs, with an optional decorrelation of the outputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Normaliser:
+    """Affine maps of inputs and outputs; means and standard deviations of shapes (D,) and (O,).
+
+    Attributes:
+        input_mean, input_std, output_mean, output_std: centres and units.
+        decorrelation: matrix (O, O) that multiplies outputs in their units from the left, so that prediction errors are
+            uncorrelated; the identity where it is None.
+    """
+
+    input_mean: Tensor
+    input_std: Tensor
+    output_mean: Tensor
+    output_std: Tensor
+    decorrelation: Tensor | None = None
+
+    def inputs(self, raw: Tensor) -> Tensor:
+        """Normalised inputs."""
+        return (raw - self.input_mean) / self.input_std
+
+    def outputs(self, raw: Tensor) -> Tensor:
+        """Normalised outputs."""
+        scaled = (raw - self.output_mean) / self.output_std
+        return scaled if self.decorrelation is None else scaled @ self.decorrelation.to(scaled).T
+
+    def raw_inputs(self, normalised: Tensor) -> Tensor:
+        """Inputs in their own units."""
+        return normalised * self.input_std + self.input_mean
+
+    def raw_outputs(self, normalised: Tensor) -> Tensor:
+        """Outputs in their own units."""
+        if self.decorrelation is not None:
+            normalised = normalised @ torch.linalg.inv_ex(self.decorrelation.double()).inverse.to(normalised).T
+        return normalised * self.output_std + self.output_mean
+
+    @property
+    def error_decorrelation(self) -> Tensor | None:
+        """Matrix (O, O) from raw errors to errors of the normalised outputs, where these are decorrelated."""
+        return None if self.decorrelation is None else self.decorrelation.to(self.output_std) / self.output_std
+
+    @property
+    def decorrelation_log_det(self) -> float:
+        """Logarithm of the decorrelation's volume factor: log densities before it are larger by this."""
+        return 0.0 if self.decorrelation is None else float(torch.linalg.slogdet(self.decorrelation.double()).logabsdet)
+
+    def decorrelated(self, by: Tensor) -> Normaliser:
+        """With a further matrix (O, O) that multiplies the normalised outputs from the left."""
+        return replace(self, decorrelation=by if self.decorrelation is None else by @ self.decorrelation)
+
+    def without_decorrelation(self) -> Normaliser:
+        """Without any decorrelation."""
+        return replace(self, decorrelation=None)
+
+    def to(self, device: torch.device | str) -> Normaliser:
+        """The same on a device."""
+        parts = (self.input_mean, self.input_std, self.output_mean, self.output_std)
+        moved = Normaliser(*(part.to(device) for part in parts))
+        return moved if self.decorrelation is None else moved.decorrelated(self.decorrelation.to(device))
+
+
+__all__ = ["Normaliser"]

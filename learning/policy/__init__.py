@@ -1,0 +1,1 @@
+"""Soft actor-critic: fast gradient step, agent and policy."""

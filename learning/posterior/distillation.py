@@ -1,0 +1,264 @@
+"""Distillation of a posterior over functions into particles of a network: what carlab calls Sim-FSVGD.
+
+This is carlab's own method, not the algorithm of Rothfuss et al. (arXiv 2403.16644); theirs is
+``learning.functional_svgd.fsvgd`` with a ``SimulatorPrior``. Here the posterior's moments are in closed form
+(``function_posterior``: a Gaussian process around a simulator whose parameters are drawn by sequential Monte Carlo).
+Particles are moved until they have these moments at many small measurement sets: Stein's direction with a linear kernel
+(``stein.moment_direction``; Liu and Wang 2018, "Stein Variational Gradient Descent as Moment Matching"), pulled back to
+the networks' parameters as in algorithm 1 of the paper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError, DivergedError
+from learning.functional_svgd.stein import moment_direction
+from learning.networks.adam import Adam
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Activation, Network
+from learning.posterior.function_posterior import JITTER, FunctionPosterior
+from learning.posterior.particle_posterior import ParticlePosterior, input_clip_of
+from learning.priors.domain_models import DomainModel
+
+PROGRESS_PERIOD_STEPS = 200
+FINAL_RATE_SHARE = 0.001
+"""Share of the learning rate at the end of its half cosine."""
+SQUARE_DECAY = 0.99
+"""Adam's decay of the mean square of a gradient."""
+MIN_ROWS_FOR_NEIGHBOURS = 20
+"""Rows from which on half of the measurement points are neighbours of rows."""
+MIN_ROWS_FOR_NOISE = 40
+"""Rows from which on the particles' misfit is measured at the rows, and not at the measurement points."""
+MIN_NOISE_SHARE = 0.5
+"""Lower bound of the particles' noise, relative to the measurement noise."""
+MAX_MISFIT_STD = 3.0
+"""Upper bound of the misfit at a single row, in standard deviations of the noise."""
+SLOPE_PENALTY_SHARE = 1e-6
+"""Ridge penalty of the linear trend, as a share of the total weight."""
+MAX_NEIGHBOUR_DISTANCE = 0.5
+"""Largest standard deviation of a neighbour's distance from its row, in units of the inputs."""
+
+
+@dataclass(frozen=True, slots=True)
+class DistillationSettings:
+    """How particles are fitted to a posterior.
+
+    Attributes:
+        particles: L, their number.
+        hidden: widths of each particle's hidden layers.
+        steps: of Adam.
+        sets: measurement sets of a step.
+        points: of a set; fewer than particles, because L particles have a covariance of rank L - 1.
+        learning_rate: at the start; it falls to ``FINAL_RATE_SHARE`` of it along a half cosine.
+        activation: of the hidden units.
+        seed: of all draws.
+    """
+
+    particles: int = 20
+    hidden: tuple[int, ...] = (64, 64, 64)
+    steps: int = 3000
+    sets: int = 16
+    points: int = 4
+    learning_rate: float = 1.5e-2
+    activation: Activation = "silu"
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Targets:
+    """Moments at B measurement sets of N points.
+
+    Attributes:
+        inputs: normalised (B, N, D).
+        mean: without the trend (B, O, N).
+        cholesky: factors of the covariances (B, O, N, N).
+        weight: of an error at each point (B, O, N).
+    """
+
+    inputs: Tensor
+    mean: Tensor
+    cholesky: Tensor
+    weight: Tensor
+
+
+def distil(
+    target: FunctionPosterior,
+    points: Tensor,
+    settings: DistillationSettings,
+    progress: Callable[[int], None] = lambda step: None,
+    start: Tensor | None = None,
+) -> ParticlePosterior:
+    """Fit particles to the moments of a posterior over functions.
+
+    Args:
+        target: the posterior.
+        points: raw inputs of the domain (M, D), from which measurement sets are made.
+        settings: of the fit.
+        progress: called with the number of steps done, every ``PROGRESS_PERIOD_STEPS``.
+        start: parameters of earlier particles (L, P) to start from.
+
+    Returns:
+        The particles. Their noise is the measurements' and the particles' misfit to the target's mean.
+
+    Raises:
+        DataError: there are fewer points than a measurement set has.
+        DivergedError: the particles diverged.
+    """
+    if len(points) < settings.points:
+        raise DataError(f"{len(points)} points of the domain make no measurement set of {settings.points}; give more.")
+    normaliser = target.normaliser
+    generator = torch.Generator().manual_seed(settings.seed)
+    network = Network(points.shape[1], len(target.noise_std), settings.hidden, settings.activation)
+    if start is None:
+        start = network.initial(settings.particles, generator, points.device)
+    parameters = start.to(points).clone()
+    count = len(points) // settings.points
+    chosen = torch.randperm(len(points), generator=generator)[: count * settings.points].to(points.device)
+    sets = points[chosen].view(count, settings.points, -1)
+    mean, covariance = target.marginals(sets)
+    cholesky, weight = _factors(covariance, target.noise_std)
+    inputs = normaliser.inputs(sets)
+    row_inputs = target.inputs[:, : inputs.shape[2]].to(inputs)
+    input_clip = input_clip_of(torch.cat([inputs.flatten(0, 1), row_inputs]))
+    trend = _trend(inputs, mean, weight)
+    targets = _Targets(inputs, mean - _linear(trend, inputs), cholesky, weight)
+    with torch.no_grad():
+        _train(network, parameters, targets, settings, generator, progress)
+        if not bool(torch.isfinite(parameters).all()):
+            raise DivergedError("The fit diverged; fit again with a smaller learning rate.")
+        max_misfit = math.inf
+        if len(target.inputs) >= MIN_ROWS_FOR_NOISE:
+            sets = target.data[:, None]
+            mean, covariance = target.marginals(sets)
+            weight, max_misfit = torch.ones_like(mean), MAX_MISFIT_STD
+            inputs = normaliser.inputs(sets)
+        values = network(parameters, inputs.flatten(0, 1)).view(-1, *sets.shape[:2], mean.shape[1]).transpose(2, 3)
+        variance = covariance.diagonal(dim1=2, dim2=3).to(values)
+        noise = _noise(values + _linear(trend, inputs), mean, variance, weight, target.noise_std, max_misfit)
+    return ParticlePosterior(
+        network, parameters, noise, normaliser, target.dof, trend, target.correlation, input_clip
+    )  # fmt: skip
+
+
+def _train(
+    network: Network,
+    parameters: Tensor,
+    targets: _Targets,
+    settings: DistillationSettings,
+    generator: torch.Generator,
+    progress: Callable[[int], None],
+) -> None:
+    """Move parameters (L, P) in place along the pulled-back moment direction."""
+    particles, outputs = len(parameters), targets.mean.shape[1]
+    layers, adam = network.split(parameters), Adam(parameters, second=SQUARE_DECAY)
+    order = torch.randint(len(targets.inputs), (settings.steps, settings.sets), generator=generator)
+    for step, sets in enumerate(order.to(parameters.device)):
+        values, pullback = network.through(layers, targets.inputs[sets].flatten(0, 1))
+        by_set = values.view(particles, settings.sets, settings.points, outputs)
+        # One set and output a row: (L, sets * outputs, points).
+        rows = by_set.transpose(2, 3).flatten(1, 2)
+        direction = moment_direction(rows, targets.mean[sets].flatten(0, 1), targets.cholesky[sets].flatten(0, 1))
+        direction = direction * targets.weight[sets].flatten(0, 1)
+        direction = direction.view(particles, settings.sets, outputs, settings.points)
+        gradient = -pullback(direction.transpose(2, 3).flatten(1, 2))
+        cosine = 0.5 * (1.0 + math.cos(math.pi * step / settings.steps))
+        adam.step(gradient, settings.learning_rate * (FINAL_RATE_SHARE + (1.0 - FINAL_RATE_SHARE) * cosine))
+        if (step + 1) % PROGRESS_PERIOD_STEPS == 0:
+            progress(step + 1)
+
+
+def measurement_points(
+    model: DomainModel | None,
+    inputs: Tensor,
+    normaliser: Normaliser,
+    generator: torch.Generator,
+    count: int = 8192,
+    domain: Tensor | None = None,
+) -> Tensor:
+    """Raw inputs (count, D) at which particles are fitted to a posterior.
+
+    Half are neighbours of rows, if there are ``MIN_ROWS_FOR_NEIGHBOURS``; the rest is drawn from the simulator's
+    domain, or from ``domain`` where there is no simulator.
+
+    Args:
+        model: the simulator.
+        inputs: raw inputs of the rows (n, D).
+        normaliser: its units.
+        generator: of the draws.
+        count: how many.
+        domain: raw inputs (M, D).
+
+    Raises:
+        DataError: there are neither rows nor a domain.
+    """
+    if model is None and domain is None and not len(inputs):
+        raise DataError("There is neither data nor a domain to learn in; name a car file as the prior.")
+    rows_only = model is None and domain is None
+    neighbours = count if rows_only else count // 2 if len(inputs) >= MIN_ROWS_FOR_NEIGHBOURS else 0
+    parts = []
+    if neighbours:
+        rows = inputs[torch.randint(len(inputs), (neighbours,), generator=generator).to(inputs.device)]
+        distance = MAX_NEIGHBOUR_DISTANCE * torch.rand((neighbours, 1), generator=generator)
+        offset = distance * torch.randn(rows.shape, generator=generator)
+        parts.append(rows + offset.to(rows) * normaliser.input_std)
+    if model is not None:
+        parts.append(model.inputs(count - neighbours, generator).to(inputs))
+    elif domain is not None:
+        parts.append(domain[torch.randint(len(domain), (count - neighbours,), generator=generator).to(domain.device)])
+    return torch.cat(parts)
+
+
+def _noise(
+    values: Tensor, mean: Tensor, variance: Tensor, weight: Tensor, noise_std: Tensor, max_misfit: float
+) -> Tensor:
+    """Noise (O,) of particles: the target's, and the particles' squared misfit beyond the target's variance.
+
+    The expected squared error of a particle is that of the particles' mean plus their spread.
+
+    Args:
+        values: of the particles (L, B, O, N).
+        mean: of the target (B, O, N).
+        variance: of the target (B, O, N).
+        weight: of each point (B, O, N).
+        noise_std: of the target (O,).
+        max_misfit: bound of the misfit at a point, in ``noise_std``.
+    """
+    error = values - mean
+    misfit_sq = 2.0 * error.mean(dim=0) ** 2 - (error**2).mean(dim=0) + variance
+    misfit_sq = torch.minimum(misfit_sq, (max_misfit * noise_std)[:, None] ** 2)
+    excess = (weight * misfit_sq).sum(dim=(0, 2)) / weight.sum(dim=(0, 2))
+    return (noise_std**2 + excess).clamp_min(MIN_NOISE_SHARE * noise_std**2).sqrt()
+
+
+def _trend(inputs: Tensor, mean: Tensor, weight: Tensor) -> Tensor:
+    """Constant and slopes (1 + D, O) of the weighted least squares line through means (B, O, N) at inputs (B, N, D)."""
+    one = torch.ones_like(inputs[..., :1])
+    design = torch.cat([one, inputs], dim=2).flatten(0, 1).double()
+    means, weight = (v.transpose(1, 2).flatten(0, 1).double().T for v in (mean, weight))
+    squares = torch.einsum("on,nd,ne->ode", weight, design, design)
+    squares = squares + SLOPE_PENALTY_SHARE * weight.sum(dim=1)[:, None, None] * torch.eye(design.shape[1]).to(design)
+    coefficients: Tensor = torch.linalg.solve(squares, torch.einsum("on,nd,on->od", weight, design, means))
+    return coefficients.T.to(mean)
+
+
+def _linear(trend: Tensor, inputs: Tensor) -> Tensor:
+    """Values (B, O, N) of a trend (1 + D, O) at inputs (B, N, D)."""
+    return (trend[0] + inputs @ trend[1:]).transpose(1, 2)
+
+
+def _factors(covariance: Tensor, noise_std: Tensor) -> tuple[Tensor, Tensor]:
+    """Cholesky factors (B, O, N, N) of covariances, and weights (B, O, N) of errors: inverse predictive variances."""
+    eye = torch.eye(covariance.shape[-1], dtype=torch.float64, device=covariance.device)
+    cholesky = torch.linalg.cholesky(covariance + JITTER * eye)
+    variance = covariance.diagonal(dim1=2, dim2=3).clamp_min(0.0) + noise_std[:, None] ** 2
+    weight = 1.0 / variance
+    return cholesky.to(noise_std), (weight / weight.mean()).to(noise_std)
+
+
+__all__ = ["DistillationSettings", "distil", "measurement_points"]

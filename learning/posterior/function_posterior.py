@@ -1,0 +1,125 @@
+"""Posterior over functions: a Gaussian process around a simulator with unknown parameters, conditioned on rows.
+
+Model: ``y = f(x, theta) + discrepancy(x) + noise``, with a prior on the parameters ``theta``, a Gaussian process for
+the model discrepancy (the sim-to-real gap process of Rothfuss et al., arXiv 2403.16644, section 4.2) and Student-t
+noise. Given ``theta`` everything is Gaussian in closed form (Rasmussen and Williams 2006, equations 2.23 and 2.24);
+moments are averaged over draws of ``theta`` (law of total covariance). The paper has no such posterior; this is ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from learning.evaluation import Mixture
+from learning.networks.normaliser import Normaliser
+from learning.posterior.discrepancy import DiscrepancyCovariance
+from learning.priors.domain_models import DomainModel
+
+JITTER = 1e-5
+"""Variance added to a marginal, in normalised outputs."""
+_MAX_BATCH_POINTS = 256
+
+
+@dataclass(frozen=True, slots=True)
+class FunctionPosterior:
+    """Gaussian marginals of simulator and discrepancy given rows, in normalised outputs.
+
+    Attributes:
+        normaliser: of inputs and outputs.
+        noise_std: of the measurements (O,).
+        dof: degrees of freedom of the noise's multivariate Student-t distribution; infinite for a Gaussian.
+        correlation: of prediction errors in normalised outputs (O, O).
+        model: the simulator; a zero mean where it is None.
+        parameters: draws of its parameters given the rows (P, K).
+        discrepancy: covariance of the model discrepancy; None for a simulator that is taken as exact.
+        inputs: normalised inputs of the rows and the simulator's mean output there (n, D + O); (n, D) without one.
+        cholesky: Cholesky factors of the rows' covariance (O, n, n).
+        whitened_residuals: residuals of each draw, whitened by them (O, n, P).
+    """
+
+    normaliser: Normaliser
+    noise_std: Tensor
+    dof: float
+    correlation: Tensor
+    model: DomainModel | None
+    parameters: Tensor | None
+    discrepancy: DiscrepancyCovariance | None
+    inputs: Tensor
+    cholesky: Tensor
+    whitened_residuals: Tensor
+
+    @property
+    def data(self) -> Tensor:
+        """Raw inputs (n, D) of the rows."""
+        units = self.normaliser
+        return units.raw_inputs(self.inputs[:, : len(units.input_mean)].to(units.input_mean))
+
+    def marginals(self, sets: Tensor) -> tuple[Tensor, Tensor]:
+        """Moments of the noise-free function at measurement sets.
+
+        Args:
+            sets: raw inputs (B, N, D).
+
+        Returns:
+            Means (B, O, N), single precision, and covariances (B, O, N, N), double precision.
+        """
+        batches = [
+            self._batch_marginals(part) for part in torch.split(sets, max(_MAX_BATCH_POINTS // sets.shape[1], 1))
+        ]
+        return torch.cat([m for m, _ in batches]), torch.cat([c for _, c in batches])
+
+    def predict(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and scale (N, O) of a measurement at raw inputs (N, D), in raw units.
+
+        The scale is that of the Student-t distribution, the standard deviation where ``dof`` is infinite.
+        """
+        prediction = self.prediction(inputs)
+        return prediction.means[0], prediction.marginal_scales[0]
+
+    def prediction(self, inputs: Tensor) -> Mixture:
+        """Joint prediction of all outputs of a measurement at raw inputs (N, D), in raw units."""
+        mean, covariance = self.marginals(inputs[:, None])
+        std = (covariance[:, :, 0, 0].clamp_min(0.0) + self.noise_std**2).sqrt().float()
+        decorrelation = self.normaliser.error_decorrelation
+        if decorrelation is None:
+            std = std * self.normaliser.output_std
+        means = self.normaliser.raw_outputs(mean[:, :, 0])[None]
+        return Mixture(means, std[None], self.dof, decorrelation, self.correlation)
+
+    def _batch_marginals(self, sets: Tensor) -> tuple[Tensor, Tensor]:
+        count, points = sets.shape[:2]
+        flat = sets.flatten(0, 1)
+        at = self.normaliser.inputs(flat).double()
+        outputs = len(self.noise_std)
+        if self.model is None or self.parameters is None:
+            draws = torch.zeros((outputs, 1, len(flat)), dtype=torch.float64, device=flat.device)
+        else:
+            draws = simulate(self.model, flat, self.parameters, self.normaliser).permute(2, 0, 1)
+            at = torch.cat([at, draws.mean(dim=1).T], dim=1)
+        covariance = torch.zeros((count, outputs, points, points), dtype=torch.float64, device=flat.device)
+        if self.discrepancy is not None:
+            covariance = self.discrepancy(at.view(count, points, at.shape[1])).transpose(0, 1)
+            if len(self.inputs):
+                cross = self.discrepancy(self.inputs, at)
+                half = torch.linalg.solve_triangular(self.cholesky, cross, upper=False)
+                draws = draws + self.whitened_residuals.transpose(1, 2) @ half
+                blocks = half.view(outputs, len(self.inputs), count, points).permute(2, 0, 1, 3)  # (B, O, n, N)
+                covariance = covariance - blocks.transpose(2, 3) @ blocks
+        mean = draws.mean(dim=1)
+        deviation = (draws - mean[:, None]).view(outputs, draws.shape[1], count, points).permute(2, 0, 1, 3)
+        covariance = covariance + deviation.transpose(2, 3) @ deviation / draws.shape[1]
+        return mean.view(outputs, count, points).transpose(0, 1).float(), covariance
+
+
+def simulate(model: DomainModel, inputs: Tensor, parameters: Tensor, normaliser: Normaliser) -> Tensor:
+    """Normalised outputs (P, N, O) of the simulator, double precision."""
+    if not len(inputs):
+        return torch.zeros((len(parameters), 0, len(normaliser.output_std)), dtype=torch.float64, device=inputs.device)
+    with torch.no_grad():
+        return normaliser.outputs(model(inputs, parameters)).double()
+
+
+__all__ = ["JITTER", "FunctionPosterior", "simulate"]

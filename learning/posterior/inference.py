@@ -1,0 +1,400 @@
+"""Inference of the posterior over functions: covariance, parameters, noise and output decorrelation given rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from learning.networks.normaliser import Normaliser
+from learning.posterior.discrepancy import (
+    CHOLESKY_JITTER,
+    PRIOR_DISCREPANCY_STD,
+    DiscrepancyCovariance,
+    fit_discrepancy,
+    fit_noise,
+)
+from learning.posterior.function_posterior import FunctionPosterior, simulate
+from learning.posterior.outliers import (
+    decorrelation_of,
+    initial_row_weights,
+    leave_one_out,
+    leave_one_out_log_density,
+    mahalanobis_sq,
+    median_scale,
+    output_correlation,
+    student_weights,
+)
+from learning.posterior.parameter_posterior import posterior_parameters
+from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, DomainModel, draw_parameters
+
+PARAMETER_DRAWS = 128
+"""Draws of the parameters given data."""
+PRIOR_DRAWS = 1024
+PARAMETER_ROWS = 800
+"""Largest number of rows that the parameters are inferred from."""
+EARLY_PARAMETER_ROWS = 200
+"""The same in all iterations but the last."""
+MAX_ROWS = 2000
+"""Largest number of rows that the process is conditioned on; a random subset of more."""
+DOMAIN_ROWS = 64
+"""Inputs of the domain at which draws of the prior are checked when there is no data."""
+ITERATIONS = 3
+"""Alternations between covariance, parameters, row weights and output decorrelation (docs/decisions/0013)."""
+MIN_NOISE_SHARE = 0.01
+"""Lower bound of the noise, relative to the prior noise."""
+MIN_ROWS_STUDENT = 40
+"""Rows from which on Student-t noise, output correlation and restarts are used."""
+MULTIPLIER_SHARE = 0.1
+"""Prior size of the discrepancy's multiplicative part relative to its other parts, from ``MIN_ROWS_STUDENT`` rows on
+(docs/decisions/0012)."""
+RESTART_SCALES = (1.0, 0.3, 3.0, 10.0)
+"""Factors on the prior discrepancy from which fits start; the first is the default (docs/decisions/0011)."""
+MIN_RESTART_GAIN_SE = 2.0
+"""Standard errors by which a restart's leave-one-out density must exceed the default's."""
+ROWS_PER_DOF, MIN_DOF = 8.0, 6.0
+"""A fitted covariance allows one degree of freedom per so many rows, and never fewer than the second number."""
+
+
+def infer(
+    model: DomainModel | None,
+    inputs: Tensor,
+    outputs: Tensor,
+    normaliser: Normaliser,
+    noise_std: Tensor,
+    *,
+    discrepancy_std: Tensor | None = None,
+    with_discrepancy: bool = True,
+    noise_known: bool = False,
+    restart_scales: Sequence[float] = RESTART_SCALES,
+    seed: int = 0,
+) -> FunctionPosterior:
+    """Condition simulator, discrepancy and noise on rows.
+
+    Args:
+        model: the simulator; a zero mean where it is None.
+        inputs: raw (n, D); may be empty.
+        outputs: raw (n, O).
+        normaliser: of inputs and outputs.
+        noise_std: prior median of the noise, raw (O,).
+        discrepancy_std: prior size of the model discrepancy, raw (O,); ``PRIOR_DISCREPANCY_STD`` of the outputs' units
+            unless given.
+        with_discrepancy: whether the simulator may be wrong.
+        noise_known: whether the noise stays at ``noise_std`` where there is no discrepancy; with one it is fitted.
+            Student-t tails and the noise's scale are fitted from ``MIN_ROWS_STUDENT`` rows on in any case.
+        restart_scales: factors on ``discrepancy_std`` from which the covariance is fitted; all but the first are used
+            from ``MIN_ROWS_STUDENT`` rows on.
+        seed: of all draws.
+
+    Raises:
+        DataError: numbers are missing or infinite, a unit is zero, or the simulator gives no finite numbers.
+    """
+    _check(inputs, outputs, normaliser, noise_std)
+    if len(inputs) > MAX_ROWS:
+        generator = torch.Generator().manual_seed(seed)
+        chosen = torch.randperm(len(inputs), generator=generator)[:MAX_ROWS].to(inputs.device)
+        inputs, outputs = inputs[chosen], outputs[chosen]
+    if discrepancy_std is None:
+        prior_std = PRIOR_DISCREPANCY_STD * torch.ones_like(noise_std)
+    else:
+        prior_std = discrepancy_std / normaliser.output_std
+    problem = _Problem(
+        model, inputs, outputs, normaliser, (noise_std / normaliser.output_std).double(), prior_std.double(),
+        with_discrepancy, noise_known, seed,
+    )  # fmt: skip
+    if with_discrepancy and problem.has_student_noise:
+        return _best_of_restarts(problem, restart_scales)
+    return _fit(problem)[0]
+
+
+def _check(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, noise_std: Tensor) -> None:
+    if not (torch.isfinite(inputs).all() and torch.isfinite(outputs).all()):
+        raise DataError("The data holds numbers that are missing or infinite; leave those rows out and fit again.")
+    if len(inputs) != len(outputs):
+        raise DataError(f"There are {len(inputs)} rows of inputs and {len(outputs)} of outputs; each row needs both.")
+    if not all(bool((size > 0.0).all()) for size in (normaliser.input_std, normaliser.output_std, noise_std)):
+        raise DataError("A unit or an expected noise is zero; each input and output needs one that is larger.")
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Rows and priors; noise and discrepancy in normalised units."""
+
+    model: DomainModel | None
+    inputs: Tensor
+    outputs: Tensor
+    normaliser: Normaliser
+    noise_std: Tensor
+    discrepancy_std: Tensor
+    with_discrepancy: bool
+    noise_known: bool
+    seed: int
+
+    @property
+    def has_student_noise(self) -> bool:
+        """Whether there are rows enough for Student-t noise."""
+        return len(self.inputs) >= MIN_ROWS_STUDENT
+
+    @property
+    def multiplier_share(self) -> float:
+        """Prior size of the discrepancy's multiplicative part, relative to its other parts."""
+        return MULTIPLIER_SHARE if self.has_student_noise else 1.0
+
+    @property
+    def max_dof(self) -> float:
+        """Degrees of freedom that a covariance fitted to these rows allows."""
+        fitted = len(self.inputs) and (self.with_discrepancy or not self.noise_known)
+        return max(len(self.inputs) / ROWS_PER_DOF, MIN_DOF) if fitted else math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class _Residual:
+    """Residual of the simulator's mean.
+
+    Attributes:
+        mean: normalised outputs less the mean of the draws (n, O).
+        parameter_covariance: covariance of the draws (O, n, n); None without a simulator.
+        inputs: of the discrepancy (n, D + O), or (n, D) without a simulator.
+    """
+
+    mean: Tensor
+    parameter_covariance: Tensor | None
+    inputs: Tensor
+
+
+@dataclass(slots=True)
+class _Estimate:
+    """Current estimate of everything that is alternated over.
+
+    Attributes:
+        normaliser: with the present decorrelation of the outputs.
+        parameters: draws (P, K).
+        residual: of the simulator with these.
+        discrepancy: its covariance.
+        noise_std: (O,).
+        noise_prior_std: prior median of the noise in the next fit (O,).
+        row_weights: Student-t weights (n,).
+        correlation: of leave-one-out errors (O, O).
+        dof: degrees of freedom.
+        scale: factor on the noise by the median of leave-one-out errors (O,).
+        log_density: leave-one-out log density of each row (n,).
+    """
+
+    normaliser: Normaliser
+    parameters: Tensor | None
+    residual: _Residual
+    discrepancy: DiscrepancyCovariance | None
+    noise_std: Tensor
+    noise_prior_std: Tensor
+    row_weights: Tensor
+    correlation: Tensor
+    dof: float
+    scale: Tensor
+    log_density: Tensor
+
+    def covariance(self, rows: Tensor | None = None) -> Tensor:
+        """Covariances (O, m, m) of discrepancy and noise of some rows (m,), or of all."""
+        inputs, weights = self.residual.inputs, self.row_weights
+        if rows is not None:
+            inputs, weights = inputs[rows], weights[rows]
+        return _covariance(self.discrepancy, inputs, self.noise_std, weights)
+
+
+def _best_of_restarts(problem: _Problem, scales: Sequence[float]) -> FunctionPosterior:
+    """Fit from several prior sizes of the discrepancy; the leave-one-out density of the rows chooses.
+
+    A restart replaces the first fit only if its density is higher by ``MIN_RESTART_GAIN_SE`` standard errors. Restarts
+    use the parameters of the first fit; the parameters depend little on the scale and cost most of the time.
+    """
+    first, *restarts = (replace(problem, discrepancy_std=scale * problem.discrepancy_std) for scale in scales)
+    best, first_density = _fit(first)
+    parameters, best_gain = best.parameters, 0.0
+    for restart in restarts:
+        try:
+            posterior, density = _fit(restart, parameters)
+        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
+            continue  # This scale has no computable covariance; the first fit stands.
+        difference = density - first_density
+        gain = float(difference.mean())
+        if gain > max(best_gain, MIN_RESTART_GAIN_SE * float(difference.std()) / math.sqrt(len(difference))):
+            best, best_gain = posterior, gain
+    return best
+
+
+def _fit(problem: _Problem, known_parameters: Tensor | None = None) -> tuple[FunctionPosterior, Tensor]:
+    """Alternate between covariance, parameters, row weights and output decorrelation, then condition on the rows.
+
+    Outputs are decorrelated because each output has a discrepancy process of its own.
+
+    Args:
+        problem: rows and priors.
+        known_parameters: draws of the parameters given the rows; inferred unless given.
+
+    Returns:
+        The posterior, and the leave-one-out log density of each row (n,) from ``MIN_ROWS_STUDENT`` rows on.
+    """
+    generator = torch.Generator().manual_seed(problem.seed)
+    count = len(problem.inputs)
+    rows = torch.randperm(count, generator=generator)[:PARAMETER_ROWS].to(problem.inputs.device)
+    estimate = _initial_estimate(problem, known_parameters, generator)
+    for iteration in range(ITERATIONS if count else 0):
+        last = iteration == ITERATIONS - 1
+        _fit_covariance(problem, estimate)
+        if problem.model is not None and known_parameters is None:
+            _infer_parameters(problem, estimate, rows if last else rows[:EARLY_PARAMETER_ROWS], generator)
+        if problem.has_student_noise:
+            width, variance = _fit_student_noise(problem, estimate)
+            if not last:
+                _decorrelate_outputs(problem, estimate, width, variance)
+    return _condition(problem, estimate), estimate.log_density
+
+
+def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, generator: torch.Generator) -> _Estimate:
+    """Prior medians, draws of the prior parameters, and row weights by them."""
+    count, noise = len(problem.inputs), problem.noise_std
+    parameters = known_parameters
+    if problem.model is not None and parameters is None:
+        parameters = _prior_parameters(problem, problem.model, generator)
+    ones = torch.ones(count, dtype=torch.float64, device=problem.inputs.device)
+    discrepancy = None
+    if problem.with_discrepancy:
+        discrepancy = DiscrepancyCovariance.at_prior_median(
+            problem.inputs.shape[1], problem.discrepancy_std, problem.multiplier_share
+        )
+    residual = _residual(problem, parameters, problem.normaliser)
+    estimate = _Estimate(
+        problem.normaliser, parameters, residual, discrepancy, noise, noise, ones,
+        torch.eye(len(noise), dtype=torch.float64, device=problem.inputs.device), problem.max_dof,
+        torch.ones_like(noise), torch.zeros_like(ones),
+    )  # fmt: skip
+    if problem.has_student_noise:
+
+        def covariance(row_weights: Tensor) -> Tensor:
+            own = _covariance(discrepancy, residual.inputs, noise, row_weights)
+            return own if residual.parameter_covariance is None else own + residual.parameter_covariance
+
+        estimate.row_weights = initial_row_weights(residual.mean, covariance, noise)
+    return estimate
+
+
+def _prior_parameters(problem: _Problem, model: DomainModel, generator: torch.Generator) -> Tensor:
+    """Draws (P, K) of the prior; where there is no data, only those for which the simulator works in its domain."""
+    if len(problem.inputs):
+        return draw_parameters(model, PRIOR_DRAWS, generator).to(problem.inputs)
+    drawn = draw_parameters(model, PARAMETER_DRAWS, generator).to(problem.inputs)
+    domain = model.inputs(DOMAIN_ROWS, torch.Generator().manual_seed(problem.seed)).to(problem.inputs)
+    return drawn[_plausible(simulate(model, domain, drawn, problem.normaliser))]
+
+
+def _fit_covariance(problem: _Problem, estimate: _Estimate) -> None:
+    """Fit discrepancy and noise to the residual by the evidence."""
+    residual, noise_prior = estimate.residual, estimate.noise_prior_std
+    width = problem.inputs.shape[1]
+    if problem.with_discrepancy:
+        estimate.discrepancy, estimate.noise_std = fit_discrepancy(
+            residual.inputs[:, :width], residual.mean, residual.parameter_covariance, noise_prior,
+            problem.discrepancy_std, estimate.row_weights,
+            None if problem.model is None else residual.inputs[:, width:], problem.seed, problem.multiplier_share,
+        )  # fmt: skip
+    elif not problem.noise_known:
+        estimate.noise_std = fit_noise(
+            residual.mean, residual.parameter_covariance, noise_prior, estimate.row_weights, problem.seed
+        )
+
+
+def _infer_parameters(problem: _Problem, estimate: _Estimate, rows: Tensor, generator: torch.Generator) -> None:
+    """Draw the simulator's parameters given some of the rows (m,), and update the residual."""
+    assert problem.model is not None
+    cholesky = torch.linalg.cholesky(estimate.covariance(rows))
+    estimate.parameters = posterior_parameters(
+        problem.model, problem.inputs[rows], problem.outputs[rows], cholesky, estimate.normaliser, PARAMETER_DRAWS,
+        generator,
+    )  # fmt: skip
+    estimate.residual = _residual(problem, estimate.parameters, estimate.normaliser)
+
+
+def _fit_student_noise(problem: _Problem, estimate: _Estimate) -> tuple[Tensor, Tensor]:
+    """Fit degrees of freedom, row weights, correlation and scale to leave-one-out errors.
+
+    Returns:
+        Scales (O,) of the standardised leave-one-out errors, and their predictive variances (n, O).
+    """
+    residual, noise = estimate.residual, estimate.noise_std
+    covariance = estimate.covariance()
+    if residual.parameter_covariance is not None:
+        covariance = covariance + residual.parameter_covariance
+    standardised, variance = leave_one_out(residual.mean, covariance, noise, estimate.row_weights)
+    estimate.correlation, width = output_correlation(standardised)
+    dof, estimate.row_weights = student_weights(mahalanobis_sq(standardised, estimate.correlation), len(noise))
+    estimate.dof = min(dof, problem.max_dof)
+    estimate.scale = median_scale(standardised**2, estimate.dof)
+    log_det = estimate.normaliser.decorrelation_log_det
+    estimate.log_density = leave_one_out_log_density(standardised, variance) + log_det
+    return width, variance
+
+
+def _decorrelate_outputs(problem: _Problem, estimate: _Estimate, width: Tensor, variance: Tensor) -> None:
+    """Transform the outputs so that leave-one-out errors are uncorrelated, and update the residual."""
+    # An output that never changes says nothing about its noise.
+    estimate.noise_prior_std = torch.maximum(width * estimate.noise_std, MIN_NOISE_SHARE * problem.noise_std)
+    error_std = width * variance.median(dim=0).values.sqrt()
+    estimate.normaliser = estimate.normaliser.decorrelated(decorrelation_of(estimate.correlation, error_std))
+    estimate.residual = _residual(problem, estimate.parameters, estimate.normaliser)
+
+
+def _condition(problem: _Problem, estimate: _Estimate) -> FunctionPosterior:
+    """Condition the estimated process on all rows."""
+    model, parameters, normaliser = problem.model, estimate.parameters, estimate.normaliser
+    cholesky = torch.linalg.cholesky(estimate.covariance())
+    targets = normaliser.outputs(problem.outputs).double()
+    residuals = targets[None]
+    if model is not None and parameters is not None:
+        simulated = simulate(model, problem.inputs, parameters, normaliser)
+        plausible = _plausible(simulated)
+        parameters, residuals = parameters[plausible], targets - simulated[plausible]
+    whitened = torch.linalg.solve_triangular(cholesky, residuals.permute(2, 1, 0), upper=False)
+    noise_std = torch.maximum(estimate.scale * estimate.noise_std, MIN_NOISE_SHARE * problem.noise_std).float()
+    return FunctionPosterior(
+        normaliser, noise_std, estimate.dof, estimate.correlation.float(), model, parameters, estimate.discrepancy,
+        estimate.residual.inputs, cholesky, whitened,
+    )  # fmt: skip
+
+
+def _residual(problem: _Problem, parameters: Tensor | None, normaliser: Normaliser) -> _Residual:
+    inputs = normaliser.inputs(problem.inputs).double()
+    targets = normaliser.outputs(problem.outputs).double()
+    if problem.model is None or parameters is None:
+        return _Residual(targets, None, inputs)
+    simulated = simulate(problem.model, problem.inputs, parameters, normaliser)
+    simulated = simulated[_plausible(simulated)]
+    mean = simulated.mean(dim=0)
+    deviation = (simulated - mean).permute(2, 0, 1)
+    covariance = deviation.transpose(1, 2) @ deviation / len(simulated)
+    return _Residual(targets - mean, covariance, torch.cat([inputs, mean], dim=1))
+
+
+def _plausible(simulated: Tensor) -> Tensor:
+    """Mask (P,) of the draws whose outputs (P, N, O) are finite and of plausible size.
+
+    Raises:
+        DataError: no draw is.
+    """
+    found = (simulated.abs() < MAX_PLAUSIBLE_OUTPUT).flatten(1).all(dim=1)
+    if not bool(found.any()):
+        raise DataError(NO_FINITE_OUTPUT)
+    return found
+
+
+def _covariance(
+    discrepancy: DiscrepancyCovariance | None, inputs: Tensor, noise_std: Tensor, row_weights: Tensor
+) -> Tensor:
+    """Covariances (O, n, n) of discrepancy and noise; a row's noise variance is divided by its weight."""
+    noise = torch.diag_embed((noise_std**2)[:, None] / row_weights + CHOLESKY_JITTER)
+    return noise if discrepancy is None else discrepancy(inputs) + noise
+
+
+__all__ = ["infer"]

@@ -1,0 +1,97 @@
+"""Fitted particles of a network as a predictive distribution."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from learning.evaluation import Mixture
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.posterior.outliers import tail_scales
+
+MIN_INPUT_CLIP = 6.0
+"""Smallest bound at which normalised inputs are clipped; a network extrapolates without bound."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParticlePosterior:
+    """Particles with noise: an equally weighted mixture.
+
+    Attributes:
+        network: their shape.
+        parameters: (L, P).
+        noise_std: of the likelihood, normalised (O,).
+        normaliser: between raw and normalised units.
+        dof: degrees of freedom of the noise's multivariate Student-t distribution; infinite for a Gaussian.
+        trend: linear function of the normalised inputs that is added to all particles: a constant and slopes
+            (1 + D, O); zero where it is None.
+        correlation: of the noise of the normalised outputs (O, O); none where it is None.
+        input_clip: bounds of the normalised inputs (D,); ``MIN_INPUT_CLIP`` where it is None.
+    """
+
+    network: Network
+    parameters: Tensor
+    noise_std: Tensor
+    normaliser: Normaliser
+    dof: float = math.inf
+    trend: Tensor | None = None
+    correlation: Tensor | None = None
+    input_clip: Tensor | None = None
+
+    @property
+    def noise_scales(self) -> Tensor:
+        """Scales of each particle's noise when drawing (L, 1, 1); together they have the Student-t tails."""
+        return tail_scales(self.dof, len(self.parameters)).to(self.noise_std)[:, None, None]
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Prediction at raw inputs (N, D), in raw units."""
+        with torch.no_grad():
+            values = self.values(self.clipped_inputs(inputs))
+        decorrelation = self.normaliser.error_decorrelation
+        noise = self.noise_std if decorrelation is not None else self.noise_std * self.normaliser.output_std
+        return Mixture(
+            self.normaliser.raw_outputs(values), noise.expand(len(values), 1, -1), self.dof, decorrelation,
+            self.correlation,
+        )  # fmt: skip
+
+    def parameters_for(self, normaliser: Normaliser) -> Tensor:
+        """Parameters (L, P) of the same functions, without the trend, for another normaliser's output decorrelation."""
+        parameters = self.parameters.clone()
+        eye = torch.eye(len(self.noise_std), dtype=torch.float64, device=parameters.device)
+        own, other = (
+            eye if n.decorrelation is None else n.decorrelation.double() for n in (self.normaliser, normaliser)
+        )
+        change = (other @ torch.linalg.inv_ex(own).inverse).to(parameters).T
+        for head in self.network.split(parameters)[-1]:
+            head.copy_(head @ change)
+        return parameters
+
+    def values(self, clipped: Tensor) -> Tensor:
+        """Normalised outputs (L, N, O) at clipped inputs (N, D), or at inputs of each particle (L, N, D)."""
+        values = self.network(self.parameters, clipped)
+        return values if self.trend is None else values + self.trend[0] + clipped @ self.trend[1:]
+
+    def clipped_inputs(self, inputs: Tensor) -> Tensor:
+        """Normalised and clipped inputs (N, D) of raw inputs (N, D)."""
+        normalised = self.normaliser.inputs(inputs)
+        if self.input_clip is None:
+            return normalised.clamp(-MIN_INPUT_CLIP, MIN_INPUT_CLIP)
+        return normalised.clamp(-self.input_clip, self.input_clip)
+
+    def to(self, device: torch.device | str) -> ParticlePosterior:
+        """The same on a device."""
+        required = (self.parameters.to(device), self.noise_std.to(device), self.normaliser.to(device))
+        optional = (None if v is None else v.to(device) for v in (self.trend, self.correlation, self.input_clip))
+        return ParticlePosterior(self.network, *required, self.dof, *optional)
+
+
+def input_clip_of(inputs: Tensor) -> Tensor:
+    """Bounds (D,) of normalised training inputs (..., D), at least ``MIN_INPUT_CLIP``."""
+    return inputs.abs().flatten(0, -2).amax(dim=0).clamp_min(MIN_INPUT_CLIP)
+
+
+__all__ = ["MIN_INPUT_CLIP", "ParticlePosterior", "input_clip_of"]

@@ -1,0 +1,134 @@
+"""Distribution of the errors of a model that predicts only a mean: a multivariate Student-t fitted to its residuals.
+
+For an identified simulator, a regression or the networks of an ensemble, so that their likelihood is not that of badly
+chosen independent Gaussians: errors of the particles of ``function_posterior`` are correlated and heavy-tailed, too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from learning.evaluation import Mixture
+from learning.posterior.outliers import (
+    DOF_CANDIDATES,
+    DOF_MIN_GAIN_NATS,
+    log_student,
+    mahalanobis_sq,
+    output_correlation,
+)
+
+SCALE_ITERATIONS = 60
+"""Of expectation maximisation of the common scale."""
+MIN_DOF = DOF_CANDIDATES[0]
+MIN_SCALE, MIN_SHARE = 1e-9, 1e-3
+"""Lower bounds of an output's error, in its units and relative to its root mean square: it may be constant."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualDistribution:
+    """A zero-mean multivariate Student-t distribution.
+
+    Attributes:
+        factor: lower Cholesky factor of its scale matrix (O, O), in the outputs' units.
+        dof: its degrees of freedom; infinite for a Gaussian.
+    """
+
+    factor: Tensor
+    dof: float
+
+    @property
+    def scale(self) -> Tensor:
+        """Marginal scale of each output (O,)."""
+        return self.factor.square().sum(dim=1).sqrt()
+
+    @property
+    def whitening(self) -> Tensor:
+        """Matrix (O, O) that makes errors uncorrelated and of unit scale, from the left."""
+        eye = torch.eye(len(self.factor), dtype=self.factor.dtype, device=self.factor.device)
+        whitening: Tensor = torch.linalg.solve_triangular(self.factor, eye, upper=False)
+        return whitening
+
+    def mahalanobis_sq(self, errors: Tensor) -> Tensor:
+        """Squared Mahalanobis distance (...) of errors (..., O)."""
+        white: Tensor = errors @ self.whitening.to(errors).T
+        return white.square().sum(dim=-1)
+
+    def centred_at(self, means: Tensor) -> Mixture:
+        """The distribution around each of the means (L, N, O), as a mixture."""
+        one = torch.ones((1, 1, means.shape[2]), dtype=means.dtype, device=means.device)
+        return Mixture(means, one, self.dof, self.whitening.to(means))
+
+    def to(self, like: Tensor) -> ResidualDistribution:
+        """The same with the type and device of another tensor."""
+        return ResidualDistribution(self.factor.to(like), self.dof)
+
+
+def fit_residuals(
+    errors: Tensor, prior_std: Tensor | None = None, prior_rows: float = 1.0, fitted_rows: float = 0.0
+) -> ResidualDistribution:
+    """Fit a Student-t distribution to residuals by maximum likelihood.
+
+    Correlation and relative scales are those of ``outliers.output_correlation``; the common scale and the degrees of
+    freedom maximise the likelihood (``outliers.DOF_MIN_GAIN_NATS`` for lighter tails). The degrees of freedom are at
+    most the number of rows less those used by the fit of the mean, since the predictive distribution of a normal
+    variable with unknown variance is Student-t (Gelman et al., "Bayesian Data Analysis", 3rd edition, section 3.2).
+
+    Args:
+        errors: (n, O).
+        prior_std: prior standard deviation (O,), positive; none unless given.
+        prior_rows: its weight in rows.
+        fitted_rows: rows used up by the fit of the mean: its parameters divided by the outputs.
+
+    Raises:
+        DataError: there are no errors, or they are not finite.
+    """
+    count, outputs = errors.shape
+    if not count or not torch.isfinite(errors).all():
+        raise DataError("What a model leaves must be finite and of one row at least; check its inputs.")
+    errors = errors.double()
+    weight = 0.0 if prior_std is None else prior_rows
+    unit = errors.square().mean(dim=0).sqrt() if prior_std is None else prior_std.double()
+    unit = unit.clamp_min(MIN_SCALE)
+    correlation, scales = output_correlation(errors / unit)
+    scales = unit * ((count * scales**2 + weight) / (count + weight)).sqrt().clamp_min(MIN_SHARE)
+    square = mahalanobis_sq(errors / scales, correlation)
+    prior_square = 0.0 if prior_std is None else float((unit / scales).square().sum())
+    free_rows = max(count - fitted_rows, 0.0)
+    best, dof, scale = -math.inf, math.inf, 1.0
+    for candidate in DOF_CANDIDATES:
+        own = _common_scale(square, outputs, candidate, weight, prior_square)
+        log_likelihood = float(log_student(square / own**2, outputs, candidate).sum()) - count * outputs * math.log(own)
+        if log_likelihood > best + DOF_MIN_GAIN_NATS:
+            best, dof, scale = log_likelihood, candidate, own
+    max_dof = max(free_rows + weight, MIN_DOF)
+    # A residual of a fitted row is smaller than the error of a new one.
+    variance_factor = (count + weight) / max(free_rows + weight, 1.0)
+    factor = torch.linalg.cholesky(correlation) * scales[:, None] * scale * math.sqrt(variance_factor)
+    return ResidualDistribution(factor, min(dof, max_dof))
+
+
+def _common_scale(square: Tensor, outputs: int, dof: float, prior_rows: float, prior_square: float) -> float:
+    """Scale of all outputs by expectation maximisation (Lange, Little and Taylor 1989, section 3).
+
+    Args:
+        square: squared Mahalanobis distances (n,).
+        outputs: O.
+        dof: degrees of freedom.
+        prior_rows: weight of the prior in rows.
+        prior_square: squared Mahalanobis distance of a prior row.
+    """
+    scale_square = 1.0
+    rows = len(square) + prior_rows
+    for _ in range(SCALE_ITERATIONS):
+        weight = 1.0 if math.isinf(dof) else (dof + outputs) / (dof + square / scale_square)
+        total = float((weight * square).sum()) + prior_rows * prior_square
+        scale_square = max(total / (rows * outputs), MIN_SHARE**2)
+    return math.sqrt(scale_square)
+
+
+__all__ = ["ResidualDistribution", "fit_residuals"]

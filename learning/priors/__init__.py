@@ -1,0 +1,1 @@
+"""Simulators with unknown parameters as priors over functions."""

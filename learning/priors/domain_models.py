@@ -1,0 +1,214 @@
+"""Simulators with unknown parameters, as priors over functions: the studies of the Sim-FSVGD paper.
+
+Each maps inputs (N, D) and P parameter draws to outputs (P, N, O). Ranges, domains and step sizes are those of the
+authors' public code (lasgroup/simulation_transfer, commit 547fa14, MIT), restated from its facts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+Range = tuple[float, float]
+MAX_PLAUSIBLE_OUTPUT = 1e6
+"""Bound of plausible outputs, in normalised units or in SI units of a car; larger ones are a numerical failure."""
+NO_FINITE_OUTPUT = (
+    "The simulator gives no finite numbers for this data; narrow the ranges of its parameters, or name another."
+)
+
+
+class DomainModel(Protocol):
+    """A simulator whose parameters are only known as a distribution."""
+
+    @property
+    def size(self) -> int:
+        """K, the number of parameters."""
+        ...
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """Inputs (N, D), drawn from the domain."""
+        ...
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """Parameters (P, K) for standard normal numbers (P, K): a map from a normal draw to a draw of the prior."""
+        ...
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Outputs (P, N, O) at inputs (N, D) for parameters (P, K)."""
+        ...
+
+
+def draw_parameters(model: DomainModel, count: int, generator: torch.Generator) -> Tensor:
+    """Parameters (count, K) from the distribution of a model."""
+    return model.parameters(torch.randn((count, model.size), generator=generator))
+
+
+def within(ranges: Sequence[Range], shares: Tensor) -> Tensor:
+    """Values (..., K) at shares (..., K) of ranges, 0 being the low end and 1 the high one."""
+    low = torch.tensor([r[0] for r in ranges]).to(shares)
+    high = torch.tensor([r[1] for r in ranges]).to(shares)
+    return low + (high - low) * shares
+
+
+def uniform(ranges: Sequence[Range], count: int, generator: torch.Generator) -> Tensor:
+    """Draws (count, K), uniform in each range."""
+    return within(ranges, torch.rand((count, len(ranges)), generator=generator))
+
+
+@dataclass(frozen=True, slots=True)
+class Sinusoids:
+    """``a sin(w x) + b x`` with a ~ N(2, 0.4^2), w ~ U(1.7, 2.3), b ~ N(2, 1), for x in [-5, 5]."""
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """Places x (N, 1)."""
+        return uniform(((-5.0, 5.0),), count, generator)
+
+    @property
+    def size(self) -> int:
+        """Three."""
+        return 3
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """(a, w, b)."""
+        a, w, b = normal.T
+        return torch.stack([2.0 + 0.4 * a, 1.7 + 0.6 * torch.special.ndtr(w), 2.0 + b], dim=1)
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Values (P, N, 1)."""
+        a, w, b = (parameters[:, k, None] for k in range(3))
+        x = inputs[None, :, 0]
+        return (a * torch.sin(w * x) + b * x)[:, :, None]
+
+
+@dataclass(frozen=True, slots=True)
+class Pendulum:
+    """Change of (sin, cos, rate) of a pendulum over 50 ms: ``theta'' = (g/l) sin theta + u / (m l^2) - friction``.
+
+    Explicit Euler in ten substeps, as the authors integrate it. Friction is ``nu rate / (m l) + drag / m rate^2`` as in
+    their code (its square does not change sign with the rate) or, with ``dissipative``, ``rate |rate|``.
+
+    Attributes:
+        masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu and drag.
+        rate_gap: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] in a missing angular
+            acceleration: a discrepancy process inside the dynamics, with a polynomial kernel.
+    """
+
+    masses: Range = (0.5, 1.5)
+    lengths: Range = (0.5, 1.5)
+    gravities: Range = (5.0, 15.0)
+    frictions: Range = (0.0, 0.0)
+    drags: Range = (0.0, 0.0)
+    dissipative: bool = False
+    rate_discrepancy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    period_s: float = 0.05
+    substeps: int = 10
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """Sine and cosine of angles all around, rates within 5 rad/s, torques within 2.5 N m: (N, 4)."""
+        drawn = uniform(((-math.pi, math.pi), (-5.0, 5.0), (-2.5, 2.5)), count, generator)
+        return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
+
+    @property
+    def size(self) -> int:
+        """Five, and three coefficients of the discrepancy."""
+        return 8
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """(m, l, g, nu, drag, and three coefficients of the discrepancy)."""
+        ranges = (self.masses, self.lengths, self.gravities, self.frictions, self.drags)
+        known = within(ranges, torch.special.ndtr(normal[:, :5]))
+        return torch.cat([known, normal[:, 5:] * torch.tensor(self.rate_discrepancy).to(normal)], dim=1)
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Changes (P, N, 3)."""
+        mass, length, gravity, friction, drag, linear, odd, even = (parameters[:, k, None] for k in range(8))
+        angle = torch.atan2(inputs[:, 0], inputs[:, 1])[None]
+        rate, torque = inputs[None, :, 2], inputs[None, :, 3]
+        step = self.period_s / self.substeps
+        theta, omega = angle.expand(len(parameters), -1), rate.expand(len(parameters), -1)
+        for _ in range(self.substeps):
+            square = omega * omega.abs() if self.dissipative else omega * omega
+            resistance = friction * omega / (mass * length) + drag / mass * square
+            missing = (linear + odd * omega.abs() + even * omega) * omega
+            acceleration = gravity / length * torch.sin(theta) + torque / (mass * length**2) - resistance + missing
+            theta, omega = theta + step * omega, omega + step * acceleration
+        after = torch.stack([torch.sin(theta), torch.cos(theta), omega], dim=-1)
+        return after - inputs[None, :, :3]
+
+
+@dataclass(frozen=True, slots=True)
+class KinematicCar:
+    """Change over 1/30 s of (x, y, sin yaw, cos yaw, vx, vy in the world, yaw rate) of a car whose wheels do not slip.
+
+    ``beta = atan(l_r tan(d) / L)`` at the centre of mass; side velocity and yaw rate settle within a step. The body
+    is rotated by an unknown angle relative to the measured heading.
+    """
+
+    masses: Range = (1.6, 1.7)
+    front_axles: Range = (0.11, 0.15)
+    rear_axles: Range = (0.15, 0.19)
+    offsets: Range = (-0.15, 0.15)
+    drives: Range = (6.0, 10.0)
+    dampings: Range = (1.0, 1.8)
+    steerings: Range = (0.15, 0.4)
+    period_s: float = 1.0 / 30.0
+    substeps: int = 3
+    place_m: float = 2.0
+    speed_mps: float = 2.0
+    rate_radps: float = 3.0
+
+    def inputs(self, count: int, generator: torch.Generator) -> Tensor:
+        """x, y [m], sin, cos of yaw, vx, vy [m/s, world], yaw rate [rad/s], steering, throttle: (N, 9)."""
+        spans = (self.place_m, self.place_m, math.pi, self.speed_mps, self.speed_mps, self.rate_radps, 1.0, 1.0)
+        drawn = uniform(tuple((-v, v) for v in spans), count, generator)
+        yaw = drawn[:, 2:3]
+        return torch.cat([drawn[:, :2], torch.sin(yaw), torch.cos(yaw), drawn[:, 3:]], dim=1)
+
+    @property
+    def size(self) -> int:
+        """Seven."""
+        return 7
+
+    def parameters(self, normal: Tensor) -> Tensor:
+        """(m, l_f, l_r, offset, drive gain, root of the damping, steering at full lock)."""
+        ranges = (self.masses, self.front_axles, self.rear_axles, self.offsets, self.drives, self.dampings)
+        return within((*ranges, self.steerings), torch.special.ndtr(normal))
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        """Changes (P, N, 7)."""
+        mass, front, rear, offset, drive, damping, lock = (parameters[:, k, None] for k in range(7))
+        yaw = torch.atan2(inputs[:, 2], inputs[:, 3])[None] + offset
+        throttle = inputs[None, :, 8].clamp(-1.0, 1.0)
+        tangent = torch.tan(lock * inputs[None, :, 7].clamp(-1.0, 1.0))
+        sin, cos = torch.sin(yaw), torch.cos(yaw)
+        ahead = inputs[None, :, 4] * cos + inputs[None, :, 5] * sin
+        left = inputs[None, :, 5] * cos - inputs[None, :, 4] * sin
+        rate = inputs[None, :, 6].expand_as(ahead)
+        x, y = (inputs[None, :, k].expand_as(ahead) for k in (0, 1))
+        step = self.period_s / self.substeps
+        decay = math.exp(-1.0)  # of a deviation from rolling in one substep
+        for _ in range(self.substeps):
+            faster = ahead + step * (drive * throttle - damping**2 * ahead) / mass
+            mean = 0.5 * (ahead + faster)
+            rolling_rate = faster * tangent / (front + rear)
+            new_rate = rolling_rate + decay * (rate - rolling_rate)
+            new_left = rear * rolling_rate + decay * (left - rear * rolling_rate)
+            half = yaw + 0.25 * step * (rate + new_rate)
+            across = 0.5 * (left + new_left)
+            x = x + step * (mean * torch.cos(half) - across * torch.sin(half))
+            y = y + step * (mean * torch.sin(half) + across * torch.cos(half))
+            yaw = yaw + 0.5 * step * (rate + new_rate)
+            ahead, left, rate = faster, new_left, new_rate
+        seen = yaw - offset
+        velocity_x = ahead * torch.cos(yaw) - left * torch.sin(yaw)
+        velocity_y = ahead * torch.sin(yaw) + left * torch.cos(yaw)
+        after = torch.stack([x, y, torch.sin(seen), torch.cos(seen), velocity_x, velocity_y, rate], dim=-1)
+        return after - inputs[None, :, :7]
+
+
+__all__ = ["DomainModel", "KinematicCar", "Pendulum", "Sinusoids", "draw_parameters", "uniform", "within"]

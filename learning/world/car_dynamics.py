@@ -1,0 +1,105 @@
+"""A learned car: particles predict one step in the body frame, and exact kinematics integrate the pose.
+
+A step is ``pose + R(yaw) change``; the networks see velocities and the last commands, not the pose. Each step of each
+car samples a particle (epistemic uncertainty; Rothfuss et al., arXiv 2403.16644, section 5.3) and the likelihood's
+noise (aleatoric uncertainty).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from carlab.core.angles import wrap
+from carlab.core.episode_data import EpisodeData
+from carlab.core.observation import STATE_FEATURES, decode_history, decode_state, encode, push_action
+from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
+from learning.posterior.draws import Draws
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.world.transitions import transitions_of
+
+
+class OneStep(Protocol):
+    """One-step dynamics of a learned world."""
+
+    @property
+    def history(self) -> int:
+        """H, commands before the last one that a row of inputs holds."""
+        ...
+
+    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
+        """Features (N, 7 + 2 H) a step after ``action`` (N, 2) is sent, sampled from the predictive distribution."""
+        ...
+
+
+class StepInBody(ABC):
+    """A step from changes sampled in the body frame of its start, by exact kinematics."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
+
+    def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
+        """Features (N, 7 + 2 H) a step later."""
+        return advance(features, action, self.sample(inputs_of(features, action), generator))
+
+
+@dataclass(frozen=True, slots=True)
+class CarDynamics(StepInBody):
+    """A fitted model of one step of a car.
+
+    Attributes:
+        posterior: particles and noise.
+        history: H, commands before the last one that a row of inputs holds.
+    """
+
+    posterior: ParticlePosterior
+    history: int
+    _draws: Draws = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_draws", Draws.of(self.posterior))
+
+    def predict(self, inputs: Tensor) -> Mixture:
+        """Predictive distribution of changes at inputs (N, 3 + 2 (H + 1))."""
+        return self.posterior.predict(inputs)
+
+    def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
+        """One sample (N, 6) of the mixture for each row."""
+        return self._draws(inputs, generator)
+
+    def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
+        """Negative log-likelihood of an episode's steps [nat per step], and calibration error."""
+        rows = transitions_of([episode], self.history)
+        inputs, outputs = (torch.from_numpy(v).to(self.posterior.parameters) for v in (rows.inputs, rows.targets))
+        predicted = self.predict(inputs).smoothed()
+        return negative_log_likelihood(predicted, outputs), calibration_error(predicted, outputs)
+
+
+def inputs_of(features: Tensor, action: Tensor) -> Tensor:
+    """Rows of inputs (N, 3 + 2 (H + 1)) of features (N, 7 + 2 H) and the action (N, 2) that is sent now."""
+    return torch.cat([features[:, STATE_FEATURES - 3 :], action], dim=1)
+
+
+def advance(features: Tensor, action: Tensor, change: Tensor) -> Tensor:
+    """Features (N, 7 + 2 H) after a step that sent ``action`` (N, 2) and changed the body by ``change`` (N, 6)."""
+    sin, cos = features[:, 2], features[:, 3]
+    ahead, left = change[:, 0], change[:, 1]
+    state = decode_state(features)
+    after = torch.stack([
+        state[:, 0] + cos * ahead - sin * left,
+        state[:, 1] + sin * ahead + cos * left,
+        wrap(state[:, 2] + change[:, 2]),
+        *(state[:, 3:] + change[:, 3:]).T,
+    ], dim=1)  # fmt: skip
+    encoded: Tensor = encode(after, push_action(decode_history(features), action))
+    return encoded
+
+
+__all__ = ["CarDynamics", "OneStep", "StepInBody", "advance", "inputs_of"]

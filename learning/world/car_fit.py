@@ -1,0 +1,247 @@
+"""Learn a car from recorded rows and a simulator; save and load it."""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from carlab.core.observation import STATE_FEATURES
+from learning.functional_svgd.authors_fsvgd import WorldDynamics
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.posterior.distillation import DistillationSettings, distil, measurement_points
+from learning.posterior.inference import infer
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, draw_parameters
+from learning.priors.simulator_model import CarModel
+from learning.world.car_dynamics import CarDynamics
+from learning.world.transitions import OUTPUTS, Transitions
+
+Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
+LearnedCar = CarDynamics | WorldDynamics
+FILE_VERSION = 6
+NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
+"""Prior noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
+PRIOR_DISCREPANCY = 0.3
+PRIOR_FUNCTION = 1.0
+"""Prior sizes of a simulator's discrepancy, and of a step without a simulator, in units of the outputs."""
+MAX_ROWS = 800
+"""Largest number of rows that are conditioned on; a random subset of more."""
+_UNIT_SAMPLES = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class CarFitSettings:
+    """How a car is learned.
+
+    Attributes:
+        method: ``sim-fsvgd`` has the simulator as prior, ``fsvgd`` a zero mean; both are distilled posteriors
+            (``learning.posterior``). ``fsvgd-authors`` is FSVGD as published (``functional_svgd.authors_fsvgd``).
+        steps: of the particles' optimiser.
+        particles: their number.
+        seed: of all draws.
+        learning_rate: of the particles.
+    """
+
+    method: Method = "sim-fsvgd"
+    steps: int = 2500
+    particles: int = 20
+    seed: int = 0
+    learning_rate: float = DistillationSettings().learning_rate
+
+
+def car_units(model: CarModel, generator: torch.Generator) -> Normaliser:
+    """Units of inputs and outputs from random drives of the simulator, independent of the data.
+
+    Raises:
+        DataError: most drives give implausible numbers.
+    """
+    inputs = model.inputs(_UNIT_SAMPLES, generator)
+    with torch.no_grad():
+        outputs = model(inputs, draw_parameters(model, 16, generator)).flatten(0, 1)
+    plausible = (outputs.abs() < MAX_PLAUSIBLE_OUTPUT).all(dim=1)
+    if 2 * int(plausible.sum()) < len(outputs):
+        raise DataError(NO_FINITE_OUTPUT)
+    outputs = outputs[plausible]
+    width = inputs.std(dim=0).clamp_min(0.1)
+    return Normaliser(inputs.mean(dim=0), width, torch.zeros(len(OUTPUTS)), outputs.std(dim=0).clamp_min(1e-3))
+
+
+def fit_car(
+    rows: Transitions | None,
+    model: CarModel,
+    settings: CarFitSettings,
+    *,
+    before: CarDynamics | None = None,
+    device: torch.device | str = "cpu",
+    progress: Callable[[int], None] = lambda step: None,
+) -> CarDynamics:
+    """Learn a car.
+
+    Args:
+        rows: recorded transitions; None: the simulator alone is learned.
+        model: the simulator: the prior, or (``fsvgd``) only the source of units and domain.
+        settings: of the fit.
+        before: an earlier fit of the same car, on any device; its units and particles are the starting point.
+        device: of the fit; random numbers are drawn on the CPU.
+        progress: called with the number of optimiser steps done.
+
+    Raises:
+        DataError: the history of the rows or of the earlier fit is not the model's, or the fit diverged.
+    """
+    if rows is not None and rows.history != model.history:
+        raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; make them alike.")
+    if before is not None and before.history != model.history:
+        raise DataError(
+            f"The earlier car has {before.history} past commands, the model {model.history}; remove its folder, and it "
+            "is learned anew."
+        )
+    generator = torch.Generator().manual_seed(settings.seed)
+    earlier_units = None if before is None else before.posterior.normaliser.without_decorrelation()
+    units = (car_units(model, generator) if earlier_units is None else earlier_units).to(device)
+    width = 3 + 2 * (model.history + 1)
+    inputs, outputs = torch.zeros((0, width)), torch.zeros((0, len(OUTPUTS)))
+    if rows is not None and len(rows):
+        inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
+    if len(inputs) > MAX_ROWS:
+        chosen = torch.randperm(len(inputs), generator=generator)[:MAX_ROWS]
+        inputs, outputs = inputs[chosen], outputs[chosen]
+    inputs, outputs = inputs.to(device), outputs.to(device)
+    with_simulator = settings.method == "sim-fsvgd"
+    discrepancy_std = (PRIOR_DISCREPANCY if with_simulator else PRIOR_FUNCTION) * units.output_std
+    target = infer(
+        model if with_simulator else None, inputs, outputs, units, torch.tensor(NOISE_STD).to(device),
+        discrepancy_std=discrepancy_std, restart_scales=(1.0,), seed=settings.seed,
+    )  # fmt: skip
+    points = measurement_points(model, inputs, units, generator)
+    particles = DistillationSettings(
+        particles=settings.particles, steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
+    )
+    start = None if before is None else before.posterior.to(device).parameters_for(target.normaliser)
+    return CarDynamics(distil(target, points, particles, progress, start), model.history)
+
+
+def save_car(dynamics: LearnedCar, path: Path) -> None:
+    """Write a learned car into a file.
+
+    Args:
+        dynamics: the car, on any device.
+        path: of the file.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    posterior = dynamics.posterior.to("cpu")
+    units = posterior.normaliser
+    content: dict[str, Any] = {
+        "version": FILE_VERSION,
+        "frame": "body" if isinstance(dynamics, CarDynamics) else "world",
+        "history": dynamics.history,
+        "network": [posterior.network.inputs, posterior.network.outputs, *posterior.network.hidden],
+        "activation": posterior.network.activation,
+        "parameters": posterior.parameters,
+        "noise_std": posterior.noise_std,
+        "freedom": posterior.dof,
+        "units": [units.input_mean, units.input_std, units.output_mean, units.output_std],
+        "turn": units.decorrelation,
+        "trend": posterior.trend,
+        "correlation": posterior.correlation,
+        "reach": posterior.input_clip,
+    }
+    buffer = io.BytesIO()  # torch.save raises an error of its own where the disk is full.
+    torch.save(content, buffer)
+    path.write_bytes(buffer.getvalue())
+
+
+def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
+    """Read a learned car onto a device.
+
+    Keys of the file that differ from the attributes: ``freedom`` is ``dof``, ``turn`` is ``decorrelation``, ``reach``
+        is
+    ``input_clip``.
+
+    Raises:
+        DataError: the file cannot be read, or has another version or shape.
+    """
+    remedy = "remove its folder, and it is learned anew"
+    try:
+        content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+        version = content["version"]
+        if version != FILE_VERSION:
+            raise DataError(f"{path} is of version {version}, this program reads {FILE_VERSION}; {remedy}.")
+        inputs, outputs, *hidden = content["network"]
+        network = Network(inputs, outputs, tuple(hidden), content["activation"])
+        parameters: Tensor = content["parameters"]
+        count = parameters.shape[1]
+        units = Normaliser(*content["units"])
+        if content["turn"] is not None:
+            units = units.decorrelated(content["turn"])
+        noise_std, dof = content["noise_std"], float(content["freedom"])
+        optional = (content[name] for name in ("trend", "correlation", "reach"))
+        posterior = ParticlePosterior(network, parameters, noise_std, units, dof, *optional)
+        frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
+        car: LearnedCar = frames[content.get("frame", "body")](posterior, content["history"])
+        if count == network.parameters:
+            _check_shapes(car)
+            car = type(car)(posterior.to(device), car.history)
+    except DataError:
+        raise
+    except _READ_ERRORS as error:
+        raise DataError(f"The learned car in {path} cannot be read ({_first_line(error)}); {remedy}.") from error
+    if count != network.parameters:
+        raise DataError(f"{path} holds {count} numbers a particle for {network.parameters}; {remedy}.")
+    return car
+
+
+def _check_shapes(car: LearnedCar) -> None:
+    """Raise ValueError where a part of a file does not fit the others: a file of a stranger may hold anything."""
+    posterior, units = car.posterior, car.posterior.normaliser
+    d, o = posterior.network.inputs, posterior.network.outputs
+    state_inputs = 3 if isinstance(car, CarDynamics) else STATE_FEATURES
+    if type(car.history) is not int or car.history < 0 or d != state_inputs + 2 * (car.history + 1):
+        raise ValueError(f"a history of {car.history} and {d} inputs")
+    if o != (len(OUTPUTS) if isinstance(car, CarDynamics) else STATE_FEATURES) or not posterior.dof > 0.0:
+        raise ValueError(f"{o} outputs and {posterior.dof} degrees of freedom")
+    parts = {
+        "parameters": (posterior.parameters, (max(len(posterior.parameters), 1), posterior.network.parameters)),
+        "noise_std": (posterior.noise_std, (o,)), "input_mean": (units.input_mean, (d,)),
+        "input_std": (units.input_std, (d,)), "output_mean": (units.output_mean, (o,)),
+        "output_std": (units.output_std, (o,)), "turn": (units.decorrelation, (o, o)),
+        "trend": (posterior.trend, (1 + d, o)), "correlation": (posterior.correlation, (o, o)),
+        "reach": (posterior.input_clip, (d,)),
+    }  # fmt: skip
+    for name, (part, shape) in parts.items():
+        if part is None and name in ("turn", "trend", "correlation", "reach"):
+            continue
+        if not isinstance(part, Tensor) or part.layout != torch.strided or not part.is_floating_point():
+            raise ValueError(f"{name} is no array of numbers")
+        if tuple(part.shape) != shape or not torch.isfinite(part).all():
+            raise ValueError(f"{name} has shape {tuple(part.shape)}, not {shape}, or is not finite")
+
+
+_READ_ERRORS = (
+    OSError,
+    RuntimeError,
+    EOFError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    pickle.UnpicklingError,
+)
+
+
+def _first_line(error: BaseException) -> str:
+    """The first line of an error's message, or its type."""
+    return next(iter(str(error).splitlines()), "") or type(error).__name__
+
+
+__all__ = ["CarFitSettings", "LearnedCar", "Method", "car_units", "fit_car", "load_car", "save_car"]

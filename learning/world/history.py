@@ -1,0 +1,91 @@
+"""Choice of the number of past commands that a model sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from carlab.core.episode_data import EpisodeData
+from learning.posterior.discrepancy import CHOLESKY_JITTER, fit_discrepancy
+from learning.posterior.outliers import leave_one_out, log_student
+from learning.world.transitions import transitions_of
+
+CANDIDATE_LENGTHS = (0, 1, 2, 3, 4, 6, 8)
+MIN_GAIN_NATS = 0.1
+"""Leave-one-out log-likelihood per row that a history of one more command must gain."""
+MIN_ROWS, MAX_ROWS = 60, 240
+STUDENT_DOF = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryChoice:
+    """A chosen history.
+
+    Attributes:
+        history: commands before the last one.
+        nll: mean leave-one-out negative log-likelihood of a row by length [nat, outputs in units of their standard
+            deviation].
+    """
+
+    history: int
+    nll: dict[int, float]
+
+    def message(self) -> str:
+        """The choice in a sentence."""
+        shown = ", ".join(f"{h}: {value:.2f}" for h, value in self.nll.items())
+        return (
+            f"The data supports {self.history} past commands (leave-one-out negative log-likelihood by their number: "
+            f"{shown})."
+        )
+
+
+def find_history(episodes: Sequence[EpisodeData], seed: int = 0) -> HistoryChoice | None:
+    """The shortest history that no longer one beats, by the leave-one-out likelihood of a Gaussian process.
+
+    The process has a lengthscale for each input and is fitted by its evidence to the same rows for every length. The
+    density is Student-t, so that collisions have little influence.
+
+    Args:
+        episodes: recordings.
+        seed: of the rows that are drawn.
+
+    Returns:
+        The choice; None with fewer than ``MIN_ROWS`` rows.
+    """
+    longest = CANDIDATE_LENGTHS[-1]
+    if sum(max(e.ticks - longest, 0) for e in episodes) < MIN_ROWS:
+        return None
+    rows = transitions_of(episodes, longest)
+    if len(rows) < MIN_ROWS:
+        return None
+    chosen = torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:MAX_ROWS].numpy()
+    all_inputs, outputs = (torch.from_numpy(v[chosen]) for v in (rows.inputs, rows.targets))
+    all_inputs = (all_inputs - all_inputs.mean(dim=0)) / all_inputs.std(dim=0).clamp_min(1e-6)
+    outputs = (outputs - outputs.mean(dim=0)) / outputs.std(dim=0).clamp_min(1e-9)
+    nll = {}
+    for history in CANDIDATE_LENGTHS:
+        inputs = torch.cat([all_inputs[:, :3], all_inputs[:, 3 + 2 * (longest - history) :]], dim=1)
+        nll[history] = _leave_one_out_nll(inputs, outputs)
+    best = CANDIDATE_LENGTHS[0]
+    for history in CANDIDATE_LENGTHS[1:]:
+        if nll[history] < nll[best] - MIN_GAIN_NATS * math.sqrt(history - best):
+            best = history
+    return HistoryChoice(best, nll)
+
+
+def _leave_one_out_nll(inputs: Tensor, outputs: Tensor) -> float:
+    """Mean leave-one-out negative log-likelihood of standardised outputs (n, O) at standardised inputs (n, D) [nat]."""
+    row_weights = torch.ones(len(outputs), dtype=torch.float64)
+    one = torch.ones(outputs.shape[1], dtype=torch.float64)
+    discrepancy, noise = fit_discrepancy(inputs, outputs, None, 0.1 * one, one, row_weights)
+    covariance = discrepancy(inputs) + torch.diag_embed((noise**2 + CHOLESKY_JITTER)[:, None] / row_weights)
+    standardised, variance = leave_one_out(outputs, covariance, noise, row_weights)
+    density = log_student(standardised**2, 1, STUDENT_DOF) - 0.5 * variance.log()
+    return -float(density.sum(dim=1).mean())
+
+
+__all__ = ["HistoryChoice", "find_history"]

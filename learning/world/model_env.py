@@ -1,0 +1,247 @@
+"""A learned car as a vectorised environment of stable-baselines3, with the task of the real one.
+
+Start states are drawn from the task and from recorded states with the commands before them. An episode ends after the
+task's ticks, where the task ends, or where the safety gate would stop a real car, with no reward afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from carlab.core.errors import ConfigError, DataError
+from carlab.core.geofence import each_can_stop_inside, stopping_distance_m
+from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
+from carlab.core.safety import SafetyEnvelope
+from carlab.core.task import Task
+from learning.world.car_dynamics import OneStep
+
+FEATURE_UNITS = (2.0, 2.0, 1.0, 1.0, 2.0, 1.0, 4.0)
+"""Units of x, y [m], sine, cosine, vx, vy [m/s] and yaw rate [rad/s] in a policy's inputs."""
+REWARD_SCALE = 10.0
+MAX_POLICY_INPUT = 10.0
+"""Clip of a policy's inputs, in these units."""
+
+
+def policy_view(features: Any) -> NDArray[np.float32]:
+    """A policy's inputs for features (..., 7 + 2 H): scaled by ``FEATURE_UNITS`` and clipped."""
+    found = np.array(features, dtype=np.float32)
+    found[..., : len(FEATURE_UNITS)] /= np.array(FEATURE_UNITS, dtype=np.float32)
+    return np.clip(found, -MAX_POLICY_INPUT, MAX_POLICY_INPUT)
+
+
+def policy_spaces(width: int) -> tuple[gym.spaces.Box, gym.spaces.Box]:
+    """Spaces of what a policy sees (width,) and of its actions (2,)."""
+    high = np.full(width, MAX_POLICY_INPUT, dtype=np.float32)
+    return gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+class ModelEnv(VecEnv):
+    """Many copies of a learned car at once.
+
+    Args:
+        model: one step of the car.
+        task: reward, end and starts; its history is the model's.
+        cars: how many copies.
+        recorded: features (R, 7 + 2 H) of recorded states; may be empty.
+        from_recorded: share of starts among them, where there are any.
+        envelope: limits of the safety gate, which slews commands and stops a car that could not stop inside the arena.
+        period_s: control period, for the slew limits [s].
+        bonus: additional reward (cars,) for features (cars, 7 + 2 H) after a step; not part of the returns of
+            ``rolled_out``.
+        seed: of starts, particles and noise.
+        device: where the model's tensors are.
+
+    Raises:
+        ConfigError: task and model have other histories.
+        DataError: recorded states have another number of features.
+    """
+
+    def __init__(
+        self,
+        model: OneStep,
+        task: Task,
+        cars: int,
+        *,
+        recorded: NDArray[np.float64] | None = None,
+        from_recorded: float = 0.5,
+        envelope: SafetyEnvelope | None = None,
+        period_s: float = 1.0 / 30.0,
+        bonus: Callable[[Tensor], Tensor] | None = None,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        width = feature_size(model.history)
+        if task.history_length != model.history:
+            raise ConfigError(
+                f"The task shows {task.history_length} past commands, the learned car takes {model.history}; make them "
+                "alike."
+            )
+        if recorded is not None and recorded.shape[1:] != (width,):
+            raise DataError(f"Recorded starts have {recorded.shape[1:]} features, this car {width}; encode them anew.")
+        super().__init__(cars, *policy_spaces(width))
+        self._model, self._task, self._device = model, task, torch.device(device)
+        self._envelope = SafetyEnvelope() if envelope is None else envelope
+        rates = (self._envelope.steering_rate_per_s, self._envelope.throttle_rate_per_s)
+        self._slew = torch.tensor(rates, device=self._device) * period_s
+        limits = (self._envelope.max_steering, self._envelope.max_throttle)
+        self._limits = torch.tensor(limits, device=self._device)
+        self._recorded = np.zeros((0, width)) if recorded is None else recorded
+        self._from_recorded = from_recorded if len(self._recorded) else 0.0
+        self._bonus = bonus
+        self._own_seed = seed
+        self._rng = np.random.default_rng(seed)
+        self._generator = torch.Generator().manual_seed(seed)
+        self._features = torch.zeros((cars, width), device=self._device)
+        self._ticks = np.zeros(cars, dtype=np.int64)
+        self._actions = torch.zeros((cars, ACTION_SIZE), device=self._device)
+        self._arena_m = self._envelope.arena_m or task.arena_m
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start all cars; their episodes end at different ticks, so that no batch is all starts."""
+        everyone = np.arange(self.num_envs)
+        self._start(everyone)
+        self._ticks = self._rng.integers(self._task.max_ticks, size=self.num_envs)
+        return self._seen()
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Take the commands (cars, 2)."""
+        self._actions = torch.as_tensor(actions, dtype=torch.float32).to(self._device)
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """One step of every car; those that end start anew."""
+        before = self._features
+        with torch.no_grad():
+            action = self._gate(before, self._actions)
+            after = self._model.step(before, action, self._generator)
+            reward = self._task.reward(before, action, after)
+            if self._bonus is not None:
+                reward = reward + self._bonus(after)
+            reward = reward * REWARD_SCALE
+        here = after.cpu()
+        terminated = self._task.terminated(here).numpy() | self._stopped(here)
+        self._features = after
+        self._ticks += 1
+        seen = policy_view(here.numpy())
+        truncated = (self._ticks >= self._task.max_ticks) & ~terminated
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = np.flatnonzero(done)
+        for k in ended:
+            infos[k] = {"terminal_observation": seen[k].copy(), "TimeLimit.truncated": bool(truncated[k])}
+        if len(ended):
+            seen[ended] = policy_view(self._start(ended))
+        return seen, reward.cpu().numpy().astype(np.float32), done, infos
+
+    def rolled_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
+        """Drive every car once from a start of the task by a policy, to the end.
+
+        Args:
+            act: actions (cars, 2) for views (cars, F).
+
+        Returns:
+            Returns (cars,), unscaled and counted until a car ends, and the features at its end (cars, 7 + 2 H); both on
+            the CPU.
+        """
+        share, self._from_recorded = self._from_recorded, 0.0
+        self._start(np.arange(self.num_envs))
+        total = torch.zeros(self.num_envs)
+        ended = torch.zeros(self.num_envs, dtype=torch.bool)
+        last, seen = self._features.cpu().clone(), self._seen()
+        with torch.no_grad():
+            for _ in range(self._task.max_ticks):
+                before = self._features
+                action = self._gate(before, torch.as_tensor(act(seen)).to(self._device))
+                after = self._model.step(before, action, self._generator)
+                here = after.cpu()
+                total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
+                last = torch.where(ended[:, None], last, here)
+                ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
+                self._features, seen = after, policy_view(here.numpy())
+        self._from_recorded = share
+        return total, last
+
+    @property
+    def features(self) -> Tensor:
+        """Present features (cars, 7 + 2 H)."""
+        return self._features
+
+    def _gate(self, features: Tensor, requested: Tensor) -> Tensor:
+        """Commands (cars, 2) as the safety gate would send them after those before (``carlab.core.safety.slew``)."""
+        requested = torch.minimum(torch.maximum(requested, -self._limits), self._limits)
+        if not self._model.history:
+            return requested
+        previous = features[:, -ACTION_SIZE:]
+        previous = torch.where(requested * previous < 0.0, 0.0, previous)
+        slewed = torch.minimum(torch.maximum(requested, previous - self._slew), previous + self._slew)
+        return torch.where(requested.abs() <= previous.abs(), requested, slewed)
+
+    def _stopped(self, features: Tensor) -> NDArray[np.bool_]:
+        """Whether the gate stops a car: too fast, or not able to stop inside the arena. On the CPU."""
+        state = decode_state(features).numpy()
+        speed = np.hypot(state[:, 3], state[:, 4])
+        course = state[:, 2] + np.arctan2(state[:, 4], state[:, 3])
+        needed = stopping_distance_m(speed, self._envelope.reaction_s, self._envelope.deceleration_mps2)
+        found: NDArray[np.bool_] = ~(speed <= self._envelope.max_speed_mps)
+        if self._arena_m:
+            found |= ~each_can_stop_inside(self._arena_m, state[:, :2], course, needed)
+        return found
+
+    def _start(self, cars: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Start some of the cars anew; their features."""
+        fresh = np.array([self._task.sample_start(self._rng).to_array() for _ in cars])
+        rows = encode(fresh, np.zeros((len(cars), self._model.history, ACTION_SIZE)))
+        again = self._rng.random(len(cars)) < self._from_recorded
+        if again.any():
+            rows[again] = self._recorded[self._rng.integers(len(self._recorded), size=int(again.sum()))]
+        fresh_rows = torch.from_numpy(rows).float()
+        features = self._features.clone()
+        features[torch.from_numpy(cars).to(self._device)] = fresh_rows.to(self._device)
+        self._features = features
+        self._ticks[cars] = 0
+        found: NDArray[np.float32] = fresh_rows.numpy()
+        return found
+
+    def _seen(self) -> NDArray[np.float32]:
+        return policy_view(self._features.cpu().numpy())
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def seed_anew(self) -> None:
+        """Seed with the number given at construction; an agent of stable-baselines3 seeds with its own."""
+        self.seed(self._own_seed)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed starts, particles and noise."""
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+            self._generator.manual_seed(seed)
+        return [seed] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of the environment, once for each requested car."""
+        return [getattr(self, attr_name, None)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of all cars."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the environment once, its answer repeated for each requested car."""
+        answer = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [answer] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> list[bool]:
+        """Never."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+__all__ = ["FEATURE_UNITS", "ModelEnv", "policy_spaces", "policy_view"]

@@ -1,0 +1,87 @@
+"""What the table ``[hardware.mocap]`` of a car file holds."""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from carlab.core.errors import ConfigError, ProtocolError
+from mocap.natnet.models import NEWEST_BITSTREAM, OLDEST_BITSTREAM, BitstreamVersion
+
+
+@dataclass(frozen=True, slots=True)
+class MocapConfig:
+    """How to reach a NatNet server (Motive) and which of its rigid bodies is the car."""
+
+    server_address: str = "127.0.0.1"
+    """Address of the computer that runs Motive."""
+    local_interface: str = ""
+    """Address of this computer's interface towards it; empty for the one the system would use."""
+    mode: Literal["unicast", "multicast"] = "unicast"
+    """Transmission Type in Motive's Data Streaming pane."""
+    multicast_group: str = ""
+    """Group to join in multicast mode; empty for the one the server names, or 239.255.42.99."""
+    command_port: int = 1510
+    """The server's command port."""
+    data_port: int = 0
+    """Port of multicast frames; 0 for the one the server names, or 1511."""
+    bitstream: str = "4.1"
+    """Newest bitstream version to ask for in unicast mode; an older server is taken as it is."""
+    body: str = ""
+    """Name of the rigid body in Motive. Empty, and no body_id: the only one there is."""
+    body_id: int | None = None
+    """Streaming id of the rigid body, in place of its name."""
+    up_axis: Literal["y", "z"] = "y"
+    """Up Axis in Motive's Data Streaming pane (its default is Y); frames do not say it."""
+    yaw_offset_rad: float = 0.0
+    """Turn about the vertical from the rigid body to base_link (x forward)."""
+    pivot_in_base_link_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where the rigid body's pivot sits on the car: forward, left and up of base_link."""
+    timeout_s: float = 2.0
+    """How long to wait for the server, its list of bodies and its first frame, each."""
+
+    def __post_init__(self) -> None:
+        if not self.server_address.strip():
+            raise ConfigError("'server_address' in [hardware.mocap] is empty; name the computer that runs Motive.")
+        for name, choices in (("mode", ("unicast", "multicast")), ("up_axis", ("y", "z"))):
+            if getattr(self, name) not in choices:
+                raise ConfigError(
+                    f"'{name}' in [hardware.mocap] is {getattr(self, name)!r}; choose {' or '.join(choices)}."
+                )
+        if not all(map(math.isfinite, (self.yaw_offset_rad, *self.pivot_in_base_link_m))):
+            raise ConfigError("'yaw_offset_rad' and 'pivot_in_base_link_m' in [hardware.mocap] must be finite numbers.")
+        for name, low in (("command_port", 1), ("data_port", 0)):
+            port = getattr(self, name)
+            if not low <= port <= 65535:
+                raise ConfigError(f"'{name}' in [hardware.mocap] is {port}; a port is a number up to 65535.")
+        if not self.timeout_s > 0.0:
+            raise ConfigError(f"'timeout_s' in [hardware.mocap] is {self.timeout_s}; it must be above zero.")
+        if self.body and self.body_id is not None:
+            raise ConfigError("[hardware.mocap] has both 'body' and 'body_id'; keep one of them.")
+        if self.multicast_group:
+            check_multicast_group(self.multicast_group, "'multicast_group' in [hardware.mocap]")
+        try:
+            version = BitstreamVersion.parse(self.bitstream)
+        except ProtocolError as error:
+            raise ConfigError(f"'bitstream' in [hardware.mocap]: {error}") from error
+        if not OLDEST_BITSTREAM <= version <= NEWEST_BITSTREAM:
+            raise ConfigError(
+                f"'bitstream' in [hardware.mocap] is {version}; carlab reads {OLDEST_BITSTREAM} to {NEWEST_BITSTREAM}."
+            )
+
+    @property
+    def bitstream_version(self) -> BitstreamVersion:
+        """``bitstream`` as a version."""
+        return BitstreamVersion.parse(self.bitstream)
+
+
+def check_multicast_group(group: str, what: str) -> None:
+    """Raise ConfigError where ``group`` is no IPv4 multicast address."""
+    try:
+        valid = ipaddress.IPv4Address(group).is_multicast
+    except ValueError:
+        valid = False
+    if not valid:
+        raise ConfigError(f"{what} is {group!r}; it must be an address from 224.0.0.0 to 239.255.255.255.")

@@ -1,0 +1,1 @@
+"""An emulated NatNet server for tests, CI and laptops."""

@@ -1,0 +1,1 @@
+"""The NatNet protocol: codec (pure), sockets, discovery and client."""

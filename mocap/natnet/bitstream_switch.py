@@ -1,0 +1,46 @@
+"""Decoding while the server changes from one bitstream version to another. Pure."""
+
+from __future__ import annotations
+
+import contextlib
+
+from carlab.core.errors import ProtocolError
+from mocap.natnet.codec import decode_frame, decode_model_def, explain_frame_error
+from mocap.natnet.models import FRAME_BITSTREAM_CHANGED, BitstreamVersion, Description, Frame, check_readable
+
+_SIZED = BitstreamVersion(4, 1)
+
+
+class BitstreamSwitch:
+    """Decodes under ``version``, and under ``pending`` too while a change to it is under way.
+
+    Frames in flight still have the old syntax when the server says yes to a change. The change has taken effect once
+    a frame reads cleanly in the new syntax; where old and new are laid out alike, once a frame says so by its
+    bitstream-changed bit.
+    """
+
+    def __init__(self, version: BitstreamVersion, pending: BitstreamVersion | None = None) -> None:
+        self.version = version
+        self.pending = pending
+
+    def decode_frame(self, payload: bytes) -> Frame:
+        """Read a frame. Raises ProtocolError; where another version would fit, it says which."""
+        if self.pending is not None:
+            with contextlib.suppress(ProtocolError):  # still the old syntax, or garbage: the old decoder says which
+                frame = decode_frame(payload, self.pending)
+                alike = (self.pending < _SIZED) == (self.version < _SIZED)
+                if not alike or frame.params & FRAME_BITSTREAM_CHANGED:
+                    self.version, self.pending = self.pending, None
+                return frame
+        check_readable(self.version)
+        try:
+            return decode_frame(payload, self.version)
+        except ProtocolError as error:
+            raise explain_frame_error(payload, self.version, error) from error
+
+    def decode_models(self, payload: bytes) -> tuple[Description, ...]:
+        """Read model definitions, which change together with the frames. Raises ProtocolError."""
+        if self.pending is not None:
+            with contextlib.suppress(ProtocolError):  # as above
+                return decode_model_def(payload, self.pending)
+        return decode_model_def(payload, self.version)

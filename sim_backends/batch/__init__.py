@@ -1,0 +1,1 @@
+"""Batched rollouts in torch, differentiable in states, commands and parameters."""

@@ -1,0 +1,98 @@
+"""What a batched rollout is given: checked, and its delays and latency added up over the effects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+
+from carlab.core.errors import ConfigError, DataError
+from carlab.core.tables import check_keys
+from sim_backends.batch.schedule import Number
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS, DelayEffect
+from sim_backends.registry import REGISTRY
+
+
+class Past(NamedTuple):
+    """What happened before the first tick: commands (N, H, 2), and states (N, H, 6) where they are known."""
+
+    commands: torch.Tensor
+    states: torch.Tensor | None
+
+    @classmethod
+    def of(cls, commands: torch.Tensor | None, states: torch.Tensor | None, like: torch.Tensor) -> Past | None:
+        """From commands and states that may be missing; None where there is no tick before the first."""
+        if commands is None or not commands.shape[1]:
+            return None
+        return cls(commands.to(like), None if states is None else states.to(like))
+
+    def cut(self, cars: slice) -> Past:
+        """The same for some of the cars."""
+        return Past(self.commands[cars], None if self.states is None else self.states[cars])
+
+
+def plain_number(value: Number) -> Number:
+    """A number where a tensor holds one without a gradient, or the same for all cars."""
+    if isinstance(value, torch.Tensor) and not value.requires_grad:
+        first = value.reshape(-1)[0] if value.numel() else value.new_zeros(())
+        if bool((value == first).all()):
+            return float(first)
+    return value
+
+
+def total_delays_s(numbers: Mapping[str, Number], effects: Iterable[str]) -> tuple[Number, Number]:
+    """Delay of steering and of throttle with all effects [s]. Raises ConfigError for less than zero."""
+    steering = throttle = numbers["timing.command_delay"]
+    for effect in (EFFECTS[name] for name in effects):
+        if isinstance(effect, DelayEffect):
+            own = effect.numbers(numbers)
+            extra_steering, extra_throttle = effect.extra_delays_s(own)
+            if steering is throttle and extra_steering is extra_throttle:  # keep what is one number one number
+                steering = throttle = steering + extra_steering
+            else:
+                steering, throttle = steering + extra_steering, throttle + extra_throttle
+    for channel, delay in (("steering", steering), ("throttle", throttle)):
+        if bool((delay < 0).any()) if isinstance(delay, torch.Tensor) else delay < 0:
+            raise ConfigError(f"The delay of {channel} adds up to less than 0 s; raise command_delay.")
+    first = plain_number(steering)
+    return first, first if steering is throttle else plain_number(throttle)
+
+
+def with_effects_of(config: SimulatorConfig, given: Iterable[str]) -> SimulatorConfig:
+    """The simulator with the effects switched on whose numbers (dotted names) are ``given``."""
+    named = {name.split(".")[1] for name in given if name.startswith("effects.")}
+    missing = named - set(config.effects)
+    return replace(config, effects={**config.effects, **{name: {} for name in sorted(missing)}}) if missing else config
+
+
+def check_shapes(
+    start: torch.Tensor,
+    commands: torch.Tensor,
+    history: torch.Tensor | None,
+    history_states: torch.Tensor | None,
+) -> int:
+    """Number of cars. Raises DataError where a shape does not fit."""
+    cars = int(start.shape[0])
+    if start.ndim != 2 or start.shape[1] != 6:
+        raise DataError(f"start has shape {tuple(start.shape)}; it must be (cars, 6).")
+    for name, sequence in (("commands", commands), ("history", history)):
+        if sequence is not None and (sequence.ndim != 3 or sequence.shape[0] != cars or sequence.shape[2] != 2):
+            raise DataError(f"{name} has shape {tuple(sequence.shape)}; it must be ({cars}, ticks, 2).")
+    if history_states is not None:
+        expected = (cars, 0 if history is None else history.shape[1], 6)
+        if tuple(history_states.shape) != expected:
+            raise DataError(f"history_states has shape {tuple(history_states.shape)}; it must be {expected}.")
+    return cars
+
+
+def check_values(given: Mapping[str, Number], t0_s: Number, cars: int) -> None:
+    """Raise ConfigError for names that a rollout does not take, DataError for shapes that do not fit."""
+    check_keys(given, REGISTRY, "the values of a rollout")
+    if "timing.control_period" in given:
+        raise ConfigError("timing.control_period is shared by all cars; change it in the simulator instead.")
+    for name, value in {**given, "t0_s": t0_s}.items():
+        if isinstance(value, torch.Tensor) and value.shape not in ((), (cars,)):
+            raise DataError(f"{name} has shape {tuple(value.shape)}; it must be () or ({cars},).")

@@ -1,0 +1,138 @@
+"""When commands begin to act within a control period, and what acts when: exact, for whole batches of cars.
+
+A command given at tick ``k`` acts from ``k T + delay``. With ``delay = m T + phase`` the command of tick ``k - m``
+takes over at ``phase`` into period ``k``; so each channel switches once in each period, at the same phase. The period
+is cut there, and each piece is integrated with held commands. Nothing is rounded or averaged: the result is exact for
+any delay, and its derivative by the delay is that of the pieces' lengths. Where motion capture looks within a piece,
+that piece is integrated once more up to there, so that being looked at changes nothing.
+
+Delays that are the same for all cars make a plan of plain numbers: with one shared delay it costs no more steps than
+none. Delays of one value per car make pieces of one length per car, each with as many steps as the longest needs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch
+
+from sim_backends.dynamics.integrate import substeps_for
+
+Number: TypeAlias = "float | torch.Tensor"
+_SAME_S = 1e-9
+"""Instants closer than this are one [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A stretch of a control period. Flags are for all cars or one per car."""
+
+    start_s: Number
+    length_s: Number
+    steps: int
+    new_command: tuple[bool | torch.Tensor, bool | torch.Tensor]
+    """Whether the later of the period's two commands acts, for steering and throttle."""
+    looks: bool | torch.Tensor
+    """Whether motion capture looks in this piece."""
+    look_after_s: Number | None
+    """How far into the piece; None where at its end."""
+    look_steps: int
+
+
+@dataclass(frozen=True, slots=True)
+class PeriodPlan:
+    """The pieces of each period, and how many whole periods commands and poses are late."""
+
+    pieces: tuple[Piece, ...]
+    command_periods: tuple[int | torch.Tensor, int | torch.Tensor]
+    capture_periods: int | torch.Tensor
+
+
+def plan_period(period_s: float, delays_s: tuple[Number, Number], latency_s: Number, max_step_s: float) -> PeriodPlan:
+    """Cut a control period of ``period_s`` for delays of steering and throttle and the latency of what is measured.
+
+    Delays and latency are numbers or one per car, and must not be negative. A latency of zero costs nothing.
+    """
+    if any(isinstance(v, torch.Tensor) for v in (*delays_s, latency_s)):
+        return _plan_per_car(period_s, delays_s, latency_s, max_step_s)
+    steering, throttle, latency = float(delays_s[0]), float(delays_s[1]), float(latency_s)
+    periods, phases = zip(*(_split(d, period_s) for d in (steering, throttle)), strict=True)
+    late_periods, late_s = _split(latency, period_s)
+    look_s = period_s - late_s
+    ends: list[float] = []
+    for instant_s in sorted((*phases, period_s)):
+        if instant_s > _SAME_S and (not ends or instant_s - ends[-1] > _SAME_S):
+            ends.append(instant_s)
+    ends[-1] = period_s
+    pieces = []
+    start_s = 0.0
+    for end_s in ends:
+        new_steering, new_throttle = (phase <= start_s + _SAME_S for phase in phases)
+        length_s = end_s - start_s
+        looks = start_s + _SAME_S < look_s <= end_s + _SAME_S
+        after_s = look_s - start_s if looks and look_s < end_s - _SAME_S else None
+        pieces.append(
+            Piece(
+                start_s,
+                length_s,
+                substeps_for(length_s, max_step_s),
+                (new_steering, new_throttle),
+                looks,
+                after_s,
+                0 if after_s is None else substeps_for(after_s, max_step_s),
+            )
+        )
+        start_s = end_s
+    return PeriodPlan(tuple(pieces), (periods[0], periods[1]), late_periods)
+
+
+def _split(delay_s: float, period_s: float) -> tuple[int, float]:
+    periods = math.floor(delay_s / period_s + _SAME_S / period_s)
+    phase_s = delay_s - periods * period_s
+    return periods, phase_s if phase_s > _SAME_S else 0.0
+
+
+def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: Number, max_step_s: float) -> PeriodPlan:
+    shared = delays_s[0] is delays_s[1]
+    like = next(v for v in (*delays_s, latency_s) if isinstance(v, torch.Tensor))
+    steering, throttle, latency = (
+        torch.as_tensor(v, dtype=like.dtype, device=like.device) for v in (*delays_s, latency_s)
+    )
+    shape = (steering + throttle + latency).shape
+    steering, throttle, latency = (v.expand(shape) for v in (steering, throttle, latency))
+    whole = [torch.floor(v.detach() / period_s) for v in (steering, throttle, latency)]
+    phases = [steering - whole[0] * period_s, throttle - whole[1] * period_s]
+    look = period_s - (latency - whole[2] * period_s)
+    distinct = [phases[0]]
+    # Two delays that are equal now may still depend on different numbers.
+    differentiable = phases[0].requires_grad or phases[1].requires_grad
+    if not shared and (differentiable or not torch.equal(phases[0], phases[1])):
+        distinct.append(phases[1])
+    sorted_phases, order = torch.stack(distinct).sort(dim=0, stable=True)
+    # Which command is taken over first; two that are taken over together still have a piece of no length between.
+    places = [order.argsort(dim=0)[channel % len(distinct)] for channel in range(2)]
+    ends = torch.cat([sorted_phases, torch.full_like(look, period_s)[None]])
+    starts = torch.cat([torch.zeros_like(look)[None], ends[:-1]])
+    pieces = []
+    for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        length = end - start
+        longest_s = float(length.detach().max())
+        if longest_s <= 0.0 and not length.requires_grad:
+            continue
+        looks = (look.detach() > start.detach()) & (look.detach() <= end.detach())
+        after = torch.where(looks, look - start, torch.zeros_like(look)) if bool(looks.any()) else None
+        pieces.append(
+            Piece(
+                start,
+                length,
+                substeps_for(longest_s, max_step_s),
+                (places[0] < index, places[1] < index),
+                looks if after is not None else False,
+                after,
+                0 if after is None else substeps_for(float(after.detach().max()), max_step_s),
+            )
+        )
+    late = [w.to(torch.int64) for w in whole]
+    return PeriodPlan(tuple(pieces), (late[0], late[1]), late[2])

@@ -1,0 +1,301 @@
+"""A Runge-Kutta step of the model, and its derivative, compiled to straight-line NumPy code.
+
+The ordinary equations (``rk4_step`` of ``SingleTrack``) are traced once for each kind of model and set of effects. The
+generated function calls NumPy with a few reused buffers and nothing else: no temporaries, no dispatch, no autograd.
+"""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.car_parameters import ModelKind
+from sim_backends.compiled.tracing import Node, Tracer, fold, gradients
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.dynamics.integrate import rk4_step
+from sim_backends.dynamics.single_track import Actuation, SingleTrack
+from sim_backends.effects import Effect
+from sim_backends.registry import REGISTRY
+
+FloatRow = NDArray[np.floating[Any]]
+_NUMPY = {
+    "add": "add",
+    "sub": "subtract",
+    "mul": "multiply",
+    "div": "divide",
+    "neg": "negative",
+    "atan": "arctan",
+    "atan2": "arctan2",
+    "abs": "abs",
+}
+_NO_OUTPUT = ("less", "less_equal", "where")
+"""Operations whose result is a new array: of booleans, or because NumPy offers no other way."""
+_NO_SCALARS = ("maximum", "minimum")
+"""Operations that NumPy does slowly with a scalar, and that take their output by keyword only."""
+FEW_CARS = 2048
+"""Up to here results go to buffers of their own, above they replace arguments that are not needed any more."""
+CHUNK_CARS = 2048
+"""Cars whose intermediate results the derivative keeps at a time, so that they fit the cache."""
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """The traced step: inputs by group, outputs, and what can be computed before the first step.
+
+    ``fixed`` are the nodes that depend on parameters and the step length alone; the step takes them as inputs.
+    """
+
+    tracer: Tracer
+    values: dict[str, Node]
+    step_s: Node
+    varying: list[Node]
+    fixed: list[Node]
+    outputs: list[Any]
+
+    def fixed_values(self, ops: Ops, values: Mapping[str, Value], step_s: Value) -> list[Value]:
+        """Compute ``fixed`` for given parameters and step length."""
+        known: dict[int, Value] = {self.step_s.index: step_s}
+        known |= {node.index: values[name] for name, node in self.values.items() if name in values}
+
+        def compute(node: Any) -> Value:
+            if not isinstance(node, Node):
+                return node
+            if node.index not in known:
+                arguments = [compute(a) for a in node.arguments]
+                known[node.index] = _apply(ops, node.operation, arguments)
+            return known[node.index]
+
+        return [compute(node) for node in self.fixed]
+
+
+def _apply(ops: Ops, operation: str, arguments: list[Value]) -> Value:
+    if all(isinstance(a, float) for a in arguments):  # of the step's length alone
+        return fold(operation, *arguments)
+    match operation:
+        case "add":
+            return arguments[0] + arguments[1]
+        case "sub":
+            return arguments[0] - arguments[1]
+        case "mul":
+            return arguments[0] * arguments[1]
+        case "div":
+            return arguments[0] / arguments[1]
+        case "neg":
+            return -arguments[0]
+        case "maximum":
+            return ops.floor(arguments[0], arguments[1])
+        case "minimum":
+            return -ops.floor(-arguments[0], -arguments[1])
+        case "less":
+            return arguments[0] < arguments[1]
+        case "less_equal":
+            return arguments[0] <= arguments[1]
+        case _:
+            return getattr(ops, operation)(*arguments)
+
+
+@functools.lru_cache(maxsize=256)
+def trace_step(kind: ModelKind, effects: tuple[Effect, ...], held: bool) -> Graph:
+    """Trace one step. With ``held`` the actuation is the same at its start, middle and end.
+
+    The varying inputs are: time, state, extra states, then angle, sine, cosine and throttle of each actuation.
+    """
+    tracer = Tracer()
+    ids = [effect.id for effect in effects]
+    names = [n for n in REGISTRY if not n.startswith("effects.") or n.split(".")[1] in ids]
+    values = {name: tracer.input(name) for name in names}
+    step_s = tracer.input("step")
+    model = SingleTrack(tracer.as_ops(), kind, values, ids)
+    first_varying = len(tracer.nodes)
+    t_s = tracer.input("t")
+    state = tuple(tracer.input(f"state{i}") for i in range(6 + len(model.extra_states)))
+    actuations = [
+        Actuation(*(tracer.input(f"{name}{i}") for name in ("angle", "sin", "cos", "throttle")))
+        for i in range(1 if held else 3)
+    ]
+    start, middle, end = actuations * 3 if held else actuations
+    outputs = list(rk4_step(model, t_s, state, step_s, start, middle, end))
+    varying = [t_s, *state, *(node for actuation in actuations for node in actuation)]
+
+    depends = {node.index for node in varying}
+    fixed: dict[int, Node] = {}
+    for node in tracer.nodes:
+        if any(isinstance(a, Node) and a.index in depends for a in node.arguments):
+            depends.add(node.index)
+    for node in tracer.nodes[first_varying:]:
+        if node.index in depends:
+            fixed |= {a.index: a for a in node.arguments if isinstance(a, Node) and a.index not in depends}
+    return Graph(tracer, values, step_s, varying, list(fixed.values()), outputs)
+
+
+Step = Callable[[Sequence[Value], Sequence[FloatRow], Sequence[FloatRow], Sequence[FloatRow]], None]
+"""Inputs, buffers, outputs and constants of a generated function."""
+
+
+_SHARED = threading.local()
+_SIZES_KEPT = 4
+
+
+def _shared_buffers(count: int, cars: int, dtype: np.dtype[Any]) -> list[FloatRow]:
+    """Scratch rows of this thread, the same for every function: only one of them runs at a time."""
+    pools: dict[tuple[int, np.dtype[Any]], list[FloatRow]] = _SHARED.__dict__.setdefault("pools", {})
+    pool = pools.pop((cars, dtype), [])
+    pool += [np.empty(cars, dtype) for _ in range(count - len(pool))]
+    pools[cars, dtype] = pool
+    while len(pools) > _SIZES_KEPT:
+        del pools[next(iter(pools))]
+    return pool[:count]
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """Generated functions for few and for many cars, and the scratch memory that they work in."""
+
+    few: Step
+    many: Step
+    buffers_few: int
+    buffers_many: int
+    constants: tuple[tuple[float, bool], ...]
+    """Each number, and whether it is needed for every car."""
+    operands: int
+    """Rows that one run reads and writes, counted once for each operation."""
+    _scratch: threading.local = field(default_factory=threading.local)
+
+    def run(self, inputs: Sequence[Value], outputs: Sequence[FloatRow]) -> None:
+        """Compute ``outputs``, rows of one length and type, from ``inputs``, such rows or numbers."""
+        cars, dtype = outputs[0].shape[0], outputs[0].dtype
+        in_place = cars > FEW_CARS
+        kept = getattr(self._scratch, "kept", None)
+        if kept is None or kept[0] != (cars, dtype, in_place):
+            buffers = _shared_buffers(self.buffers_many if in_place else self.buffers_few, cars, dtype)
+            constants = [np.full(cars if row else (), value, dtype) for value, row in self.constants]
+            kept = ((cars, dtype, in_place), buffers, constants)
+            self._scratch.kept = kept
+        (self.many if in_place else self.few)(inputs, kept[1], outputs, kept[2])
+
+
+@functools.lru_cache(maxsize=256)
+def compile_step(kind: ModelKind, effects: tuple[Effect, ...], held: bool) -> Code:
+    """The step: inputs are those that are fixed and those that vary, outputs the rows of the new state."""
+    graph = trace_step(kind, effects, held)
+    return _generate([*graph.fixed, *graph.varying], graph.outputs)
+
+
+@functools.lru_cache(maxsize=512)
+def compile_gradient(kind: ModelKind, effects: tuple[Effect, ...], held: bool, wanted: tuple[bool, ...]) -> Code:
+    """The derivative of the step: inputs are those of the step, then one seed for each of its outputs.
+
+    ``wanted`` says for which inputs; the function has as many outputs as there are True.
+    """
+    graph = trace_step(kind, effects, held)
+    inputs = [*graph.fixed, *graph.varying]
+    tracer = Tracer(list(graph.tracer.nodes), dict(graph.tracer._known))
+    moved = {node.index: Node(tracer, node.index, node.operation, node.arguments) for node in tracer.nodes}
+    for index, node in moved.items():
+        node.arguments = tuple(moved[a.index] if isinstance(a, Node) else a for a in node.arguments)
+        tracer.nodes[index] = node
+    tracer._known = {key: moved[node.index] for key, node in tracer._known.items()}
+    seeds = [tracer.input(f"seed{i}") for i in range(len(graph.outputs))]
+    sources = [moved[node.index] for node, want in zip(inputs, wanted, strict=True) if want]
+    # What is fixed is given: its own derivation from the parameters is differentiated by the caller.
+    for node in graph.fixed:
+        moved[node.index].operation, moved[node.index].arguments = "input", ()
+    results = gradients([moved[o.index] if isinstance(o, Node) else o for o in graph.outputs], seeds, sources)
+    return _generate([*(moved[node.index] for node in inputs), *seeds], results)
+
+
+def _generate(inputs: Sequence[Node], outputs: Sequence[Any]) -> Code:
+    """Write and compile the straight-line code of ``outputs``, once for few cars and once for many.
+
+    For many cars a result takes the place of an argument that is not needed any more, which saves memory traffic; for
+    few the check for overlap that NumPy then makes costs more than it saves.
+    """
+    given = {node.index: f"i{k}" for k, node in enumerate(inputs)}
+    order: dict[int, Node] = {}
+    stack = [o for o in outputs if isinstance(o, Node)]
+    while stack:
+        node = stack.pop()
+        if node.index not in order and node.index not in given:
+            order[node.index] = node
+            stack += [a for a in node.arguments if isinstance(a, Node)]
+    nodes = [order[index] for index in sorted(order)]
+    few, many = (_Writer(given, nodes, outputs, in_place) for in_place in (False, True))
+    operands = sum(1 + sum(isinstance(a, Node) for a in node.arguments) for node in nodes)
+    return Code(few.function(), many.function(), few.buffers, many.buffers, tuple(few.constants), operands)
+
+
+class _Writer:
+    """Writes the code of a list of nodes, with as few buffers as it can do with."""
+
+    def __init__(self, given: Mapping[int, str], nodes: Sequence[Node], outputs: Sequence[Any], in_place: bool) -> None:
+        self.buffers = 0
+        self.constants: dict[tuple[float, bool], int] = {}
+        self._names = dict(given)
+        self._lines: list[str] = []
+        self._functions: set[str] = set()
+        self._given, self._outputs = given, outputs
+        self._free: list[int] = []
+        self._places = {o.index: k for k, o in enumerate(outputs) if isinstance(o, Node)}
+        last_use = {a.index: n.index for n in nodes for a in n.arguments if isinstance(a, Node)}
+        held_by: dict[int, int] = {}
+        for node in nodes:
+            arguments = [self._argument(a, node) for a in node.arguments]
+            done = {a.index for a in node.arguments if isinstance(a, Node) and last_use[a.index] == node.index}
+            freed = [held_by.pop(index) for index in sorted(done) if index in held_by]
+            if in_place:
+                self._free += freed
+            if (buffer := self._write(node, arguments)) is not None:
+                held_by[node.index] = buffer
+            if not in_place:
+                self._free += freed
+
+    def _argument(self, argument: Any, node: Node) -> str:
+        if isinstance(argument, Node):
+            return self._names[argument.index]
+        key = (float(argument), node.operation in _NO_SCALARS)
+        return f"c{self.constants.setdefault(key, len(self.constants))}"
+
+    def _write(self, node: Node, arguments: list[str]) -> int | None:
+        function = _NUMPY.get(node.operation, node.operation)
+        self._functions.add(function)
+        name = self._names[node.index] = f"v{node.index}"
+        if node.operation in _NO_OUTPUT:
+            self._lines.append(f"{name} = {function}({', '.join(arguments)})")
+            return None
+        buffer = None
+        if node.index in self._places:
+            target = f"o{self._places[node.index]}"
+        else:
+            if not self._free:
+                self._free.append(self.buffers)
+                self.buffers += 1
+            buffer = self._free.pop()
+            target = f"b{buffer}"
+        keyword = "out=" if node.operation in _NO_SCALARS else ""
+        self._lines.append(f"{name} = {function}({', '.join(arguments)}, {keyword}{target})")
+        return buffer
+
+    def function(self) -> Step:
+        """Compile what was written."""
+        unpack = []
+        for letter, count in (("i", len(self._given)), ("b", self.buffers), ("o", len(self._outputs))):
+            unpack += [f"{''.join(f'{letter}{k}, ' for k in range(count))} = {letter}"] if count else []
+        if self.constants:
+            unpack.append(f"{''.join(f'c{k}, ' for k in range(len(self.constants)))} = c")
+        copies = []
+        for k, o in enumerate(self._outputs):
+            if not isinstance(o, Node):
+                copies.append(f"o{k}[...] = {float(o)!r}")
+            elif o.index in self._given or self._places[o.index] != k or o.operation in _NO_OUTPUT:
+                copies.append(f"o{k}[...] = {self._names[o.index]}")
+        lines = [*unpack, *self._lines, *copies]
+        source = "def step(i, b, o, c):\n" + "".join(f"    {line}\n" for line in lines)
+        scope: dict[str, Any] = {name: getattr(np, name) for name in self._functions}
+        exec(compile(source, "<compiled step>", "exec"), scope)
+        return cast(Step, scope["step"])

@@ -1,0 +1,1 @@
+"""The single-track model, its actuators, integration and hooks for effects."""

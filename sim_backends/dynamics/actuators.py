@@ -1,0 +1,81 @@
+"""From delayed commands to wheel angle and throttle: the input effects of a car in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects import EFFECTS, ActuatorEffect
+from sim_backends.effects.base import Parameters, Triple
+
+ActuatorState = tuple[Value, ...]
+"""One value per effect with memory, steering's first."""
+
+
+class ActuatorChain:
+    """Steering and motor of a car as chains of input effects. Holds parameters, not state.
+
+    Args:
+        ops: Functions of the array library of ``values``.
+        values: Numbers by dotted name, as of ``SimulatorConfig.values``.
+        effects: Ids of effects; those that stand between command and actuator are used here.
+    """
+
+    def __init__(self, ops: Ops, values: Mapping[str, Value], effects: Iterable[str] = ()) -> None:
+        self._ops = ops
+        self._max_angle = values["steering.max_angle"]
+        chosen = [e for e in (EFFECTS[effect_id] for effect_id in effects) if isinstance(e, ActuatorEffect)]
+        chosen.sort(key=lambda e: (e.command != "steering", e.order, e.id))
+        self._links: list[tuple[ActuatorEffect, Parameters]] = [(e, e.numbers(values)) for e in chosen]
+        self.has_memory = any(e.has_state for e in chosen)
+
+    def settled(self, commands: tuple[Value, Value]) -> ActuatorState:
+        """Actuator state after ``commands`` have acted for ever."""
+        signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
+        memory = []
+        for effect, values in self._links:
+            signal = signals[effect.command]
+            if effect.has_state:
+                memory.append(effect.settled(signal))
+            else:
+                signals[effect.command] = effect.apply(self._ops, signal, values)
+        return tuple(memory)
+
+    def settled_output(self, commands: tuple[Value, Value]) -> tuple[Value, Value]:
+        """Wheel angle [rad] and throttle [1] after ``commands`` have acted for ever."""
+        signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
+        for effect, values in self._links:
+            if not effect.has_state:
+                signals[effect.command] = effect.apply(self._ops, signals[effect.command], values)
+        return signals["steering"], signals["throttle"]
+
+    def held(self, commands: tuple[Value, Value]) -> tuple[Value, Value]:
+        """Wheel angle [rad] and throttle [1] of a chain without memory."""
+        signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
+        for effect, values in self._links:
+            signals[effect.command] = effect.apply(self._ops, signals[effect.command], values)
+        return signals["steering"], signals["throttle"]
+
+    def step(
+        self, commands: tuple[Value, Value], memory: ActuatorState, step_s: Value
+    ) -> tuple[tuple[Triple, Triple], ActuatorState]:
+        """Wheel angle and throttle at start, middle and end of a step with held commands; the memory at its end."""
+        angle = self._max_angle * commands[0]
+        signals: dict[str, Triple] = {"steering": (angle, angle, angle), "throttle": (commands[1],) * 3}
+        left = iter(memory)
+        after: list[Value] = []
+        for effect, values in self._links:
+            start, middle, end = signals[effect.command]
+            if effect.has_state:
+                out, state = effect.step(self._ops, (start, middle, end), next(left), step_s, values)
+                after.append(state)
+            elif start is middle and middle is end:
+                out = (effect.apply(self._ops, start, values),) * 3
+            else:
+                out = (
+                    effect.apply(self._ops, start, values),
+                    effect.apply(self._ops, middle, values),
+                    effect.apply(self._ops, end, values),
+                )
+            signals[effect.command] = out
+        return (signals["steering"], signals["throttle"]), tuple(after)

@@ -1,0 +1,189 @@
+"""The measurement model: what motion capture and the velocity filter make of true states. Written once for all engines.
+
+    y(t) = F( W( h( x(t - latency) ) ) )
+
+with the true state ``x``, the observation effects ``h`` in their order (``ObservationEffect.observe``), the window
+``W`` over which velocities were differentiated, and the first-order filter ``F`` on the velocities. It runs on floats,
+NumPy arrays and torch tensors; a value may hold one number for each car or parameter set, of a shape that broadcasts
+with the states.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeAlias
+
+from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.effects import EFFECTS, DelayEffect, ObservationEffect
+from sim_backends.effects.base import Parameters
+from sim_backends.effects.first_order import lag_weights
+
+State: TypeAlias = tuple[Value, ...]
+"""x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]."""
+LATENCY = "mocap.latency"
+COMMAND_DELAY = "timing.command_delay"
+
+
+def observation_effects(effects: Iterable[str]) -> list[ObservationEffect]:
+    """The observation effects among ``effects`` (ids), in the order in which they act."""
+    found = [e for e in (EFFECTS[name] for name in effects) if isinstance(e, ObservationEffect)]
+    return sorted(found, key=lambda e: (e.order, e.id))
+
+
+def is_measured(name: str) -> bool:
+    """Whether a number of the car file belongs to what is measured: motion capture's, or an observation effect's."""
+    table, _, rest = name.partition(".")
+    return table == "mocap" or (table == "effects" and EFFECTS[rest.partition(".")[0]].kind == "observation")
+
+
+def filters_velocities(effect_id: str) -> bool:
+    """Whether an effect is a filter on the measured velocities."""
+    effect, plain = EFFECTS[effect_id], ObservationEffect.velocity_time_constant_s
+    return isinstance(effect, ObservationEffect) and type(effect).velocity_time_constant_s is not plain
+
+
+class MeasurementModel:
+    """Measures true states and inverts the measurement.
+
+    Args:
+        ops: Functions of the array library of ``values``.
+        values: Numbers by dotted name, ``mocap.latency`` and those of the effects among them.
+        effects: Ids of effects; those of the observation are used here.
+    """
+
+    def __init__(self, ops: Ops, values: Mapping[str, Value], effects: Iterable[str]) -> None:
+        self._ops = ops
+        self.latency_s: Value = values[LATENCY]
+        """Age of what is measured [s]."""
+        self.velocity_time_constant_s: Value | None = None
+        """Time constant of the filter on the velocities [s]; None where there is none."""
+        self._static: list[tuple[ObservationEffect, Parameters]] = []
+        for effect in observation_effects(effects):
+            own = effect.numbers(values)
+            if (latency_s := effect.latency_s(own)) is not None:
+                self.latency_s = latency_s
+            if (lag_s := effect.velocity_time_constant_s(own)) is not None:
+                others_s: Value | None = self.velocity_time_constant_s
+                self.velocity_time_constant_s = lag_s if others_s is None else others_s + lag_s
+            if type(effect).observe is not ObservationEffect.observe:
+                self._static.append((effect, own))
+
+    def observe(self, state: State) -> State:
+        """``h(x)``: the measured state at one instant, without latency, window and filter."""
+        for effect, values in self._static:
+            state = effect.observe(self._ops, state, values)
+        return state
+
+    def invert(self, measured: State) -> State:
+        """The true state that ``observe`` maps to ``measured``."""
+        for effect, values in reversed(self._static):
+            measured = effect.invert(self._ops, measured, values)
+        return measured
+
+    def invert_poses(self, measured: State) -> State:
+        """The true state of measured poses and of velocities differentiated from them."""
+        for effect, values in reversed(self._static):
+            if not effect.velocities_only:
+                measured = effect.invert(self._ops, measured, values)
+        return measured
+
+    def observe_velocities(self, from_poses: State) -> State:
+        """The measured state for measured poses and velocities differentiated from them."""
+        for effect, values in self._static:
+            if effect.velocities_only:
+                from_poses = effect.observe(self._ops, from_poses, values)
+        return from_poses
+
+    def measure(
+        self,
+        trajectory: Sequence[State],
+        period_s: Value,
+        *,
+        window_s2: float = 0.0,
+        velocities_before: Sequence[State] = (),
+        filtered: State | None = None,
+    ) -> list[State]:
+        """Measured states of a trajectory at even ticks, in the recording's own time (latency is not applied).
+
+        Args:
+            trajectory: True states, one for each tick.
+            period_s: From one tick to the next [s].
+            window_s2: Variance [s2] of the window over which velocities were differentiated.
+            velocities_before: Unfiltered measured velocities (vx, vy, yaw rate) at the ticks before the trajectory,
+                from the first of which the filter starts settled.
+            filtered: Output of the filter at the first tick, instead.
+        """
+        shown = [self.observe(state) for state in trajectory]
+        if window_s2 > 0.0:
+            shown = windowed(self._ops, shown, period_s, window_s2)
+        if self.velocity_time_constant_s is None:
+            return shown
+        inputs = [*velocities_before, *(state[3:6] for state in shown)]
+        outputs = filter_velocities(self._ops, inputs, period_s, self.velocity_time_constant_s, filtered)
+        return [(*s[:3], *v) for s, v in zip(shown, outputs[len(velocities_before) :], strict=True)]
+
+
+def filter_step(ops: Ops, output: State, first: State, last: State, step_s: Value, lag_s: Value) -> State:
+    """First-order filter over one step, exact for an input that goes from ``first`` to ``last`` in a straight line.
+
+    ``lag_s dy/dt = u - y``; a time constant of 0 passes the input on unchanged.
+    """
+    weights = lag_weights(ops, lag_s, 2.0 * step_s)
+    return tuple(weights.after_half(y, u0, u1) for y, u0, u1 in zip(output, first, last, strict=True))
+
+
+def filter_velocities(
+    ops: Ops, inputs: Sequence[State], period_s: Value, lag_s: Value, begin: State | None = None
+) -> list[State]:
+    """Outputs of the first-order filter at even ticks; settled at the first input unless it begins at ``begin``."""
+    outputs = [inputs[0] if begin is None else begin]
+    for first, last in itertools.pairwise(inputs):
+        outputs.append(filter_step(ops, outputs[-1], first, last, period_s, lag_s))
+    return outputs
+
+
+def windowed(ops: Ops, states: Sequence[State], period_s: Value, variance_s2: float) -> list[State]:
+    """Velocities as a symmetric window of a variance [s2] gives them: ``v + variance / 2 d2v/dt2``, to fourth order.
+
+    The first and the last state stay as they are.
+    """
+    found = [states[0]]
+    for before, now, after in zip(states[:-2], states[1:-1], states[2:], strict=True):
+        curvature = velocity_curvature(ops, before, now, after, period_s)
+        velocities = (v + 0.5 * variance_s2 * c for v, c in zip(now[3:6], curvature, strict=True))
+        found.append((*now[:3], *velocities))
+    return [*found, states[-1]] if len(states) > 1 else found
+
+
+def velocity_curvature(ops: Ops, before: State, now: State, after: State, period_s: Value) -> State:
+    """Second time derivative of the world velocities [m/s3, rad/s3] in the body frame of ``now``, by differences.
+
+    The neighbours' velocities are turned into the present body frame first.
+    """
+    ahead, behind = after[2] - now[2], now[2] - before[2]
+    cos_a, sin_a, cos_b, sin_b = ops.cos(ahead), ops.sin(ahead), ops.cos(behind), ops.sin(behind)
+    along = cos_a * after[3] - sin_a * after[4] - 2.0 * now[3] + (cos_b * before[3] + sin_b * before[4])
+    across = sin_a * after[3] + cos_a * after[4] - 2.0 * now[4] + (cos_b * before[4] - sin_b * before[3])
+    turning = after[5] - 2.0 * now[5] + before[5]
+    return tuple(value / period_s**2 for value in (along, across, turning))
+
+
+def delay_as_recorded_s(ops: Ops, values: Mapping[str, Value], effects: Iterable[str], latency_s: Value) -> Value:
+    """The ``timing.command_delay`` [s] seen from a recording: measured states are old, so commands act that much later.
+
+    It is raised where it and the delay effects would add up to less than 0.
+    """
+    base = values[COMMAND_DELAY] + latency_s
+    extras: list[Value] = [0.0, 0.0]
+    for effect in (EFFECTS[name] for name in effects):
+        if isinstance(effect, DelayEffect):
+            own = effect.numbers(values)
+            extras = [a + b for a, b in zip(extras, effect.extra_delays_s(own), strict=True)]
+    for extra in extras:
+        negative = base + extra < 0.0
+        if isinstance(negative, bool):  # plain numbers, whatever the library of the others
+            base = -extra if negative else base
+        else:
+            base = ops.where(negative, 0.0 * base - extra, base)
+    return base

@@ -1,0 +1,77 @@
+"""Each option of a verb is an argument of the call with the same name."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable
+
+import pytest
+
+import carlab
+from carlab.api.recordings import CHANNEL_OPTIONS, RENAMED_OPTIONS
+from carlab.cli.diagnose import Diagnose
+from carlab.cli.drive import Drive
+from carlab.cli.import_ import Import
+from carlab.cli.learn import Learn
+from carlab.cli.options import CarOptions
+from carlab.cli.replay import Replay
+from carlab.recording.csv.mapping import CHANNELS, ColumnMapping
+
+CASES = [
+    (Drive, carlab.drive, {"verbose"}),
+    (Learn, carlab.learn, {"verbose"}),
+    # --decisions is DiagnosisReport.save_decisions.
+    (Diagnose, carlab.diagnose, {"verbose", "decisions"}),
+    # replay also drives, and takes only the simulators of a car: carlab.drive and carlab.load_car do that.
+    (Replay, carlab.predict, {"verbose", "save", "drive", "seconds", "seed", "out", "vehicle", "dry_run", "reality"}),
+]
+
+
+def options_of(verb: type) -> dict[str, object]:
+    """Option names of a verb with their defaults; the car's options are options of the verb."""
+    found: dict[str, object] = {}
+    for option in dataclasses.fields(verb):
+        if option.name == "which_car":
+            found |= options_of(CarOptions)
+        else:
+            found[option.name] = option.default
+    return found
+
+
+@pytest.mark.parametrize(("verb", "call", "only_in_the_verb"), CASES)
+def test_each_option_is_an_argument_with_the_same_name(
+    verb: type, call: Callable[..., object], only_in_the_verb: set[str]
+) -> None:
+    arguments = inspect.signature(call).parameters
+    missing = set(options_of(verb)) - set(arguments) - only_in_the_verb
+    assert missing == set()
+
+
+@pytest.mark.parametrize(("verb", "call"), [(Drive, carlab.drive), (Learn, carlab.learn), (Replay, carlab.predict)])
+def test_option_and_argument_have_the_same_default(verb: type, call: Callable[..., object]) -> None:
+    arguments = inspect.signature(call).parameters
+    for name, default in options_of(verb).items():
+        if name in arguments and arguments[name].default is not inspect.Parameter.empty:
+            assert str(arguments[name].default) == str(default), name
+
+
+def test_each_option_of_import_is_an_option_of_load() -> None:
+    mapping = {field.name for field in dataclasses.fields(ColumnMapping)}
+    for name in set(options_of(Import)) - {"recording", "out", "mapping", "report", "verbose"}:
+        channel, _, part = name.rpartition("_")
+        of_a_column = part in CHANNEL_OPTIONS and channel in CHANNELS
+        assert of_a_column or RENAMED_OPTIONS.get(name, name) in mapping, name
+
+
+@pytest.mark.parametrize("name", carlab.__all__)
+def test_each_public_name_is_there_and_documented(name: str) -> None:
+    value = getattr(carlab, name)
+    if inspect.isfunction(value) or inspect.isclass(value):
+        assert value.__doc__
+        if inspect.isfunction(value):
+            assert all(f"        {argument}: " in value.__doc__ for argument in named_arguments(value))
+            assert "Returns:" in value.__doc__
+            assert "Raises:" in value.__doc__
+
+
+def named_arguments(call: Callable[..., object]) -> list[str]:
+    return [p.name for p in inspect.signature(call).parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]

@@ -1,0 +1,73 @@
+"""Calibration repeats recorded decisions at other thresholds and counts false and missed names."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from carlab.benchmark import CaseSpec, Proof
+from carlab.benchmark.proof.calibration import calibrate, passes
+from carlab.cli import run
+
+CHI2, SHARE = "selection.accept_chi2_min", "selection.accept_unseen_share"
+
+
+def decision(stage: str, effect: str, chi2: float, share: float = 1.0, step: int = 0) -> dict[str, Any]:
+    conditions = [
+        {"setting": CHI2, "statistic": chi2, "threshold": 20.0, "above": True},
+        {"setting": SHARE, "statistic": share, "threshold": 0.5, "above": True},
+    ]
+    passed = chi2 > 20.0 and share > 0.5
+    return {"stage": stage, "effect": effect, "step": step, "passed": passed, "alternatives": [conditions]}
+
+
+def content(*decisions: dict[str, Any]) -> dict[str, Any]:
+    return {"schema": "carlab.decisions/1", "decisions": list(decisions)}
+
+
+ANSWERS: dict[str, Any] = {"a": {"effects": [{"id": "steering_lag"}]}, "b": {"effects": []}}
+DECISIONS = {
+    "a": content(decision("accept", "steering_lag", 35.0), decision("accept", "steering_delay", 33.0)),
+    "b": content(decision("accept", "motor_lag", 12.0)),
+}
+
+
+def test_a_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_names() -> None:
+    counts = {
+        r.value / 20.0: (r.false, r.wrong, r.missed, r.true) for r in calibrate(ANSWERS, DECISIONS) if r.setting == CHI2
+    }
+    assert counts[0.5] == (1, 2, 0, 1), "the null case gets a name"
+    assert counts[1.0] == (0, 2, 0, 1)
+    assert counts[1.5] == (0, 2, 0, 1), "the first that passes is taken, not the second"
+    assert counts[2.0] == (0, 2, 1, 1), "no candidate passes any more"
+    assert [r.is_present_value for r in calibrate(ANSWERS, DECISIONS) if r.value == 20.0] == [True]
+
+
+def test_names_that_are_kept_one_by_one_count_one_by_one() -> None:
+    kept = {"a": content(decision("keep", "steering_lag", 25.0), decision("keep", "motor_lag", 25.0))}
+    by_value = {r.value / 20.0: (r.false, r.missed) for r in calibrate(ANSWERS, kept) if r.setting == CHI2}
+    assert by_value[1.0] == (1, 0)
+    assert by_value[1.5] == (0, 1)
+
+
+def test_one_alternative_is_sufficient_and_a_condition_may_hold_below() -> None:
+    below = [{"setting": "rivals.spurious_share", "statistic": 0.2, "threshold": 0.1, "above": False}]
+    made = decision("stand", "steering_lag", 10.0)
+    made["alternatives"].append(below)
+    assert not passes(made, CHI2, 20.0)
+    assert passes(made, CHI2, 5.0)
+    assert passes(made, "rivals.spurious_share", 0.3)
+
+
+def test_a_folder_without_decisions_is_refused_in_a_sentence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert run(["prove", "--set", "development", "--calibrate", "--out", str(tmp_path / "proof")]) == 2
+    assert "run the same command without --calibrate" in " ".join(capfd.readouterr().err.split())
+
+
+def test_decisions_of_finished_runs_are_read_with_the_names_of_their_cases(tmp_path: Path) -> None:
+    proof = Proof(tmp_path, [CaseSpec("null", 1)])
+    for name, made in DECISIONS.items():
+        (tmp_path / "reports" / name).mkdir(parents=True)
+        (tmp_path / "reports" / name / "decisions.json").write_text(json.dumps(made))
+    assert proof.decisions() == DECISIONS

@@ -1,0 +1,178 @@
+"""The generator's physics against the simulator's, which was written apart from it, and against plain mechanics."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from carlab.benchmark.effects.catalogue import Draw, Form
+from carlab.benchmark.effects.forms import all_forms
+from carlab.benchmark.world.base_car import BaseCar, Kind
+from carlab.benchmark.world.measurement import Noise, record
+from carlab.benchmark.world.physics import World
+from carlab.benchmark.world.simulation import Drive, drive
+from sim_backends import EFFECTS, SimulatorConfig, rollout
+
+# 0.6 mm and 2 mrad of motion capture, and what differentiating makes of them.
+NOISE_FLOOR = np.array([6e-4, 6e-4, 2e-3, 0.01, 0.01, 0.03])
+FORMS = all_forms()
+CAR = BaseCar()
+# Large enough to move the car by many noise floors within a second, whatever the effect.
+STRONG = {"battery_sag": 0.3, "friction_drift": 0.4, "longitudinal_slip": 2.0, "tyre_saturation": 0.8}
+
+
+def commands(seed: int = 1, count: int = 31, period_s: float = CAR.control_period) -> np.ndarray:
+    """Held steps of both commands, braking among them."""
+    rng = np.random.default_rng(seed)
+    hold = max(1, round(0.1 / period_s))
+    steps = rng.uniform((-1.0, -0.3), (1.0, 1.0), (count // hold + 1, 2))
+    return np.repeat(steps, hold, axis=0)[:count]
+
+
+def scripted(table: np.ndarray, period_s: float) -> Any:
+    return lambda t, state: tuple(table[round(t / period_s)])
+
+
+def drive_here(world: World, table: np.ndarray, start: tuple[float, ...]) -> Drive:
+    period = world.car.control_period
+    return drive(world, scripted(table, period), (len(table) - 1) * period, start=start)
+
+
+def drive_there(car: BaseCar, effects: dict[str, dict[str, float]], table: np.ndarray, start: tuple[float, ...]) -> Any:
+    tables = car.table() | {"effects": effects}
+    config = SimulatorConfig.from_tables(tables)
+    begin = torch.tensor([start], dtype=torch.float64)
+    acts = torch.tensor(table[None, :-1], dtype=torch.float64)
+    return rollout(config, begin, acts, measured=True, max_step_s=0.002)
+
+
+def draw_of(car: BaseCar) -> Draw:
+    return Draw(car, 1.0, (0.1, 0.6, 0.3), (1.0, 0.1))
+
+
+@pytest.mark.parametrize("kind", ["dynamic", "linear_tyre", "kinematic", "blend"])
+@pytest.mark.parametrize("start", [(0.0, 0.0, 0.3, 1.8, 0.0, 0.0), (0.0,) * 6])
+def test_null_is_the_simulator_within_a_tenth_of_the_noise_floor(kind: Kind, start: tuple[float, ...]) -> None:
+    car = dataclasses.replace(CAR, kind=kind, latency=0.0)
+    for seed in range(3):
+        table = commands(seed)
+        ours = drive_here(World(car), table, start).rows
+        theirs = drive_there(car, {}, table, start).states[0].numpy()
+        assert np.abs(ours[-1] - ours[0]).max() > 0.3
+        assert (np.abs(ours - theirs).max(axis=0) < 0.1 * NOISE_FLOOR).all()
+
+
+def comparable() -> list[Form]:
+    observed = ("mocap_latency", "marker_offset", "mocap_yaw_misalignment", "velocity_filter_lag")
+    return [f for f in FORMS.values() if f.form == "catalogue" and f.id in EFFECTS and f.id not in observed]
+
+
+@pytest.mark.parametrize("form", comparable(), ids=lambda f: f.id)
+def test_catalogue_form_is_the_simulators_effect(form: Form) -> None:
+    car = dataclasses.replace(CAR, kind=form.nominal_kind, latency=0.0)
+    # How fast a slipping wheel turns at a moving start is a choice; at a standstill it stands.
+    start = (0.0, 0.0, 0.3, 0.0 if form.id == "longitudinal_slip" else 1.8, 0.0, 0.0)
+    parameters = form.sized(STRONG.get(form.id, min(4.0 * form.typical, form.largest)), draw_of(car))
+    table = commands(5)
+    world = World(car)
+    form.attach(world, parameters)
+    ours = drive_here(world, table, start).rows
+    told = {k: v for k, v in parameters.items() if k != "all_axles"}
+    theirs = drive_there(car, {form.id: told}, table, start).states[0].numpy()
+    null = drive_here(World(car), table, start).rows
+    moved = np.abs(ours - null).max(axis=0) / NOISE_FLOOR
+    apart = np.abs(ours - theirs).max(axis=0) / NOISE_FLOOR
+    assert moved.max() > 2.0, "the effect must be seen, or the comparison says nothing"
+    # Fixed steps run over the edge of a patch; the adaptive ones find it.
+    share = 0.05 if form.id == "low_friction_patch" else 0.02
+    assert apart.max() < max(0.2, share * moved.max())
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("mocap_latency", {"latency": 0.05}),
+        ("marker_offset", {"ahead": 0.05, "left": -0.03}),
+        ("mocap_yaw_misalignment", {"angle": 0.04}),
+    ],
+)
+def test_observation_effects_are_the_simulators(name: str, parameters: dict[str, float]) -> None:
+    start = (0.2, 0.1, 0.3, 1.8, 0.0, 0.0)
+    table = commands(7)
+    world = World(CAR)
+    FORMS[(name, "catalogue")].attach(world, parameters)
+    quiet = Noise(0.0, 0.0)
+    ours = record(drive_here(world, table, start), world, quiet, np.random.default_rng(0)).measured
+    theirs = drive_there(CAR, {name: parameters}, table, start).measured[0].numpy()
+    assert (np.abs(ours - theirs).max(axis=0)[:3] < 0.1 * NOISE_FLOOR[:3]).all()
+
+
+def identities() -> list[Form]:
+    return [form for form in FORMS.values() if form.smallest == 0.0]
+
+
+@pytest.mark.parametrize("form", identities(), ids=lambda f: f"{f.id}-{f.form}")
+def test_every_form_at_size_zero_is_the_base_model(form: Form) -> None:
+    car = dataclasses.replace(CAR, kind=form.nominal_kind)
+    table = commands(3, 46)
+    start = (0.0,) * 6
+    world = World(car)
+    form.attach(world, form.sized(0.0, draw_of(car)))
+    quiet = Noise(0.0, 0.0)
+    changed, plain = (
+        record(drive_here(one, table, start), one, quiet, np.random.default_rng(0)).measured
+        for one in (world, World(car))
+    )
+    apart = np.abs(changed - plain).max(axis=0)
+    assert (apart < 0.02 * NOISE_FLOOR).all()
+
+
+def test_signs_and_energy() -> None:
+    held = np.tile([0.5, 0.4], (60, 1))
+    rows = drive_here(World(CAR), held, (0.0,) * 6).rows
+    assert rows[-1, 2] > 0.5  # positive steering turns left
+    assert (np.diff(np.hypot(rows[:, 3], rows[:, 4])) > -0.05).all()
+    back = drive_here(World(CAR), held * [1.0, -1.0], (0.0,) * 6).rows
+    assert back[-1, 2] < -0.3  # in reverse the other way
+    rolling = drive_here(World(CAR), np.zeros((60, 2)), (0.0, 0.0, 0.0, 2.0, 0.6, 3.0)).rows
+    energy = 0.5 * CAR.mass * (rolling[:, 3] ** 2 + rolling[:, 4] ** 2) + 0.5 * CAR.yaw_inertia * rolling[:, 5] ** 2
+    assert (np.diff(energy) <= 1e-9).all()
+
+
+def test_straight_coasting_is_exponential() -> None:
+    rows = drive_here(World(CAR), np.zeros((61, 2)), (0.0, 0.0, 0.0, 2.0, 0.0, 0.0)).rows
+    t = np.maximum(np.arange(61) * CAR.control_period - CAR.latency, 0.0)
+    np.testing.assert_allclose(rows[1:, 3], 2.0 * np.exp(-CAR.damping / CAR.mass * t[1:]), rtol=1e-7)
+
+
+def test_every_resistance_takes_energy() -> None:
+    names = ("rolling_resistance", "aerodynamic_drag", "cornering_drag")
+    for form in (f for f in FORMS.values() if f.id in names):
+        world = World(CAR)
+        form.attach(world, form.sized(form.largest / 4, draw_of(CAR)))
+        table = np.tile([0.1, 0.0], (31, 1))
+        slowed, free = (drive_here(w, table, (0.0, 0.0, 0.0, 2.0, 0.0, 0.0)).rows[20] for w in (world, World(CAR)))
+        energies = [CAR.mass * (r[3] ** 2 + r[4] ** 2) + CAR.yaw_inertia * r[5] ** 2 for r in (slowed, free)]
+        assert energies[0] < energies[1]
+
+
+def test_slope_pulls_down_hill_in_the_world_frame() -> None:
+    world = World(CAR)
+    FORMS[("road_slope", "catalogue")].attach(world, {"angle": 0.05, "direction": math.pi / 2})
+    rows = drive_here(world, np.zeros((31, 2)), (0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0)).rows
+    assert rows[-1, 1] < -0.05  # rises towards +y, so the car rolls back
+    assert abs(rows[-1, 0]) < 1e-6
+
+
+def test_packets_keep_their_order_and_their_mean() -> None:
+    world = World(CAR)
+    FORMS[("command_delay", "other")].attach(world, {"extra_delay": 0.05, "seed": 3.0})
+    ticks = np.arange(600) * CAR.control_period
+    acts = np.array([world.arrival[1](world.arrival[0](t) * 0.0 + t) for t in ticks])
+    assert (np.diff(acts) > 0.0).all()
+    assert np.mean(acts - ticks) == pytest.approx(CAR.command_delay + 0.05, abs=0.004)

@@ -1,0 +1,245 @@
+"""The seal holds, a proof resumes, and the scorer says right of right and wrong of wrong."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.cases.seal import check, digest, new_nonce
+from carlab.benchmark.proof.case_score import score_case, valid_set
+from carlab.benchmark.proof.runner import Proof
+from carlab.benchmark.proof.scores import (
+    confusion,
+    draw_confusion,
+    score_cases,
+    summarise,
+    table_rows,
+    wilson,
+    write_scores,
+)
+from carlab.core.errors import DataError
+
+STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in.py")))
+SPECS = [
+    CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=10.0, hold_s=6.0),
+    CaseSpec("null", 2, fit_s=8.0, hold_s=5.0),
+]
+
+
+def answer(kind: str = "single", name: str = "steering_lag", **more: Any) -> dict[str, Any]:
+    effect = {
+        "id": name, "form": "catalogue", "parameters": {"time_constant": 0.1}, "lag_s": 0.1, "place": None,
+        "time": None, "class_words": [["steering"]],
+    }  # fmt: skip
+    return {
+        "kind": kind, "effects": [effect] if kind in ("single", "outside") else [], "main_channels": ["yaw_rate"],
+        "target_excess": 1.0, "excess": 1.0, "fault": None, **more,
+    }  # fmt: skip
+
+
+def report(*named: str, others: tuple[str, ...] = (), verdict: str | None = None, **more: Any) -> dict[str, Any]:
+    effects = [
+        {
+            "id": name,
+            "parameters": {"time_constant": {"value": 0.11, "low90": 0.09, "high90": 0.12}},
+            "indistinguishable_from": list(others),
+            "where": {"channels": ["yaw_rate"], "lag_s": 0.11, "time": None, "place": None},
+        }
+        for name in named
+    ]
+    return {
+        "schema": "carlab.diagnosis/1",
+        "verdict": verdict or ("mismatch" if named else "none"),
+        "effects": effects,
+        "fit": {"held_out": {"refit": {"score": 3.0}, "with_effects": {"score": 1.2}}},
+        **more,
+    }
+
+
+def test_right_name() -> None:
+    row = score_case(answer(), report("steering_lag"), oracle=report("steering_lag"))
+    assert row["strict_top1"]
+    assert row["set_top1"]
+    assert row["channel_right"]
+    assert row["lag_right"]
+    assert row["parameters"]["time_constant"]["relative_error"] == pytest.approx(0.1)
+    assert row["parameters"]["time_constant"]["covered"]
+    assert row["floor_ratio"] == pytest.approx(0.9)
+    assert row["oracle_ratio"] == pytest.approx(1.0)
+
+
+def test_wrong_name_and_second_place_do_not_count() -> None:
+    assert not score_case(answer(), report("motor_lag"))["set_top1"]
+    assert not score_case(answer(), report("motor_lag", "steering_lag"))["set_top1"]
+
+
+def test_a_set_counts_only_by_the_rule() -> None:
+    in_set = score_case(answer(name="tyre_relaxation"), report("steering_lag", others=("tyre_relaxation",)))
+    assert in_set["set_top1"]
+    assert not in_set["strict_top1"]
+    assert "parameters" not in in_set
+    assert not score_case(answer(name="motor_lag"), report("steering_lag", others=("motor_lag",)))["set_top1"]
+    three = ("steering_delay", "steering_rate_limit", "tyre_relaxation")
+    assert not score_case(answer(name="tyre_relaxation"), report("steering_lag", others=three))["set_top1"]
+    lags = report("steering_lag", others=("steering_delay",))
+    assert score_case(answer(name="steering_delay"), lags, same=lambda a, b: None)["set_top1"]
+    assert not score_case(answer(name="steering_delay"), lags, same=lambda a, b: False)["set_top1"]
+    assert valid_set({"id": "yaw_damping", "indistinguishable_from": []})
+
+
+def test_false_alarms_and_quiet_nulls() -> None:
+    for kind, verdict in (("null", "none"), ("parameters", "parameters")):
+        quiet, loud = score_case(answer(kind), report(verdict=verdict)), score_case(answer(kind), report("battery_sag"))
+        assert (quiet["false_alarm"], quiet["verdict_right"]) == (False, True)
+        assert (loud["false_alarm"], loud["verdict_right"]) == (True, False)
+
+
+def test_pairs_need_both() -> None:
+    pair = answer("pair")
+    pair["effects"] = [answer()["effects"][0], answer(name="battery_sag")["effects"][0]]
+    assert score_case(pair, report("battery_sag", "steering_lag"))["both_found"]
+    assert not score_case(pair, report("steering_lag"))["both_found"]
+
+
+def test_outside_asks_for_channel_and_class_and_no_name() -> None:
+    rest = {"channels": ["yaw_rate"], "class": "odd in steering, acts on yaw_rate", "regime": "", "share": 0.5}
+    good = score_case(answer("outside", "camber"), report(verdict="unexplained", unexplained=rest))
+    assert (good["is_spurious"], good["main_channel_right"], good["class_right"]) == (False, True, True)
+    bad = score_case(answer("outside", "camber"), report("steering_offset"))
+    assert (bad["is_spurious"], bad["main_channel_right"], bad["class_right"]) == (True, False, False)
+
+
+def test_place_time_and_turns() -> None:
+    truth = answer(name="low_friction_patch")
+    truth["effects"][0] |= {"place": {"x": 1.0, "y": 2.0, "radius": 0.5}, "lag_s": None, "time": "drift"}
+    truth["effects"][0]["parameters"] = {"direction": math.pi - 0.05}
+    said = report("low_friction_patch")
+    said["effects"][0]["where"] |= {"place": {"x": 1.3, "y": 2.2}, "time": "drift over the run"}
+    said["effects"][0]["parameters"] = {"direction": {"value": -math.pi + 0.05, "low90": -3.3, "high90": -3.0}}
+    row = score_case(truth, said)
+    assert row["place_right"]
+    assert row["time_right"]
+    assert row["parameters"]["direction"]["relative_error"] == pytest.approx(0.1 / (math.pi - 0.05))
+    assert row["parameters"]["direction"]["covered"]
+    said["effects"][0]["where"]["place"] = {"x": 1.6, "y": 2.2}
+    assert not score_case(truth, said)["place_right"]
+
+
+def test_a_missing_report_is_a_miss_and_another_schema_an_error() -> None:
+    row = score_case(answer(), None)
+    assert not row["set_top1"]
+    assert not row["reported"]
+    with pytest.raises(DataError, match="schema"):
+        score_case(answer(), report("steering_lag") | {"schema": "carlab.diagnosis/9"})
+
+
+def test_wilson_against_published_values() -> None:
+    # Newcombe (1998), Statistics in Medicine 17, table I: 81/263, 15/148, 0/20, 1/29 at 95 %.
+    for hits, count, low, high in (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ):
+        assert wilson(hits, count) == (pytest.approx(low, abs=2e-4), pytest.approx(high, abs=2e-4))
+
+
+def test_summary_table_and_pictures(tmp_path: Path) -> None:
+    rows = {
+        "a": score_case(answer(), report("steering_lag"), seconds=40.0),
+        "b": score_case(answer(), report("motor_lag"), seconds=50.0),
+        "c": score_case(answer("null"), report(), seconds=30.0),
+    }
+    summary = summarise(rows.values())
+    shares = {r["figure"]: r["share"] for r in summary["rates"]}
+    assert shares["correct effect first, strictly, excess >= 1"] == 0.5
+    assert shares["false alarms, null and parameters"] == 0.0
+    assert shares["90 % intervals cover"] == 1.0
+    assert any(row[0].startswith("seconds") and row[1].startswith("40") for row in table_rows(summary))
+    trues, said, counts = confusion(rows.values())
+    assert trues == ["steering_lag", "null"]
+    assert (
+        counts[0, said.index("steering_lag")]
+        == counts[0, said.index("motor_lag")]
+        == counts[1, said.index("none")]
+        == 1
+    )
+    draw_confusion(tmp_path / "confusion.png", rows.values())
+    assert (tmp_path / "confusion.png").read_bytes()[:4] == b"\x89PNG"
+    write_scores(tmp_path / "scores.json", rows, summary)
+    assert json.loads((tmp_path / "scores.json").read_text())["summary"]["cases"] == 3
+
+
+def test_any_change_breaks_the_seal() -> None:
+    answers = {"aa": answer(), "bb": answer("null")}
+    nonce = new_nonce()
+    sealed = digest(answers, nonce)
+    check(answers, nonce, sealed)
+    changed = copy.deepcopy(answers)
+    changed["aa"]["effects"][0]["parameters"]["time_constant"] += 1e-12
+    for wrong, key in ((changed, nonce), (answers, new_nonce()), ({"aa": answers["aa"]}, nonce)):
+        with pytest.raises(DataError, match="seal is broken"):
+            check(wrong, key, sealed)
+
+
+def test_a_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
+    root = tmp_path / "proof"
+    told: list[tuple[str, int, int, str]] = []
+    stops = iter([False, True])
+    first = Proof(root, SPECS, command=STAND_IN, stop_requested=lambda: next(stops))
+    assert first.make() is None
+    made = {p.name: p.stat().st_mtime_ns for p in (root / "answers").glob("*.json")}
+    assert len(made) == 2  # the plan and one answer
+    with pytest.raises(DataError, match="Seal"):
+        first.diagnose()
+    again = Proof(root, SPECS, command=STAND_IN, progress=lambda *step: told.append(step))
+    sealed = again.make()
+    assert sealed is not None
+    assert ("seal", 2, 2, sealed) in told
+    assert all((root / "answers" / name).stat().st_mtime_ns == when for name, when in made.items())
+
+    stops = iter([False, True])
+    assert not Proof(root, SPECS, command=STAND_IN, stop_requested=lambda: next(stops)).diagnose()
+    done = {p: p.stat().st_mtime_ns for p in (root / "reports").glob("*/run.json")}
+    assert len(done) == 1
+    assert again.make() == sealed
+    assert again.diagnose()
+    assert again.diagnose(oracle=True)
+    assert all(p.stat().st_mtime_ns == when for p, when in done.items())
+
+    answers = again.open_seal()
+    reports = again.reports()
+    seen = [run["report"]["seen"] for run in reports.values()]
+    assert all(s["files"] == ["car.toml", "fit.csv", "hold.csv", "out"] for s in seen)
+    assert all(str(root) not in json.dumps(s) for s in seen)
+    rows = score_cases(answers, reports, again.reports(oracle=True), again.same)
+    by_kind = {row["kind"]: row for row in rows.values()}
+    assert by_kind["single"]["strict_top1"]
+    assert by_kind["single"]["oracle_ratio"] == pytest.approx(1.4 / 1.8)
+    assert by_kind["null"]["false_alarm"]
+    assert all(row["seconds"] > 0.0 for row in rows.values())
+
+    with pytest.raises(DataError, match="other cases"):
+        Proof(root, SPECS[:1], command=STAND_IN).make()
+    handed = next((root / "handed").glob("*/fit.csv"))
+    handed.write_bytes(handed.read_bytes() + b"\n")
+    with pytest.raises(DataError, match="seal is broken"):
+        again.open_seal()
+
+
+def test_a_diagnosis_that_fails_or_hangs_is_noted(tmp_path: Path) -> None:
+    root = tmp_path / "proof"
+    proof = Proof(root, SPECS[1:], command=(sys.executable, "-c", "import sys; sys.exit('no such verb')"))
+    proof.make()
+    assert proof.diagnose()
+    (run,) = proof.reports().values()
+    assert run["report"] is None
+    assert run["exit_status"] == 1
+    assert "no such verb" in run["words"]

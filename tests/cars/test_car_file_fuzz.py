@@ -1,0 +1,81 @@
+"""Mutations of valid car files: whatever is in them, only ConfigError leaves the loader, with one sentence."""
+
+import os
+import random
+import re
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from carlab.cars import load_car_file
+from carlab.core.errors import ConfigError
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "car-file.md"
+ROUNDS = int(os.environ.get("CARLAB_FUZZ_ROUNDS", "1500"))
+VALUES = (
+    "true", "false", '""', '"x"', "nan", "inf", "-inf", "-1", "0", "1e400", "1" + "0" * 400, "[]", "[[]]", "{}",
+    "[[0, 0], [1], [1, 1]]", '[["a", 0], [1, 0], [1, 1]]', "[[0, 0], [1, 0], [1, inf]]", "[1, 2, 3]", "{value = 1}",
+    "{value = 1, low = 2, high = 3}", "{low = 1}", '{value = "a"}', "{value = 1, std = -1}", "1979-05-27", "07:32:00",
+    "[{a = 1}]", "9223372036854775808", "-0.0", '"\\u0000"', "{value = [1]}", "{value = 1, low = nan, high = 2}",
+    "[[[0, 0]], [[1, 0]], [[1, 1]]]", "[[0, 0], [1, 0], {a = 1}]",
+)  # fmt: skip
+
+
+def seeds() -> list[str]:
+    block = re.search(r"<!-- test: car file -->\n```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
+    assert block is not None
+    presets = (resources.files("sim_backends") / "presets").iterdir()
+    return [block[1], *(p.read_text(encoding="utf-8") for p in presets if p.name.endswith(".toml"))]
+
+
+def mutated(text: str, rng: random.Random) -> str:
+    """One to three changes: a value, a key, a table header, a line, or a character."""
+    for _ in range(rng.randint(1, 3)):
+        lines = text.split("\n")
+        k = rng.randrange(len(lines))
+        match rng.randrange(7):
+            case 0 | 1 | 2:
+                keyed = [n for n, line in enumerate(lines) if "=" in line and not line.lstrip().startswith("#")]
+                k = rng.choice(keyed) if keyed else k
+                lines[k] = lines[k].split("=")[0] + "= " + rng.choice(VALUES)
+            case 3:
+                lines[k] = lines[k].replace("_", "", 1) if "_" in lines[k] else "x" + lines[k]
+            case 4:
+                lines.insert(k, f"[{rng.choice(('vehicle', 'effects', 'hardware', 'mocap', 'hardware.limits', 'x'))}]")
+            case 5:
+                lines.insert(k, lines.pop(rng.randrange(len(lines))))
+            case _:
+                line = lines[k]
+                at = rng.randrange(len(line) + 1)
+                lines[k] = line[:at] + chr(rng.choice((0, 34, 39, 91, 93, 123, 125, 61, 46, 233, 8232, 48))) + line[at:]
+        text = "\n".join(lines)
+    return text
+
+
+def test_only_config_errors_leave_the_loader(tmp_path: Path) -> None:
+    rng, files = random.Random(0), seeds()
+    path = tmp_path / "car.toml"
+    refused = 0
+    for _ in range(ROUNDS):
+        text = mutated(rng.choice(files), rng)
+        path.write_text(text, encoding="utf-8")
+        try:
+            load_car_file(path)
+        except ConfigError as error:
+            refused += 1
+            assert "\n" not in str(error).strip(), text
+        except Exception as error:
+            pytest.fail(f"{type(error).__name__}: {error}\n{text}")
+    assert 0.2 * ROUNDS < refused < ROUNDS
+
+
+@pytest.mark.parametrize(
+    "corners", ["[[0, 0], [1], [1, 1]]", '[["a", 0], [1, 0], [1, 1]]', "[[0, 0], [1, 0], {a = 1}]", "3", "[]"]
+)
+def test_corners_that_are_no_polygon_are_refused_in_one_sentence(corners: str, tmp_path: Path) -> None:
+    text = re.sub(r"corners_m = .*", f"corners_m = {corners}", seeds()[0])
+    path = tmp_path / "car.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"corners_m .* must be at least three corners"):
+        load_car_file(path)

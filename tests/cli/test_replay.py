@@ -1,0 +1,64 @@
+"""``carlab replay`` on a simulated car: errors by part and channel, the overlay in rerun, and what it refuses."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+Carlab = Callable[..., tuple[int, str]]
+HEADER = "t,x,y,yaw,vx,vy,yaw_rate,steering,throttle"
+
+
+def circle(path: Path, seconds: float, offset_s: float = 0.0) -> Path:
+    """A circle driven at 1 m/s, exactly."""
+    t = offset_s + np.arange(round(30 * seconds)) / 30.0
+    yaw = 0.8 * t
+    columns = [t, np.sin(yaw) / 0.8, (1 - np.cos(yaw)) / 0.8, (yaw + math.pi) % (2 * math.pi) - math.pi]
+    columns += [np.ones(len(t)), np.zeros(len(t)), np.full(len(t), 0.8), np.full(len(t), 0.4), 0.3 + 0.01 * np.sin(t)]
+    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header=HEADER, comments="")
+    return path
+
+
+def test_both_parts_and_all_channels_are_printed_beside_constant_velocity(carlab: Carlab, tmp_path: Path) -> None:
+    """Constant velocity is right on a circle; the default car takes another one."""
+    code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), "--save", tmp_path / "drive.rrd")
+    assert code == 0
+    assert "whole recording (107 windows from 0.6 to 29.9 s)" in text
+    assert "last 30 % (" in text
+    assert text.count("constant velocity 0.0000 0.0000") == 2
+    for channel in ("x [m]", "y [m]", "yaw [rad]", "vx [m/s]", "vy [m/s]", "yaw_rate [rad/s]"):
+        assert channel in text
+    assert (tmp_path / "drive.rrd").stat().st_size > 0
+
+
+def test_a_short_recording_is_scored_whole(carlab: Carlab, tmp_path: Path) -> None:
+    code, text = carlab("replay", circle(tmp_path / "drive.csv", 5.0))
+    assert code == 0
+    assert "whole recording (" in text
+    assert "The last part is too short to be scored by itself." in text
+
+
+def test_another_share_and_horizon_are_scored(carlab: Carlab, tmp_path: Path) -> None:
+    path = circle(tmp_path / "drive.csv", 30.0)
+    code, text = carlab("replay", path, "--holdout-share", "0.5", "--horizon", "0.5", "--stride", "0.5")
+    assert code == 0
+    assert "Error after 0.50 s, last 50 % (" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--holdout-share", "0.7"), "at most 0.5"),
+        (("--horizon", "60"), "shorter horizon"),
+        (("--horizon", "0"), "--horizon 0: a number above zero"),
+        (("--stride", "-1"), "--stride -1: a number above zero"),
+    ],
+)
+def test_what_cannot_be_scored_is_said_in_a_sentence(
+    carlab: Carlab, tmp_path: Path, options: tuple[str, ...], words: str
+) -> None:
+    code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), *options)
+    assert code != 0
+    assert words in text

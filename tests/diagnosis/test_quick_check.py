@@ -1,0 +1,225 @@
+"""The quick check: whether, where and why a simulator disagrees with drives whose truth is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import parking_drives as drives
+import pytest
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.state_estimator import fit_velocity
+from carlab.diagnosis.own_recordings import as_captured, window_variance_s2
+from carlab.diagnosis.quick.conditions import find_conditions
+from carlab.diagnosis.quick.quick_check import quick_check
+from carlab.diagnosis.quick.sentences import sentences, short
+from carlab.diagnosis.settings import DEFAULT
+from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.recording.mcap.source import read_episode
+from sim_backends.car_parameters import SimulatorConfig
+
+SIMULATOR = SimulatorConfig.from_preset()
+
+
+def recorded(folder: Path, true: SimulatorConfig, seed: int, episodes: int = 5) -> list[EpisodeData]:
+    run = drives.drive_like_learning(true, folder, episodes, seed)
+    return [read_episode(path) for path in run.recordings()]
+
+
+@pytest.mark.parametrize("seed", [20, 21, 22])
+def test_the_simulator_explains_its_own_recordings_from_the_first_on(tmp_path: Path, seed: int) -> None:
+    episodes = recorded(tmp_path, SIMULATOR, seed)
+    for count in (1, 3, 5):
+        check = quick_check(episodes[:count], SIMULATOR)
+        assert check.verdict == "explains", check
+        assert check.causes == ()
+        assert 0.5 < check.score < DEFAULT.quick.score_max
+    assert "explains" in sentences(check)[0]
+
+
+@pytest.mark.parametrize(
+    ("effect", "size"), [("motor_lag", 1.0), ("marker_offset", 1.0), ("road_slope", 2.0)]
+)  # fmt: skip
+def test_what_an_independent_generator_conceals_is_found_where_it_shows_and_named(effect: str, size: float) -> None:
+    case = drives.concealed_drives(effect, size, seed=23)
+    check = quick_check(case.episodes, case.simulator)
+    assert check.verdict == "left"
+    assert check.channels[0].channel in case.main_channels
+    first = check.causes[0]
+    assert first.id == effect
+    for name, value in case.parameters.items():
+        found = first.parameters[f"effects.{effect}.{name}"]
+        assert found.value == pytest.approx(value, rel=0.15, abs=0.002)
+    assert first.share > 0.9
+    assert not first.with_refit
+    assert effect in sentences(check)[1]
+    assert effect in short(check)
+
+
+def test_with_refit_that_are_off_an_effect_is_named_too() -> None:
+    case = drives.concealed_drives("motor_lag", 3.0, seed=24, share=0.1)
+    check = quick_check(case.episodes, case.simulator)
+    assert check.verdict == "left"
+    found = {c.id: c for c in check.causes}["motor_lag"]
+    assert found.with_refit
+    truth = case.parameters["time_constant"]
+    assert found.parameters["effects.motor_lag.time_constant"].value == pytest.approx(truth, rel=0.15)
+
+
+def test_a_wrong_number_is_distinguished_from_an_effect_and_so_is_an_effect_that_changed(tmp_path: Path) -> None:
+    weaker = SIMULATOR.with_values({"motor.drive_gain": 7.4})
+    check = quick_check(recorded(tmp_path, weaker, 25), SIMULATOR)
+    assert (check.verdict, check.causes[0].id) == ("left", "motor.drive_gain")
+    number = check.causes[0].parameters["motor.drive_gain"]
+    assert number.value == pytest.approx(7.4, rel=0.01)
+    assert number.before == SIMULATOR.values()["motor.drive_gain"]
+    known, slower = (replace(SIMULATOR, effects={"steering_lag": {"time_constant": t}}) for t in (0.05, 0.09))
+    episodes = recorded(tmp_path, slower, 21)
+    assert quick_check(episodes, slower).verdict == "explains", "a diagnosed simulator is checked with its effects"
+    check = quick_check(episodes, known)
+    assert (check.verdict, check.causes[0].id) == ("left", "effects.steering_lag")
+    assert check.causes[0].parameters["effects.steering_lag.time_constant"].value == pytest.approx(0.09, rel=0.1)
+
+
+def test_the_same_recordings_give_the_same_answer() -> None:
+    case = drives.concealed_drives("rolling_resistance", 3.0, seed=27, episodes=2)
+    first, again = (quick_check(case.episodes, case.simulator).to_dict() for _ in range(2))
+    assert first == again
+    assert first["verdict"] == "left"
+
+
+def test_recordings_that_are_not_sufficient_are_undecided_with_a_reason() -> None:
+    case = drives.concealed_drives(None, 0.0, seed=28, episodes=1)
+    (episode,) = case.episodes
+    standing = np.zeros_like(episode.states)
+    short_one = replace(
+        episode, times_s=episode.times_s[:20], states=episode.states[:20], sent=episode.sent[:19],
+        requested=episode.requested[:19], rewards=episode.rewards[:19],
+    )  # fmt: skip
+    lost = episode.states.copy()
+    lost[::4, 0] = np.nan
+    for episodes in ([], [replace(episode, states=standing)], [short_one], [replace(episode, states=lost)]):
+        check = quick_check(episodes, case.simulator)
+        assert check.verdict == "undecided"
+        assert check.why
+        (sentence,) = sentences(check)
+        assert check.why in sentence
+
+
+def test_one_accident_is_undecided(tmp_path: Path) -> None:
+    """Somebody pushes the car aside in one episode."""
+    episodes = recorded(tmp_path, SIMULATOR, 21)
+    index = next(k for k, e in enumerate(episodes) if e.ticks > 80)
+    pushed = episodes[index]
+    moved, poses = pushed.states.copy(), pushed.poses.copy()
+    ramp = np.clip((pushed.times_s - pushed.times_s[40]) / 0.4, 0.0, 1.0)
+    moved[:, 1] += 0.1 * ramp
+    poses[:, 2] += 0.1 * np.clip((poses[:, 0] - pushed.times_s[40]) / 0.4, 0.0, 1.0)
+    episodes[index] = replace(pushed, states=moved, poses=poses)
+    check = quick_check(episodes, SIMULATOR)
+    assert check.score > DEFAULT.quick.score_max
+    assert check.verdict == "undecided"
+    assert "accident" in check.why
+
+
+# -- where ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def windows() -> PredictionWindows:
+    return cut_windows(tracks_of(drives.concealed_drives(None, 0.0, seed=30).episodes), 0.8, 0.2)
+
+
+def test_errors_on_one_side_at_one_place_or_while_braking_are_located(windows: PredictionWindows) -> None:
+    noise = 1.0 + 0.2 * np.random.default_rng(1).random(len(windows))
+    assert find_conditions(windows, noise) == ()
+    left = windows.commands[:, :, 0].mean(axis=1) > 0.0
+    first = find_conditions(windows, np.where(left, 5.0, 1.0) * noise)[0]
+    assert first.text == "steering to the left"
+    assert first.inside == pytest.approx(5.0 * first.outside, rel=0.15)
+    assert first.windows == left.sum()
+    x, y = np.median(windows.measured[:, :, :2].reshape(-1, 2), axis=0).round(1)
+    near = (np.hypot(windows.measured[:, :, 0] - x, windows.measured[:, :, 1] - y) < 0.4).any(axis=1)
+    assert 5 < near.sum() < len(windows) - 5
+    texts = [c.text for c in find_conditions(windows, np.where(near, 6.0, 1.0) * noise)]
+    assert any(text.startswith("within 0.5 m of") for text in texts)
+
+
+# -- recordings as carlab makes them ----------------------------------------------------------------------------------
+
+RADIUS_M, RATE = 0.8, 1.5
+
+
+def circle(t_s: np.ndarray) -> np.ndarray:
+    """States on a circle, its speed growing: pose and body velocities in closed form."""
+    angle, rate = RATE * t_s + 0.3 * t_s**2, RATE + 0.6 * t_s
+    x, y = RADIUS_M * np.sin(angle), RADIUS_M * (1.0 - np.cos(angle))
+    yaw = (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return np.stack([x, y, yaw, RADIUS_M * rate, np.zeros_like(t_s), rate], axis=1)
+
+
+def circled(filter_left: float = 0.0) -> EpisodeData:
+    """Forty ticks as a control loop sees them: the newest pose of 120 Hz, velocities of a line through six."""
+    captures = np.arange(-30, 180) / 120.0 + 0.0021
+    poses = np.column_stack([captures, circle(captures)[:, :3]])
+    unwrapped = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
+    times = np.arange(41) / 30.0
+    states, age, delay = [], [], []
+    for t in times:
+        newest = int(np.searchsorted(captures, t - 0.009)) - 1
+        line = fit_velocity(unwrapped[newest - 5 : newest + 1])
+        states.append([*poses[newest, 1:], line.vx_mps - filter_left, line.vy_mps, line.yaw_rate_radps])
+        age.append(t - captures[newest])
+        delay.append(captures[newest] - line.t_s)
+    nothing = np.zeros((40, 2))
+    extra = {"pose_age_s": np.array(age), "velocity_delay_s": np.array(delay)}
+    return EpisodeData(times, np.array(states), nothing, nothing, np.zeros(40), poses, extra=extra)
+
+
+def test_states_are_those_of_the_stated_latency() -> None:
+    episode, latency_s = circled(), 0.008
+    truth = circle(episode.times_s - latency_s)
+    assert np.abs(episode.states - truth)[:, 3:].max() > 0.01, "as recorded they are too old"
+    seen = as_captured(episode, latency_s)
+    rows = np.searchsorted(episode.times_s, seen.times_s)
+    assert seen.ticks >= 38
+    error = seen.states - truth[rows]
+    error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    assert np.abs(error[:, :3]).max() < 1e-4
+    assert np.abs(error[:, 3:]).max() < 2e-3
+    np.testing.assert_array_equal(seen.sent, episode.sent[rows[:-1]])
+
+
+def test_a_filter_behind_the_estimator_is_kept() -> None:
+    seen, filtered = (as_captured(circled(left), 0.008) for left in (0.0, 0.07))
+    np.testing.assert_allclose(seen.states[:, 3] - filtered.states[:, 3], 0.07, atol=1e-9)
+
+
+def test_where_poses_are_missing_nothing_is_made_up_and_foreign_recordings_are_left_alone() -> None:
+    episode = circled()
+    gone = (episode.poses[:, 0] > 0.6) & (episode.poses[:, 0] < 0.75)
+    broken = as_captured(replace(episode, poses=episode.poses[~gone]), 0.008)
+    missing = np.isnan(broken.states).any(axis=1)
+    assert missing[np.argmin(np.abs(broken.times_s - 0.68))]
+    assert not missing[broken.times_s < 0.55].any()
+    assert not missing[broken.times_s > 0.82].any()
+    foreign = replace(episode, extra={})
+    assert as_captured(foreign, 0.008) is foreign
+    assert window_variance_s2([foreign]) is None
+
+
+def test_the_window_smears_velocities_by_its_variance() -> None:
+    """x = t^3: velocities of a symmetric window of variance s2 are 3 t^2 + 3 s2."""
+    t = np.arange(-60, 61) / 120.0
+    poses = np.column_stack([t, t**3, np.zeros_like(t), np.zeros_like(t)])
+    times = np.array([-0.2, 0.0, 0.2])
+    ages = {"pose_age_s": np.full(3, 0.01), "velocity_delay_s": np.full(3, np.nan)}
+    nothing = np.zeros((2, 2))
+    episode = EpisodeData(times, np.zeros((3, 6)), nothing, nothing, np.zeros(2), poses, extra=ages)
+    smear = as_captured(episode, 0.0).states[:, 3] - 3.0 * times**2
+    variance = window_variance_s2([episode])
+    assert variance is not None
+    np.testing.assert_allclose(smear, 3.0 * variance, rtol=1e-6)

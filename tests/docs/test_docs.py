@@ -1,0 +1,181 @@
+"""Documentation: commands parse or run, car files load, programs run, links and references resolve."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from carlab.cars import load_car_file
+from carlab.cli import _verbs
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+README = ROOT / "README.md"
+MARKER = re.compile(r"^<!-- test: (?P<kind>run|parse|hardware|file|car file)(?P<note>[^>]*)-->$")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page, and the marker in the line above it."""
+
+    page: Path
+    language: str
+    text: str
+    marker: str
+    note: str
+
+
+def blocks(page: Path) -> list[Block]:
+    lines = page.read_text(encoding="utf-8").split("\n")
+    found, start = [], None
+    for number, line in enumerate(lines):
+        if line.startswith("```") and start is None:
+            start = number
+        elif line.startswith("```") and start is not None:
+            marker = MARKER.match(lines[start - 1]) if start else None
+            found.append(
+                Block(
+                    page,
+                    lines[start][3:].strip(),
+                    "\n".join(lines[start + 1 : number]) + "\n",
+                    marker["kind"] if marker else "",
+                    marker["note"].strip() if marker else "",
+                )
+            )
+            start = None
+    assert start is None, f"{page}: a fenced block is not closed"
+    return found
+
+
+BLOCKS = [block for page in PAGES for block in blocks(page)]
+CONSOLE = [block for block in BLOCKS if block.language == "console"]
+COMMANDS = sorted({line[2:] for block in CONSOLE for line in block.text.split("\n") if line.startswith("$ ")})
+
+
+def _name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def test_every_console_block_of_the_site_says_how_it_is_tested() -> None:
+    unmarked = [f"{_name(b.page)}: {b.text}" for b in CONSOLE if (ROOT / "docs") in b.page.parents and not b.marker]
+    assert unmarked == []
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("carlab ")])
+def test_every_command_parses(command: str) -> None:
+    import tyro
+
+    arguments = shlex.split(command, comments=True)[1:]
+    parsed = tyro.extras.subcommand_cli_from_dict(_verbs(), args=arguments, prog="carlab")
+    assert callable(parsed.run)
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if "pytest " in c])
+def test_every_pytest_command_names_tests_that_exist(command: str) -> None:
+    paths = [word for word in shlex.split(command, comments=True) if word.startswith("tests/")]
+    assert paths
+    assert [path for path in paths if not (ROOT / path.split("::")[0]).exists()] == []
+
+
+def test_every_make_target_exists() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = {match for command in COMMANDS for match in re.findall(r"^make (\w+)", command)}
+    assert {"demo", "test", "docs"} <= targets
+    assert [target for target in targets if not re.search(rf"^{target}:", makefile, flags=re.M)] == []
+
+
+@pytest.mark.realtime
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize("page", sorted({b.page for b in BLOCKS if b.marker == "run"}), ids=_name)
+def test_commands_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
+    bin_folder = Path(sys.executable).parent
+    environment = os.environ | {"PATH": f"{bin_folder}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    for block in blocks(page):
+        if block.marker == "file":
+            (tmp_path / block.note).write_text(block.text, encoding="utf-8")
+        if block.marker != "run":
+            continue
+        for command in (line[2:] for line in block.text.split("\n") if line.startswith("$ ")):
+            done = subprocess.run(
+                ["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+            )
+            assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+            assert "Traceback" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("verb", list(_verbs()))
+def test_every_verb_explains_itself(verb: str) -> None:
+    done = subprocess.run([sys.executable, "-m", "carlab", verb, "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    summary = (_verbs()[verb].__doc__ or "").split("\n")[0].rstrip(".")
+    assert summary.split()[0] in done.stdout
+    assert "--verbose" in done.stdout
+
+
+def test_readme_has_every_verb_and_nothing_else() -> None:
+    documented = re.findall(r"^\| `carlab (\w+)", README.read_text(encoding="utf-8"), flags=re.M)
+    assert [verb for verb in documented if verb not in _verbs()] == []
+    assert [verb for verb in _verbs() if verb not in documented] == []
+
+
+def test_readme_is_short() -> None:
+    lines = README.read_text(encoding="utf-8").split("\n")
+    assert len(lines) <= 150
+    paragraphs = re.split(r"\n\s*\n", re.sub(r"```.*?```", "", README.read_text(encoding="utf-8"), flags=re.S))
+    prose = [p for p in paragraphs if not p.lstrip().startswith(("|", "*", "1.", "#", "!"))]
+    assert [p for p in prose if len(p.strip().split("\n")) > 4] == []
+
+
+def test_the_car_file_loads_and_is_a_real_car(tmp_path: Path) -> None:
+    (block,) = [b for b in BLOCKS if b.marker == "car file"]
+    path = tmp_path / "car.toml"
+    path.write_text(block.text, encoding="utf-8")
+    car = load_car_file(path)
+    assert car.real is not None
+    assert car.real.name == "blue car"
+    assert car.real.envelope.max_speed_mps == 3.0
+    assert car.simulator.effects["steering_lag"]["time_constant"] == 0.05
+    assert set(tomllib.loads(block.text)["hardware"]) == {
+        "name",
+        "actuator",
+        "calibration",
+        "mocap",
+        "arena",
+        "limits",
+    }
+
+
+@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "python"], ids=lambda b: _name(b.page))
+def test_every_program_compiles(block: Block) -> None:
+    compile(block.text, _name(block.page), "exec")
+
+
+def test_links_between_files_of_the_repository_resolve() -> None:
+    broken = [
+        f"{_name(page)}: {target}"
+        for page in PAGES
+        for target in re.findall(r"\]\((?!https?://|#|mailto:)([^)#\s]+)", page.read_text(encoding="utf-8"))
+        if not (page.parent / target).exists()
+    ]
+    assert broken == []
+
+
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    mkdocs = Path(sys.executable).with_name("mkdocs")
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [str(mkdocs), "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "site" / "reference" / "cli.html").is_file()

@@ -1,0 +1,34 @@
+"""The log of a fake firmware on a disk that is full or missing: one warning, and the entries stay in memory."""
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from drivers.emulators.command_log import CommandLog
+
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full, a device whose every write fails with ENOSPC")
+def test_a_full_disk_is_reported_once_and_the_log_goes_on(caplog: pytest.LogCaptureFixture) -> None:
+    log = CommandLog(FULL)
+    log.open()
+    with caplog.at_level(logging.WARNING):
+        for k in range(3):
+            log.add(float(k), "current", 1.0)
+    log.close()
+    assert [e.t_s for e in log.entries("current")] == [0.0, 1.0, 2.0]
+    assert len(caplog.messages) == 1
+    assert "No space left on device" in caplog.messages[0]
+
+
+def test_a_folder_that_is_missing_is_reported_and_the_log_goes_on(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = CommandLog(tmp_path / "missing" / "firmware.jsonl")
+    with caplog.at_level(logging.WARNING):
+        log.open()
+        log.add(1.0, "current")
+    assert len(log.entries()) == 1
+    assert len(caplog.messages) == 1

@@ -1,0 +1,176 @@
+"""The sender's loop with a fake device and a fake clock: what is written after the process was stopped for a while."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
+from drivers.config import ActuatorConfig
+from drivers.device import DeviceCounters
+from drivers.sender import loop as loop_module
+from drivers.sender.logic import ORDER_SIZE, Order, SenderState, Wish
+from drivers.sender.loop import SenderLoop
+from drivers.sender.slots import Slot
+from drivers.sender.status import STATUS_SIZE
+from drivers.vesc.payloads import FirmwareVersion, MotorValues
+
+CONFIG = ActuatorConfig(rate_hz=100.0, watchdog_s=0.15, latch_s=0.5)
+CALIBRATION = ActuatorCalibration(max_current_a=10.0, servo_min=0.2, servo_max=0.8)
+MOVING = DeviceCommand(MotorKind.CURRENT, 3000, 600)
+HEALTHY = MotorValues(erpm=0.0, input_v=11.1, fault_code=0, status_bits=0)
+STOPPED_S = 0.18
+
+
+class FakeDevice:
+    """Keeps what is written; answers nothing."""
+
+    def __init__(self) -> None:
+        self.counters = DeviceCounters()
+        self.written: list[DeviceCommand] = []
+
+    def open(self) -> None: ...
+    def close(self) -> None: ...
+    def fileno(self) -> None: ...
+    def receive(self, now_s: float) -> list[object]:
+        return []
+
+    def send(self, command: DeviceCommand) -> None:
+        self.written.append(command)
+
+    def request_firmware(self) -> None: ...
+    def request_telemetry(self) -> None: ...
+
+
+class FakeTime:
+    """The loop's clock."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+
+class Bench:
+    """An armed sender with one fresh moving command."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.time = FakeTime()
+        monkeypatch.setattr(loop_module, "time", self.time)
+        self.orders, self.statuses = Slot.create(ORDER_SIZE), Slot.create(STATUS_SIZE)
+        self.wake, self._other_end = socket.socketpair()
+        self.device = FakeDevice()
+        self.loop = SenderLoop(
+            self.device,  # type: ignore[arg-type]
+            CONFIG,
+            CALIBRATION,
+            self.orders,
+            self.statuses,
+            self.wake,
+            lambda: True,
+        )
+        self.loop._is_link_open = True
+        self.loop.logic.link_up()
+        self.loop.logic.firmware(FirmwareVersion(6, 5, "TEST", b"u" * 12))
+        self.loop.logic.telemetry(self.time.now_s, HEALTHY)
+        self.order(1, Wish.ARM, 0)
+        self.loop._tick(self.time.now_s)
+        assert self.loop.logic.state == SenderState.ARMED
+        self.order(1, Wish.ARM, 1)
+
+    def order(self, epoch: int, wish: Wish, number: int) -> None:
+        self.orders.write(Order(epoch, wish, number, self.time.now_s, MOVING).pack())
+
+    def stop_process_after_decision(self, meanwhile: Callable[[], None] = lambda: None) -> None:
+        """The next decision is followed by a pause of the process, in which the main process goes on."""
+        decide = self.loop.logic.decide
+
+        def decide_then_pause(now_s: float) -> DeviceCommand | None:
+            decided = decide(now_s)
+            self.loop.logic.decide = decide  # type: ignore[method-assign]
+            meanwhile()
+            self.time.now_s += STOPPED_S
+            return decided
+
+        self.loop.logic.decide = decide_then_pause  # type: ignore[method-assign]
+
+    def pause_after_each_decision(self, pause_s: float) -> None:
+        decide = self.loop.logic.decide
+
+        def decide_then_pause(now_s: float) -> DeviceCommand | None:
+            decided = decide(now_s)
+            self.time.now_s += pause_s
+            return decided
+
+        self.loop.logic.decide = decide_then_pause  # type: ignore[method-assign]
+
+    def close(self) -> None:
+        self.wake.close()
+        self._other_end.close()
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    made = Bench(monkeypatch)
+    yield made
+    made.close()
+
+
+def test_a_fresh_command_is_written(bench: Bench) -> None:
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == MOVING
+
+
+def test_a_command_that_grew_old_between_decision_and_write_is_not_written(bench: Bench) -> None:
+    bench.stop_process_after_decision()
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == CALIBRATION.neutral
+    assert MOVING not in bench.device.written
+
+
+def test_a_stop_that_came_between_decision_and_write_counts(bench: Bench) -> None:
+    bench.stop_process_after_decision(lambda: bench.order(2, Wish.STOP_AND_LATCH, 0))
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == CALIBRATION.neutral
+    assert MOVING not in bench.device.written
+    assert bench.loop.logic.state == SenderState.FAULT
+
+
+def test_a_newer_command_that_came_meanwhile_is_written(bench: Bench) -> None:
+    newer = DeviceCommand(MotorKind.CURRENT, 1000, 500)
+
+    def meanwhile() -> None:
+        issued_s = bench.time.now_s + STOPPED_S - 0.02
+        bench.orders.write(Order(1, Wish.ARM, 2, issued_s, newer).pack())
+        bench.loop.logic.telemetry(issued_s, HEALTHY)
+
+    bench.stop_process_after_decision(meanwhile)
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == newer
+
+
+def test_a_process_that_is_stopped_again_and_again_writes_neutral(bench: Bench) -> None:
+    bench.pause_after_each_decision(0.02)
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == CALIBRATION.neutral
+
+
+def test_only_written_neutral_frames_count_before_the_sender_leaves(bench: Bench) -> None:
+    """Neutral is written at least three times before the sender ends, also if each decision is followed by a pause."""
+    bench.pause_after_each_decision(0.05)
+    bench.order(2, Wish.SHUT_DOWN, 0)
+    bench.device.written.clear()
+    while not bench.loop.logic.is_finished:
+        bench.loop._tick(bench.time.now_s)
+    assert len(bench.device.written) >= 3
+    assert set(bench.device.written) == {CALIBRATION.neutral}
+
+
+def test_a_command_that_neutral_replaced_is_not_reported_as_sent(bench: Bench) -> None:
+    bench.pause_after_each_decision(0.02)
+    bench.loop._tick(bench.time.now_s)
+    assert bench.device.written[-1] == CALIBRATION.neutral
+    assert bench.loop.logic.sent_number == 0

@@ -1,0 +1,126 @@
+"""A disk that fills up while a car drives: the run ends, one sentence names the disk, and no traceback appears."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from carlab.cars import choose_car
+from carlab.core.documents import EpisodeEnded, Tick
+from carlab.core.errors import DataError
+from carlab.core.outcome import EndReason
+from carlab.core.safety import SafetyEnvelope
+from carlab.core.task import ParkingTask
+from carlab.experiment.campaign.campaign import Campaign
+from carlab.experiment.campaign.training import TrainingPlan, model_folder
+from carlab.experiment.episodes.scripted_policies import NeutralPolicy
+from carlab.experiment.episodes.session import Session, SessionHooks
+from carlab.recording.mcap.sink import McapSink
+from carlab.recording.run_folder import RunDirectory
+from drivers.emulators.command_log import CommandLog
+from sim_backends.simulated_car import SimulatedCar
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+needs_dev_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+
+
+def fill_disk(monkeypatch: pytest.MonkeyPatch, when: type[Tick] | type[EpisodeEnded]) -> None:
+    """From a document of this type on, nothing is written to the MCAP file any more."""
+    write = McapSink._write
+
+    def fails(self: McapSink, item: Any) -> None:
+        if isinstance(item, when):
+            raise FULL
+        write(self, item)
+
+    monkeypatch.setattr(McapSink, "_write", fails)
+
+
+@pytest.mark.parametrize("when", [Tick, EpisodeEnded])
+def test_a_recording_that_cannot_be_finished_ends_the_run(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    when: type[Tick] | type[EpisodeEnded],
+) -> None:
+    fill_disk(monkeypatch, when)
+    run = RunDirectory.create(tmp_path, "full")
+    with SimulatedCar() as car:
+        session = Session(
+            car, NeutralPolicy(), ParkingTask(), SafetyEnvelope(), run, 1 / 30, max_ticks=400, record_rerun=False,
+            hooks=SessionHooks(),
+        )  # fmt: skip
+        (result,) = session.drive(3)
+    assert result.reason is EndReason.RECORDER_ERROR
+    assert result.data.metadata["end_reason"] == "RECORDER_ERROR"
+    sentence = result.data.metadata["end_detail"]
+    assert f"{run.episodes / '0001.mcap'} could not be written because the disk is full; free some space" in sentence
+    assert "MB free) and start again." in sentence
+    assert "\n" not in sentence
+    assert "Traceback" not in capfd.readouterr().err
+    assert not (run.episodes / "0001.mcap").exists()
+
+
+def test_learning_ends_with_the_sentence_and_drives_no_further_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill_disk(monkeypatch, EpisodeEnded)
+    run, choice = RunDirectory.create(tmp_path, "full"), choose_car("sim", seed=0)
+    plan = TrainingPlan("", ticks=20)
+    model_folder(run.models, 1).mkdir(parents=True)
+
+    class Untrained:
+        def policy(self) -> NeutralPolicy:
+            return NeutralPolicy()
+
+    monkeypatch.setattr("carlab.experiment.campaign.campaign.SacAgent.load", lambda *arguments: Untrained())
+    with choice.car, pytest.raises(DataError, match=r"the disk is full; free some space on the disk of .* MB free"):
+        list(Campaign(choice, plan, 2, run, max_ticks=20, record_rerun=False).go_on())
+    assert run.recordings() == []
+
+
+@needs_dev_full
+def test_the_log_of_a_run_loses_lines_in_silence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    run = RunDirectory.create(tmp_path, "full")
+    (run.path / "log.jsonl").symlink_to("/dev/full")
+    handler, logger = run.log_handler(), logging.getLogger("carlab.test_disk_full")
+    logger.addHandler(handler)
+    try:
+        logger.warning("a line")
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
+    assert "Traceback" not in capfd.readouterr().err
+
+
+@needs_dev_full
+def test_the_firmware_emulator_goes_on_without_its_log_file(tmp_path: Path) -> None:
+    path = tmp_path / "firmware.jsonl"
+    path.symlink_to("/dev/full")
+    log = CommandLog(path)
+    log.open()
+    for k in range(20_000):
+        log.add(float(k), "current", 1.0)
+    log.close()
+    assert len(log.entries("current")) == 20_000
+
+
+def test_an_error_of_the_disk_names_the_disk_and_no_cable(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from carlab.cli import run
+    from carlab.cli.check import Check
+
+    def fails(self: Check) -> int:
+        raise FULL
+
+    monkeypatch.setattr(Check, "run", fails)
+    assert run(["check"]) == 1
+    text = capfd.readouterr().err
+    assert "the disk is full; free some space on the disk of" in text
+    assert "cable" not in text

@@ -1,0 +1,128 @@
+"""After an episode: whether reality has left the simulator; nothing that goes wrong with it ends a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import parking_drives as drives
+import pytest
+
+from carlab.cars import choose_car
+from carlab.core.errors import DataError
+from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
+from carlab.experiment.campaign.figures import EpisodeFigures
+from carlab.experiment.campaign.quick_check import QuickCheck, check, check_path, run_check_subprocess
+from carlab.experiment.campaign.report import keep_check, keep_row, learning_curve
+from carlab.experiment.campaign.training import TrainingPlan
+from carlab.recording.run_folder import RunDirectory
+from sim_backends.car_parameters import SimulatorConfig
+
+SIMULATOR = SimulatorConfig.from_preset()
+LAGGING = replace(SIMULATOR, effects={"motor_lag": {"time_constant": 0.08}})
+ROW = EpisodeFigures(1, 20.0, 30.0, False, 0.5, 0.1, 0.0, 97, 1.0, 0.1, 3.0, 60.0, 100, "COMPLETED")
+
+
+def a_run(folder: Path, true: SimulatorConfig, episodes: int) -> RunDirectory:
+    run: RunDirectory = drives.drive_like_learning(true, folder, episodes, seed=21)
+    for number in range(1, episodes + 1):
+        (run.models / f"{number:04d}").mkdir()
+    return run
+
+
+def test_the_check_is_kept_beside_the_model_and_names_the_next_step(tmp_path: Path) -> None:
+    run = a_run(tmp_path, LAGGING, 4)
+    told = run_check_subprocess(run, SIMULATOR)
+    assert told is not None
+    assert (told.episode, told.verdict) == (4, "left")
+    assert told.excess > 1.0
+    assert "motor_lag" in told.sentences[1]
+    kept = json.loads(check_path(run, 4).read_text())
+    assert kept["sentences"] == list(told.sentences)
+    assert kept["causes"][0]["id"] == "motor_lag"
+    assert kept["next"] == f"carlab diagnose {run.path} --car {run.path}/simulator.toml --out {run.path}/diagnosis"
+    assert kept["next"] in told.sentences[1]
+    assert not check_path(run, 3).exists()
+
+
+def test_what_goes_wrong_is_told_in_one_sentence(tmp_path: Path) -> None:
+    run = a_run(tmp_path, SIMULATOR, 1)
+    run.recordings()[0].write_bytes(b"rubbish")
+    told = run_check_subprocess(run, SIMULATOR)
+    assert told is not None
+    assert told.verdict == "failed"
+    (sentence,) = told.sentences
+    assert "learning goes on" in sentence
+    assert "MCAP" in sentence
+    assert "\n" not in sentence
+    assert json.loads(check_path(run, 1).read_text())["verdict"] == "failed", "it is not tried again"
+    with pytest.raises(DataError):
+        check(run.path, run.recordings(), SIMULATOR)
+
+
+def test_a_check_that_is_stopped_leaves_nothing_and_is_made_up_for(tmp_path: Path) -> None:
+    run = a_run(tmp_path, SIMULATOR, 1)
+    assert run_check_subprocess(run, SIMULATOR, stop=lambda: True) is None
+    assert not check_path(run, 1).exists()
+    keep_row(run, ROW)
+    heard: list[QuickCheck] = []
+
+    def on_check(told: QuickCheck) -> None:
+        heard.append(told)
+        keep_check(run, told)
+
+    campaign = Campaign(choose_car("sim"), TrainingPlan(""), 1, run, CampaignHooks(on_check=on_check))
+    assert list(campaign.go_on()) == []
+    assert [t.verdict for t in heard] == ["explains"]
+    (row,) = learning_curve(run)
+    assert (row.verdict, row.excess) == ("explains", heard[0].excess)
+    assert row.diagnosis == heard[0].sentences[0]
+    assert row.total_reward == ROW.total_reward
+    assert list(campaign.go_on()) == []
+    assert len(heard) == 1, "once an episode"
+
+
+def test_rows_of_a_learning_curve_come_back_with_a_check_without_and_from_older_runs(tmp_path: Path) -> None:
+    run = a_run(tmp_path, SIMULATOR, 0)
+    told = QuickCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
+    keep_row(run, replace(ROW, episode=2))
+    keep_check(run, told)
+    keep_row(run, ROW)
+    content = json.loads((run.path / "learn.json").read_text())
+    for name in ("verdict", "excess", "excess_std", "diagnosis"):
+        del content["episodes"][0][name]
+    (run.path / "learn.json").write_text(json.dumps(content))
+    first, second = learning_curve(run)
+    assert str(first) == str(ROW)
+    assert str(second) == str(replace(ROW, episode=2).with_check(told))
+    assert content["episodes"][1]["excess_std"] is None
+
+
+def test_rows_of_the_first_version_are_read_under_their_new_names(tmp_path: Path) -> None:
+    run = a_run(tmp_path, SIMULATOR, 0)
+    row = replace(ROW, predicted_return=31.5, verdict="left").to_dict()
+    assert row["distance_m"] == ROW.distance_m
+    row["foretold"], row["reality"] = row.pop("predicted_return"), row.pop("verdict")
+    (run.path / "learn.json").write_text(json.dumps({"schema": "carlab.learn/1", "episodes": [row]}))
+    (read,) = learning_curve(run)
+    assert (read.predicted_return, read.verdict) == (31.5, "left")
+    keep_row(run, replace(ROW, episode=ROW.episode + 1))
+    content = json.loads((run.path / "learn.json").read_text())
+    assert content["schema"] == "carlab.learn/2"
+    assert content["episodes"][0]["predicted_return"] == 31.5
+
+
+@pytest.mark.parametrize("changed", [{"distance_m": "far"}, {"episode": [1]}, {"unknown": 1.0}])
+def test_a_row_that_is_none_is_refused_in_a_sentence(tmp_path: Path, changed: dict[str, object]) -> None:
+    run = a_run(tmp_path, SIMULATOR, 0)
+    (run.path / "learn.json").write_text(json.dumps({"episodes": [{**ROW.to_dict(), **changed}]}))
+    with pytest.raises(DataError, match=r"cannot be read .*remove it, and it is written anew\.$"):
+        learning_curve(run)
+
+
+@pytest.mark.parametrize(
+    ("distance_m", "yaw_rad", "strictly"), [(0.049, 0.19, True), (0.051, 0.0, False), (0.0, 0.21, False)]
+)
+def test_the_strict_criterion_is_that_of_the_authors(distance_m: float, yaw_rad: float, strictly: bool) -> None:
+    assert replace(ROW, distance_m=distance_m, yaw_error_rad=yaw_rad).is_strictly_parked is strictly

@@ -1,0 +1,154 @@
+"""Files of a model folder that a stranger may have written: nothing in them runs, and one sentence says what to do."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from carlab.core.errors import DataError
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.policy.sac_agent import SacAgent, SacSettings
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.world.car_dynamics import CarDynamics
+from learning.world.car_fit import load_car, save_car
+
+
+class Payload:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, made: Path) -> None:
+        self._made = made
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
+        return os.mkdir, (str(self._made),)
+
+
+def write_stable_baselines(path: Path, payload: Payload) -> None:
+    """A file as ``stable_baselines3`` saves an agent."""
+    data = {"policy_class": {":type:": "type", ":serialized:": base64.b64encode(pickle.dumps(payload)).decode()}}
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("data", json.dumps(data))
+        archive.writestr("_stable_baselines3_version", "2.9.2")
+
+
+def write_pickle(path: Path, payload: Payload) -> None:
+    path.write_bytes(pickle.dumps(payload, protocol=2))  # torch's own; of others it warns before it refuses
+
+
+def write_torch(path: Path, payload: Payload) -> None:
+    torch.save({"version": payload}, path)
+
+
+def write_object_array(path: Path, payload: Payload) -> None:
+    with path.open("wb") as file:
+        np.savez(file, version=np.array([payload], dtype=object))
+
+
+WRITERS = [write_stable_baselines, write_pickle, write_torch, write_object_array]
+
+
+@pytest.mark.parametrize("write", WRITERS)
+@pytest.mark.parametrize("name", ["agent.zip", "policy.npz", "dynamics.pt"])
+def test_a_payload_in_a_model_folder_does_not_run(
+    tmp_path: Path, name: str, write: Callable[[Path, Payload], None]
+) -> None:
+    made = tmp_path / "made"
+    folder = tmp_path / "models" / "0001"
+    folder.mkdir(parents=True)
+    write(folder / name, Payload(made))
+    with pytest.raises(DataError, match=r"; remove .* anew\.$") as error:
+        load_car(folder / name) if name == "dynamics.pt" else SacAgent.load(folder, SacSettings(), 0)
+    assert not made.exists()
+    assert "\n" not in str(error.value)
+    assert str(folder) in str(error.value)
+
+
+def test_the_payload_would_have_run(tmp_path: Path) -> None:
+    """Each file is dangerous where it is read in the usual way."""
+    from stable_baselines3 import SAC
+
+    readers: dict[Callable[[Path, Payload], None], Callable[[Path], object]] = {
+        write_stable_baselines: SAC.load,
+        write_pickle: lambda path: pickle.loads(path.read_bytes()),
+        write_torch: lambda path: torch.load(path, weights_only=False),
+        write_object_array: lambda path: np.load(path, allow_pickle=True)["version"],
+    }
+    for write in WRITERS:
+        made = tmp_path / write.__name__
+        path = tmp_path / f"{write.__name__}.zip"
+        write(path, Payload(made))
+        try:
+            readers[write](path)
+        except Exception:  # The file holds nothing but the payload.
+            assert made.is_dir(), write.__name__
+        assert made.is_dir(), write.__name__
+
+
+WIDTH = 3 + 2 * 2
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"noise_std": torch.ones(5)},
+        {"noise_std": "text"},
+        {"noise_std": None},
+        {"parameters": [1.0]},
+        {"parameters": torch.zeros((2, 4)).to_sparse()},
+        {"units": [torch.zeros(WIDTH)] * 4},
+        {"units": [torch.zeros(WIDTH), torch.full((WIDTH,), torch.nan), torch.zeros(6), torch.ones(6)]},
+        {"turn": torch.ones(6)},
+        {"trend": torch.zeros((3, 6))},
+        {"correlation": 1.0},
+        {"reach": torch.ones(WIDTH, dtype=torch.int64)},
+        {"history": 5},
+        {"history": "1"},
+        {"history": 10**9},
+        {"freedom": -1.0},
+        {"frame": "moon"},
+        {"frame": ["world"]},
+        {"network": [WIDTH, 6, -4]},
+        {"network": 3},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_parts_of_a_learned_car_that_do_not_fit_are_refused_in_a_sentence(
+    tmp_path: Path, changed: dict[str, object]
+) -> None:
+    network = Network(WIDTH, 6, (4,))
+    units = Normaliser(torch.zeros(WIDTH), torch.ones(WIDTH), torch.zeros(6), torch.ones(6))
+    parameters = network.initial(2, torch.Generator().manual_seed(0))
+    path = tmp_path / "dynamics.pt"
+    save_car(CarDynamics(ParticlePosterior(network, parameters, torch.ones(6), units), 1), path)
+    load_car(path)
+    torch.save(torch.load(path, weights_only=True) | changed, path)
+    with pytest.raises(DataError, match=r"; remove its folder, and it is learned anew\.$") as error:
+        load_car(path)
+    assert "\n" not in str(error.value)
+
+
+def test_the_source_has_no_other_unpickler() -> None:
+    """Every reader of files in the packages reads data only."""
+    root = Path(__file__).parents[2]
+    readers = ("pickle.load", "allow_pickle=True", "weights_only=False", "joblib", "yaml.load", "SAC.load", "Sac.load")
+    found = [
+        f"{path.relative_to(root)}: {reader}"
+        for package in ("carlab", "drivers", "mocap", "learning", "sim_backends")
+        for path in (root / package).rglob("*.py")
+        for reader in readers
+        if reader in path.read_text(encoding="utf-8")
+    ]
+    assert found == []
+    for path in (root / "learning").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        assert text.count("torch.load(") == text.count("weights_only=True"), path

@@ -1,0 +1,161 @@
+"""Damaged and hostile files: nothing but carlab's own errors leaves the readers, each one sentence that names the file.
+
+Cases are drawn from a fixed seed, so that a failure repeats; the number in the message is the case.
+"""
+
+import gzip
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from carlab.core.errors import CarlabError
+from carlab.recording.csv.foreign import import_csv
+from carlab.recording.mcap import schemas as schemas
+from carlab.recording.mcap.messages import ended_to_metadata, started_to_metadata
+from carlab.recording.mcap.sink import McapSink
+from carlab.recording.mcap.source import read_episode
+from carlab.recording.recorder import Recorder
+
+_spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
+foreign = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(foreign)
+
+CELLS = ["", "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "true", "x", '"', "9" * 400, "\x00", "1,2", "0x1f"]
+JSON_TEXTS = ["", "null", "3", "[]", "[1]", "{}", '"a"', "[[1]]", "[[1, 2, 3]]", "[null, 1, 2]", "[" * 100_000, "nan"]
+JSON_TEXTS += ["1e999", "-1", "9" * 5000, '{"a": "b"}', '{"a": null}', "[{}, {}, {}]", '[["a", "b"]]']
+
+
+def damaged(rng, content):
+    """Bytes cut short, overwritten, inserted, or with a stretch removed."""
+    content = bytearray(content)
+    for _ in range(int(rng.integers(1, 6))):
+        at = int(rng.integers(len(content)))
+        match int(rng.integers(4)):
+            case 0:
+                content = content[: max(at, 1)]
+            case 1:
+                content[at] = int(rng.integers(256))
+            case 2:
+                content[at:at] = rng.bytes(int(rng.integers(1, 9)))
+            case _:
+                del content[at : at + int(rng.integers(1, 40))]
+        if not content:
+            return b"\x00"
+    return bytes(content)
+
+
+def refusal(read, path):
+    """The error that reading raises, None where the file can be read; any error but carlab's own is a failure."""
+    try:
+        read(path)
+    except CarlabError as error:
+        return str(error)
+    return None
+
+
+@pytest.fixture(scope="module")
+def rows():
+    columns = foreign.drive(np.arange(60) / 30.0)
+    return [list(columns), *np.column_stack(list(columns.values())).astype(str).tolist()]
+
+
+@pytest.mark.filterwarnings("error")
+class TestCsv:
+    def test_damaged_bytes(self, rows, tmp_path):
+        rng = np.random.default_rng(1)
+        plain = "\n".join(",".join(row) for row in rows).encode()
+        refused = 0
+        for case in range(60):
+            path = tmp_path / f"{case}.csv"
+            path.write_bytes(gzip.compress(damaged(rng, plain)) if case % 5 == 0 else damaged(rng, plain))
+            refused += refusal(import_csv, path) is not None
+        assert refused > 20
+
+    def test_damaged_gzip_is_refused(self, rows, tmp_path):
+        rng = np.random.default_rng(2)
+        packed = gzip.compress("\n".join(",".join(row) for row in rows).encode())
+        for case in range(50):
+            path = tmp_path / f"{case}.csv.gz"
+            path.write_bytes(damaged(rng, packed))
+            refusal(import_csv, path)
+
+    def test_cells_of_another_kind(self, rows, tmp_path):
+        rng = np.random.default_rng(3)
+        for case in range(80):
+            changed = [list(row) for row in rows]
+            column = int(rng.integers(len(rows[0])))
+            whole = rng.random() < 0.3
+            cell = str(rng.choice(CELLS))
+            for row in range(1, len(rows)) if whole else rng.integers(0, len(rows), 4).tolist():
+                changed[row][column] = cell
+            path = tmp_path / f"{case}.csv"
+            path.write_text("\n".join(",".join(row) for row in changed), encoding="utf-8")
+            refusal(import_csv, path)
+
+
+def recording_with(path, documents, monkeypatch, key, text):
+    """A recording with ticks, whose record of the episode's end has ``text`` under ``key``."""
+    with monkeypatch.context() as patch:
+        record = {**ended_to_metadata(documents[-1]), key: text}
+        patch.setattr("carlab.recording.mcap.sink.ended_to_metadata", lambda _: record)
+        with Recorder([McapSink(path)]) as recorder:
+            for document in documents:
+                recorder.emit(document)
+    return path
+
+
+def metadata_file(path, record, config=b""):
+    """A complete MCAP file with one metadata record of an episode and no message."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="carlab 1")
+        writer.add_attachment(0, 0, schemas.CONFIG_ATTACHMENT, "text/plain", config)
+        writer.add_metadata(schemas.EPISODE_RECORD, record)
+        writer.finish()
+    return path
+
+
+class TestMcap:
+    def test_damaged_bytes(self, make_documents, tmp_path):
+        rng = np.random.default_rng(4)
+        whole = tmp_path / "whole.mcap"
+        with Recorder([McapSink(whole)]) as recorder:
+            for document in make_documents(20):
+                recorder.emit(document)
+        content = whole.read_bytes()
+        for case in range(100):
+            path = tmp_path / f"{case}.mcap"
+            path.write_bytes(damaged(rng, content))
+            refusal(read_episode, path)
+
+    def test_metadata_of_another_kind_is_refused_by_name_of_the_file(self, make_documents, tmp_path):
+        documents = make_documents(3)
+        record = {**started_to_metadata(documents[0]), **ended_to_metadata(documents[-1])}
+        for key in ("episode", "start_t_s", "reality", "goal", "arena_m", "end_reason", "statistics"):
+            for case, text in enumerate(JSON_TEXTS):
+                path = metadata_file(tmp_path / f"{case}.mcap", {**record, key: text})
+                message = refusal(read_episode, path)
+                assert message is not None  # it holds no tick
+                assert str(path) in message, (key, text[:20])
+                assert len(message) < 600, (key, text[:20])
+
+    def test_configuration_that_is_not_text(self, make_documents, tmp_path):
+        path = metadata_file(tmp_path / "c.mcap", started_to_metadata(make_documents(3)[0]), b"\xff\xfe")
+        assert str(path) in refusal(read_episode, path)
+
+    def test_goal_with_too_few_numbers(self, make_documents, tmp_path):
+        record = started_to_metadata(make_documents(3)[0]) | {"goal": json.dumps([1.0])}
+        message = refusal(read_episode, metadata_file(tmp_path / "goal.mcap", record))
+        assert schemas.EPISODE_RECORD in message
+
+    @pytest.mark.parametrize("text", ["[1]", "3", "null", '{"a": "b"}', '{"a": null}', '{"a": [1]}'])
+    def test_statistics_that_are_not_numbers_by_name(self, make_documents, tmp_path, monkeypatch, text):
+        path = recording_with(tmp_path / "end.mcap", make_documents(3), monkeypatch, "statistics", text)
+        message = refusal(read_episode, path)
+        assert message is not None
+        assert "statistics are not numbers" in message
+        assert str(path) in message

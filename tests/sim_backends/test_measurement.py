@@ -1,0 +1,141 @@
+"""The measurement model on floats, arrays and tensors: inverse, filter, window, latency and delays."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from sim_backends.car_parameters import MocapParameters, SimulatorConfig
+from sim_backends.dynamics.array_ops import ARRAYS, FLOATS
+from sim_backends.dynamics.torch_ops import torch_ops
+from sim_backends.effects import EFFECTS, ObservationEffect
+from sim_backends.measurement import (
+    MeasurementModel,
+    delay_as_recorded_s,
+    filter_velocities,
+    filters_velocities,
+    is_measured,
+    windowed,
+)
+
+OBSERVATIONS = [e.id for e in EFFECTS.values() if e.kind == "observation"]
+STATE = (0.4, -1.2, 2.0, 1.5, -0.2, 0.9)
+ALL = {name: {p.name: p.typical for p in EFFECTS[name].parameters} for name in OBSERVATIONS}
+
+
+def model_of(config, ops=FLOATS, convert=float):
+    return MeasurementModel(ops, {k: convert(v) for k, v in config.values().items()}, config.effects)
+
+
+@pytest.mark.parametrize("name", OBSERVATIONS)
+def test_the_inverse_of_every_observation_effect_gives_the_state_back(name):
+    for size in (-3.0, 0.0, 1.0, 10.0):
+        low, high = EFFECTS[name].parameters[0].low, EFFECTS[name].parameters[0].high
+        values = {p.name: min(max(size * p.typical, low), high) for p in EFFECTS[name].parameters}
+        model = model_of(SimulatorConfig(effects={name: values}))
+        assert model.invert(model.observe(STATE)) == pytest.approx(STATE, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", OBSERVATIONS)
+def test_newtons_inverse_equals_the_closed_form(name):
+    effect, values = EFFECTS[name], ALL[name]
+    closed = effect.invert(FLOATS, STATE, values)
+    assert ObservationEffect.invert(effect, FLOATS, STATE, values) == pytest.approx(closed, rel=1e-11)
+
+
+def test_newtons_inverse_turns_a_quarter_round():
+    """There the first pivot is zero."""
+    effect = EFFECTS["mocap_yaw_misalignment"]
+    seen = effect.observe(FLOATS, STATE, {"angle": math.pi / 2})
+    assert ObservationEffect.invert(effect, FLOATS, seen, {"angle": math.pi / 2}) == pytest.approx(STATE, rel=1e-11)
+
+
+def test_floats_arrays_and_tensors_measure_alike():
+    config = SimulatorConfig(effects=ALL)
+    trajectory = [tuple(v + 0.1 * k * (i + 1) for i, v in enumerate(STATE)) for k in range(6)]
+    settings = {"window_s2": 3e-4, "velocities_before": [(1.0, 0.0, 0.5), (1.2, 0.1, 0.6)]}
+    expected = model_of(config).measure(trajectory, 0.03, **settings)
+
+    def batch(states, of):
+        return [tuple(of([[v, v]] * 3) for v in state) for state in states]
+
+    tensor = torch.tensor([[0.0] * 2] * 3, dtype=torch.float64)
+    for ops, of in (
+        (ARRAYS, np.array),
+        (torch_ops(tensor), lambda v: torch.tensor(v, dtype=torch.float64)),
+    ):
+        model = MeasurementModel(ops, {k: of([[v]] * 3) for k, v in config.values().items()}, config.effects)
+        before = batch(settings["velocities_before"], of)
+        found = model.measure(batch(trajectory, of), 0.03, window_s2=3e-4, velocities_before=before)
+        inverted = model.invert(found[0])
+        for wanted, state in zip(expected, found, strict=True):
+            for value, row in zip(wanted, state, strict=True):
+                assert np.allclose(np.asarray(row), value, rtol=1e-13)
+        assert np.allclose(np.asarray(inverted[0]), model_of(config).invert(expected[0])[0], rtol=1e-12)
+
+
+def test_the_filter_solves_its_differential_equation():
+    """Response to a ramp of slope 1: ``t - T (1 - exp(-t / T))``; a time constant of 0 passes it on."""
+    period, lag = 0.02, 0.07
+    inputs = [(k * period,) * 3 for k in range(20)]
+    for k, output in enumerate(filter_velocities(FLOATS, inputs, period, lag)):
+        assert output[0] == pytest.approx(k * period - lag * (1.0 - math.exp(-k * period / lag)), abs=1e-14)
+    assert filter_velocities(FLOATS, inputs, period, 0.0) == inputs
+    assert filter_velocities(FLOATS, inputs[:1], period, lag, (5.0,) * 3) == [(5.0,) * 3]
+
+
+def test_the_window_is_the_mean_of_world_velocities_over_a_box():
+    """Velocities of poses by a central difference over two ticks; their variance in time is that of the box."""
+    period = 0.01
+    half = period
+    t = period * np.arange(-4, 5)
+
+    def pose(t):
+        return np.stack([np.sin(2.0 * t), 0.3 * np.cos(1.5 * t), 0.8 * t + 0.2 * np.sin(t)])
+
+    def world(t):
+        return np.stack([2.0 * np.cos(2.0 * t), -0.45 * np.sin(1.5 * t), 0.8 + 0.2 * np.cos(t)])
+
+    def body(velocity, yaw):
+        c, s = np.cos(yaw), np.sin(yaw)
+        return c * velocity[0] + s * velocity[1], c * velocity[1] - s * velocity[0], velocity[2]
+
+    yaw = pose(t)[2]
+    mean = (pose(t + half) - pose(t - half)) / (2.0 * half)
+    states = [tuple(row) for row in np.column_stack([*pose(t), *body(world(t), yaw)])]
+    found = windowed(FLOATS, states, period, (2.0 * half) ** 2 / 12.0)
+    wanted = np.column_stack(body(mean, yaw))
+    assert np.allclose([s[3:] for s in found[1:-1]], wanted[1:-1], atol=2e-8)
+    assert np.abs(wanted - [s[3:] for s in states]).max() > 5e-5
+    assert found[0] == states[0]
+    assert found[-1] == states[-1]
+
+
+def test_latency_is_the_car_files_or_that_of_an_effect():
+    config = SimulatorConfig(mocap=MocapParameters(latency_s=0.01))
+    assert model_of(config).latency_s == 0.01
+    late = SimulatorConfig(mocap=MocapParameters(latency_s=0.01), effects={"mocap_latency": {"latency": 0.04}})
+    assert model_of(late).latency_s == 0.04
+    assert model_of(config).velocity_time_constant_s is None
+
+
+def test_commands_act_later_by_the_latency_and_never_before_they_are_given():
+    config = SimulatorConfig(command_delay_s=0.05, effects={"command_delay": {}, "steering_delay": {}})
+    values = config.values()
+    assert delay_as_recorded_s(FLOATS, values, config.effects, 0.02) == pytest.approx(0.07)
+    early = {**values, "effects.command_delay.extra_delay": -0.2}
+    assert delay_as_recorded_s(FLOATS, early, config.effects, 0.02) == pytest.approx(0.2)
+    several = {**values, "effects.command_delay.extra_delay": np.array([-0.2, 0.0])}
+    assert np.allclose(delay_as_recorded_s(ARRAYS, several, config.effects, 0.02), [0.2, 0.07])
+
+
+def test_what_is_measured_is_told_from_what_drives():
+    assert is_measured("mocap.latency")
+    assert is_measured("effects.marker_offset.ahead")
+    assert not is_measured("effects.steering_lag.time_constant")
+    assert not is_measured("timing.command_delay")
+
+
+def test_one_effect_of_the_catalogue_filters_velocities():
+    assert [name for name in EFFECTS if filters_velocities(name)] == ["velocity_filter_lag"]
