@@ -27,7 +27,7 @@ lint: $(VENV)/.installed
 
 # Tests that only compute run side by side, one to a core; the others drive against the clock, two at once.
 COMPUTING := tests/benchmark tests/studies tests/prediction tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/api tests/examples tests/test_architecture.py tests/docs \
-	$(addprefix tests/experiment/,test_reality_check.py test_learning_on_a_device.py)
+	$(addprefix tests/experiment/,test_quick_check.py test_priors_and_predictions.py test_training.py test_learning_on_a_device.py)
 test: export OMP_NUM_THREADS := 1
 
 test: lint

@@ -90,6 +90,13 @@ def test_every_make_target_exists() -> None:
     assert [target for target in targets if not re.search(rf"^{target}:", makefile, flags=re.M)] == []
 
 
+def test_the_make_file_names_tests_that_exist() -> None:
+    printed = subprocess.run(["make", "-n", "test"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    paths = set(re.findall(r"tests/[\w/.]+", printed))
+    assert len(paths) > 10
+    assert [path for path in sorted(paths) if not (ROOT / path).exists()] == []
+
+
 @pytest.mark.realtime
 @pytest.mark.timeout(1500)
 @pytest.mark.parametrize("page", sorted({b.page for b in BLOCKS if b.marker == "run"}), ids=_name)
