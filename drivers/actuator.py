@@ -47,7 +47,7 @@ class Actuator:
         self._epoch = 0
         self._number = 0
         self._armed_epoch = 0
-        self._latched = ""  # a fault known on this side, kept even where the sender could not be told
+        self._latched = ""  # a fault known on this side, kept even where the sender could not be reached
 
     @property
     def is_open(self) -> bool:

@@ -10,7 +10,7 @@ from carlab.core.quantities import NEUTRAL, Action, CarState, Health, Observatio
 
 
 class DryRunCar(Car):
-    """Wraps any car: what it sees is passed on, what it is told is checked and swallowed.
+    """Wraps any car: observations are passed on, commands are checked and discarded.
 
     The wrapped car is never armed; it keeps sending neutral. ``as_sent`` turns an action into what the car would
     have sent (a calibration's rounding, for example) and is the identity unless given.
@@ -54,7 +54,7 @@ class DryRunCar(Car):
         return action if self._as_sent is None else self._as_sent(action)
 
     def stop(self, *, planned: bool) -> None:
-        """Disarm; the car itself is told to stop as well."""
+        """Disarm; the wrapped car stops as well."""
         self._is_armed = False
         self._is_latched = self._is_latched or not planned
         self.car.stop(planned=planned)

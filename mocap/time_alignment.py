@@ -40,7 +40,7 @@ class Echo:
 class Exposure:
     """When a frame was exposed, on the host's clock.
 
-    ``is_aligned`` is False where that had to be told from the time of arrival; ``is_odd`` is True where the stamps
+    ``is_aligned`` is False where that had to be estimated from the time of arrival; ``is_odd`` is True where the stamps
     and the time of arrival do not go together, so that a new echo is worth sending at once.
     """
 
@@ -70,8 +70,8 @@ class ClockAlignment:
         return self._reference is not None
 
     @property
-    def is_doubtful(self) -> bool:
-        """True while the last echoes tell of a server clock that may have been set anew."""
+    def is_uncertain(self) -> bool:
+        """True while the last echoes suggest that the server clock was set anew."""
         return self._strangers > 0
 
     @property

@@ -63,9 +63,9 @@ class SimulatorConfig:
     """A whole simulator: parameters, timing, kind of model, motion capture, effects, and what is known of each.
 
     ``effects`` maps ids of the catalogue to their parameters (all of them, in SI units; a choice may be given by its
-    word and is kept as its position); ``priors`` maps dotted
-    names to (low, high) where the car file gives a range, ``doubts`` to a standard deviation where it gives one, as a
-    diagnosis does. ``unknown`` names what the car file does not state although every car has its own: the latency of
+    word and is kept as its position). ``priors`` maps dotted names to (low, high) where the car file gives a range;
+    ``parameter_std`` maps them to a standard deviation where it gives one, as the model file of a diagnosis does.
+    ``unknown`` names what the car file does not state although every car has its own: the latency of
     motion capture; its value is a default then, and a diagnosis estimates it. Building one checks it: ConfigError says
     what is wrong.
     """
@@ -77,7 +77,7 @@ class SimulatorConfig:
     mocap: MocapParameters = MocapParameters()
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    doubts: Mapping[str, float] = field(default_factory=dict)
+    parameter_std: Mapping[str, float] = field(default_factory=dict)
     unknown: frozenset[str] = field(default=frozenset(), compare=False)
 
     def __post_init__(self) -> None:
@@ -100,8 +100,8 @@ class SimulatorConfig:
         for name, (low, high) in self.priors.items():
             if not low <= self.values()[name] <= high:
                 raise ConfigError(f"{name} = {self.values()[name]:g} lies outside its own range {low:g} to {high:g}.")
-        check_keys(self.doubts, REGISTRY, "the doubts")
-        for name, std in self.doubts.items():
+        check_keys(self.parameter_std, REGISTRY, "the standard deviations")
+        for name, std in self.parameter_std.items():
             if not 0.0 < std < float("inf") or REGISTRY[name].choices:
                 raise ConfigError(f"The std of {name} is {std:g}; give a number above zero, and none to a word.")
         for channel, delay_s in zip(("steering", "throttle"), self.delays_s(), strict=True):
@@ -166,7 +166,7 @@ class SimulatorConfig:
         check_keys(tables, TABLES, where)
         values: dict[str, float] = {}
         priors: dict[str, tuple[float, float]] = {}
-        doubts: dict[str, float] = {}
+        parameter_std: dict[str, float] = {}
         model = _table(tables, "model", where)
         check_keys(model, ("kind",), f"[model] of {where}")
         for prefix, table in _sections(tables, where):
@@ -179,7 +179,7 @@ class SimulatorConfig:
                 if prior is not None:
                     priors[f"{prefix}.{key}"] = prior
                 if std is not None:
-                    doubts[f"{prefix}.{key}"] = std
+                    parameter_std[f"{prefix}.{key}"] = std
         effects: dict[str, dict[str, float]] = {name: {} for name in _table(tables, "effects", where)}
         try:
             plain = cls(kind=model.get("kind", "dynamic")).with_values(
@@ -187,7 +187,9 @@ class SimulatorConfig:
             )
             with_effects = replace(plain, effects=effects).with_values(values) if effects else plain
             stated = {*values, *(p.same_as for name in effects for p in EFFECTS[name].parameters)}
-            return replace(with_effects, priors=priors, doubts=doubts, unknown=frozenset({LATENCY}) - stated)
+            return replace(
+                with_effects, priors=priors, parameter_std=parameter_std, unknown=frozenset({LATENCY}) - stated
+            )
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
 
@@ -201,12 +203,12 @@ class SimulatorConfig:
             table = tables
             for part in path:
                 table = table.setdefault(part, {})
-            if name in self.priors or name in self.doubts:
+            if name in self.priors or name in self.parameter_std:
                 table[key] = {"value": value}
                 if name in self.priors:
                     table[key] |= dict(zip(("low", "high"), self.priors[name], strict=True))
-                if name in self.doubts:
-                    table[key]["std"] = self.doubts[name]
+                if name in self.parameter_std:
+                    table[key]["std"] = self.parameter_std[name]
             elif choices := REGISTRY[name].choices:
                 table[key] = choices[int(value)]
             else:

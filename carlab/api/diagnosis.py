@@ -228,10 +228,10 @@ def _diagnosed(
 
 def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str) -> CarFile:
     from carlab.cars import CarFile
-    from carlab.diagnosis.report.write import completed, model_toml, with_doubts
+    from carlab.diagnosis.report.write import completed, model_toml, with_parameter_std
 
     worded = completed(diagnosis)
-    return CarFile(f"{name} (diagnosed)", model_toml(worded, simulator), with_doubts(worded, simulator), None)
+    return CarFile(f"{name} (diagnosed)", model_toml(worded, simulator), with_parameter_std(worded, simulator), None)
 
 
 def _check_effects(effects: Sequence[str]) -> None:

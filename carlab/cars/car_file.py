@@ -87,7 +87,7 @@ def is_preset(path: Path) -> bool:
 
 
 def default_car() -> CarFile:
-    """The car that sim and emulated drive unless told otherwise."""
+    """The car that sim and emulated drive by default."""
     return CarFile("rc_car", "", SimulatorConfig.from_preset(), None)
 
 

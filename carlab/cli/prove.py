@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 STAGES = {
     "make": "cases made",
     "diagnose": "cases diagnosed",
-    "oracle": "cases diagnosed with the names told",
+    "oracle": "cases diagnosed with the true names",
     "baselines": "cases put to the baselines",
 }
 DAY_S = 86400.0
@@ -30,7 +30,7 @@ DAY_S = 86400.0
 
 @dataclass
 class Prove:
-    """Conceal effects in fresh recordings, diagnose them without being told, then open the seal and score.
+    """Conceal effects in fresh recordings, diagnose them without their names, then open the seal and score.
 
     Prints a hash over the answers before the first diagnosis. Takes hours (--set short: minutes). ^C ends after the
     running cases, twice at once; the same command goes on from there. Writes scores.json, confusion.png, results.md.
@@ -59,7 +59,7 @@ class Prove:
     """A diagnosis that takes longer counts as failed [s]."""
 
     oracle: bool = True
-    """Diagnose again with the names told, for the oracle ratio."""
+    """Diagnose again with the true names, for the oracle ratio."""
 
     baselines: bool = True
     """Put the same cases to PySINDy, a Gaussian process, stepwise BIC and cross-correlation."""

@@ -26,14 +26,14 @@ def circular_mean(angles_rad: FloatArray) -> float:
     return float(np.arctan2(np.mean(np.sin(angles_rad)), np.mean(np.cos(angles_rad))))
 
 
-def on_one_branch(measured_rad: FloatArray, starts: ArrayLike, foretold_rad: FloatArray) -> tuple[FloatArray, ...]:
+def on_one_branch(measured_rad: FloatArray, starts: ArrayLike, predicted_rad: FloatArray) -> tuple[FloatArray, ...]:
     """A measured angle (n,) without jumps, and predictions of it (B, N) on the branch where each begins.
 
     Args:
         measured_rad: over the ticks (n,).
         starts: tick of the first angle of each prediction (B,).
-        foretold_rad: without jumps (B, N).
+        predicted_rad: without jumps (B, N).
     """
     whole = np.unwrap(measured_rad)
-    turns = np.round((whole[np.asarray(starts, dtype=int)] - foretold_rad[:, 0]) / (2.0 * np.pi))
-    return whole, foretold_rad + 2.0 * np.pi * turns[:, None]
+    turns = np.round((whole[np.asarray(starts, dtype=int)] - predicted_rad[:, 0]) / (2.0 * np.pi))
+    return whole, predicted_rad + 2.0 * np.pi * turns[:, None]

@@ -122,7 +122,7 @@ def simulate_windows(
     effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
     delay_s = delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s)
     inner[COMMAND_DELAY] = np.asarray(delay_s)[:, 0]
-    unmeasured = replace(whole, effects=effects, control_period_s=windows.period_s, priors={}, doubts={})
+    unmeasured = replace(whole, effects=effects, control_period_s=windows.period_s, priors={}, parameter_std={})
     count = len(windows)
 
     def tensor(array: FloatArray) -> torch.Tensor:

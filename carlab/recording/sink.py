@@ -41,7 +41,7 @@ def partial_path(path: Path) -> Path:
 def claim(path: Path) -> Path:
     """Make the folder of a new file and return its ``.partial`` name.
 
-    Raises OSError where the file is there already or the disk is as good as full: better told before the car moves.
+    Raises OSError where the file is there already or the disk is nearly full, before the car moves.
     """
     if path.exists():
         raise FileExistsError(errno.EEXIST, "is already there", str(path))

@@ -19,7 +19,7 @@ def measure_speed(
     Args:
         seconds: length of each condition of the sender's measurement [s].
         device: of particles and SAC; everything else is the CPU's.
-        note: told what is being measured.
+        note: called with what is being measured.
 
     Returns:
         Figures by part and name; the names say the unit.

@@ -34,7 +34,7 @@ LATENESS_EVERY_DEADLINES = 50
 
 
 class SenderLoop:
-    """Sends what ``SenderLogic`` says, over a device, until it is told to leave or its main process is gone."""
+    """Sends what ``SenderLogic`` says, over a device, until the main process asks it to stop or is gone."""
 
     def __init__(
         self,

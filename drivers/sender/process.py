@@ -2,7 +2,7 @@
 
 It is started as ``python -m drivers.sender.process`` rather than by ``multiprocessing``: nothing of the main program is
 imported again, no shared name can leak, and a terminal's ^C does not reach it. It ignores SIGINT, SIGTERM and SIGHUP;
-it leaves when told to, or when the main process is gone, and in both cases only after neutral has been sent at least
+it leaves on request, or when the main process is gone, and in both cases only after neutral has been sent at least
 three times over at least 60 ms.
 """
 

@@ -43,7 +43,7 @@ MEAN_HOLD_TICKS = 8
 def known_ranges(config: SimulatorConfig) -> dict[str, tuple[float, float]]:
     """Ranges of all uncertain numbers of a car file; the physical bounds of those with only a standard deviation."""
     known = config.values()
-    bounds = {name: REGISTRY[name] for name in config.doubts if name in known}
+    bounds = {name: REGISTRY[name] for name in config.parameter_std if name in known}
     return {name: (info.low, info.high) for name, info in bounds.items()} | dict(config.priors)
 
 
@@ -87,21 +87,21 @@ class CarModel:
     def parameters(self, normal: Tensor) -> Tensor:
         """Parameters (P, K) for standard normal numbers (P, K): uniform in their ranges, or around a diagnosed value.
 
-        A number with a standard deviation (``config.doubts``) has a Cauchy distribution within its range: half of its
-        mass lies within ``CAUCHY_SCALE_STD`` deviations, and its tails let data overrule a diagnosis, whose standard
-        deviations hold only if its model is complete.
+        A number with a standard deviation (``config.parameter_std``) has a Cauchy distribution within its range: half
+        of its mass lies within ``CAUCHY_SCALE_STD`` deviations, and its tails let data overrule a diagnosis,
+        whose standard deviations hold only if its model is complete.
         """
         shares = torch.special.ndtr(normal)
         uniform = within(tuple(self.ranges.values()), shares)
         about = [
-            self._about(name, shares[:, k]) if name in self.config.doubts else uniform[:, k]
+            self._about(name, shares[:, k]) if name in self.config.parameter_std else uniform[:, k]
             for k, name in enumerate(self.names)
         ]
         return torch.stack(about, dim=1) if about else shares
 
     def _about(self, name: str, shares: Tensor) -> Tensor:
         value, (low, high) = self.config.values()[name], self.ranges[name]
-        scale = max(CAUCHY_SCALE_STD * self.config.doubts[name], MIN_CAUCHY_SCALE_SHARE * abs(value))
+        scale = max(CAUCHY_SCALE_STD * self.config.parameter_std[name], MIN_CAUCHY_SCALE_SHARE * abs(value))
         least = MIN_SHARE * value if REGISTRY[name].positive else -math.inf
         low, high = (
             max(low, least, value - MAX_CAUCHY_DEVIATION * scale),
@@ -153,7 +153,7 @@ class CarModel:
         values = {name: parameters[:, k].to(start).repeat_interleave(each) for k, name in enumerate(self.names)}
         seen = DrawnMeasurement(self.config, values, start, self.velocity_delay_s)
         effects = {name: v for name, v in self.config.effects.items() if not _is_left_out(EFFECTS[name])}
-        config = replace(self.config, priors={}, doubts={}, effects=effects)
+        config = replace(self.config, priors={}, parameter_std={}, effects=effects)
         inner = {name: v for name, v in values.items() if name in config.values() and not name.startswith("mocap.")}
         inner[DELAY] = seen.command_delay_s
 

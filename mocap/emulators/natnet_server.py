@@ -216,7 +216,7 @@ class NatNetServer:
             return {address: client.version for address, client in self._clients.items()}
 
     def set_bodies(self, bodies: Sequence[EmulatedBody]) -> None:
-        """Change what is tracked; clients are told by a bit in the frames. ``poses`` must fit at once."""
+        """Change what is tracked; a bit tells clients in the frames. ``poses`` must fit at once."""
         with self._lock:
             self._scene = EmulatedScene(tuple(bodies), self._scene.up_axis)
             self._models_changed_until_s = time.monotonic() + MODELS_CHANGED_S

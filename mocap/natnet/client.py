@@ -382,7 +382,7 @@ class NatNetClient:
     def _keep_up(self, now_s: float) -> None:
         if self.server_info is None:
             return
-        settled = self.alignment.echoes >= FIRST_ECHOES and not self.alignment.is_doubtful
+        settled = self.alignment.echoes >= FIRST_ECHOES and not self.alignment.is_uncertain
         for message_id in self._upkeep.due(now_s, has_clock=self.server_info.clock_hz > 0, settled=settled):
             payload = b""
             if message_id == MessageId.CONNECT:

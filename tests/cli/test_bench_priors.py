@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
 def model(tmp_path: Path) -> Path:
     path = tmp_path / "found" / "model.toml"
     path.parent.mkdir()
-    found = replace(CAR.with_values({"effects.motor_lag.time_constant": 0.02}), doubts={"motor.drive_gain": 0.2})
+    found = replace(CAR.with_values({"effects.motor_lag.time_constant": 0.02}), parameter_std={"motor.drive_gain": 0.2})
     path.write_text(tomli_w.dumps(found.to_tables()))
     return path
 

@@ -277,7 +277,7 @@ def test_an_interrupted_run_tells_how_it_goes_on(
     ],
 )
 def test_the_car_that_a_command_names_is_the_one_that_it_was(options: CarOptions) -> None:
-    """What one is told to type means the same options when it is read."""
+    """The printed command means the same options when it is parsed."""
     assert tyro.cli(CarOptions, args=shlex.split(options.typed())) == options
 
 

@@ -1,4 +1,4 @@
-"""The safety gate: dense around its bounds, and driven through a car that only writes down what it is told."""
+"""The safety gate: dense around its bounds, and driven through a car that only logs its commands."""
 
 import math
 from dataclasses import fields, replace

@@ -104,7 +104,7 @@ def test_circular_mean_agrees_with_scipy(rng: np.random.Generator) -> None:
 def test_predictions_of_an_angle_are_laid_on_the_branch_of_what_was_measured():
     true = np.linspace(2.5, 10.0, 76)
     starts = [0, 30, 60]
-    foretold = np.stack([wrap(true[k]) + (true[k : k + 10] - true[k]) for k in starts])
-    whole, told = on_one_branch(wrap(true), starts, foretold)
+    predicted = np.stack([wrap(true[k]) + (true[k : k + 10] - true[k]) for k in starts])
+    whole, shifted = on_one_branch(wrap(true), starts, predicted)
     assert whole == pytest.approx(true)
-    assert told == pytest.approx(np.stack([true[k : k + 10] for k in starts]))
+    assert shifted == pytest.approx(np.stack([true[k : k + 10] for k in starts]))

@@ -228,5 +228,5 @@ def test_a_latency_that_the_car_file_does_not_state_is_a_parameter_and_no_effect
     if not stated:
         written = report.model.simulator
         assert written.mocap.latency_s == found.value
-        assert written.doubts["mocap.latency"] == found.std
+        assert written.parameter_std["mocap.latency"] == found.std
         assert not written.unknown

@@ -226,9 +226,9 @@ def test_a_diagnosis_screens_fits_and_names_all_three(found: Outcome) -> None:
 
 
 def test_the_report_has_its_texts(found: Outcome, report: Path) -> None:
-    told = json.loads((report / "report.json").read_text())
+    written = json.loads((report / "report.json").read_text())
     page = (report / "report.html").read_text()
-    for effect in told["effects"]:
+    for effect in written["effects"]:
         own = EFFECTS[effect["id"]]
         assert effect["sentence"].startswith("Left out: " + own.sentence.split("{")[0])
         assert escape(effect["sentence"]) in page

@@ -164,8 +164,8 @@ def test_a_wheel_is_not_blamed_for_a_frequency_of_its_own(plain: Drive, of_time:
 )
 def test_vibration_is_said_and_named_nothing_else(shaking: Drive, effects: tuple[str, ...] | None) -> None:
     fit, hold = (list(import_csv(shaking.folder / name).episodes) for name in ("fit.csv", "hold.csv"))
-    told = diagnose(fit, hold, shaking.nominal, TEXTS, effects=effects).diagnosis
-    assert told.verdict == "unexplained"
-    assert told.unexplained is not None
-    assert told.unexplained.kind.startswith("vibration")
-    assert told.unexplained.channels[0] in shaking.case.answer()["main_channels"]
+    found = diagnose(fit, hold, shaking.nominal, TEXTS, effects=effects).diagnosis
+    assert found.verdict == "unexplained"
+    assert found.unexplained is not None
+    assert found.unexplained.kind.startswith("vibration")
+    assert found.unexplained.channels[0] in shaking.case.answer()["main_channels"]

@@ -208,15 +208,15 @@ def test_names_from_outside_cannot_become_markup(tmp_path: Path) -> None:
     assert "script" not in page.tags
     assert "<script" not in text
     assert any('<script>alert("x")</script>' in word for word in page.words)
-    assert replace(load_car_file(tmp_path / "model.toml").simulator, doubts={}) == material.model()
+    assert replace(load_car_file(tmp_path / "model.toml").simulator, parameter_std={}) == material.model()
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["recordings"][0]["path"] == HOSTILE
 
 
 def test_model_is_a_car_file_that_says_where_it_comes_from(written: Path) -> None:
     loaded = load_car_file(written / "model.toml")
-    assert replace(loaded.simulator, doubts={}) == material.model()
+    assert replace(loaded.simulator, parameter_std={}) == material.model()
     known = {"effects.steering_lag.time_constant": material.lag_finding().parameters["time_constant"]}
-    assert loaded.simulator.doubts == {name: e.std for name, e in (material.PARAMETERS | known).items()}
+    assert loaded.simulator.parameter_std == {name: e.std for name, e in (material.PARAMETERS | known).items()}
     assert loaded.simulator.effects["steering_lag"]["time_constant"] == 0.11
     comments = [line for line in loaded.text.splitlines() if line.startswith("#")]
     assert any("drives/2024-06-07 morning.csv" in line for line in comments)

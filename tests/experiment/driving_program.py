@@ -1,4 +1,4 @@
-"""A program that drives the emulated car and misbehaves as told; the tests run it as a process and break things.
+"""A program that drives the emulated car and misbehaves as configured; the tests run it as a process and break things.
 
 python driving_program.py RUNS_FOLDER MISBEHAVIOUR
 Prints one JSON line with its process ids and run folder, then ``tick N`` per tick.
@@ -28,7 +28,7 @@ FOREVER_TICKS = 3000
 
 
 class MisbehavingPolicy:
-    """Drives a circle; at a tick it does what it is told."""
+    """Drives a circle; at one tick it misbehaves as configured."""
 
     name = "misbehaving"
 

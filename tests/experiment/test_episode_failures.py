@@ -131,23 +131,23 @@ def test_an_error_at_any_call_leaves_the_car_stopped(name: str, number: int, err
         documents, raised = drive(car, fuse)
         assert not car.is_armed
         if isinstance(documents[-1], EpisodeStarted):
-            assert (name, number) == ("emit", 0)  # Nobody was told of an episode, and nothing was armed.
+            assert (name, number) == ("emit", 0)  # No recorder started, and nothing was armed.
             assert car.stops == []
             assert raised is error
             return
         assert car.stops, "it was not stopped"
         assert sum(isinstance(d, EpisodeEnded) for d in documents) == 1
-        told = documents[-1]
-        assert isinstance(told, EpisodeEnded)
+        ended = documents[-1]
+        assert isinstance(ended, EpisodeEnded)
     if name == "act" and isinstance(error, Boom):
         assert raised is None
-        assert told.reason is EndReason.POLICY_ERROR
+        assert ended.reason is EndReason.POLICY_ERROR
     else:
         assert raised is error
         at_the_end = name == "stop" or (name in ("emit", "heartbeat") and number == CALLS[name])
         if not at_the_end:
-            assert told.reason is EndReason.CRASHED
-            assert type(error).__name__ in told.detail
+            assert ended.reason is EndReason.CRASHED
+            assert type(error).__name__ in ended.detail
 
 
 def test_the_reason_survives_a_stop_that_fails() -> None:

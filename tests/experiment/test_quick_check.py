@@ -33,26 +33,26 @@ def a_run(folder: Path, true: SimulatorConfig, episodes: int) -> RunDirectory:
 
 def test_the_check_is_kept_beside_the_model_and_names_the_next_step(tmp_path: Path) -> None:
     run = a_run(tmp_path, LAGGING, 4)
-    told = run_check_subprocess(run, SIMULATOR)
-    assert told is not None
-    assert (told.episode, told.verdict) == (4, "left")
-    assert told.excess > 1.0
-    assert "motor_lag" in told.sentences[1]
+    check_result = run_check_subprocess(run, SIMULATOR)
+    assert check_result is not None
+    assert (check_result.episode, check_result.verdict) == (4, "left")
+    assert check_result.excess > 1.0
+    assert "motor_lag" in check_result.sentences[1]
     kept = json.loads(check_path(run, 4).read_text())
-    assert kept["sentences"] == list(told.sentences)
+    assert kept["sentences"] == list(check_result.sentences)
     assert kept["causes"][0]["id"] == "motor_lag"
     assert kept["next"] == f"carlab diagnose {run.path} --car {run.path}/simulator.toml --out {run.path}/diagnosis"
-    assert kept["next"] in told.sentences[1]
+    assert kept["next"] in check_result.sentences[1]
     assert not check_path(run, 3).exists()
 
 
 def test_what_goes_wrong_is_told_in_one_sentence(tmp_path: Path) -> None:
     run = a_run(tmp_path, SIMULATOR, 1)
     run.recordings()[0].write_bytes(b"rubbish")
-    told = run_check_subprocess(run, SIMULATOR)
-    assert told is not None
-    assert told.verdict == "failed"
-    (sentence,) = told.sentences
+    check_result = run_check_subprocess(run, SIMULATOR)
+    assert check_result is not None
+    assert check_result.verdict == "failed"
+    (sentence,) = check_result.sentences
     assert "learning goes on" in sentence
     assert "MCAP" in sentence
     assert "\n" not in sentence
@@ -68,9 +68,9 @@ def test_a_check_that_is_stopped_leaves_nothing_and_is_made_up_for(tmp_path: Pat
     keep_row(run, ROW)
     heard: list[QuickCheck] = []
 
-    def on_check(told: QuickCheck) -> None:
-        heard.append(told)
-        keep_check(run, told)
+    def on_check(check_result: QuickCheck) -> None:
+        heard.append(check_result)
+        keep_check(run, check_result)
 
     campaign = Campaign(choose_car("sim"), TrainingPlan(""), 1, run, CampaignHooks(on_check=on_check))
     assert list(campaign.go_on()) == []
@@ -85,9 +85,9 @@ def test_a_check_that_is_stopped_leaves_nothing_and_is_made_up_for(tmp_path: Pat
 
 def test_rows_of_a_learning_curve_come_back_with_a_check_without_and_from_older_runs(tmp_path: Path) -> None:
     run = a_run(tmp_path, SIMULATOR, 0)
-    told = QuickCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
+    check_result = QuickCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
     keep_row(run, replace(ROW, episode=2))
-    keep_check(run, told)
+    keep_check(run, check_result)
     keep_row(run, ROW)
     content = json.loads((run.path / "learn.json").read_text())
     for name in ("verdict", "excess", "excess_std", "diagnosis"):
@@ -95,7 +95,7 @@ def test_rows_of_a_learning_curve_come_back_with_a_check_without_and_from_older_
     (run.path / "learn.json").write_text(json.dumps(content))
     first, second = learning_curve(run)
     assert str(first) == str(ROW)
-    assert str(second) == str(replace(ROW, episode=2).with_check(told))
+    assert str(second) == str(replace(ROW, episode=2).with_check(check_result))
     assert content["episodes"][1]["excess_std"] is None
 
 

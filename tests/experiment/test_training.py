@@ -1,4 +1,4 @@
-"""What is trained between episodes: what the model is told of the recordings, and what happens where a fit fails."""
+"""What is trained between episodes: what the model gets of the recordings, and what happens where a fit fails."""
 
 from __future__ import annotations
 

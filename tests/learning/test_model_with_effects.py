@@ -208,13 +208,13 @@ def test_a_diagnosed_number_is_cauchys_within_what_is_possible():
     config = SimulatorConfig(
         effects={"motor_lag": {"time_constant": 0.06}},
         priors={"motor.drive_gain": (6.0, 9.0), "motor.damping": (1.0, 2.0)},
-        doubts={"motor.drive_gain": 0.3, "effects.motor_lag.time_constant": 0.01, "vehicle.yaw_inertia": 1e-9},
+        parameter_std={"motor.drive_gain": 0.3, "effects.motor_lag.time_constant": 0.01, "vehicle.yaw_inertia": 1e-9},
     )
     model = CarModel(config, HISTORY, known_ranges(config))
     shares = np.linspace(0.01, 0.99, 99)
     normal = torch.from_numpy(norm.ppf(shares))[:, None].expand(-1, model.size)
     drawn = dict(zip(model.names, model.parameters(normal).numpy().T, strict=True))
-    assert set(drawn) == set(config.doubts) | set(config.priors)
+    assert set(drawn) == set(config.parameter_std) | set(config.priors)
     assert np.allclose(drawn["motor.damping"], 1.0 + shares)
     spread = {"motor.drive_gain": (8.2, 0.6, 6.0, 9.0), "effects.motor_lag.time_constant": (0.06, 0.02, 0.0, 0.26)}
     for name, (middle, scale, low, high) in spread.items():

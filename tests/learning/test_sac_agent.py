@@ -28,7 +28,7 @@ X_M = np.array([-1.2, -0.6, 0.6, 1.2])
 
 @dataclass
 class Still(StepInBody):
-    """A car that changes by this number in everything, so unless it is told one it stands."""
+    """A car that changes by this number in everything; by default it stands."""
 
     history: int = HISTORY
     change: float = 0.0

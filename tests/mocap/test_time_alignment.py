@@ -74,14 +74,14 @@ def test_a_clock_set_anew_is_believed_after_three_echoes() -> None:
     for i in range(20):
         echo(alignment, before, 10.0 + 0.25 * i, 1e-4, 1e-4)
     echo(alignment, after, 20.0, 1e-4, 1e-4)
-    assert alignment.is_doubtful
+    assert alignment.is_uncertain
     assert alignment.to_host_s(before.ticks(20.0)) == pytest.approx(20.0, abs=1e-4)
-    echo(alignment, before, 20.1, 1e-4, 1e-4)  # it was a stray: doubt is over
-    assert not alignment.is_doubtful
+    echo(alignment, before, 20.1, 1e-4, 1e-4)  # it was a stray: the alignment is certain again
+    assert not alignment.is_uncertain
     for i in range(3):
         echo(alignment, after, 21.0 + 0.02 * i, 1e-4, 1e-4)
     assert alignment.resets == 1
-    assert not alignment.is_doubtful
+    assert not alignment.is_uncertain
     assert alignment.to_host_s(after.ticks(21.5)) == pytest.approx(21.5, abs=1e-4)
 
 

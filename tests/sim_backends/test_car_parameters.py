@@ -142,7 +142,11 @@ def test_a_number_may_have_a_deviation_with_or_without_a_range():
         "effects": {"steering_lag": {"time_constant": {"value": 0.1, "std": 0.02}}},
     }
     found = SimulatorConfig.from_tables(tables)
-    assert found.doubts == {"motor.drive_gain": 0.5, "motor.damping": 0.1, "effects.steering_lag.time_constant": 0.02}
+    assert found.parameter_std == {
+        "motor.drive_gain": 0.5,
+        "motor.damping": 0.1,
+        "effects.steering_lag.time_constant": 0.02,
+    }
     assert found.priors == {"motor.damping": (1.0, 2.0)}
     assert SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(found.to_tables()))) == found
     for wrong in (0.0, -1.0, float("nan"), float("inf")):

@@ -47,7 +47,9 @@ HISTORY = 5
 TRUTH = SimulatorConfig.from_preset().with_values(
     {"effects.motor_lag.time_constant": 0.09, "effects.mocap_yaw_misalignment.angle": 0.08}
 )
-KNOWN = replace(TRUTH, doubts={"effects.motor_lag.time_constant": 0.004, "effects.mocap_yaw_misalignment.angle": 0.004})
+KNOWN = replace(
+    TRUTH, parameter_std={"effects.motor_lag.time_constant": 0.004, "effects.mocap_yaw_misalignment.angle": 0.004}
+)
 
 
 def drive(seed: int, ticks: int = 240) -> EpisodeData:
@@ -181,7 +183,7 @@ def test_a_diagnosed_car_is_a_real_cars_prior_with_its_standard_deviations(tmp_p
     case = recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
     simulator = load_car_file(path).simulator
     assert isinstance(case.prior, CarModel)
-    assert set(KNOWN.doubts) == set(simulator.doubts) <= set(case.prior.ranges)
+    assert set(KNOWN.parameter_std) == set(simulator.parameter_std) <= set(case.prior.ranges)
     assert repr(case.prior) == repr(prior_models(case, simulator, simulator)[NOMINAL])
     drawn = draw_parameters(case.prior, 400, torch.Generator().manual_seed(0))
     lags = drawn[:, case.prior.names.index("effects.motor_lag.time_constant")]
@@ -193,7 +195,7 @@ def test_a_nominal_cars_prior_is_uncertain_of_its_ranges_alone() -> None:
     car = load_car_file(Path("eth_rc_car")).simulator
     case = recorded_case([[drive(1)], [drive(2)]], Path("eth_rc_car"), HISTORY)
     assert isinstance(case.prior, CarModel)
-    assert not car.doubts
+    assert not car.parameter_std
     assert not car.effects
     assert case.prior.config == car
     assert list(case.prior.ranges.items()) == [(DELAY, DELAY_S), *car.priors.items()]

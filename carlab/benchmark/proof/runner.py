@@ -4,9 +4,9 @@ Folder of a proof:
 
     seal.json            the hash, made known before the first diagnosis
     handed/NAME/         fit.csv, hold.csv, car.toml: all that a diagnosis gets (copied into a fresh folder elsewhere)
-    answers/             plan, names, nonce and one answer a case; no diagnosis is told of it
+    answers/             plan, names, nonce and one answer a case; no diagnosis sees it
     reports/NAME/        report.json, decisions.json and run.json (exit status, seconds, peak memory)
-    oracle/NAME/         the same, where the tool was told the names
+    oracle/NAME/         the same, where the diagnosis got the true names
     baselines/NAME.json  what the baselines said
     checks/NAME.json     whether the generator's refit can tell apart what a report says is one set
 """
@@ -49,7 +49,7 @@ class Proof:
         root: Folder of the proof; made where it is not there.
         specs: The cases. A folder that was begun with other ones is refused.
         command: How a diagnosis is started; ``fit.csv --car car.toml --holdout hold.csv --out out`` is appended, and
-            ``--effects ID ...`` where the tool is told the names.
+            ``--effects ID ...`` where the diagnosis gets the true names.
         progress: Called with stage (``make``, ``seal``, ``diagnose``, ``oracle``, ``baselines``), done, total and a
             note.
         timeout_s: A diagnosis that takes longer is ended and counts as failed.
@@ -93,7 +93,7 @@ class Proof:
         return self.seal()
 
     def seal(self) -> str:
-        """Hash the answers, once; the hash is in seal.json and told to ``progress``."""
+        """Hash the answers, once; the hash is in seal.json and passed to ``progress``."""
         path = self.root / "seal.json"
         if not path.exists():
             nonce = new_nonce()
@@ -105,23 +105,23 @@ class Proof:
         return sealed
 
     def diagnose(self, *, oracle: bool = False) -> bool:
-        """Diagnose every case that has no report yet; with ``oracle`` the single and paired ones, told their names.
+        """Diagnose every case that has no report yet; with ``oracle`` the single and paired ones, with the true names.
 
         Returns whether all are done. Raises DataError where nothing is sealed yet.
         """
         self._need_seal()
         names = sorted(self._names())  # sorted: random names give a random order of kinds
-        told: dict[str, tuple[str, ...]] = {}
+        true_effects: dict[str, tuple[str, ...]] = {}
         if oracle:
             by_name = dict(zip(self._names(), self.specs, strict=True))
-            told = {n: by_name[n].effects for n in names if by_name[n].kind in ("single", "pair")}
-            names = list(told)
+            true_effects = {n: by_name[n].effects for n in names if by_name[n].kind in ("single", "pair")}
+            names = list(true_effects)
         folder = self.root / ("oracle" if oracle else "reports")
         return self._stage(
             "oracle" if oracle else "diagnose",
             names,
             lambda name: (folder / name / "run.json").exists(),
-            lambda name: self._diagnose_one(name, folder / name, told.get(name, ())),
+            lambda name: self._diagnose_one(name, folder / name, true_effects.get(name, ())),
         )
 
     def baselines(self) -> bool:
@@ -244,14 +244,14 @@ class Proof:
             raise DataError(f"A case of the proof could not be done ({what}): {last[0]}")
         return end
 
-    def _diagnose_one(self, name: str, to: Path, told: tuple[str, ...]) -> ChildEnd:
+    def _diagnose_one(self, name: str, to: Path, true_effects: tuple[str, ...]) -> ChildEnd:
         with tempfile.TemporaryDirectory(prefix="diagnosis-") as fresh:
             here = Path(fresh)
             for file in FILES:
                 shutil.copyfile(self.root / "handed" / name / file, here / file)
             command = [*self.command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out"]
-            if told:
-                command += ["--effects", *told]
+            if true_effects:
+                command += ["--effects", *true_effects]
             environment = ONE_THREAD if self.jobs > 1 else {}
             end = run_child(command, here, timeout_s=self.timeout_s, environment=environment, abandon=self.abandon)
             if end.abandoned:

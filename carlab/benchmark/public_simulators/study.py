@@ -132,7 +132,7 @@ def study(
         command: How a diagnosis is started, as in ``runner.Proof``.
         timeout_s: A diagnosis that takes longer is ended and counts as failed.
         lengths_s: Seconds to fit and held out.
-        say: Told what is being done.
+        say: called with what is being done.
         abandon: Asked all along; True ends the study after what is done.
 
     Returns:

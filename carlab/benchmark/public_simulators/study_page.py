@@ -70,7 +70,7 @@ def _evidence(effect: dict[str, Any]) -> str:
     cells = [(k.replace("_", " "), f"{v:.3g}") for k, v in given.items()]
     cells += [(name, _value(p, effect["true_values"].get(name))) for name, p in (effect["parameters"] or {}).items()]
     others = [f"{name} ({STANCES[stance]})" for name, stance in effect["others"].items()]
-    cells += [("not to be told from", ", ".join(others))] if others else []
+    cells += [("indistinguishable from", ", ".join(others))] if others else []
     cells.append((f"the package: {STANCES[effect['in_equations']]}", effect["why"]))
     return markdown(("evidence", "value"), cells)
 

@@ -92,7 +92,7 @@ class World:
         # Maps of a command when it starts to act, in order; a map may remember. Steering in rad, throttle in 1.
         self.steering_maps: list[Callable[[float], float]] = []
         self.throttle_maps: list[Callable[[float], float]] = []
-        # Told whenever a command starts to act: (t, wheel angle wanted, throttle wanted).
+        # Called whenever a command starts to act: (t, wheel angle wanted, throttle wanted).
         self.switch_listeners: list[Callable[[float, float, float], None]] = []
         # Observation: extra age of every channel [s], and changes of pose and velocity columns (see measurement).
         self.extra_latency_s = 0.0

@@ -61,7 +61,7 @@ def _ends(windows: PredictionWindows, nominal: SimulatorConfig, max_step_s: floa
         return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
 
     states = rollout(
-        replace(nominal, control_period_s=windows.period_s, priors={}, doubts={}),
+        replace(nominal, control_period_s=windows.period_s, priors={}, parameter_std={}),
         tensor(windows.initial_states),
         tensor(windows.commands),
         history=tensor(windows.past_commands),

@@ -103,21 +103,21 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
     if scores:
         lines.append(f"Held-out error in noise floors: {', '.join(scores)}.")
     comments = "".join(f"# {row}\n" for line in lines for row in _rows(line))
-    return f"{comments}\n{tomli_w.dumps(with_doubts(diagnosis, model).to_tables())}"
+    return f"{comments}\n{tomli_w.dumps(with_parameter_std(diagnosis, model).to_tables())}"
 
 
-def with_doubts(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:
+def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:
     """The simulator with the standard deviation of every estimated number, which becomes a prior of learning."""
     estimates = dict(diagnosis.parameters)
     for effect in diagnosis.effects:
         estimates |= {f"effects.{effect.id}.{name}": found for name, found in effect.parameters.items()}
     known = model.values()
-    doubts = {
+    parameter_std = {
         name: found.std
         for name, found in estimates.items()
         if name in known and not REGISTRY[name].choices and 0.0 < found.std < math.inf and math.isfinite(known[name])
     }
-    return replace(model, doubts=doubts)
+    return replace(model, parameter_std=parameter_std)
 
 
 def _rows(line: str) -> list[str]:

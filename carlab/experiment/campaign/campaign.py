@@ -76,8 +76,8 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
     values = car.values()
     if kind == "kinematic":
         spans = {n: car.priors.get(n, _about(values[n])) for n in KINEMATIC_UNCERTAIN}
-        return replace(car, kind="kinematic", effects={}, priors=spans, doubts={})
-    if car.priors or car.doubts:
+        return replace(car, kind="kinematic", effects={}, priors=spans, parameter_std={})
+    if car.priors or car.parameter_std:
         return car
     names = KINEMATIC_UNCERTAIN if car.kind == "kinematic" else UNCERTAIN
     return replace(car, priors={n: _about(values[n]) for n in names})

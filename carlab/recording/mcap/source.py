@@ -84,7 +84,7 @@ def read_recording(path: Path | str) -> Recording:
                 raise
             except Exception:
                 # Cut short or damaged: the readers of mcap, zstandard and protobuf each raise errors of their own.
-                # What came before is whole (chunks carry checksums), and the caller is told by `recovered`.
+                # What came before is whole (chunks carry checksums), and `recovered` says so to the caller.
                 complete = False
     except FileNotFoundError as error:
         raise DataError(_missing(path)) from error
