@@ -13,7 +13,7 @@ is reached by its module.
 import importlib
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from carlab.core.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from carlab.api import (

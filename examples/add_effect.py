@@ -14,7 +14,7 @@ from carlab.core.geofence import rectangle
 from carlab.core.manoeuvres import Manoeuvre
 from carlab.core.task import RecordedTask
 from carlab.experiment.episodes.scripted_policies import ManoeuvrePolicy
-from sim_backends.dynamics.array_ops import Ops
+from sim_backends.array_ops import Ops
 from sim_backends.effects.base import DynamicsEffect, EffectParameter, Forces, Parameters
 from sim_backends.registry import register
 

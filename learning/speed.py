@@ -27,9 +27,9 @@ from learning.posterior.inference import infer
 from learning.posterior.particle_posterior import MIN_INPUT_CLIP, ParticlePosterior
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import CarModel
+from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.car_fit import NOISE_STD, CarFitSettings, fit_car
-from learning.world.transitions import Transitions
 from sim_backends.car_parameters import SimulatorConfig
 
 AUTHORS_STEPS_PER_S = 10.0

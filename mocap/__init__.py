@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mocap.config import MocapConfig
-    from mocap.natnet.client import NatNetClient
     from mocap.natnet.discovery import FoundServer, discover
+    from mocap.natnet_client import NatNetClient
     from mocap.rigid_body import RigidBodyPoseSource
     from mocap.time_alignment import ClockAlignment
 

@@ -13,8 +13,8 @@ from carlab.core.errors import NotReadyError
 from carlab.core.quantities import PoseSample
 from mocap.axes import base_link_pose, tilt_rad, z_up_quaternion, z_up_vector
 from mocap.config import MocapConfig
-from mocap.natnet.client import NatNetClient
 from mocap.natnet.models import Description, Frame, Quaternion, RigidBody, RigidBodyDescription
+from mocap.natnet_client import NatNetClient
 
 SAMPLES_KEPT = 1024
 NORM_TOLERANCE = 0.01

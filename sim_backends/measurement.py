@@ -14,7 +14,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects import EFFECTS, DelayEffect, ObservationEffect
 from sim_backends.effects.base import Parameters
 from sim_backends.effects.first_order import lag_weights

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from carlab.core.angles import wrap
 from carlab.core.quantities import Action, CarState
+from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
-from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held, substeps_for
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.measurement import MeasurementModel

@@ -10,8 +10,8 @@ import numpy as np
 
 from carlab.core.angles import wrap
 from carlab.core.quantities import PoseSample
+from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.measurement import MeasurementModel
 from sim_backends.plant import Pose
 

@@ -11,8 +11,8 @@ from carlab.core.clock import Clock, SimulatedClock
 from carlab.core.errors import ActuatorFaultError, NotArmedError, NotOpenError, PoseLostError
 from carlab.core.quantities import NEUTRAL, Action, ActionLimits, CarState, Health, Observation, PoseSample, Reality
 from carlab.core.state_estimator import StateEstimator
+from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.measurement import MeasurementModel, State, filter_step
 from sim_backends.plant import Plant, Pose
 from sim_backends.sensor import MocapSensor

@@ -193,10 +193,10 @@ def _diagnosed(
 ) -> DiagnosisReport:
     from carlab.diagnosis.diagnose import Inconclusive
     from carlab.diagnosis.diagnose import diagnose as search
+    from carlab.diagnosis.evidence import Texts
     from carlab.diagnosis.findings import Diagnosis, Exhibits
     from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
     from carlab.diagnosis.report.write import completed
-    from carlab.diagnosis.selection.evidence import Texts
     from sim_backends.effects import confusable_effects
 
     uses, faults = (*fit.uses, *validation.uses), (*fit.faults, *validation.faults)

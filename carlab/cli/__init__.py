@@ -24,12 +24,12 @@ def run(argv: Sequence[str]) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "2")
     import tyro
 
-    from carlab import __version__
     from carlab.cli.console import console, fail, log_to_console
     from carlab.core.errors import CarlabError
+    from carlab.core.version import VERSION
 
     if list(argv) == ["--version"]:
-        console.print(f"carlab {__version__}")
+        console.print(f"carlab {VERSION}")
         return 0
     verb = tyro.extras.subcommand_cli_from_dict(_verbs(), args=list(argv), prog="carlab", description=_DESCRIPTION)
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))

@@ -181,8 +181,8 @@ class Prove:
         import os
         from datetime import datetime
 
-        from carlab import __version__
         from carlab.core.clock import wall_clock_ns
+        from carlab.core.version import VERSION
 
         seeds = [spec.seed for spec in proof.specs]
         memory = [run["peak_memory_mib"] for run in runs.values()]
@@ -191,7 +191,7 @@ class Prove:
             "date": datetime.fromtimestamp(wall_clock_ns() * 1e-9).astimezone().isoformat(timespec="minutes"),
             "command": f"`{shlex.join(['carlab', *sys.argv[1:]])}`",
             "seeds": f"{min(seeds)} to {max(seeds)} ({len(seeds)} cases)",
-            "carlab": f"{__version__}, {os.cpu_count()} cores, {' and '.join(map(str, jobs))} cases at a time",
+            "carlab": f"{VERSION}, {os.cpu_count()} cores, {' and '.join(map(str, jobs))} cases at a time",
             "peak memory of a diagnosis": f"{max(memory, default=0.0):.0f} MiB",
         }
 

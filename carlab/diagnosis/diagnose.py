@@ -12,15 +12,7 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Decision
-from carlab.diagnosis.findings import DataFault, Diagnosis, Exhibits, RecordingUse
-from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
-from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
-from carlab.diagnosis.identification.velocity_window import with_initial_states
-from carlab.diagnosis.own_recordings import with_known_latency
-from carlab.diagnosis.recording_faults import find as data_faults_of
-from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, check_held_out_share, split_recordings
-from carlab.diagnosis.report.exhibits import exhibits_of
-from carlab.diagnosis.selection.evidence import (
+from carlab.diagnosis.evidence import (
     ScoredSearch,
     Texts,
     base_estimates,
@@ -28,7 +20,15 @@ from carlab.diagnosis.selection.evidence import (
     unexplained_share,
     verdict_of,
 )
-from carlab.diagnosis.selection.naming import NamingResult, accept_names, describe_unexplained, residual_of
+from carlab.diagnosis.findings import DataFault, Diagnosis, Exhibits, RecordingUse
+from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
+from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
+from carlab.diagnosis.identification.velocity_window import with_initial_states
+from carlab.diagnosis.naming import NamingResult, accept_names, describe_unexplained, residual_of
+from carlab.diagnosis.own_recordings import with_known_latency
+from carlab.diagnosis.recording_faults import find as data_faults_of
+from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, check_held_out_share, split_recordings
+from carlab.diagnosis.report.exhibits import exhibits_of
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings

@@ -15,10 +15,10 @@ import torch
 
 from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import PredictionWindows
+from sim_backends.array_ops import ARRAYS
 from sim_backends.batch.inputs import with_effects_of
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.dynamics.array_ops import ARRAYS
 from sim_backends.effects import EFFECTS
 from sim_backends.measurement import (
     COMMAND_DELAY,

@@ -27,9 +27,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Self
 
-import carlab
 from carlab.core.clock import wall_clock_ns
 from carlab.core.errors import DataError
+from carlab.core.version import VERSION
 from carlab.recording.sink import describe_os_error
 
 _PACKAGES = (
@@ -219,14 +219,14 @@ def environment() -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             continue
     return {
-        "carlab": carlab.__version__,
+        "carlab": VERSION,
         "python": platform.python_version(),
         "host": platform.node(),
         "platform": platform.platform(),
         "cpu_count": os.cpu_count(),
         "command": sys.argv,
         "start": datetime.fromtimestamp(wall_clock_ns() * 1e-9).astimezone().isoformat(),
-        "git": git_state(Path(carlab.__file__).parent),
+        "git": git_state(Path(__file__).parents[1]),
         "packages": packages,
     }
 

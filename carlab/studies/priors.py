@@ -22,7 +22,7 @@ from carlab.studies.regression.scores import Score
 from carlab.studies.regression.study import Progress, scored
 from learning.priors.domain_models import DomainModel
 from learning.priors.simulator_model import DELAY, CarModel, known_ranges
-from learning.world.transitions import velocity_delay_s
+from learning.transitions import velocity_delay_s
 from sim_backends.car_parameters import SimulatorConfig
 
 NONE, KINEMATIC, NOMINAL, DIAGNOSED = "none (FSVGD)", "kinematic", "nominal", "diagnosed"

@@ -25,7 +25,7 @@ from learning.networks.particles import Network
 from learning.posterior.draws import Draws
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.priors.function_prior import RbfCovariance
-from learning.world.transitions import transitions_of
+from learning.transitions import transitions_of
 
 STATE_STD = (3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0)
 CHANGE_STD = (0.127, 0.123, 0.060, 0.056, 2.86, 2.86, 5.65)

@@ -23,11 +23,11 @@ from torch import Tensor
 
 from carlab.core.errors import DataError, DivergedError
 from learning.evaluation import negative_log_likelihood
-from learning.functional_svgd.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.posterior.particle_posterior import ParticlePosterior, input_clip_of
 from learning.priors.function_prior import JITTER, Marginal, RbfCovariance, gaussian_process, simulator_marginal
+from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
 PROGRESS_PERIOD_STEPS = 500
 MIN_NOISE = 1e-4

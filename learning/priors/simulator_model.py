@@ -1,6 +1,6 @@
 """The car simulator as a prior over one-step models: any car file, its ranges and its effects.
 
-Inputs and outputs are the measured ones of ``learning.world.transitions``. Recorded states are ``mocap.latency`` old,
+Inputs and outputs are the measured ones of ``learning.transitions``. Recorded states are ``mocap.latency`` old,
 so that every command acts later by this. The measurement model is inverted at the start of a step and applied at its
 end. Hidden states of actuators and tyres follow from the past commands of a row. A row has neither place nor time:
 effects of the place are ignored, and drifting effects act as at one time.

@@ -20,7 +20,7 @@ from carlab.core.observation import STATE_FEATURES, decode_history, decode_state
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.posterior.draws import Draws
 from learning.posterior.particle_posterior import ParticlePosterior
-from learning.world.transitions import transitions_of
+from learning.transitions import transitions_of
 
 
 class OneStep(Protocol):

@@ -22,8 +22,8 @@ from learning.posterior.inference import infer
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, draw_parameters
 from learning.priors.simulator_model import CarModel
+from learning.transitions import OUTPUTS, Transitions
 from learning.world.car_dynamics import CarDynamics
-from learning.world.transitions import OUTPUTS, Transitions
 
 Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
 LearnedCar = CarDynamics | WorldDynamics

@@ -12,7 +12,7 @@ from torch import Tensor
 from carlab.core.episode_data import EpisodeData
 from learning.posterior.discrepancy import CHOLESKY_JITTER, fit_discrepancy
 from learning.posterior.outliers import leave_one_out, log_student
-from learning.world.transitions import transitions_of
+from learning.transitions import transitions_of
 
 CANDIDATE_LENGTHS = (0, 1, 2, 3, 4, 6, 8)
 MIN_GAIN_NATS = 0.1

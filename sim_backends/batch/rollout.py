@@ -16,6 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
+from sim_backends.array_ops import ARRAYS, Ops, Value, has_wide_vectors
 from sim_backends.batch.inputs import (
     Past,
     check_shapes,
@@ -28,7 +29,6 @@ from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.stepper import CompiledStepper
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
-from sim_backends.dynamics.array_ops import ARRAYS, Ops, Value, has_wide_vectors
 from sim_backends.dynamics.integrate import MAX_STEP_S, Stepper, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.dynamics.torch_ops import torch_ops

@@ -15,9 +15,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backends.array_ops import Ops, Value
 from sim_backends.car_parameters import ModelKind
 from sim_backends.compiled.tracing import Node, Tracer, fold, gradients
-from sim_backends.dynamics.array_ops import Ops, Value
 from sim_backends.dynamics.integrate import rk4_step
 from sim_backends.dynamics.single_track import Actuation, SingleTrack
 from sim_backends.effects import Effect

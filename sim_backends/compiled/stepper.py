@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from sim_backends.array_ops import Ops, Value
 from sim_backends.car_parameters import ModelKind
 from sim_backends.compiled.step import CHUNK_CARS, compile_gradient, compile_step, trace_step
-from sim_backends.dynamics.array_ops import Ops, Value
 from sim_backends.dynamics.single_track import Actuation, State
 from sim_backends.effects import EFFECTS, Effect
 

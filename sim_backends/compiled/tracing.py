@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
-from sim_backends.dynamics.array_ops import Ops
+from sim_backends.array_ops import Ops
 
 Argument = "Node | float"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects import EFFECTS
 from sim_backends.effects.base import DynamicsEffect, Forces, ModelKind, Parameters, StepStart, StiffStep
 

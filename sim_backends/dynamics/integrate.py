@@ -7,8 +7,8 @@ import math
 from collections.abc import Mapping
 from typing import Protocol
 
+from sim_backends.array_ops import Value
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
-from sim_backends.dynamics.array_ops import Value
 from sim_backends.dynamics.single_track import NO_STIFF_STEPS, Actuation, SingleTrack, State
 from sim_backends.effects.base import Forces, StepStart, StiffStep
 

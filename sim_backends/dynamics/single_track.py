@@ -14,8 +14,8 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
+from sim_backends.array_ops import Ops, Value
 from sim_backends.car_parameters import GRAVITY_MPS2, ModelKind
-from sim_backends.dynamics.array_ops import Ops, Value
 from sim_backends.dynamics.effect_hooks import EffectHooks
 from sim_backends.effects.base import Forces, StiffStep
 

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import torch
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 
 
 class TorchOps:

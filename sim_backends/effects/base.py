@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol, get_args
 
 from carlab.core.quantities import FloatArray
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.inverse import newton_inverse
 
 GRAVITY_MPS2 = 9.81

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim_backends.dynamics.array_ops import Value
+from sim_backends.array_ops import Value
 from sim_backends.effects.base import Confusable, DelayEffect, EffectParameter, Parameters
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.dynamics.array_ops import Ops
+from sim_backends.array_ops import Ops
 from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 LARGEST_FORCE_N = 1e9

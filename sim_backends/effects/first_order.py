@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 
 NO_STEP_S = 1e-15
 """Added to a step, so that one of no length divides and has a derivative [s]."""

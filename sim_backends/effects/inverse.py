@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 
 _DIFFERENCE = 1e-4
 """Step of the difference quotients [m, rad, m/s, rad/s]: each iteration shrinks the error by about this factor."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters, Triple
 from sim_backends.effects.first_order import lag_weights
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import GRAVITY_MPS2, Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 ROLL_SENSITIVITY = 0.3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import Confusable, EffectParameter, ObservationEffect, Parameters, ScreeningProbe
 
 

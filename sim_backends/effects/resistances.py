@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim_backends.dynamics.array_ops import Ops
+from sim_backends.array_ops import Ops
 from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 ROLLING_SPEED_MPS = 0.05

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters, Triple
 
 FASTEST_RADPS = 1e6

@@ -5,7 +5,7 @@ Acting order: dead band, nonlinearity, lag. Throttle in [-1, 1].
 
 from __future__ import annotations
 
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters
 
 _SMALLEST = 1e-12

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from sim_backends.dynamics.array_ops import Ops, Value
+from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import (
     Confusable,
     DynamicsEffect,

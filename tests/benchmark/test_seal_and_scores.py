@@ -13,6 +13,7 @@ import pytest
 
 from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.cases.seal import check, digest, new_nonce
+from carlab.benchmark.intervals import wilson
 from carlab.benchmark.proof.case_score import score_case, valid_set
 from carlab.benchmark.proof.runner import Proof
 from carlab.benchmark.proof.scores import (
@@ -21,7 +22,6 @@ from carlab.benchmark.proof.scores import (
     score_cases,
     summarise,
     table_rows,
-    wilson,
     write_scores,
 )
 from carlab.core.errors import DataError

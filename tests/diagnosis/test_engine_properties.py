@@ -13,11 +13,11 @@ from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import Outcome, diagnose
+from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.identification.fit import Fit, Fitter, Scale, base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.selection.elimination import eliminate
-from carlab.diagnosis.selection.evidence import Texts
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.unexplained.residual_terms import TERMS, responses

@@ -18,6 +18,7 @@ from carlab.core.errors import ConfigError
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.core.quantities import Action, CarState
 from carlab.diagnosis.diagnose import Outcome, diagnose
+from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.report.sentences import (
     effect_noun,
     effect_sentence,
@@ -26,7 +27,6 @@ from carlab.diagnosis.report.sentences import (
     wrong_sentence,
 )
 from carlab.diagnosis.report.write import write_report
-from carlab.diagnosis.selection.evidence import Texts
 from carlab.prediction.initial_states import as_recorded
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import cut_windows, tracks_of
@@ -284,7 +284,7 @@ def test_the_car_file_keeps_it_and_learning_has_it_in_its_prior(found: Outcome, 
 
 
 def test_the_prior_predicts_rows_of_a_recording_with_the_effects() -> None:
-    from learning.world.transitions import transitions_of
+    from learning.transitions import transitions_of
 
     config = SimulatorConfig(effects=TRUE, control_period_s=1.0 / 30.0)
     rows = transitions_of([recording(3, 10.0)], 8)

@@ -18,11 +18,11 @@ from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import drive as simulated_drive
 from carlab.cars import load_car_file
 from carlab.diagnosis.diagnose import diagnose
+from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
-from carlab.diagnosis.selection.evidence import Texts
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows

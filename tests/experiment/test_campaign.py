@@ -40,9 +40,9 @@ from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import read_log
 from learning.evaluation import negative_log_likelihood
 from learning.policy.sac_agent import SacAgent, SacPolicy, SacSettings
+from learning.transitions import transitions_of
 from learning.world import car_fit
 from learning.world.car_fit import load_car
-from learning.world.transitions import transitions_of
 
 
 def listened_to(choice: CarChoice) -> list[Action]:

@@ -26,9 +26,9 @@ from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.posterior.particle_posterior import MIN_INPUT_CLIP, ParticlePosterior
 from learning.priors.simulator_model import CarModel
+from learning.transitions import transitions_of
 from learning.world.car_dynamics import CarDynamics, advance, inputs_of
 from learning.world.car_fit import FILE_VERSION, CarFitSettings, fit_car, load_car, save_car
-from learning.world.transitions import transitions_of
 from sim_backends.car_parameters import SimulatorConfig
 
 HISTORY = 3

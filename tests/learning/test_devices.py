@@ -38,10 +38,10 @@ from learning.posterior.particle_posterior import ParticlePosterior
 from learning.priors.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids, draw_parameters
 from learning.priors.function_prior import RbfCovariance
 from learning.priors.simulator_model import CarModel
+from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.car_fit import CarFitSettings, fit_car, load_car, save_car
 from learning.world.model_env import ModelEnv
-from learning.world.transitions import Transitions
 from sim_backends.car_parameters import SimulatorConfig
 
 ROWS, HISTORY = 48, 1

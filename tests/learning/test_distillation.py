@@ -11,13 +11,13 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from learning.functional_svgd.stein import moment_direction
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.posterior import distillation
 from learning.posterior.distillation import MAX_NEIGHBOUR_DISTANCE, DistillationSettings, distil, measurement_points
 from learning.posterior.inference import infer
 from learning.priors.domain_models import uniform
+from learning.stein import moment_direction
 
 UNITS = Normaliser(torch.tensor([0.5]), torch.tensor([1.5]), torch.tensor([1.0]), torch.tensor([2.0]))
 NOISE = torch.tensor([0.2])

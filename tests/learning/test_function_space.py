@@ -8,9 +8,9 @@ import torch
 from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
-from learning.functional_svgd.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 from learning.networks.particles import LEAKY_RELU_SLOPE, Network
 from learning.priors.function_prior import RbfCovariance, gaussian_process, simulator_marginal
+from learning.stein import RbfKernel, median_bandwidth, natural_direction, stein_direction
 
 
 def generator(seed=0):

@@ -12,7 +12,7 @@ from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, CarState
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import CarModel, known_ranges
-from learning.world.transitions import transitions_of, velocity_delay_s
+from learning.transitions import transitions_of, velocity_delay_s
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.plant import Plant

@@ -11,7 +11,7 @@ from carlab.core.errors import ConfigError
 from learning.baselines.system_identification import identify
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import CarModel
-from learning.world.transitions import transitions_of
+from learning.transitions import transitions_of
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
 

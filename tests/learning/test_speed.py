@@ -13,9 +13,9 @@ from carlab.experiment.campaign.training import velocity_delay_s
 from learning import speed
 from learning.evaluation import Mixture
 from learning.priors.simulator_model import CarModel
+from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.car_fit import CarFitSettings, fit_car
-from learning.world.transitions import Transitions
 
 
 def test_networks_alone_whole_predictions_and_steps_of_the_learned_car_have_figures_of_their_own(

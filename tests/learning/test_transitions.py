@@ -13,7 +13,7 @@ from carlab.core.quantities import Action
 from carlab.core.task import ParkingTask
 from carlab.experiment.episodes.episode import run_episode
 from learning.baselines.ridge import PENALTIES, Ridge
-from learning.world.transitions import OUTPUTS, Transitions, has_whole_step, transitions_of, velocity_delay_s
+from learning.transitions import OUTPUTS, Transitions, has_whole_step, transitions_of, velocity_delay_s
 
 
 def episode(ticks=30, seed=0):

@@ -17,7 +17,6 @@ from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
 from mocap.emulators.scene import EmulatedBody
 from mocap.natnet.bitstream_switch import BitstreamSwitch
-from mocap.natnet.client import NatNetClient
 from mocap.natnet.codec import (
     Frame,
     MessageId,
@@ -36,6 +35,7 @@ from mocap.natnet.models import (
     RigidBody,
     RigidBodyDescription,
 )
+from mocap.natnet_client import NatNetClient
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]

@@ -11,9 +11,9 @@ from carlab.core.errors import ConfigError, NotReadyError
 from mocap.config import MocapConfig
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
-from mocap.natnet.client import NatNetClient
 from mocap.natnet.discovery import discover
 from mocap.natnet.models import BitstreamVersion
+from mocap.natnet_client import NatNetClient
 
 Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]

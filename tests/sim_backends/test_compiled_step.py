@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from sim_backends.array_ops import FLOATS
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.tracing import Tracer, gradients
-from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.effects import EFFECTS
 
 EVERYTHING = {  # all but the one that turns a kinematic or linear-tyre car into a dynamic one

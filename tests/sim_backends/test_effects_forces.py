@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from carlab.core.quantities import Action, CarState
+from sim_backends.array_ops import FLOATS
 from sim_backends.car_parameters import CarParameters, SimulatorConfig
-from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.plant import Plant
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
+from sim_backends.array_ops import FLOATS
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.dynamics.actuators import ActuatorChain
-from sim_backends.dynamics.array_ops import FLOATS
 from sim_backends.effects import EFFECTS
 from sim_backends.effects.first_order import lag_weights
 

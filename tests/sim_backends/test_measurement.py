@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from sim_backends.array_ops import ARRAYS, FLOATS
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
-from sim_backends.dynamics.array_ops import ARRAYS, FLOATS
 from sim_backends.dynamics.torch_ops import torch_ops
 from sim_backends.effects import EFFECTS, ObservationEffect
 from sim_backends.measurement import (

@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from carlab.core.quantities import Action, CarState
+from sim_backends.array_ops import ARRAYS, FLOATS
 from sim_backends.car_parameters import CarParameters, SimulatorConfig
-from sim_backends.dynamics.array_ops import ARRAYS, FLOATS
 from sim_backends.dynamics.plain_loop import derivative as plain_derivative
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.effects import EFFECTS

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from carlab.benchmark.baselines.run import BASELINES, NAMES_NOTHING
-from carlab.benchmark.proof.scores import wilson
+from carlab.benchmark.intervals import wilson
 
 Row = Mapping[str, Any]
 COLUMNS = ("tool", *BASELINES)

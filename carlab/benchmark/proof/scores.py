@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from carlab.benchmark.effects.catalogue import EFFECT_IDS
+from carlab.benchmark.intervals import wilson
 from carlab.benchmark.proof.case_score import score_case
 
 Row = Mapping[str, Any]
@@ -45,16 +45,6 @@ RATES: tuple[tuple[str, str, Callable[[Row], bool], str], ...] = (
     ("located: patch centre within its radius", "place_right", lambda r: True, ""),
     ("located: drift separated from switch", "time_right", lambda r: True, ">= 0.80"),
 )
-
-
-def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
-    """95 % interval of a share (Wilson, 1927). (0, 1) where nothing was counted."""
-    if count == 0:
-        return 0.0, 1.0
-    share, squared = hits / count, z * z
-    middle = (share + squared / (2 * count)) / (1 + squared / count)
-    half = z / (1 + squared / count) * math.sqrt(share * (1 - share) / count + squared / (4 * count * count))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
 
 
 def score_cases(

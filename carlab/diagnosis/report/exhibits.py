@@ -9,8 +9,8 @@ import numpy as np
 
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.evidence import ScoredSearch, score_ladder
 from carlab.diagnosis.findings import Exhibits, Trace
-from carlab.diagnosis.selection.evidence import ScoredSearch, score_ladder
 from carlab.diagnosis.settings import ReportSettings
 from carlab.diagnosis.unexplained.description import REGIMES, start_features
 from carlab.prediction.errors import prediction_errors

@@ -26,9 +26,9 @@ from carlab.core.state_estimator import StateEstimator
 from carlab.core.task import ParkingTask
 from carlab.recording.episode_builder import VELOCITY_DELAY
 from learning.priors.simulator_model import CarModel, known_ranges
+from learning.transitions import Transitions, has_whole_step, transitions_of
 from learning.world.car_fit import LearnedCar, Method
 from learning.world.history import find_history
-from learning.world.transitions import Transitions, has_whole_step, transitions_of
 from sim_backends.car_parameters import SimulatorConfig
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ from typing import IO
 import mcap_protobuf.schema
 from mcap.writer import Writer
 
-import carlab
 from carlab.core.documents import EpisodeEnded, EpisodeStarted, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
+from carlab.core.version import VERSION
 from carlab.recording.episode_builder import OWN_COLUMNS, documents_from_episode
 from carlab.recording.mcap import schemas as schemas
 from carlab.recording.mcap.messages import (
@@ -61,7 +61,7 @@ class McapSink(Sink):
         try:
             self._file = claim(self.path).open("xb")
             self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
-            self._writer.start(profile="", library=f"carlab {carlab.__version__}")
+            self._writer.start(profile="", library=f"carlab {VERSION}")
             self._writer.add_metadata(schemas.RUN_RECORD, self._run_metadata)
             for topic, message_class in schemas.TOPIC_CLASSES.items():
                 schema_id = mcap_protobuf.schema.register_schema(self._writer, message_class)

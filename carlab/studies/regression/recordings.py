@@ -16,9 +16,9 @@ from carlab.core.errors import DataError
 from carlab.experiment.campaign.campaign import check_period, prior_simulator
 from carlab.studies.regression.cases import Case, Data
 from learning.priors.simulator_model import DELAY, CarModel, known_ranges
+from learning.transitions import Transitions, transitions_of, velocity_delay_s
 from learning.world.car_fit import NOISE_STD
 from learning.world.history import find_history
-from learning.world.transitions import Transitions, transitions_of, velocity_delay_s
 from sim_backends.car_parameters import SimulatorConfig
 
 MAX_YAW_RATE_RADPS = 10.0
