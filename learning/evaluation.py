@@ -9,7 +9,7 @@ import torch
 from scipy.special import stdtr
 from torch import Tensor
 
-from learning.posterior.outliers import log_student, mahalanobis_sq, tail_scales
+from learning.outliers import log_student, mahalanobis_sq, tail_scales
 
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.977, 0.99)
 """Nominal coverages of the calibration error."""

@@ -1,10 +1,13 @@
 """The structure, proven: layers, who may print, who may ask for the time, and light package roots."""
 
 import ast
+import graphlib
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
+import grimp
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -16,6 +19,73 @@ def test_layers_point_down() -> None:
     linter = Path(sys.executable).with_name("lint-imports")
     done = subprocess.run([str(linter)], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """Modules that each module imports, at its head, inside functions or for type checking."""
+    graph = grimp.build_graph(*PACKAGES, cache_dir=None)
+    return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+
+
+def test_modules_do_not_import_each_other_in_a_cycle(imports: dict[str, set[str]]) -> None:
+    assert len(imports) > 300
+    assert _cycle(imports) == []
+
+
+def test_packages_do_not_import_each_other_in_a_cycle(imports: dict[str, set[str]]) -> None:
+    """In every package: its modules and sub-packages, each taken as one."""
+    packages = {module.rpartition(".")[0] for module in imports} - {""}
+    assert {"carlab", "carlab.diagnosis", "learning"} <= packages
+    assert {package: cycle for package in packages if (cycle := _cycle(_members(imports, package)))} == {}
+
+
+def _members(imports: dict[str, set[str]], package: str) -> dict[str, set[str]]:
+    """Imports among the direct members of ``package``, without its ``__init__``."""
+    depth = package.count(".") + 2
+
+    def member(module: str) -> str:
+        return ".".join(module.split(".")[:depth])
+
+    within = [module for module in imports if module.startswith(f"{package}.")]
+    return {
+        name: {
+            member(imported)
+            for module in within
+            if member(module) == name
+            for imported in imports[module]
+            if imported.startswith(f"{package}.")
+        }
+        - {name}
+        for name in {member(module) for module in within}
+    }
+
+
+def _cycle(imports: dict[str, set[str]]) -> list[str]:
+    try:
+        graphlib.TopologicalSorter(imports).prepare()
+    except graphlib.CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_a_cycle_is_found() -> None:
+    imports = {"p.a.x": {"p.b.x"}, "p.b.x": set(), "p.b.y": {"p.a.y"}, "p.a.y": set(), "p.a": set(), "p.b": set()}
+    assert _cycle(imports) == []
+    assert set(_cycle(_members(imports, "p"))) == {"p.a", "p.b"}
+
+
+def test_every_package_has_a_layer(imports: dict[str, set[str]]) -> None:
+    """An exhaustive contract fails where a member of its package has no layer."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    covered = {
+        container for contract in contracts if contract.get("exhaustive") for container in contract["containers"]
+    }
+    packages = {module.rpartition(".")[0] for module in imports} - {""}
+    assert {parent for package in packages if (parent := package.rpartition(".")[0])} - covered == set()
+    assert set(PACKAGES) <= covered
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -75,3 +145,17 @@ def test_every_package_is_typed() -> None:
 def test_files_stay_readable() -> None:
     long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > 400}
     assert long == {}
+
+
+def test_functions_stay_short() -> None:
+    """At most 60 lines; ruff counts their branches. ``reference_rates`` is one table of equations."""
+    sources = [*SOURCES, *(p for folder in ("tests", "docs", "examples") for p in (ROOT / folder).rglob("*.py"))]
+    long = {
+        f"{path.relative_to(ROOT)}: {node.name}"
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.end_lineno is not None
+        and node.end_lineno - node.lineno >= 60
+    }
+    assert long == {"tests/sim_backends/test_effects_dynamics.py: reference_rates"}

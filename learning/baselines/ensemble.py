@@ -16,7 +16,7 @@ from learning.baselines.ridge import Ridge
 from learning.evaluation import Mixture
 from learning.functional_svgd.fsvgd import FsvgdSettings, check_rows, fit_fsvgd
 from learning.networks.normaliser import Normaliser
-from learning.posterior.outliers import decorrelation_of, output_correlation
+from learning.outliers import decorrelation_of, output_correlation
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.posterior.residuals import ResidualDistribution, fit_residuals
 

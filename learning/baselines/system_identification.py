@@ -13,7 +13,7 @@ from carlab.core.errors import DataError
 from learning.evaluation import Mixture
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
 from learning.networks.normaliser import Normaliser
-from learning.posterior.outliers import log_student
+from learning.outliers import log_student
 from learning.posterior.residuals import ResidualDistribution, fit_residuals
 from learning.priors.domain_models import DomainModel, draw_parameters
 from learning.priors.function_prior import RbfCovariance

@@ -4,8 +4,8 @@ This is carlab's own method, not the algorithm of Rothfuss et al. (arXiv 2403.16
 ``learning.functional_svgd.fsvgd`` with a ``SimulatorPrior``. Here the posterior's moments are in closed form
 (``function_posterior``: a Gaussian process around a simulator whose parameters are drawn by sequential Monte Carlo).
 Particles are moved until they have these moments at many small measurement sets: Stein's direction with a linear kernel
-(``learning.stein.moment_direction``; Liu and Wang 2018, "Stein Variational Gradient Descent as Moment Matching"), pulled
-back to the networks' parameters as in algorithm 1 of the paper.
+(``learning.stein.moment_direction``; Liu and Wang 2018, "Stein Variational Gradient Descent as Moment Matching"),
+pulled back to the networks' parameters as in algorithm 1 of the paper.
 """
 
 from __future__ import annotations

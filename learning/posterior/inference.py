@@ -11,15 +11,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.networks.normaliser import Normaliser
-from learning.posterior.discrepancy import (
-    CHOLESKY_JITTER,
-    PRIOR_DISCREPANCY_STD,
-    DiscrepancyCovariance,
-    fit_discrepancy,
-    fit_noise,
-)
-from learning.posterior.function_posterior import FunctionPosterior, simulate
-from learning.posterior.outliers import (
+from learning.outliers import (
     decorrelation_of,
     initial_row_weights,
     leave_one_out,
@@ -29,6 +21,14 @@ from learning.posterior.outliers import (
     output_correlation,
     student_weights,
 )
+from learning.posterior.discrepancy import (
+    CHOLESKY_JITTER,
+    PRIOR_DISCREPANCY_STD,
+    DiscrepancyCovariance,
+    fit_discrepancy,
+    fit_noise,
+)
+from learning.posterior.function_posterior import FunctionPosterior, simulate
 from learning.posterior.parameter_posterior import posterior_parameters
 from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, DomainModel, draw_parameters
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from learning.evaluation import Mixture
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
-from learning.posterior.outliers import tail_scales
+from learning.outliers import tail_scales
 
 MIN_INPUT_CLIP = 6.0
 """Smallest bound at which normalised inputs are clipped; a network extrapolates without bound."""

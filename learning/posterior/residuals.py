@@ -14,7 +14,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.evaluation import Mixture
-from learning.posterior.outliers import (
+from learning.outliers import (
     DOF_CANDIDATES,
     DOF_MIN_GAIN_NATS,
     log_student,

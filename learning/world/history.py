@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from carlab.core.episode_data import EpisodeData
+from learning.outliers import leave_one_out, log_student
 from learning.posterior.discrepancy import CHOLESKY_JITTER, fit_discrepancy
-from learning.posterior.outliers import leave_one_out, log_student
 from learning.transitions import transitions_of
 
 CANDIDATE_LENGTHS = (0, 1, 2, 3, 4, 6, 8)

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import multivariate_t, norm
 from scipy.stats import t as student
 
-from learning.posterior.outliers import (
+from learning.outliers import (
     LOG_MEDIAN_VARIANCE,
     SCALE_LOG_STD,
     SCALE_RANGE,

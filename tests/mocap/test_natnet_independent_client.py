@@ -28,30 +28,10 @@ FRAMES = 240
 BODIES = (EmulatedBody("car", 7), EmulatedBody("trailer", 9))
 
 
-@pytest.mark.realtime
-@pytest.mark.parametrize("mode", ["unicast", "multicast"])
-@pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
-def test_another_client_receives_our_frames(
-    serve: Callable[..., NatNetServer], mode: str, version: BitstreamVersion
-) -> None:
-    sent: dict[int, list[RigidBodySample | None]] = {}
-
-    def poses(t_s: float) -> list[RigidBodySample | None]:
-        number = server.frames
-        car = RigidBodySample.planar(t_s - 0.004, 0.001 * number, -1.5, 0.01 * (number % 300), 0.125)
-        trailer = None if number % 5 == 0 else RigidBodySample.planar(t_s - 0.004, 2.0, 0.5, -0.5)
-        sent[number] = [car, trailer]
-        return sent[number]
-
-    opened = threading.Event()
-    server: NatNetServer
-
-    def first(t_s: float) -> list[RigidBodySample | None]:
-        opened.wait()
-        return poses(t_s)
-
-    server = serve(first, bodies=BODIES, rate_hz=240.0, mode=mode, version=version)
-    opened.set()
+def receive(
+    server: NatNetServer, mode: str, version: BitstreamVersion
+) -> tuple[list[DataFrame], DataDescriptions, float]:
+    """Frames, descriptions and the seconds that the other client took to receive them."""
     frames: list[DataFrame] = []
     models: list[DataDescriptions] = []
     done, described = threading.Event(), threading.Event()
@@ -80,9 +60,58 @@ def test_another_client_receives_our_frames(
         client.stop_async()
         assert client.protocol_version.components[:2] == tuple(version)
         assert client.server_info.application_name == "carlab emulator"
+    return frames, models[0], elapsed_s
 
-    assert [(b.name, b.id_num) for b in models[0].rigid_bodies] == [("car", 7), ("trailer", 9)]
-    assert [s.name for s in models[0].marker_sets] == ["car", "trailer", "all"]
+
+def check_frame(frame: DataFrame, truth: list[RigidBodySample | None], server: NatNetServer) -> None:
+    """The frame holds the poses that the server sent under its number."""
+    number = frame.prefix.frame_number
+    car, trailer = frame.rigid_bodies
+    first = truth[0]
+    assert first is not None
+    assert (car.id_num, trailer.id_num) == (7, 9)
+    assert car.tracking_valid
+    assert trailer.tracking_valid == (number % 5 != 0)
+    # Y up on the wire: (x, y, z) of the map is (x, z, -y).
+    assert car.pos == pytest.approx((0.001 * number, 0.125, 1.5), abs=1e-6)
+    heading = Rotation.from_quat(car.rot).apply([1.0, 0.0, 0.0])
+    turned = Rotation.from_euler("y", 0.01 * (number % 300)).apply([1.0, 0.0, 0.0])
+    assert heading == pytest.approx(turned, abs=1e-5)
+    suffix = frame.suffix
+    assert suffix.stamp_camera_mid_exposure == server.ticks(first.t_capture_s)
+    assert suffix.stamp_camera_mid_exposure <= suffix.stamp_data_received <= suffix.stamp_transmit
+    assert suffix.timestamp == pytest.approx(number / 240.0, abs=1e-9)
+    assert len(frame.labeled_markers) == 8
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("mode", ["unicast", "multicast"])
+@pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
+def test_another_client_receives_our_frames(
+    serve: Callable[..., NatNetServer], mode: str, version: BitstreamVersion
+) -> None:
+    sent: dict[int, list[RigidBodySample | None]] = {}
+
+    def poses(t_s: float) -> list[RigidBodySample | None]:
+        number = server.frames
+        car = RigidBodySample.planar(t_s - 0.004, 0.001 * number, -1.5, 0.01 * (number % 300), 0.125)
+        trailer = None if number % 5 == 0 else RigidBodySample.planar(t_s - 0.004, 2.0, 0.5, -0.5)
+        sent[number] = [car, trailer]
+        return sent[number]
+
+    opened = threading.Event()
+    server: NatNetServer
+
+    def first(t_s: float) -> list[RigidBodySample | None]:
+        opened.wait()
+        return poses(t_s)
+
+    server = serve(first, bodies=BODIES, rate_hz=240.0, mode=mode, version=version)
+    opened.set()
+    frames, models, elapsed_s = receive(server, mode, version)
+
+    assert [(b.name, b.id_num) for b in models.rigid_bodies] == [("car", 7), ("trailer", 9)]
+    assert [s.name for s in models.marker_sets] == ["car", "trailer", "all"]
 
     numbers = [frame.prefix.frame_number for frame in frames]
     assert numbers == sorted(set(numbers))
@@ -92,20 +121,4 @@ def test_another_client_receives_our_frames(
     assert 100.0 < len(numbers) / elapsed_s < 260.0
 
     for frame in frames:
-        number = frame.prefix.frame_number
-        car, trailer = frame.rigid_bodies
-        truth = sent[number][0]
-        assert truth is not None
-        assert (car.id_num, trailer.id_num) == (7, 9)
-        assert car.tracking_valid
-        assert trailer.tracking_valid == (number % 5 != 0)
-        # Y up on the wire: (x, y, z) of the map is (x, z, -y).
-        assert car.pos == pytest.approx((0.001 * number, 0.125, 1.5), abs=1e-6)
-        heading = Rotation.from_quat(car.rot).apply([1.0, 0.0, 0.0])
-        turned = Rotation.from_euler("y", 0.01 * (number % 300)).apply([1.0, 0.0, 0.0])
-        assert heading == pytest.approx(turned, abs=1e-5)
-        suffix = frame.suffix
-        assert suffix.stamp_camera_mid_exposure == server.ticks(truth.t_capture_s)
-        assert suffix.stamp_camera_mid_exposure <= suffix.stamp_data_received <= suffix.stamp_transmit
-        assert suffix.timestamp == pytest.approx(number / 240.0, abs=1e-9)
-        assert len(frame.labeled_markers) == 8
+        check_frame(frame, sent[frame.prefix.frame_number], server)

@@ -34,8 +34,8 @@ from carlab.studies.regression import recordings as regression_recordings
 from carlab.studies.regression.recordings import DELAY_S, RecordedCase, recorded_case
 from carlab.studies.regression.study import run_study
 from learning.baselines.ridge import Ridge
+from learning.outliers import tail_scales
 from learning.posterior.inference import infer
-from learning.posterior.outliers import tail_scales
 from learning.posterior.residuals import fit_residuals
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import DELAY, CarModel, known_ranges
