@@ -3,6 +3,7 @@
 The truth is the concealed generator's, which shares no code with the diagnosis and keeps what noise was added.
 """
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -140,7 +141,7 @@ def test_vibration_of_a_wheel_is_found_with_its_radius(shaking: Drive, plain: Dr
     found = find_vibration(shaking.tracks)
     assert found is not None
     assert 1.0 / (2.0 * np.pi * found.periods_per_m) == pytest.approx(0.06, rel=0.02)
-    assert "60 mm" in found.words() or "61 mm" in found.words()
+    assert re.search("6[01] mm", found.class_statement())
     assert find_vibration(plain.tracks) is None
 
 
