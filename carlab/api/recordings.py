@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
     from carlab.recording.audit.report import AuditReport
-    from carlab.recording.csv.mapping import ColumnMapping
+    from carlab.recording.column_mapping import ColumnMapping
 
 CSV_ENDINGS = (".csv", ".csv.gz")
 
@@ -167,7 +167,7 @@ def resolved_mapping(
     Raises:
         ConfigError: the mapping file or an option is wrong.
     """
-    from carlab.recording.csv.mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
+    from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
     from carlab.recording.csv.table import read_csv
 
     columns: dict[str, dict[str, Any]] = {}

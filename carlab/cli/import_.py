@@ -16,7 +16,7 @@ from carlab.cli.recordings import print_findings
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from carlab.recording.csv.mapping import ColumnMapping
+    from carlab.recording.column_mapping import ColumnMapping
 
 Sign = Literal[1, -1]
 NOT_OF_THE_MAPPING = ("recording", "out", "mapping", "report", "verbose")

@@ -14,7 +14,7 @@ from carlab.cli.import_ import Import
 from carlab.cli.learn import Learn
 from carlab.cli.options import CarOptions
 from carlab.cli.replay import Replay
-from carlab.recording.csv.mapping import CHANNELS, ColumnMapping
+from carlab.recording.column_mapping import CHANNELS, ColumnMapping
 
 CASES = [
     (Drive, carlab.drive, {"verbose"}),

@@ -8,13 +8,13 @@ from scipy.signal import lfilter
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from carlab.diagnosis.recording_faults.episode_motion import held_means, lagged
 from carlab.diagnosis.recording_faults.find import check
 from carlab.diagnosis.recording_faults.integration_step import check_integration
 from carlab.recording.audit.report import RefusedError
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
 from carlab.recording.csv.repairing_import import import_mended
+from carlab.recording.faults.robust import first_order_lag, held_means
 from sim_backends.car_parameters import SimulatorConfig
 
 NOMINAL = SimulatorConfig.from_preset()
@@ -371,7 +371,7 @@ def test_held_values_are_averaged_and_a_lag_has_its_own_delay_only():
     means = held_means(t, np.array([1.0, 5.0, 2.0, 7.0]), np.array([0.5, 1.0, 2.9]), 1.0)
     np.testing.assert_allclose(means, [3.0, 5.0, 0.1 * 2.0 + 0.9 * 7.0])
     grid = np.arange(0.0, 20.0, 0.03)
-    followed = lagged(grid, 0.03, 0.2)
+    followed = first_order_lag(grid, 0.03, 0.2)
     np.testing.assert_allclose((grid - followed)[200:], 0.2, atol=1e-6)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from carlab.recording.audit.audit import Severity
+from carlab.recording.column_mapping import CANONICAL, DART, ETH
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
-from carlab.recording.csv.mapping import CANONICAL, DART, ETH
 from carlab.recording.pose_velocity import pose_jumps
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
@@ -64,6 +64,11 @@ def test_a_clean_recording_raises_no_alarm(clean, tmp_path):
             {"columns": {"yaw_rate": {"scale": 0.714}}},
         ),
         (
+            lambda c: {"vx": 0.9 * c["vx"], "vy": 0.9 * c["vy"]},
+            ("column_scale", "vx, vy"),
+            {"columns": {"vx": {"scale": 1.111}, "vy": {"scale": 1.111}}},
+        ),
+        (
             lambda c: {"vx": np.cos(c["yaw"]) * c["vx"], "vy": np.sin(c["yaw"]) * c["vx"]},
             ("wrong_frame", "vx, vy"),
             {"velocity_frame": "world"},
@@ -83,6 +88,7 @@ def test_a_clean_recording_raises_no_alarm(clean, tmp_path):
         "yaw_rate",
         "vx",
         "gyro scale",
+        "speed scale",
         "world frame",
         "clockwise",
         "axes",

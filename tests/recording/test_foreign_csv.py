@@ -9,8 +9,8 @@ import pytest
 
 from carlab.core.errors import ConfigError, DataError
 from carlab.recording.audit.audit import Severity
+from carlab.recording.column_mapping import CANONICAL, DART, ETH, ColumnMapping, ColumnSource, load_mapping
 from carlab.recording.csv.foreign import import_csv
-from carlab.recording.csv.mapping import CANONICAL, DART, ETH, ColumnMapping, ColumnSource, load_mapping
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
 foreign = importlib.util.module_from_spec(_spec)

@@ -1,1 +1,1 @@
-"""Audit of a foreign recording: stamps, units, frames, signs, spikes, delays."""
+"""Audit of a recording: findings with severity and remedy."""

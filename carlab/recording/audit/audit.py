@@ -1,25 +1,52 @@
-"""The audit of a recording: runs all checks in the order in which one can rely on another.
+"""The audit of a recording: runs the fault detection on a file's columns and says which option corrects what.
 
-Nothing is changed here. Each finding carries numbers and, where there is one, the option that would act on it; see
-``audit_stamps``, ``audit_motion`` and ``audit_commands`` for the checks and the reasons for their thresholds.
+Nothing is changed here. Each finding carries numbers and, where there is one, the option that acts on it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.recording.audit import commands as audit_commands
-from carlab.recording.audit import motion as audit_motion
-from carlab.recording.audit import stamps as audit_stamps
+from carlab.recording.audit import file_checks
 from carlab.recording.audit.report import AuditReport, Finding, Severity
-from carlab.recording.csv.mapping import COMMAND_CHANNELS, VELOCITY_CHANNELS, ColumnMapping
+from carlab.recording.column_mapping import COMMAND_CHANNELS, VELOCITY_CHANNELS, ColumnMapping
+from carlab.recording.faults.commands import (
+    MIN_ROWS,
+    CommandResponse,
+    command_response,
+    grid_motion,
+    wrong_command_sign,
+)
+from carlab.recording.faults.fault import Fault
+from carlab.recording.faults.heading import heading_faults
+from carlab.recording.faults.robust import LAGS_S, ColumnFit, correlation, fit_column, held_at
+from carlab.recording.faults.settings import LIMITS
+from carlab.recording.faults.stamps import nominal_clock, periods_by_distance
+from carlab.recording.faults.velocity import (
+    comparable_rows,
+    scale_faults,
+    spike_fault,
+    velocity_lag,
+    velocity_references,
+    velocity_spikes,
+    wrong_velocity_frame,
+)
 from carlab.recording.pose_velocity import BoolArray, PoseMotion
 
 __all__ = ["AuditReport", "Channels", "Finding", "Severity", "audit_channels"]
+
+MIN_MOVING_ROWS, MIN_TURNING_ROWS = 50, 30
+MIN_COMMAND_RANGE = 0.05
+"""Range of a command (full command = 1) below which nothing is said about its sign."""
+EFFECTS = {"steering": "the path's curvature", "throttle": "the acceleration"}
+SIGN_REMEDIES = {
+    "steering": "use --steering-sign -1",
+    "throttle": "use --throttle-sign -1, or --yaw-offset 3.1416 if yaw points to the rear",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,101 +63,185 @@ class Channels:
     segment: FloatArray
     motion: PoseMotion | None
 
-    @property
-    def pose_speed_mps(self) -> FloatArray:
-        """Speed over ground of the pose, shape (N,); zero where there is no pose."""
-        if self.motion is None:
-            return np.zeros(len(self.t_s))
-        return np.hypot(self.motion.vx_world, self.motion.vy_world)
+    def periods_s(self) -> FloatArray:
+        """Time from row to row by distance over speed [s], shape (N - 1,); NaN at low speed."""
+        position, velocity = (np.stack([self.values[name] for name in pair]) for pair in (("x", "y"), ("vx", "vy")))
+        return periods_by_distance(position, velocity, self.segment)
 
 
 def audit_channels(channels: Channels, mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:
     """Check all but order, gaps and jumps. Returns findings and the mask of rows with a yaw_rate spike, (N,)."""
     t_s, values, motion = channels.t_s, channels.values, channels.motion
-    spikes = np.zeros(len(t_s), dtype=bool)
-    findings = audit_stamps.check_held(t_s, {**values, **channels.extra})
-    findings += audit_commands.check_command_range(values, mapping)
+    findings = file_checks.check_held(t_s, {**values, **channels.extra})
+    findings += file_checks.check_command_range(values, mapping)
     if mapping.throttle_gate:
         gate = channels.extra[mapping.throttle_gate]
-        findings += audit_commands.check_gate(values["throttle"], gate, mapping.throttle_gate)
+        findings += file_checks.check_gate(values["throttle"], gate, mapping.throttle_gate)
     if motion is None:
-        return findings, spikes
-    findings += audit_stamps.check_stale(values, channels.pose_speed_mps)
-    used = mapping.velocities == "columns"
-    estimated = [name for name in VELOCITY_CHANNELS if name not in values or not used]
-    if "vx" in values and "vy" in values:
-        if used:
-            findings += audit_motion.check_velocity(t_s, values["vx"], values["vy"], motion, mapping)
-        findings += check_clock(channels)
-    if "yaw_rate" in values and used:
-        found, spikes = audit_motion.check_yaw_rate(t_s, values["yaw_rate"], motion, mapping)
-        findings += found
-    if estimated:
-        lacking = "are not in the file and " if used else ""
-        findings.append(
-            Finding(
-                "estimated_velocity",
-                ", ".join(estimated),
-                Severity.INFO,
-                f"{', '.join(estimated)} {lacking}were estimated from the pose: {motion.method()}.",
-            )
-        )
-    steering, throttle = (np.nan_to_num(values[name]) for name in COMMAND_CHANNELS)
-    if mapping.throttle_gate:
-        throttle = throttle * channels.extra[mapping.throttle_gate]
-    findings += audit_commands.check_steering(t_s, steering, motion)
-    findings += audit_commands.check_throttle(t_s, throttle, motion, channels.segment)
-    states = {"vx": motion.vx, "vy": motion.vy, "yaw_rate": motion.yaw_rate}
+        return findings, np.zeros(len(t_s), dtype=bool)
+    findings += file_checks.check_stale(t_s, values)
+    found, spikes = _check_velocities(channels, motion, mapping)
+    findings += found + _check_commands(channels, motion, mapping)
+    states = velocity_references(motion)
     for name, channel in mapping.references.items():
         if name in channels.extra and channel in states:
-            findings += audit_commands.check_reference(t_s, name, channels.extra[name], channel, states[channel])
-    if "frozen_pose" in (f.id for f in findings):  # several sensors see the same; the first is enough
-        first = next(f for f in findings if f.id == "frozen_pose")
-        findings = [f for f in findings if f.id != "frozen_pose" or f is first]
+            found = file_checks.check_reference(t_s, name, channels.extra[name], channel, states[channel])
+            # Several sensors show the same frozen pose; the first finding is enough.
+            known = {f.id for f in findings} & {"frozen_pose"}
+            findings += [f for f in found if f.id not in known]
     return findings, spikes
 
 
-def true_periods(channels: Channels) -> FloatArray:
-    """Time from row to row by distance over speed [s], shape (N - 1,); NaN below 0.3 m/s.
-
-    Right where the velocity columns are backward differences of the pose by the true period, as loggers make them.
-    """
-    values = channels.values
-    distance = np.hypot(np.diff(values["x"]), np.diff(values["y"]))
-    speed = np.hypot(values["vx"], values["vy"])[1:]
-    whole = (speed > 0.3) & (np.diff(channels.segment) == 0)
-    return np.where(whole, distance / np.where(whole, speed, 1.0), np.nan)
+def check_heading(t_s: FloatArray, values: Mapping[str, FloatArray], mapping: ColumnMapping) -> list[Finding]:
+    """Unit, sense and axis of the pose by the course over ground. ``values`` holds x, y and yaw (N,)."""
+    return [_finding(fault, mapping) for fault in heading_faults(t_s, values)]
 
 
-def check_clock(channels: Channels) -> list[Finding]:
-    """Compare the stamps with distance over speed: shows a nominal clock over rows that were not even."""
-    periods = true_periods(channels)
-    stamped = np.diff(channels.t_s)
-    known = np.isfinite(periods)
-    if known.sum() < 200:
+def _finding(fault: Fault, mapping: ColumnMapping) -> Finding:
+    """A fault of columns, by their names. A unit that is not SI and not declared is an error."""
+    if fault.id == "too_little_motion":
+        return Finding.of_fault(fault, Severity.INFO)
+    sources = [mapping.columns[channel] for channel in fault.channel.split(", ")]
+    severity, remedy = Severity.FAULT, f"use {fault.option}"
+    if fault.id == "wrong_unit" and not sources[0].unit:
+        severity, remedy = Severity.ERROR, f"say so with {fault.option}"
+    elif fault.channel == "x, y":
+        severity = Severity.WARNING
+    alternative = {"x, y": " (or --x-unit m --y-unit m if it is so)", "--yaw-sign -1": " (or --y-sign -1)"}
+    remedy += alternative.get(fault.channel, alternative.get(fault.option or "", ""))
+    names = ", ".join(f"'{source.name}'" for source in sources)
+    named = replace(fault, observation=f"{'Columns' if len(sources) > 1 else 'Column'} {names}: {fault.observation}")
+    return Finding.of_fault(named, severity, remedy)
+
+
+def _check_velocities(
+    channels: Channels, motion: PoseMotion, mapping: ColumnMapping
+) -> tuple[list[Finding], BoolArray]:
+    """Checks of vx, vy and yaw_rate against the pose. Returns findings and the mask of yaw_rate spikes, (N,)."""
+    t_s, values = channels.t_s, channels.values
+    is_used = mapping.velocities == "columns"
+    findings: list[Finding] = []
+    spikes = np.zeros(len(t_s), dtype=bool)
+    if "vx" in values and "vy" in values:
+        findings += _check_velocity(t_s, np.stack([values["vx"], values["vy"]]), motion, mapping) if is_used else []
+        clock = nominal_clock(t_s, channels.periods_s())
+        if clock is not None:
+            findings.append(Finding.of_fault(clock, Severity.WARNING, "rebuild them with --clock velocity"))
+    if "yaw_rate" in values and is_used:
+        found, spikes = _check_yaw_rate(t_s, values["yaw_rate"], motion, mapping)
+        findings += found
+    estimated = ", ".join(name for name in VELOCITY_CHANNELS if name not in values or not is_used)
+    if estimated:
+        absent = "are not in the file and " if is_used else ""
+        sentence = f"{estimated} {absent}were estimated from the pose: {motion.method()}."
+        findings.append(Finding("estimated_velocity", estimated, Severity.INFO, sentence))
+    return findings, spikes
+
+
+def _check_velocity(t_s: FloatArray, velocity: FloatArray, motion: PoseMotion, mapping: ColumnMapping) -> list[Finding]:
+    """Unit, frame, signs and lag of vx and vy (2, N) as declared, against the pose."""
+    moving = comparable_rows(motion, "vx")
+    if moving.sum() < MIN_MOVING_ROWS:
         return []
-    ratio = periods[known] / stamped[known]
-    # The comparison means something only where velocities are plain differences: then most ratios agree to 1 or 2 %.
-    # Steps that then are off by more than 10 % in more than 1 % of the rows were stamped wrongly.
-    low, middle, high = (float(q) for q in np.percentile(ratio, [25, 50, 75]))
-    odd = np.flatnonzero(known)[np.abs(ratio - middle) > 0.1]
-    if high - low > 0.02 or abs(middle - 1) > 0.1 or len(odd) < 0.01 * known.sum():
-        return []
-    p1, p99 = (float(q) for q in np.percentile(periods[known], [1, 99]))
-    mean = float(np.mean(periods[known]))
-    return [
-        Finding(
-            "clock_drift",
-            "t",
-            Severity.WARNING,
-            f"By distance over speed, rows were {p1 * 1e3:.1f} to {p99 * 1e3:.1f} ms apart (98 %), "
-            f"{mean * 1e3:.2f} ms on average, "
-            f"where the stamps say {float(np.mean(stamped)) * 1e3:.2f} ms; {len(odd)} steps are off by more than "
-            f"10 %: the time column "
-            "is nominal; rebuild it with --clock velocity.",
-            len(odd),
-            tuple(int(k) + 2 for k in odd[:20]),
-            {"mean_s": mean, "p1_s": p1, "p99_s": p99, "stamped_s": float(np.mean(stamped))},
-            "--clock velocity",
-        )
+    speed = np.hypot(motion.vx_world, motion.vy_world)
+    # Unit and factor by the speed: both columns have the same, and vy alone is often noise.
+    faults = scale_faults("vx, vy", fit_column(t_s, speed, np.hypot(*velocity), moving), speed[moving])
+    frame = mapping.velocity_frame
+    wrong_frame = wrong_velocity_frame(t_s, velocity, motion, frame)
+    if wrong_frame is not None:
+        frame = "world" if frame == "body" else "body"
+    references = velocity_references(motion, frame)
+    columns = {"vx": velocity[0], "vy": velocity[1]}
+    if not faults:
+        for name, column in columns.items():
+            fit = fit_column(t_s, references[name], column, moving)
+            faults += scale_faults(name, fit, references[name][moving])
+    faults += [] if wrong_frame is None else [wrong_frame]
+    if faults:
+        return [_finding(fault, mapping) for fault in faults]
+    fits = [
+        fit_column(t_s, references[name], column, moving, lags_s=LAGS_S, time_constants_s=(0.0,))
+        for name, column in columns.items()
     ]
+    return _lag_findings("vx, vy", t_s, max(fits, key=lambda fit: fit.rms**2 * fit.unexplained_unshifted))
+
+
+def _check_yaw_rate(
+    t_s: FloatArray, yaw_rate: FloatArray, motion: PoseMotion, mapping: ColumnMapping
+) -> tuple[list[Finding], BoolArray]:
+    """Unit, sign, lag and spikes of a yaw_rate column (N,). Returns findings and the mask of spiked rows, (N,)."""
+    rows = np.abs(motion.yaw_rate) > LIMITS.turning_radps
+    no_spikes = np.zeros(len(t_s), dtype=bool)
+    if rows.sum() < MIN_TURNING_ROWS:
+        return [], no_spikes
+    faults = scale_faults("yaw_rate", fit_column(t_s, motion.yaw_rate, yaw_rate, rows), motion.yaw_rate[rows])
+    if faults:
+        return [_finding(fault, mapping) for fault in faults], no_spikes
+    fit = fit_column(t_s, motion.yaw_rate, yaw_rate, rows, lags_s=LAGS_S, time_constants_s=(0.0,))
+    findings = _lag_findings("yaw_rate", t_s, fit)
+    spikes = velocity_spikes("yaw_rate", float(np.median(np.diff(t_s))), yaw_rate, fit.prediction)
+    fault = spike_fault("yaw_rate", yaw_rate, spikes, motion)
+    if fault is not None and mapping.repair_yaw_rate:
+        findings.append(Finding.of_fault(fault, Severity.REPAIRED, "those rows were taken from the pose"))
+    elif fault is not None:
+        findings.append(Finding.of_fault(fault, remedy=f"take those rows from the pose with {fault.option}"))
+    if spikes.others.any():
+        sentence = (
+            f"yaw_rate is far from the turn rate of yaw in {spikes.others.sum()} further rows (first row "
+            f"{np.argmax(spikes.others) + 1}): an impact, or a frame that came late."
+        )
+        findings.append(Finding.at(spikes.others, "outliers", "yaw_rate", Severity.INFO, sentence))
+    return findings, spikes.rows if fault is not None else no_spikes
+
+
+def _lag_findings(channel: str, t_s: FloatArray, fit: ColumnFit) -> list[Finding]:
+    fault = velocity_lag(channel, float(np.median(np.diff(t_s))), fit)
+    remedy = "estimate velocities without delay with --velocities pose"
+    return [] if fault is None else [Finding.of_fault(fault, Severity.INFO, remedy)]
+
+
+def _check_commands(channels: Channels, motion: PoseMotion, mapping: ColumnMapping) -> list[Finding]:
+    """Sign and delay of both commands by their effect on the motion."""
+    findings = []
+    grid = grid_motion(channels.t_s, motion, channels.segment)
+    for index, channel in enumerate(COMMAND_CHANNELS):
+        command = np.nan_to_num(channels.values[channel])
+        if channel == "throttle" and mapping.throttle_gate:
+            command = command * channels.extra[mapping.throttle_gate]
+        answer = command_response(grid, channels.t_s, command, channel)
+        effect = EFFECTS[channel]
+        evidence = {} if answer is None else _command_evidence(channel, channels.t_s, command, motion, answer)
+        if answer is None or answer.best < LIMITS.command_explained[index]:
+            if np.ptp(command) > MIN_COMMAND_RANGE and grid.rows.sum() >= MIN_ROWS:
+                sentence = f"{channel.capitalize()} explains too little of {effect}: its sign is unknown."
+                findings.append(Finding("unclear_sign", channel, Severity.INFO, sentence, evidence=evidence))
+        elif answer.gain < 0 and answer.lag_s > -LIMITS.early_response_s:
+            fault = wrong_command_sign(channel, answer, evidence)
+            findings.append(Finding.of_fault(fault, remedy=SIGN_REMEDIES[channel]))
+        elif answer.is_lag_inside:  # at the edge, the drive does not show the delay
+            delay_s = evidence["delay_s"]
+            sentence = (
+                f"{effect[0].upper()}{effect[1:]} {'follows' if delay_s >= 0 else 'precedes'} {channel} by about "
+                f"{abs(delay_s):.2f} s ({answer.best:.0%} explained), delay, servo or motor and tyres together."
+            )
+            findings.append(Finding("command_delay", channel, Severity.INFO, sentence, evidence=evidence))
+    return findings
+
+
+def _command_evidence(
+    channel: str, t_s: FloatArray, command: FloatArray, motion: PoseMotion, answer: CommandResponse
+) -> dict[str, float]:
+    """Delay with the time constant [s], gain, share explained, and correlations of the delayed command (N,)."""
+    delay_s = answer.lag_s + answer.time_constant_s
+    evidence = {"explained": answer.best, "gain": answer.gain, "delay_s": delay_s}
+    held = held_at(t_s, command, delay_s)
+    moving = np.abs(motion.vx) > LIMITS.moving_mps
+    if channel == "throttle":
+        return evidence | {"correlation_speed": correlation(held[moving], motion.vx[moving])}
+    # 5 1/m: a turning circle of 0.2 m, tighter than any such car; beyond it the car spins or stands.
+    curvature = np.clip(motion.yaw_rate[moving] / motion.vx[moving], -5.0, 5.0)
+    evidence["correlation"] = correlation(held[moving], curvature)
+    for word, rows in (("forward", motion.vx > LIMITS.moving_mps), ("reverse", motion.vx < -LIMITS.moving_mps)):
+        if rows.sum() > 100:
+            evidence[f"correlation_yaw_rate_{word}"] = correlation(held[rows], motion.yaw_rate[rows])
+    return evidence

@@ -1,4 +1,4 @@
-"""What an audit of a recording says: findings with evidence, and the option that would act on each."""
+"""What an audit of a recording says: findings with evidence, and the option that acts on each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,14 @@ import enum
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from carlab.core.errors import DataError
+from carlab.recording.faults.fault import Fault
+from carlab.recording.pose_velocity import BoolArray, IndexArray
+
+MAX_ROWS = 60
+"""Row numbers that a finding lists."""
 
 
 class Severity(enum.IntEnum):
@@ -17,7 +24,7 @@ class Severity(enum.IntEnum):
     REPAIRED = 1
     """A fault that the mapping declares how to repair, and that was repaired."""
     WARNING = 2
-    """Degrades what is learnt from the recording."""
+    """Degrades what is learned from the recording."""
     FAULT = 3
     """Very likely wrong as imported; the option says what would change it."""
     ERROR = 4
@@ -29,7 +36,7 @@ class Finding:
     """One observation about a recording.
 
     ``rows`` are the first data rows concerned (row 1 follows the header), ``count`` is how many there are; ``option``
-    is the ``carlab import`` option that would act on it.
+    is the ``carlab import`` option that acts on it.
     """
 
     id: str
@@ -41,10 +48,29 @@ class Finding:
     evidence: Mapping[str, float] = field(default_factory=dict)
     option: str | None = None
 
+    @classmethod
+    def at(
+        cls,
+        rows: IndexArray | BoolArray,
+        identity: str,
+        channel: str,
+        severity: Severity,
+        sentence: str,
+        evidence: Mapping[str, float] | None = None,
+        option: str | None = None,
+    ) -> Finding:
+        """A finding about some rows: their indices (from 0), or a mask."""
+        indices = np.flatnonzero(rows) if rows.dtype == bool else rows
+        numbers = tuple(int(k) + 1 for k in indices[:MAX_ROWS])
+        return cls(identity, channel, severity, sentence, len(indices), numbers, evidence or {}, option)
 
-def first_rows(indices: Sequence[int] | Iterable[int], most: int = 20) -> tuple[int, ...]:
-    """Data row numbers (from 1) of array indices (from 0), the first ``most`` of them."""
-    return tuple(int(k) + 1 for k in list(indices)[:most])
+    @classmethod
+    def of_fault(cls, fault: Fault, severity: Severity = Severity.FAULT, remedy: str | None = None) -> Finding:
+        """A fault with its remedy, by default its option. A repaired fault has no option left."""
+        clause = f"use {fault.option}" if remedy is None and fault.option else remedy
+        sentence = fault.observation[0].upper() + fault.observation[1:] + (f"; {clause}." if clause else ".")
+        option = None if severity is Severity.REPAIRED else fault.option
+        return cls.at(fault.rows, fault.id, fault.channel, severity, sentence, fault.evidence, option)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,10 @@ from scipy.ndimage import median_filter
 
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
-from carlab.recording.audit.audit import Channels, true_periods
+from carlab.recording.audit.audit import Channels
 from carlab.recording.audit.report import Finding, Severity
-from carlab.recording.audit.stamps import gap_rows
+from carlab.recording.faults.robust import robust_std
+from carlab.recording.faults.stamps import gap_rows
 
 _LEAST_ROWS = 200
 _BEAT_ROWS = 51
@@ -21,7 +22,7 @@ def rebuilt_clock(channels: Channels) -> tuple[FloatArray, str]:
     """Stamps (N,) from distance over speed; slower than 0.3 m/s, the median of those periods. And a note on it."""
     if "vx" not in channels.values or "vy" not in channels.values:
         raise DataError("The clock can be rebuilt only where vx and vy columns are given; use --clock column.")
-    periods = true_periods(channels)
+    periods = channels.periods_s()
     median = float(np.nanmedian(periods)) if np.isfinite(periods).any() else float("nan")
     # Beyond half to three times the median, the speed is at fault (an impact, a stale row), not the clock.
     trusted = (periods > 0.5 * median) & (periods < 3 * median)
@@ -62,14 +63,14 @@ def even_clock(t_s: FloatArray) -> tuple[FloatArray, list[Finding]]:
     if not moved:
         return t_s, []
     off = even - t_s
-    spread = 1.4826 * float(np.median(np.abs(off)))
+    jitter_s = robust_std(off)
     finding = Finding(
         "arrival_stamps",
         "t",
         Severity.REPAIRED,
-        f"The stamps of {moved} rows are those of arrival and jitter by {spread * 1e3:.2f} ms (up to "
+        f"The stamps of {moved} rows are those of arrival and jitter by {jitter_s * 1e3:.2f} ms (up to "
         f"{float(np.abs(off).max()) * 1e3:.1f} ms) about an even beat; the beat was taken.",
         moved,
-        evidence={"jitter_s": spread, "largest_s": float(np.abs(off).max())},
+        evidence={"jitter_s": jitter_s, "largest_s": float(np.abs(off).max())},
     )
     return even - even[0], [finding]

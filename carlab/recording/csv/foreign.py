@@ -13,14 +13,20 @@ import numpy as np
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
-from carlab.recording.audit.audit import Channels, audit_channels
-from carlab.recording.audit.comparison import held_at
-from carlab.recording.audit.heading import check_heading
+from carlab.recording.audit.audit import Channels, audit_channels, check_heading
+from carlab.recording.audit.file_checks import check_jumps, check_missing, check_order, check_stamps
 from carlab.recording.audit.report import AuditReport, Finding, Severity, raise_errors
-from carlab.recording.audit.stamps import check_jumps, check_missing, check_order, check_stamps, gap_rows, segments
+from carlab.recording.column_mapping import (
+    CHANNELS,
+    VELOCITY_CHANNELS,
+    ColumnMapping,
+    missing_columns,
+    recognise_layout,
+)
 from carlab.recording.csv.clocks import even_clock, rebuilt_clock
-from carlab.recording.csv.mapping import CHANNELS, VELOCITY_CHANNELS, ColumnMapping, missing_columns, recognise_layout
 from carlab.recording.csv.table import CsvTable, read_csv
+from carlab.recording.faults.robust import held_at
+from carlab.recording.faults.stamps import gap_rows, segments
 from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
 
 

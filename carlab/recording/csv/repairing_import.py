@@ -9,8 +9,8 @@ from typing import Any
 
 from carlab.core.errors import DataError
 from carlab.recording.audit.report import Finding, RefusedError
+from carlab.recording.column_mapping import ColumnMapping, recognise_layout
 from carlab.recording.csv.foreign import ImportedRecording, import_csv
-from carlab.recording.csv.mapping import ColumnMapping, recognise_layout
 from carlab.recording.csv.table import read_csv
 
 _CHANNELS = ("x", "y", "yaw", "vx", "vy", "yaw_rate")

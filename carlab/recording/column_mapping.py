@@ -1,6 +1,6 @@
 """What the columns of a foreign CSV mean: declared in TOML, or known of a layout that its header gives away.
 
-A mapping declares; the audit (``data_audit``) detects. Only what is declared is converted.
+A mapping declares; the audit (``carlab.recording.audit``) detects. Only what is declared is converted.
 """
 
 from __future__ import annotations

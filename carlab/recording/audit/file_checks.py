@@ -1,0 +1,257 @@
+"""Checks of a file's columns by themselves: missing values, stamps, repeats, range of commands, further sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.recording.audit.report import Finding, Severity
+from carlab.recording.column_mapping import COMMAND_CHANNELS, POSE_CHANNELS, ColumnMapping
+from carlab.recording.faults.pose import frozen_rows, stale_rows
+from carlab.recording.faults.robust import LAGS_S, correlation, fit_column, wrapped
+from carlab.recording.faults.stamps import gap_rows
+from carlab.recording.pose_velocity import BoolArray, IndexArray
+
+MAX_NUMBER = 1e12
+"""Larger numbers in SI units are markers or damage, and their squares overflow soon."""
+MAX_COMMAND = 1.05
+"""A calibration overshoots by up to 5 %; more is another unit (degrees, per cent, microseconds)."""
+
+
+def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:
+    """Find cells that are empty, not finite or absurdly large. Returns findings and the mask of whole rows, shape (N,).
+
+    Commands of the last row are never executed, so they may be missing.
+    """
+    rows = len(values["t"])
+    whole = np.ones(rows, dtype=bool)
+    findings = []
+    is_dropped = mapping.missing == "drop"
+    severity, treatment, option = (
+        (Severity.REPAIRED, "those rows were left out and the command before each was held", None)
+        if is_dropped
+        else (Severity.ERROR, "leave those rows out with --missing drop, or repair the file", "--missing drop")
+    )
+    for channel, column in values.items():
+        bad = ~np.isfinite(column) | (np.abs(column) > MAX_NUMBER)
+        bad[-1] &= channel not in COMMAND_CHANNELS
+        if not bad.any():
+            continue
+        whole &= ~bad
+        name = mapping.columns[channel].name if channel in mapping.columns else channel
+        sentence = (
+            f"Column '{name}' has no number in {bad.sum()} of {rows} rows, the first in row {np.argmax(bad) + 1}; "
+            f"{treatment}."
+        )
+        findings.append(
+            Finding.at(bad, "not_a_number", channel, severity, sentence, {"share": float(np.mean(bad))}, option)
+        )
+    return findings, whole
+
+
+def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:
+    """Find stamps that repeat or go back. Returns findings and the mask of rows that advance, shape (N,)."""
+    advances = t_s > np.maximum.accumulate(np.concatenate([[-np.inf], t_s[:-1]]))
+    if advances.all():
+        return [], advances
+    step = np.diff(t_s)
+    repeated, back = int(np.sum(step == 0)), int(np.sum(step < 0))
+    k = int(np.flatnonzero(step <= 0)[0])
+    severity, treatment, option = (
+        (Severity.REPAIRED, f"{(~advances).sum()} rows were left out", None)
+        if mapping.stamps == "drop"
+        else (Severity.ERROR, "leave such rows out with --stamps drop, or sort or cut the file", "--stamps drop")
+    )
+    sentence = (
+        f"Time does not increase: {repeated} stamps repeat and {back} go back, first from {t_s[k]:.6g} s in row "
+        f"{k + 1} to {t_s[k + 1]:.6g} s in row {k + 2}; {treatment}."
+    )
+    evidence = {"repeated": repeated, "back": back, "largest_step_back_s": float(-min(step.min(), 0.0))}
+    return [Finding.at(~advances, "stamp_order", "t", severity, sentence, evidence, option)], advances
+
+
+def check_stamps(t_s: FloatArray, mapping: ColumnMapping) -> list[Finding]:
+    """Gaps, jitter and a clock that was constructed afterwards. ``t_s`` (N,) increases."""
+    gaps = gap_rows(t_s)
+    findings = [_gap_finding(t_s, gaps, mapping)] if len(gaps) else []
+    return findings + (_check_even_stamps(t_s) or _check_jitter(t_s, gaps))
+
+
+def _gap_finding(t_s: FloatArray, gaps: IndexArray, mapping: ColumnMapping) -> Finding:
+    step = np.diff(t_s)
+    median, longest = float(np.median(step)), float(step[gaps - 1].max())
+    severity, treatment = {
+        "error": (Severity.ERROR, "split the recording there with --gaps split, or import it whole with --gaps keep"),
+        "split": (Severity.REPAIRED, "the recording was split there"),
+        "keep": (Severity.WARNING, "kept as one episode; the command before each gap is held across it"),
+    }[mapping.gaps]
+    sentence = (
+        f"{len(gaps)} gaps in time, the first after row {gaps[0]} ({step[gaps[0] - 1]:.3f} s where rows are "
+        f"{median:.4f} s apart), the longest {longest:.3f} s; {treatment}."
+    )
+    option = "--gaps split" if mapping.gaps == "error" else None
+    return Finding.at(gaps, "dropouts", "t", severity, sentence, {"median_s": median, "longest_s": longest}, option)
+
+
+def _check_even_stamps(t_s: FloatArray) -> list[Finding]:
+    """Stamps that all lie within 2 % of a period of a straight line: no computer that drives a car measures those."""
+    rows = np.arange(len(t_s))
+    slope, start = np.polyfit(rows, t_s, 1)
+    deviation = float(np.abs(t_s - start - slope * rows).max())
+    if len(t_s) <= 30 or deviation >= 0.02 * float(np.median(np.diff(t_s))):
+        return []
+    sentence = (
+        f"Every stamp lies within {deviation * 1e3:.2g} ms of an even {1 / slope:.5g} Hz: the clock may be nominal "
+        "(row number times period) rather than measured."
+    )
+    evidence = {"rate_hz": float(1 / slope), "largest_deviation_s": deviation}
+    return [Finding("nominal_clock", "t", Severity.INFO, sentence, evidence=evidence)]
+
+
+def _check_jitter(t_s: FloatArray, gaps: IndexArray) -> list[Finding]:
+    """Steps of time, other than ``gaps``, that vary by more than 5 % or are off by more than half a period."""
+    step = np.diff(t_s)
+    median = float(np.median(step))
+    low, high = (float(q) for q in np.percentile(step, [1, 99]))
+    odd = np.setdiff1d(np.flatnonzero((step < 0.5 * median) | (step > 1.5 * median)) + 1, gaps)
+    if high - low <= 0.05 * median and not len(odd):
+        return []
+    longest = float(np.delete(step, gaps - 1).max())
+    sentence = (
+        f"Rows are {median * 1e3:.2f} ms apart, 98 % of them between {low * 1e3:.2f} and {high * 1e3:.2f} ms; "
+        f"{len(odd)} steps are off by more than half a period (the longest without a gap {longest * 1e3:.1f} ms). "
+        "Stamps are kept as they are."
+    )
+    evidence = {"median_s": median, "p1_s": low, "p99_s": high, "shortest_s": float(step.min())}
+    return [Finding.at(odd, "stamp_jitter", "t", Severity.INFO, sentence, evidence)]
+
+
+def check_held(t_s: FloatArray, columns: Mapping[str, FloatArray]) -> list[Finding]:
+    """Columns that change only every few rows: a slow source repeated in fast rows. One finding a hold length."""
+    held: dict[int, list[str]] = {}
+    for name, column in columns.items():
+        edges = np.flatnonzero(np.concatenate([[True], np.diff(column) != 0, [True]]))
+        lengths = np.diff(edges)
+        # A held column repeats for the same number of rows over and over: at least 20 runs, most of one length (give or
+        # take the beat between the two rates), hardly any shorter.
+        if len(lengths) < 20:
+            continue
+        mode = int(np.bincount(lengths).argmax())
+        tolerance = max(1, round(0.2 * mode))
+        is_mode = np.abs(lengths - mode) <= tolerance
+        if mode >= 3 and is_mode.mean() > 0.4 and np.mean(lengths < mode - tolerance) < 0.1:
+            held.setdefault(mode, []).append(name)
+    period = float(np.median(np.diff(t_s)))
+    findings = []
+    for length, names in sorted(held.items()):
+        rate_hz = 1 / (length * period)
+        sentence = (
+            f"{', '.join(names)}: new values only every {length} rows, {rate_hz:.1f} Hz in rows of {1 / period:.1f} "
+            f"Hz; a change is seen up to {length * period:.2f} s late."
+        )
+        evidence = {"rows": length, "rate_hz": rate_hz}
+        findings.append(Finding("held_samples", ", ".join(names), Severity.INFO, sentence, evidence=evidence))
+    return findings
+
+
+def check_stale(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Finding]:
+    """Rows that repeat the pose before while the car moves."""
+    stale = stale_rows(t_s, np.column_stack([values[name] for name in POSE_CHANNELS]))
+    if not stale.any():
+        return []
+    severity = Severity.WARNING if stale.mean() > 0.01 else Severity.INFO
+    sentence = (
+        f"{stale.sum()} rows repeat the pose of the row before although the car moves (first row "
+        f"{np.argmax(stale) + 1}): the logger was faster than the camera system or lost a frame."
+    )
+    return [Finding.at(stale, "stale_samples", "x, y, yaw", severity, sentence)]
+
+
+def check_jumps(
+    t_s: FloatArray, values: Mapping[str, FloatArray], jumps: IndexArray, mapping: ColumnMapping
+) -> list[Finding]:
+    """Steps of the pose that no car makes. ``jumps`` (J,) as ``pose_jumps`` returns them."""
+    if not len(jumps):
+        return []
+    step = float(np.hypot(np.diff(values["x"]), np.diff(values["y"]))[jumps - 1].max())
+    turn = float(np.abs(wrapped(np.diff(values["yaw"])))[jumps - 1].max())
+    severity, treatment, option = (
+        (Severity.REPAIRED, "The recording was split there", None)
+        if mapping.gaps == "split"
+        else (Severity.FAULT, "Velocities are not estimated across; cut it with --gaps split", "--gaps split")
+    )
+    sentence = (
+        f"The pose jumps {len(jumps)} times (first at row {jumps[0] + 1}, {t_s[jumps[0]]:.2f} s), by up to {step:.2f} "
+        f"m and {turn:.2f} rad between rows: tracking was lost or another body was taken for the car. {treatment}."
+    )
+    evidence = {"largest_m": step, "largest_rad": turn}
+    return [Finding.at(jumps, "outliers", "x, y, yaw", severity, sentence, evidence, option)]
+
+
+def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> list[Finding]:
+    """Commands beyond [-1, 1], and commands that never change. The last row's command is not executed."""
+    findings = []
+    for channel in COMMAND_CHANNELS:
+        column = values[channel][:-1]
+        name = mapping.columns[channel].name
+        largest = float(np.abs(column).max())
+        beyond = np.abs(column) > 1.0 + 1e-6
+        if beyond.any():
+            severity = Severity.ERROR if largest > MAX_COMMAND else Severity.WARNING
+            option = f"--{channel}-scale {1 / largest:.3g}"
+            sentence = (
+                f"Column '{name}' ({channel}) reaches {largest:.4g} where commands lie in [-1, 1], first in row "
+                f"{np.argmax(beyond) + 1}; say what full command is, for example {option}."
+            )
+            evidence = {"largest": largest}
+            findings.append(Finding.at(beyond, "command_range", channel, severity, sentence, evidence, option))
+        elif float(np.ptp(column)) < 1e-6:
+            sentence = f"Column '{name}' ({channel}) is {column[0]:.3g} throughout: its effect cannot be identified."
+            findings.append(Finding("constant_command", channel, Severity.WARNING, sentence, len(column)))
+    return findings
+
+
+def check_gate(throttle: FloatArray, gate: FloatArray, name: str) -> list[Finding]:
+    """Rows whose throttle did not reach the motor because the gate column (N,) is not 1."""
+    inert = (throttle != 0) & (gate != 1) & np.isfinite(throttle)
+    if not inert.any():
+        return []
+    sentence = (
+        f"In {inert.sum()} rows (first row {np.argmax(inert) + 1}) throttle is logged but '{name}' is not 1, so the "
+        "car did not get it: 'sent' holds their product, 'requested' the column."
+    )
+    return [Finding.at(inert, "gated_throttle", "throttle", Severity.REPAIRED, sentence)]
+
+
+def check_reference(t_s: FloatArray, name: str, column: FloatArray, channel: str, state: FloatArray) -> list[Finding]:
+    """Compare a sensor (N,) with the state (N,) it measures again; find where the pose stands still meanwhile."""
+    findings = []
+    threshold = max(0.25 * float(np.percentile(np.abs(column), 95)), 0.2)
+    frozen = frozen_rows(t_s, state, column, threshold)
+    if frozen.any():  # tracking was lost, or another body was taken for the car
+        first = int(np.argmax(frozen))
+        sentence = (
+            f"The pose stands still in {frozen.sum()} rows (first row {first + 1}, {t_s[first]:.2f} s) in which "
+            f"'{name}' shows motion: it is not the car's; leave that part out (--gaps split)."
+        )
+        evidence = {"seconds": float(frozen.sum() * np.median(np.diff(t_s)))}
+        findings.append(
+            Finding.at(frozen, "frozen_pose", "x, y, yaw", Severity.FAULT, sentence, evidence, "--gaps split")
+        )
+    rows = ~frozen & np.isfinite(column) & (np.abs(state) > threshold)
+    if rows.sum() < 100:
+        return findings
+    fit = fit_column(t_s, state, column, rows, lags_s=LAGS_S, time_constants_s=(0.0,))
+    agreement = correlation(fit.prediction[rows], column[rows]) * float(np.sign(fit.scale))
+    if abs(agreement) > 0.3:
+        is_inside = LAGS_S[0] < fit.lag_s < LAGS_S[-1]
+        lag = f"{fit.lag_s * 1e3:.0f} ms later" if is_inside else "at a lag that this drive does not show"
+        sentence = (
+            f"'{name}' is {fit.scale:.2f} times the {channel} of the pose, {lag} (correlation {agreement:.2f}); it is "
+            "kept as an extra column and not used for the state."
+        )
+        evidence = {"scale": fit.scale, "correlation": agreement} | ({"lag_s": fit.lag_s} if is_inside else {})
+        findings.append(Finding("reference_column", channel, Severity.INFO, sentence, evidence=evidence))
+    return findings

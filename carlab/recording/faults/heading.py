@@ -1,0 +1,112 @@
+"""Unit of x, y and yaw, sense of rotation and axes of a pose, by the course over ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.recording.faults.fault import Fault
+from carlab.recording.faults.robust import wrapped
+from carlab.recording.faults.settings import LIMITS
+
+
+@dataclass(frozen=True, slots=True)
+class _Course:
+    """Course over ground [rad], yaw [rad] and turn per metre [rad/m] on the rows that move; each (n,)."""
+
+    course: FloatArray
+    yaw: FloatArray
+    turn_per_m: FloatArray
+
+
+def heading_faults(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Fault]:
+    """Compare yaw with the course over ground: unit, sense of rotation, constant offset.
+
+    A car moves along its heading, forward or backward, up to its slip. So course - yaw, doubled to make forward and
+    backward alike, is concentrated when yaw is read correctly, and spread over the circle otherwise. ``values`` holds
+    x, y and yaw (N,) as declared.
+    """
+    reach = max(1, round(0.05 / float(np.median(np.diff(t_s)))))
+    span = t_s[2 * reach :] - t_s[: -2 * reach]
+    dx, dy, turn = (values[name][2 * reach :] - values[name][: -2 * reach] for name in ("x", "y", "yaw"))
+    distance = np.hypot(dx, dy)
+    speed = distance / span
+    faults, unit_per_m = _length_unit(speed)
+    moving = speed > LIMITS.heading_mps * unit_per_m
+    course = np.arctan2(dy, dx)[moving]
+    if moving.sum() < 50 or abs(np.mean(np.exp(2j * course))) > 0.95:
+        observation = (
+            f"the car moves in only {int(moving.sum())} rows or always in one direction: unit and sign of yaw cannot "
+            "be checked"
+        )
+        return [*faults, Fault("too_little_motion", "yaw", observation)]
+    path = _Course(course, values["yaw"][reach:-reach][moving], wrapped(turn[moving]) / distance[moving])
+    return faults + _yaw_faults(path)
+
+
+def _length_unit(speed: FloatArray) -> tuple[list[Fault], float]:
+    """Unit of x and y by the speed (N,) that they give. Returns faults and how many of that unit are a metre."""
+    fast = float(np.percentile(speed, 95)) if len(speed) else 0.0
+    if fast <= LIMITS.model_car_mps:
+        return [], 1.0
+    unit, unit_per_m = ("mm", 1000.0) if fast > 10.0 * LIMITS.model_car_mps else ("cm", 100.0)
+    observation = f"the pose moves at up to {fast:.0f} m/s if x and y are metres: they look like {unit}"
+    option = f"--x-unit {unit} --y-unit {unit}"
+    evidence = {"speed_p95_mps": fast, "factor": 1.0 / unit_per_m}
+    return [Fault("wrong_unit", "x, y", observation, evidence, option)], unit_per_m
+
+
+def _yaw_faults(path: _Course) -> list[Fault]:
+    """Unit, sense of rotation and offset of yaw by how concentrated course - yaw is under each reading."""
+    means = {
+        (unit, sign): complex(np.mean(np.exp(2j * (path.course - sign * factor * path.yaw))))
+        for unit, factor in (("rad", 1.0), ("deg", np.pi / 180.0))
+        for sign in (1, -1)
+    }
+    best = max(means, key=lambda key: abs(means[key]))
+    declared, found = abs(means["rad", 1]), abs(means[best])
+    evidence = {f"concentration_{u}{'+' if s > 0 else '-'}": abs(m) for (u, s), m in means.items()}
+    is_concentrated = found > LIMITS.heading_concentration
+    if best != ("rad", 1) and is_concentrated and found - declared > LIMITS.heading_gain:
+        degrees = (
+            f"yaw follows the course over ground only when read in degrees (agreement {found:.2f} against "
+            f"{declared:.2f} in radians)"
+        )
+        faults = [Fault("wrong_unit", "yaw", degrees, evidence, "--yaw-unit deg")] if best[0] == "deg" else []
+        return faults + ([_clockwise(means[best], declared, evidence)] if best[1] < 0 else [])
+    offset = _offset(path, float(np.angle(means["rad", 1])) / 2)
+    if declared <= LIMITS.heading_concentration or abs(offset) <= LIMITS.heading_offset_rad:
+        return []
+    observation = f"the car moves {np.rad2deg(offset):.0f} degrees away from its yaw on average: yaw has another axis"
+    evidence = {**evidence, "offset_rad": offset}
+    return [Fault("wrong_frame", "yaw", observation, evidence, f"--yaw-offset {offset:.3f}")]
+
+
+def _clockwise(mean: complex, declared: float, evidence: Mapping[str, float]) -> Fault:
+    """Yaw counts the other way: x and y are exchanged where the remaining offset is a right angle."""
+    exchanged = abs(np.angle(mean)) / 2 > np.pi / 4
+    observation = (
+        f"yaw turns against the course over ground (agreement {abs(mean):.2f} with the sign changed, {declared:.2f} as "
+        f"it is): {'x and y are exchanged' if exchanged else 'yaw counts clockwise, or y points to the right'}"
+    )
+    option = "--swap-xy" if exchanged else "--yaw-sign -1"
+    return Fault("wrong_frame" if exchanged else "wrong_sign", "yaw", observation, evidence, option)
+
+
+def _offset(path: _Course, mean: float) -> float:
+    """Angle from yaw to course [rad] without what turning adds: a point ahead of the rear axle moves sideways.
+
+    Fits course - yaw = offset + ahead * (signed path curvature) by the rows less than 45 degrees from ``mean``.
+    """
+    away = wrapped(path.course - path.yaw - mean)
+    forward = np.where(np.abs(away) < np.pi / 2, 1.0, -1.0)
+    away = (away + np.pi / 2) % np.pi - np.pi / 2
+    near = np.abs(away) < np.pi / 4
+    design = np.column_stack([np.ones(int(near.sum())), (forward * path.turn_per_m)[near]])
+    if float(np.std(design[:, 1])) < 1e-6:
+        return mean
+    fitted = mean + float(np.linalg.lstsq(design, away[near], rcond=None)[0][0])
+    return min(mean, fitted, key=abs)  # always turning alike, the fit extrapolates; turning tightly, the mean is biased

@@ -1,0 +1,86 @@
+"""Thresholds of the fault detection, one a concept, with unit and reason."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class FaultSettings:
+    """Thresholds that the audit of a file and the diagnosis share. Channels are in the order vx, vy, yaw rate."""
+
+    gap_periods: float = 3.0
+    """A gap is longer than this many median periods and than ``gap_s``."""
+    gap_s: float = 0.1
+    """[s] In that time, a car at its limit (10 m/s^2) moves 5 cm away from any interpolation."""
+    clock_spread: float = 0.02
+    """Interquartile range of distance / (speed * period). Above it, the velocities are not differences of the pose."""
+    clock_step: float = 0.1
+    """Relative error of a stamped period that counts as wrong; more than 1 % of such rows make a nominal clock."""
+
+    moving_mps: float = 0.3
+    """[m/s] Below it, velocities are compared with noise."""
+    turning_radps: float = 0.3
+    """[rad/s] Below it, a yaw rate is compared with noise."""
+    stale_mps: float = 0.15
+    """[m/s] A row that repeats the pose is stale if the car moves faster: 5 mm a row at 30 Hz, 1.5 mm at 100 Hz."""
+
+    outlier_neighbours: int = 3
+    """Rows on either side that predict a row."""
+    outlier_sigmas: float = 14.0
+    outlier_m: float = 0.02
+    """[m] An outlier is at least this far from its prediction: more than a mount shakes between two frames."""
+    outlier_rad: float = 0.10
+    outlier_share: float = 0.05
+    """A larger share of outliers is a property of the measurement."""
+
+    heading_mps: float = 0.2
+    """[m/s] Below it, the course over ground is noise."""
+    model_car_mps: float = 40.0
+    """[m/s] No model car drives faster; one at 0.04 m/s does where millimetres pass for metres."""
+    heading_concentration: float = 0.6
+    """Concentration of course - yaw under the right reading. Chance stays below 0.3, recordings are above 0.7."""
+    heading_gain: float = 0.2
+    """Gain of concentration at which another reading of yaw is accepted."""
+    heading_offset_rad: float = math.radians(10.0)
+    """[rad] A misplaced rigid body is off by less, another convention (yaw from north) by 90 degrees."""
+
+    scale_share: float = 0.06
+    """A factor this far from 1 is a fault. A filter of another kind than first order leaves 2 to 3 %."""
+    unit_share: float = 0.1
+    """A factor this near to that of a unit is that unit. The known units are a factor 2.8 or more apart."""
+    scale_unexplained: tuple[float, float] = (0.02, 0.1)
+    """Unexplained variance up to which a factor is accepted: between 3/4 and 4/3, and beyond. A larger remainder next
+    to a factor near 1 is a filter, vibration between the rows, or noise."""
+    sign_unexplained: float = 0.25
+    """Unexplained variance up to which the sign of a column is accepted (correlation 0.87)."""
+    unrelated_unexplained: float = 0.9
+    """Unexplained variance from which a column does not measure the motion of the pose."""
+    frame_unexplained: float = 0.05
+    """Unexplained variance up to which the declared frame is accepted; lag and noise leave less."""
+    frame_ratio: float = 0.3
+    """Another frame is accepted if it leaves less than this share of what the declared frame leaves."""
+
+    spike_sigmas: float = 12.0
+    """A spike is this far from the fit and at least ``spike_step / period``. At 8 sigma, impacts count too."""
+    spike_step: tuple[float, float, float] = (0.1, 0.1, 0.25 * 2.0 * math.pi)
+    """[m, m, rad] Error of a single difference. A wrapped angle makes 2 pi; a filter behind it leaves a quarter."""
+    spike_tail_sigmas: float = 8.0
+    """Rows within two rows of a spike belong to it if they are this far off and at least ``spike_tail``."""
+    spike_tail: tuple[float, float, float] = (0.3, 0.3, 3.0)
+    """[m/s, m/s, rad/s]"""
+    interpolated_sigmas: float = 4.0
+    """Next to interpolated poses, velocities that far off came from the faulty poses."""
+    wrap_concentration: float = 0.8
+    """Concentration of the yaw at the spikes of a wrapped angle."""
+
+    command_explained: tuple[float, float] = (0.3, 0.15)
+    """Share of the motion that steering and throttle explain where their sign and lag are known."""
+    early_response_s: float = 0.03
+    """[s] A response this much before its command exceeds the error of the method (0.02 s); its sign means nothing."""
+    constant_command: float = 0.02
+    """Standard deviation of a command (full command = 1) below which it shows no effect."""
+
+
+LIMITS = FaultSettings()

@@ -1,0 +1,194 @@
+"""Faults of velocity columns by kinematics alone: a velocity is the derivative of the pose.
+
+No physics of the car enters. A marker off the centre, a rotated body or a latency act on the pose and on its derivative
+alike. A filter behind the velocities is fitted and is no fault.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.recording.column_mapping import UNITS, VELOCITY_CHANNELS
+from carlab.recording.faults.fault import Fault
+from carlab.recording.faults.robust import ColumnFit, fit_column, robust_std
+from carlab.recording.faults.settings import LIMITS
+from carlab.recording.pose_velocity import BoolArray, PoseMotion
+
+Frame = Literal["body", "world"]
+
+
+def velocity_references(motion: PoseMotion, frame: Frame = "body") -> dict[str, FloatArray]:
+    """Velocities of the pose (N,) that the columns vx, vy and yaw_rate should hold."""
+    vx, vy = (motion.vx, motion.vy) if frame == "body" else (motion.vx_world, motion.vy_world)
+    return {"vx": vx, "vy": vy, "yaw_rate": motion.yaw_rate}
+
+
+def comparable_rows(motion: PoseMotion, channel: str) -> BoolArray:
+    """Rows (N,) in which the motion of the pose is well above noise."""
+    moving: BoolArray = np.hypot(motion.vx_world, motion.vy_world) > LIMITS.moving_mps
+    return moving | (np.abs(motion.yaw_rate) > LIMITS.turning_radps) if channel == "yaw_rate" else moving
+
+
+def wrong_velocity_frame(t_s: FloatArray, velocity: FloatArray, motion: PoseMotion, declared: Frame) -> Fault | None:
+    """Compare vx and vy (2, N) with the pose in both frames: the right frame leaves far less, whatever the scale."""
+    moving = comparable_rows(motion, "vx")
+    size = np.mean(velocity[:, moving] ** 2, axis=1)
+    total = float(size.sum()) + 1e-18
+    unexplained: dict[Frame, float] = {}
+    frames: tuple[Frame, Frame] = ("body", "world")
+    for frame in frames:
+        references = velocity_references(motion, frame)
+        shares = [
+            fit_column(t_s, references[name], velocity[k], moving).unexplained for k, name in ((0, "vx"), (1, "vy"))
+        ]
+        unexplained[frame] = float(np.dot(shares, size)) / total
+    other: Frame = "world" if declared == "body" else "body"
+    if unexplained[declared] <= LIMITS.frame_unexplained:
+        return None
+    if unexplained[other] >= LIMITS.frame_ratio * unexplained[declared]:
+        return None
+    observation = (
+        f"vx and vy are in the {other} frame, not in the {declared} frame: the motion of the pose leaves "
+        f"{unexplained[other]:.1%} of them unexplained there and {unexplained[declared]:.0%} in the {declared} frame"
+    )
+    evidence = {f"remainder_{frame}_mps": math.sqrt(share * total) for frame, share in unexplained.items()}
+    return Fault("wrong_frame", "vx, vy", observation, evidence, f"--velocity-frame {other}")
+
+
+def unit_of_scale(channel: str, scale: float) -> str | None:
+    """The unit of ``channel``, other than SI, whose numbers are ``scale`` times those in SI."""
+    units = list(UNITS[channel].items())[1:]
+    return next((unit for unit, factor in units if abs(scale * factor - 1.0) < LIMITS.unit_share), None)
+
+
+def scale_faults(channel: str, fit: ColumnFit, reference: FloatArray) -> list[Fault]:
+    """Sign, unit and factor of a velocity column by its fit to the pose's velocity.
+
+    Args:
+        channel: ``vx``, ``vy`` or ``yaw_rate``; ``vx, vy`` for the speed of both.
+        fit: the column fitted by the reference.
+        reference: the pose's velocity on the compared rows (n,).
+
+    Returns:
+        Faults with ``factor`` in their evidence, by which to multiply the column; without it, the column does not
+        measure the motion at all.
+    """
+    size, rms = abs(fit.scale), math.sqrt(float(np.mean(reference**2)))
+    evidence = {"slope": fit.scale, "unexplained": fit.unexplained}
+    if rms > 0.3 and (fit.unexplained > LIMITS.unrelated_unexplained or size < 1e-3):
+        observation = f"{channel} does not follow the motion of the pose"
+        return [Fault("column_scale", channel, observation, evidence, "--velocities pose")]
+    if fit.unexplained > LIMITS.sign_unexplained or rms < 1e-6 or size == 0.0:
+        return []
+    faults = []
+    flag = channel.replace("_", "-")
+    if fit.scale < 0:
+        observation = f"{channel} runs against the motion of the pose (slope {fit.scale:.2f})"
+        faults.append(Fault("wrong_sign", channel, observation, evidence | {"factor": -1.0}, f"--{flag}-sign -1"))
+    is_off = abs(size - 1.0) > max(LIMITS.scale_share, 4.0 * math.sqrt(fit.unexplained / len(reference)))
+    if not is_off or fit.unexplained >= LIMITS.scale_unexplained[0 if 0.75 < size < 4.0 / 3.0 else 1]:
+        return faults
+    names = channel.split(", ")
+    unit = unit_of_scale(names[0], size)
+    factor = 1.0 / size if unit is None else UNITS[names[0]][unit]
+    quantity, verb = ("speed", "are") if len(names) > 1 else ("motion", "is")
+    observation = f"{channel} {verb} {size:.4g} times the {quantity} of the pose"
+    observation += f": the unit looks like {unit}" if unit else ""
+    what = f"unit {unit}" if unit else f"scale {factor:.4g}"
+    option = " ".join(f"--{name.replace('_', '-')}-{what}" for name in names)
+    identity = "wrong_unit" if unit else "column_scale"
+    return [*faults, Fault(identity, channel, observation, evidence | {"factor": factor}, option)]
+
+
+@dataclass(frozen=True, slots=True)
+class Spikes:
+    """Spikes of a column: rows with a spike, with a spike or its tail, and other rows far off; each (N,)."""
+
+    peaks: BoolArray
+    rows: BoolArray
+    others: BoolArray
+    error_sigmas: FloatArray
+
+    def without(self, rows: BoolArray) -> Spikes:
+        """The spikes outside ``rows`` (N,)."""
+        return Spikes(self.peaks & ~rows, self.rows & ~rows, self.others & ~rows, self.error_sigmas)
+
+
+def velocity_spikes(channel: str, period_s: float, column: FloatArray, prediction: FloatArray) -> Spikes:
+    """Rows of a velocity column (N,) far from its fit to the pose's velocity."""
+    index = VELOCITY_CHANNELS.index(channel)
+    error = np.abs(column - prediction)
+    sigma = robust_std(column - prediction)
+    peaks = error > max(LIMITS.spike_sigmas * sigma, LIMITS.spike_step[index] / period_s)
+    far = error > max(LIMITS.spike_tail_sigmas * sigma, LIMITS.spike_tail[index])
+    near = np.convolve(peaks, np.ones(5), mode="same") > 0
+    return Spikes(peaks, peaks | (far & near), far & ~near, error / max(sigma, 1e-12))
+
+
+def spike_fault(channel: str, column: FloatArray, spikes: Spikes, motion: PoseMotion) -> Fault | None:
+    """Spikes at one yaw come from the difference of a wrapped angle; spikes at no particular yaw are outliers."""
+    peaks = spikes.peaks
+    if not peaks.any():
+        return None
+    direction = complex(np.exp(1j * motion.yaw_unwrapped[peaks]).mean())
+    is_wrap = channel == "yaw_rate" and abs(direction) > LIMITS.wrap_concentration
+    size = np.abs(column[peaks])
+    share_ccw = float(np.mean(motion.yaw_rate[peaks] > 0))
+    where = (
+        f"all where yaw passes {np.angle(direction):.1f} rad, {share_ccw:.0%} of them counter-clockwise: the "
+        "difference of a wrapped angle"
+        if is_wrap
+        else "at no particular yaw: outliers"
+    )
+    observation = (
+        f"{channel} has {len(size)} spikes of {size.min():.0f} to {size.max():.0f} ({int(spikes.rows.sum())} rows with "
+        f"their tails), {where}"
+    )
+    evidence = {"spikes": len(size), "smallest": size.min(), "largest": size.max(), "share_ccw": share_ccw}
+    identity = "yaw_wrap_spikes" if is_wrap else "outliers"
+    rows = np.flatnonzero(spikes.rows)
+    return Fault(identity, channel, observation, {k: float(v) for k, v in evidence.items()}, "--repair-yaw-rate", rows)
+
+
+def velocity_lag(channel: str, period_s: float, fit: ColumnFit) -> Fault | None:
+    """Dead time of a column behind the pose. A fifth of a row is what the fit resolves on 30 s of clean data."""
+    if abs(fit.lag_s) < 0.2 * period_s or fit.unexplained > 0.9**2 * fit.unexplained_unshifted:
+        return None
+    rows = fit.lag_s / period_s
+    like = ", as backward differences are" if abs(rows - 0.5) < 0.15 else ""
+    evidence: Mapping[str, float] = {
+        "lag_s": fit.lag_s,
+        "rows": rows,
+        "remainder": fit.remainder,
+        "remainder_unshifted": fit.rms * math.sqrt(fit.unexplained_unshifted),
+    }
+    observation = f"{channel} lag the differentiated pose by {fit.lag_s * 1e3:.0f} ms ({rows:.2f} rows{like})"
+    return Fault("column_shift", channel, observation, evidence, "--velocities pose")
+
+
+def backward_differences(t_s: FloatArray, states: FloatArray, segment: FloatArray, motion: PoseMotion) -> Fault | None:
+    """Whether the velocities in ``states`` (N, 6) are backward differences of its poses, by any clock.
+
+    Such columns are half a row late and contain nothing else than the pose. The comparison is relative and about the
+    medians: nominal stamps change both by the same factor.
+    """
+    distance = np.hypot(*np.diff(states[:, :2], axis=0).T)
+    speed = np.hypot(states[1:, 3], states[1:, 4])
+    centred = np.hypot(motion.vx, motion.vy)[1:]
+    rows = (np.diff(segment) == 0) & (speed > 0.5) & (distance > 0) & (centred > 0.1)
+    if rows.sum() < 100:
+        return None
+    to_backward = robust_std(speed[rows] * np.diff(t_s)[rows] / distance[rows])
+    if to_backward > min(0.4 * robust_std(speed[rows] / centred[rows]), 0.02):
+        return None
+    observation = (
+        f"the velocities are backward differences of the pose (the speed to {to_backward:.1%}), so they are half a row "
+        f"({500 * float(np.median(np.diff(t_s))):.0f} ms) late"
+    )
+    return Fault("column_shift", "vx, vy, yaw_rate", observation)
