@@ -1,7 +1,7 @@
 """The whole story: a car that differs from its car file learns to park, and a diagnosis says what the file left out.
 
 The servo of the emulated car lags by 70 ms, and its motor is weaker than the car file says. carlab reads the car file
-and what comes over the wire, nothing else. Takes about five minutes on two idle cores;
+and what comes over the wire, nothing else. Takes about four minutes on two idle cores;
 ``python examples/demo.py --car sim --updates 300`` takes one or two.
 """
 
@@ -84,7 +84,7 @@ def main() -> None:
     """Learn, drive, diagnose, and say where everything is."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--car", default="emulated", choices=("sim", "emulated", "emulated-can"))
-    parser.add_argument("--updates", type=int, default=24000, help="gradient steps of the policy before an episode")
+    parser.add_argument("--updates", type=int, default=12000, help="gradient steps of the policy before an episode")
     parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--effects", nargs="*", default=(), help="try only these effects, which is faster")
     parser.add_argument("--out", type=Path, default=Path("runs"))

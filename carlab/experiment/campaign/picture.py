@@ -62,7 +62,7 @@ def draw(
         axis.grid(alpha=0.3)
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
     if rows[-1].verdict:
-        figure.suptitle(textwrap.shorten(rows[-1].diagnosis, 300, placeholder=" …"), fontsize=8, wrap=True)
+        figure.suptitle(textwrap.fill(textwrap.shorten(rows[-1].diagnosis, 400, placeholder=" …"), 200), fontsize=8)
     _plan(plan, episode, predictions, task)
     plan.set_title(f"episode {number}: driven, and predicted one second ahead", fontsize=9)
     for k in range(len(STATE_NAMES)):
