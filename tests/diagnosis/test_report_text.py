@@ -153,6 +153,15 @@ def test_the_share_of_what_was_attainable() -> None:
     assert "removes 100 % of the error above the noise" in text
 
 
+def test_a_simulator_that_is_worse_than_constant_velocity_is_warned_of() -> None:
+    fitted = diagnosis("mismatch", finding("motor_lag"), refit=60.0, with_effects=47.8)
+    held = fitted.held_out | {"nominal": replace(fitted.held_out["refit"], score=409.0)}
+    for score, warns in ((35.8, True), (50.0, False)):
+        known = replace(fitted, held_out=held | {"constant_velocity": replace(held["refit"], score=score)})
+        assert ("Constant velocity predicts these recordings better" in verdict_sentence(known)) == warns
+        assert ("(35.8 noise floors for 47.8)" in verdict_sentence(known)) == warns
+
+
 @pytest.mark.parametrize("verdict", ["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"])
 def test_every_verdict_has_a_sentence_even_with_no_figures(verdict: str) -> None:
     bare = replace(diagnosis(verdict), held_out={})

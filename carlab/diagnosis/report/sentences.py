@@ -206,7 +206,7 @@ def set_noun(effect: EffectFinding) -> str:
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one to three sentences, with the figures that carry it."""
+    """The verdict in one to four sentences, with the figures that carry it."""
     made = {
         "mismatch": _mismatch,
         "parameters": _parameters,
@@ -215,7 +215,19 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "unexplained": _unexplained,
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
-    return made(diagnosis)
+    return f"{made(diagnosis)}{_worse_than_constant_velocity(diagnosis)}"
+
+
+def _worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
+    """A warning where the best simulator predicts held-out recordings worse than a car that keeps its velocity."""
+    held = diagnosis.held_out
+    ours = [held[name].score for name in ("nominal", "refit", "with_effects") if name in held]
+    if not ours or "constant_velocity" not in held or held["constant_velocity"].score >= min(ours):
+        return ""
+    return (
+        f" Constant velocity predicts these recordings better ({number(held['constant_velocity'].score)} noise floors "
+        f"for {number(min(ours))}), so do not rely on this simulator there."
+    )
 
 
 def _fall(diagnosis: Diagnosis, before: str, after: str) -> str:
