@@ -17,6 +17,7 @@ from carlab.core.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from carlab.api import (
+        CarCheck,
         DiagnosisReport,
         DriveRun,
         LearnHooks,
@@ -24,12 +25,14 @@ if TYPE_CHECKING:
         PredictionErrors,
         Recording,
         RunHooks,
+        check,
         diagnose,
         drive,
         learn,
         load,
         load_car,
         predict,
+        replay,
     )
     from carlab.core.car import Car
     from carlab.core.errors import CarlabError
@@ -37,8 +40,9 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "api": (
-        *("DiagnosisReport", "DriveRun", "LearnHooks", "LearnRun", "PredictionErrors", "Recording", "RunHooks"),
-        *("diagnose", "drive", "learn", "load", "load_car", "predict"),
+        *("CarCheck", "DiagnosisReport", "DriveRun", "LearnHooks", "LearnRun", "PredictionErrors"),
+        *("Recording", "RunHooks"),
+        *("check", "diagnose", "drive", "learn", "load", "load_car", "predict", "replay"),
     ),
     "core.car": ("Car",),
     "core.errors": ("CarlabError",),
@@ -50,6 +54,7 @@ __all__ = [
     "NEUTRAL",
     "Action",
     "Car",
+    "CarCheck",
     "CarState",
     "CarlabError",
     "DiagnosisReport",
@@ -64,12 +69,14 @@ __all__ = [
     "Recording",
     "RunHooks",
     "__version__",
+    "check",
     "diagnose",
     "drive",
     "learn",
     "load",
     "load_car",
     "predict",
+    "replay",
 ]
 
 if not TYPE_CHECKING:

@@ -10,14 +10,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from carlab.api.arguments import at_least
+from carlab.api.arguments import above_zero, at_least
 from carlab.api.runs import RunHooks, html_picture, html_table, new_run, write_result
 from carlab.core.errors import ConfigError, NotReadyError
 
 if TYPE_CHECKING:
+    from carlab.api.recordings import Recording
     from carlab.cars import CarChoice, CarFile
     from carlab.core.clock import Clock
     from carlab.core.documents import Tick
+    from carlab.core.episode_data import EpisodeData
     from carlab.core.outcome import EndReason
     from carlab.core.policy import Policy
     from carlab.core.safety import SafetyEnvelope
@@ -147,6 +149,75 @@ def drive(
         results = _drive(choice, policy, task, max_throttle, run, episodes, hooks, options)
     _write_results(run, results, picture)
     return DriveRun(run.path, tuple(results))
+
+
+def replay(
+    recording: Path | str | Recording,
+    car: str | CarFile = "sim",
+    *,
+    seconds: float | None = None,
+    seed: int = 0,
+    out: Path | str = "runs",
+    vehicle: Path | CarFile | None = None,
+    reality: Path | CarFile | None = None,
+    dry_run: bool = False,
+    hooks: RunHooks | None = None,
+) -> tuple[EpisodeData, DriveRun]:
+    """Put a car at the start of a recording, send the recorded actions at their times, and record the drive.
+
+    Args:
+        recording: an MCAP or CSV file, or a loaded recording; its longest episode is replayed.
+        car: any car, see ``drive``. An emulated or simulated car without an arena gets 20 m around the recording.
+        seconds: send the actions of this much of the recording; of all of it unless given.
+        seed: of sensor noise.
+        out: folder that receives the run's folder.
+        vehicle: see ``drive``; so are ``reality``, ``dry_run`` and ``hooks``.
+        reality: see ``vehicle``.
+        dry_run: see ``vehicle``.
+        hooks: see ``vehicle``.
+
+    Returns:
+        The recorded episode, and the run; its ``episodes`` are empty where it was interrupted before the first.
+
+    Raises:
+        ConfigError, DataError: an argument or the recording is wrong.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven; nothing has moved.
+    """
+    from carlab.api.recordings import Recording, load
+    from carlab.cars import choose_car
+    from carlab.experiment.episodes.scripted_policies import ReplayPolicy
+
+    above_zero(seconds=seconds)
+    at_least(0, seed=seed)
+    choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
+    episode = (recording if isinstance(recording, Recording) else load(recording)).episode
+    run = drive(
+        car,
+        policy=ReplayPolicy(episode.times_s[:-1], episode.sent),
+        task=_recorded_task(episode, choice, seconds),
+        seed=seed,
+        out=out,
+        name="replay",
+        picture=False,
+        vehicle=vehicle,
+        reality=reality,
+        dry_run=dry_run,
+        hooks=hooks,
+    )
+    return episode, run
+
+
+def _recorded_task(episode: EpisodeData, choice: CarChoice, seconds: float | None) -> Task:
+    from carlab.core.geofence import rectangle
+    from carlab.core.quantities import CarState, Reality
+    from carlab.core.task import RecordedTask
+
+    duration_s = float(episode.times_s[-1] - episode.times_s[0])
+    ticks = max(round(min(duration_s, seconds or duration_s) / choice.control_period_s), 1)
+    x, y = episode.states[:, 0], episode.states[:, 1]
+    is_real = choice.car.reality is Reality.REAL
+    arena_m = () if is_real else rectangle(x.min() - 20, x.max() + 20, y.min() - 20, y.max() + 20)
+    return RecordedTask(CarState.from_array(episode.states[0]), max_ticks=ticks, arena_m=arena_m)
 
 
 def _drive(

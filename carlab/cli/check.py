@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from tyro.conf import OmitArgPrefixes
 
-from carlab.api.arguments import above_zero
+from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, table
 from carlab.cli.options import CarOptions
 from carlab.core.errors import NotReadyError
@@ -34,35 +34,23 @@ class Check:
 
     def run(self) -> int:
         """Check and print."""
-        from carlab.cars.emulated_car import EmulatedCar
-        from carlab.cars.latency import LatencyParts, measure_latency, measure_pose_latency
+        from carlab.api import check
 
-        above_zero(seconds=self.seconds)
-        choice = self.which_car.choose(seed=0)
-        banner(choice.car.reality, choice.car.name, moves=False)
-        with choice.car as car:
-            latency: LatencyParts | None = None
-            try:
-                latency = measure_pose_latency(car, seconds=self.seconds, period_s=choice.control_period_s)
-                if self.wheels and isinstance(car, EmulatedCar):
-                    latency = measure_latency(car, period_s=choice.control_period_s)
-            except (NotReadyError, TimeoutError) as error:
-                fail(str(error))
-            health = car.health()
-        if health.readings:
-            rows = [[_label(name), f"{value:.4g}", _unit(name)] for name, value in health.readings.items()]
+        hooks = RunHooks(on_start=lambda folder, car: banner(car.reality, car.name, moves=False))
+        found = check(**self.which_car.arguments(), seconds=self.seconds, wheels=self.wheels, hooks=hooks)
+        if readings := found.health.readings:
+            rows = [[_label(name), f"{value:.4g}", _unit(name)] for name, value in readings.items()]
             table("Readings", ["reading", "value", "unit"], rows)
-        if latency is not None and latency.parts:
+        if found.latency is not None and found.latency.parts:
             lines = [
                 [name, f"{p50:.2f}", f"{p99:.2f}", f"{top:.2f}", str(count)]
-                for name, p50, p99, top, count in latency.rows()
+                for name, p50, p99, top, count in found.latency.rows()
             ]
             table("Latency [ms]", ["part", "p50", "p99", "max", "samples"], lines)
-        for problem in health.problems:
+        for problem in found.problems:
             fail(problem)
-        ready = health.ready and latency is not None
-        console.print("[green]Ready.[/green]" if ready else "[red]Not ready.[/red]")
-        return 0 if ready else NotReadyError.exit_code
+        console.print("[green]Ready.[/green]" if found.is_ready else "[red]Not ready.[/red]")
+        return 0 if found.is_ready else NotReadyError.exit_code
 
 
 def _unit(name: str) -> str:

@@ -11,20 +11,25 @@ from carlab.cli.console import console, table
 from carlab.core.episode_data import EpisodeData
 
 if TYPE_CHECKING:
+    from carlab.api.recordings import Recording
     from carlab.diagnosis.findings import FitErrors
     from carlab.recording.audit.report import AuditReport
 
 
 def load_episodes(path: Path) -> Sequence[EpisodeData]:
     """Read an MCAP recording (one episode) or a CSV (one or several), and print what was found in it."""
-    recording = load(path)
+    return print_recording(load(path)).episodes
+
+
+def print_recording(recording: Recording) -> Recording:
+    """Print what was found in a recording, and return it."""
     if recording.audit is not None:
         console.print(recording.announcement)
         print_findings(recording.audit)
     if recording.is_recovered:
         ticks = recording.episode.ticks
-        console.print(f"[yellow]{path} was never finished; {ticks} complete ticks were recovered.[/yellow]")
-    return recording.episodes
+        console.print(f"[yellow]{recording.path} was never finished; {ticks} complete ticks were recovered.[/yellow]")
+    return recording
 
 
 def print_findings(report: AuditReport) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,10 +10,11 @@ import numpy as np
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from carlab.api.arguments import above_zero
-from carlab.api.runs import RunHooks, new_run, write_result
+from carlab.api.recordings import load
+from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.options import CarOptions, new_file
-from carlab.cli.recordings import load_episodes, print_errors
+from carlab.cli.recordings import print_errors, print_recording
 from carlab.cli.runs import ask_to_place
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
@@ -22,7 +22,6 @@ from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray, Reality
 
 if TYPE_CHECKING:
     from carlab.api import PredictionErrors
-    from carlab.cars import CarChoice
 
 
 @dataclass
@@ -74,11 +73,11 @@ class Replay:
             raise ConfigError(f"--seed {self.seed}: at least 0.")
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
-        choice = self.which_car.choose(seed=self.seed)
-        if choice.car.reality is Reality.SIMULATED and not self.drive:
-            self._predict()
-            return 0
-        return self._drive(max(load_episodes(self.recording), key=lambda e: e.ticks), choice)
+        simulated = self.which_car.choose(seed=self.seed).car.reality is Reality.SIMULATED
+        if not simulated or self.drive:
+            return self._drive()
+        self._predict()
+        return 0
 
     def _predict(self) -> None:
         from carlab.api import predict
@@ -123,53 +122,38 @@ class Replay:
         columns = ["channel", "rms", "median", "p90", "bias", "constant velocity: rms", "no change: rms"]
         table(f"By channel, {found.score.whole.part}", columns, rows)
 
-    def _drive(self, episode: EpisodeData, choice: CarChoice) -> int:
+    def _drive(self) -> int:
+        from carlab.api import replay
         from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
         from carlab.core.outcome import EndReason
-        from carlab.core.quantities import CarState
-        from carlab.core.task import RecordedTask
-        from carlab.experiment.episodes.scripted_policies import ReplayPolicy
-        from carlab.experiment.episodes.session import Session, SessionHooks
 
-        period_s = choice.control_period_s
-        duration_s = float(episode.times_s[-1] - episode.times_s[0])
-        duration_s = duration_s if self.seconds is None else min(duration_s, self.seconds)
-        task = RecordedTask(CarState.from_array(episode.states[0]), max_ticks=max(round(duration_s / period_s), 1))
-        envelope = choice.envelope
-        if not envelope.arena_m and choice.car.reality is not Reality.REAL:
-            x, y = episode.states[:, 0], episode.states[:, 1]
-            from carlab.core.geofence import rectangle
-
-            envelope = replace(envelope, arena_m=rectangle(x.min() - 20, x.max() + 20, y.min() - 20, y.max() + 20))
-        with contextlib.ExitStack() as stack:
-            run = stack.enter_context(
-                new_run(
-                    self.out, "replay", choice, RunHooks(on_start=lambda folder, car: banner(car.reality, car.name))
-                )
-            )
-            car = stack.enter_context(choice.car)
-            bar = stack.enter_context(progress())
-            row = bar.add_task("replay", total=task.max_ticks, note="")
-            hooks = SessionHooks(
+        recording = print_recording(load(self.recording))
+        with progress() as bar:
+            row = bar.add_task("replay", total=None, note="")
+            hooks = RunHooks(
+                on_start=lambda folder, car: banner(car.reality, car.name),
                 place_by_hand=ask_to_place(bar, "use a terminal"),
+                on_episode=lambda number, ticks: bar.update(row, total=ticks),
                 on_tick=lambda tick: bar.update(row, completed=tick.step + 1),
             )
-            policy = ReplayPolicy(episode.times_s[:-1], episode.sent)
-            session = Session(
-                car, policy, task, envelope, run, period_s, seed=self.seed, config_toml=choice.config_toml, hooks=hooks
+            episode, run = replay(
+                recording,
+                **self.which_car.arguments(),
+                seconds=self.seconds,
+                seed=self.seed,
+                out=self.out,
+                hooks=hooks,
             )
-            results = session.drive(1)
-        if not results:
+        if not run.episodes:
             console.print("Nothing was driven.")
             return EXIT_INTERRUPTED
-        write_result(run, results)
-        driven = results[0].data
-        _print_difference(driven, episode)
-        console.print(f"Recorded in {results[0].path}")
-        if results[0].reason.is_safety_stop:
-            fail(f"{results[0].reason.value} {driven.metadata['end_detail']}".rstrip())
+        (result,) = run.episodes
+        _print_difference(result.data, episode)
+        console.print(f"Recorded in {result.path}")
+        if result.reason.is_safety_stop:
+            fail(f"{result.reason.value} {result.data.metadata['end_detail']}".rstrip())
             return EXIT_SAFETY_STOP
-        return EXIT_INTERRUPTED if results[0].reason is EndReason.STOP_REQUESTED else 0
+        return EXIT_INTERRUPTED if result.reason is EndReason.STOP_REQUESTED else 0
 
 
 def _print_difference(driven: EpisodeData, episode: EpisodeData) -> None:

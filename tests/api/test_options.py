@@ -3,11 +3,13 @@
 import dataclasses
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 import carlab
 from carlab.api.recordings import CHANNEL_OPTIONS, RENAMED_OPTIONS
+from carlab.cli.check import Check
 from carlab.cli.diagnose import Diagnose
 from carlab.cli.drive import Drive
 from carlab.cli.import_ import Import
@@ -21,8 +23,10 @@ CASES = [
     (Learn, carlab.learn, {"verbose"}),
     # --decisions is DiagnosisReport.save_decisions.
     (Diagnose, carlab.diagnose, {"verbose", "decisions"}),
-    # replay also drives, and takes only the simulators of a car: carlab.drive and carlab.load_car do that.
+    # Without --drive, replay predicts with a simulator; with it, it drives, which is carlab.replay.
     (Replay, carlab.predict, {"verbose", "save", "drive", "seconds", "seed", "out", "vehicle", "dry_run", "reality"}),
+    (Replay, carlab.replay, {"verbose", "save", "drive", "horizon_s", "stride_s", "holdout_share"}),
+    (Check, carlab.check, {"verbose"}),
 ]
 
 
@@ -46,7 +50,7 @@ def test_each_option_is_an_argument_with_the_same_name(
     assert missing == set()
 
 
-@pytest.mark.parametrize(("verb", "call"), [(Drive, carlab.drive), (Learn, carlab.learn), (Replay, carlab.predict)])
+@pytest.mark.parametrize(("verb", "call"), [(verb, call) for verb, call, _ in CASES if verb is not Diagnose])
 def test_option_and_argument_have_the_same_default(verb: type, call: Callable[..., object]) -> None:
     arguments = inspect.signature(call).parameters
     for name, default in options_of(verb).items():
@@ -75,3 +79,19 @@ def test_each_public_name_is_there_and_documented(name: str) -> None:
 
 def named_arguments(call: Callable[..., object]) -> list[str]:
     return [p.name for p in inspect.signature(call).parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
+
+
+def test_a_simulated_car_is_ready_and_says_its_latency() -> None:
+    found = carlab.check("sim", seconds=0.2)
+    assert found.is_ready
+    assert found.problems == ()
+    assert "ready" in repr(found)
+    assert "<table>" in found._repr_html_()
+
+
+def test_recorded_actions_are_sent_again_and_lead_to_the_same_place(tmp_path: Path) -> None:
+    driven = carlab.drive("sim", policy="slow_circle", ticks=40, out=tmp_path, rerun=False, picture=False)
+    episode, again = carlab.replay(driven.recordings[0], "sim", seconds=1.0, out=tmp_path)
+    assert again.folder.name.endswith("replay")
+    assert again.episodes[0].data.ticks == 30
+    assert again.episodes[0].data.states[-1, :2] == pytest.approx(episode.states[30, :2], abs=0.02)

@@ -1,0 +1,95 @@
+"""Whether a car can be armed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from carlab.api.arguments import above_zero
+from carlab.api.runs import RunHooks, html_table
+from carlab.core.errors import NotReadyError
+
+if TYPE_CHECKING:
+    from carlab.cars import CarFile
+    from carlab.cars.latency import LatencyParts
+    from carlab.core.quantities import Health
+
+
+@dataclass(frozen=True)
+class CarCheck:
+    """What ``carlab.check`` measured.
+
+    Attributes:
+        health: readings by name, with their unit at the end, and problems as sentences.
+        latency: samples [s] of each part of the delay; None where no pose arrived.
+        problems: why the car is not ready; empty where it is.
+    """
+
+    health: Health
+    latency: LatencyParts | None
+    problems: tuple[str, ...]
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the car can be armed."""
+        return self.health.ready and self.latency is not None
+
+    def __repr__(self) -> str:
+        """Ready, or the problems."""
+        return "<CarCheck ready>" if self.is_ready else f"<CarCheck not ready: {'; '.join(self.problems)}>"
+
+    def _repr_html_(self) -> str:
+        parts = [] if self.latency is None else self.latency.rows()
+        return html_table(["reading", "value"], [[*item] for item in self.health.readings.items()]) + html_table(
+            ["latency [ms]", "p50", "p99", "max", "samples"], parts
+        )
+
+
+def check(
+    car: str | CarFile = "sim",
+    *,
+    seconds: float = 2.0,
+    wheels: bool = True,
+    vehicle: Path | CarFile | None = None,
+    reality: Path | CarFile | None = None,
+    dry_run: bool = False,
+    hooks: RunHooks | None = None,
+) -> CarCheck:
+    """Open a car and move nothing: health, rates and latency of each part.
+
+    Args:
+        car: any car, see ``carlab.drive``; so are ``vehicle``, ``reality`` and ``dry_run``.
+        seconds: how long to watch motion capture.
+        wheels: on an emulated car, also steer at standstill to measure the latency of a command; a real car never
+            moves.
+        vehicle: see ``car``.
+        reality: see ``car``.
+        dry_run: see ``car``.
+        hooks: ``on_start`` is called before the car is opened.
+
+    Returns:
+        Readings, latency and problems; ``is_ready`` says whether the car can be armed.
+
+    Raises:
+        ConfigError: an argument is wrong.
+        NotReadyError, ActuatorFaultError: the hardware cannot be opened.
+    """
+    from carlab.cars import choose_car
+    from carlab.cars.emulated_car import EmulatedCar
+    from carlab.cars.latency import measure_latency, measure_pose_latency
+
+    above_zero(seconds=seconds)
+    choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=0)
+    (hooks or RunHooks()).on_start(Path(), choice.car)
+    latency: LatencyParts | None = None
+    problems: list[str] = []
+    with choice.car as opened:
+        try:
+            latency = measure_pose_latency(opened, seconds=seconds, period_s=choice.control_period_s)
+            if wheels and isinstance(opened, EmulatedCar):
+                latency = measure_latency(opened, period_s=choice.control_period_s)
+        except (NotReadyError, TimeoutError) as error:
+            problems.append(str(error))
+        health = opened.health()
+    return CarCheck(health, latency, (*problems, *health.problems))
