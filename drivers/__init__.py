@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from drivers.dry_run_car import DryRunCar
     from drivers.hardware_car import HardwareCar
 
-_HOMES = {
+_MODULES = {
     "Actuator": "actuator",
     "ActuatorCalibration": "calibration",
     "ActuatorConfig": "config",
@@ -36,6 +36,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'drivers' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"drivers.{_HOMES[name]}"), name)
+    return getattr(importlib.import_module(f"drivers.{_MODULES[name]}"), name)

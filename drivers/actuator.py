@@ -1,4 +1,4 @@
-"""The main process's face of the sender: opens it, arms it, hands commands over and reads how it fares."""
+"""The main process's interface to the sender: it opens and arms the sender, posts commands and reads the status."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from carlab.core.errors import ActionOutOfRangeError, ActuatorFaultError, NotArm
 from carlab.core.quantities import NEUTRAL, Action, Health
 from drivers.calibration import ActuatorCalibration, DeviceCommand
 from drivers.config import ActuatorConfig
-from drivers.sender.logic import Order, SenderState, Wish
+from drivers.sender.logic import Order, Request, SenderState
 from drivers.sender.process import Sender, start_sender
 from drivers.sender.status import SenderStatus
 
@@ -22,14 +22,14 @@ START_TIMEOUT_S = 15.0
 ANSWER_TIMEOUT_S = 2.0
 SILENT_SENDER_S = 0.5
 POLL_S = 0.001
-SAFETY_STOP = "The car was stopped for safety; look at it, then reset the fault and arm again."
+SAFETY_STOP = "The car was stopped for safety; check the car, then reset the fault and arm again."
 
 
 class Actuator:
-    """A steered and driven car seen from the command side.
+    """Steering servo and drive motor of a car, commanded through a sender process.
 
-    The commands are sent by a process of its own, see ``sender_process``; this object only posts the newest one. It
-    belongs to the process that opened it: a fork of it can neither command nor close it.
+    A separate process sends the commands (``drivers.sender.process``); this object posts the newest command to it. The
+    object belongs to the process that opened it: after a fork the child can neither command nor close it.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Actuator:
         self._epoch = 0
         self._number = 0
         self._armed_epoch = 0
-        self._latched = ""  # a fault known on this side, kept even where the sender could not be reached
+        self._latched = ""  # fault known in the main process; it stays if the sender cannot be reached
 
     @property
     def is_open(self) -> bool:
@@ -57,12 +57,12 @@ class Actuator:
     def open(self) -> None:
         """Start the sender and wait until the motor controller answers; idempotent.
 
-        Raises NotReadyError where the port is wrong, nothing answers, or the firmware is too old.
+        Raises NotReadyError if the port is wrong, no device answers or the firmware is too old.
         """
         if self.is_open:
             return
         if self._sender is not None:
-            raise NotReadyError("This actuator was opened by another process", ("make a new one after a fork.",))
+            raise NotReadyError("This actuator was opened by another process", ("create a new Actuator after a fork.",))
         self._epoch = self._number = self._armed_epoch = 0
         self._latched = ""
         self._owner_pid = os.getpid()
@@ -75,40 +75,40 @@ class Actuator:
             raise
 
     def arm(self) -> None:
-        """Let commands through. Raises NotReadyError, or ActuatorFaultError while a fault is latched."""
+        """Enable commands. Raises NotReadyError, or ActuatorFaultError while a fault is latched."""
         self.require_no_fault()
         self._await(lambda s: s.state != SenderState.STOPPING, ANSWER_TIMEOUT_S)
         with self._lock:
-            # A stop of another thread, posted since, must not be overwritten in the sender's slot.
+            # Another thread may have posted a stop since; its order must stay in the sender's slot.
             if self._latched:
                 raise ActuatorFaultError(self._latched)
-            epoch = self._post_wish(Wish.ARM)
+            epoch = self._post_request(Request.ARM)
         status = self._await_epoch(epoch)
         if status.state == SenderState.FAULT:
             raise ActuatorFaultError(status.fault)
         if status.state != SenderState.ARMED or status.epoch != epoch:
-            raise NotReadyError("The actuator cannot be armed", (status.refusal or "it was stopped meanwhile.",))
+            raise NotReadyError("The actuator cannot be armed", (status.refusal or "it was stopped; arm it again.",))
         with self._lock:
             if self._epoch == epoch:
                 self._armed_epoch = epoch
 
     def command(self, action: Action) -> Action:
-        """Post the newest command and return it as it will be on the wire, clamped and rounded by the calibration.
+        """Post the newest command and return the command on the wire, clamped and rounded by the calibration.
 
-        That is neutral while the telemetry is stale: the sender holds everything else back then. Neutral is
-        accepted, and changes nothing, while disarmed. Raises NotOpenError, ActuatorFaultError,
-        ActionOutOfRangeError (not a number) and NotArmedError.
+        While the telemetry is stale the sender sends neutral, and neutral is returned. A disarmed actuator accepts
+        neutral without effect. Raises NotOpenError, ActuatorFaultError, ActionOutOfRangeError (not a number) and
+        NotArmedError.
         """
         sender = self._opened()
         if not action.is_finite:
             raise ActionOutOfRangeError(f"{action} is not a number; the policy that made it has diverged.")
-        status = self._unfaulted_status(sender)
+        status = self._require_faultless_status(sender)
         device = self.calibration.to_device(action)
         with self._lock:
             is_armed = self._armed_epoch == self._epoch > 0 and status.state == SenderState.ARMED
             if is_armed:
                 self._number += 1
-                sender.post(Order(self._epoch, Wish.ARM, self._number, time.monotonic(), device))
+                sender.post(Order(self._epoch, Request.ARM, self._number, time.monotonic(), device))
         if not is_armed:
             if action.is_neutral:
                 return NEUTRAL
@@ -118,17 +118,17 @@ class Actuator:
         return self.calibration.from_device(device)
 
     def stop(self, *, planned: bool) -> None:
-        """Neutral and disarm; ``planned=False`` latches a fault. Returns when neutral was sent three times.
+        """Send neutral and disarm; ``planned=False`` latches a fault. Returns after three neutral frames.
 
-        Does nothing for an actuator that is closed or whose sender is gone. Never waits longer than two seconds, and
-        not for a sender that hangs: it finds the order when it goes on.
+        Does nothing if the actuator is closed or the sender has ended. Waits two seconds at most, and not at all for
+        a sender that hangs: the order stays in its slot, and the sender executes it when it resumes.
         """
         if not self.is_open or not self._is_sender_alive():
             return
         with self._lock:
             if not planned:
                 self._latched = self._latched or SAFETY_STOP
-            epoch = self._post_wish(Wish.STOP if planned else Wish.STOP_AND_LATCH)
+            epoch = self._post_request(Request.STOP if planned else Request.STOP_AND_LATCH)
 
         def is_over(status: SenderStatus) -> bool:
             is_neutral = status.epoch >= epoch and (status.is_neutral_settled or not status.is_sending)
@@ -137,29 +137,29 @@ class Actuator:
         self._await(is_over, ANSWER_TIMEOUT_S)
 
     def reset_fault(self) -> None:
-        """Clear a latched fault, staying disarmed. Raises ActuatorFaultError where its cause persists."""
-        status = self._living_status(self._opened())
+        """Clear a latched fault; the actuator stays disarmed. Raises ActuatorFaultError if the cause persists."""
+        status = self._require_live_status(self._opened())
         if not self._latched and status.state != SenderState.FAULT:
             return
         if status.state != SenderState.FAULT:
-            self._await_epoch(self._post_wish(Wish.STOP_AND_LATCH))
-        status = self._await_epoch(self._post_wish(Wish.RESET_FAULT))
+            self._await_epoch(self._post_request(Request.STOP_AND_LATCH))
+        status = self._await_epoch(self._post_request(Request.RESET_FAULT))
         if status.state == SenderState.FAULT:
             raise ActuatorFaultError(status.refusal or status.fault)
         self._latched = ""
 
     def status(self) -> SenderStatus:
-        """What the sender last published. Raises NotOpenError."""
+        """The newest status that the sender has published. Raises NotOpenError."""
         return self._opened().status()
 
     def require_no_fault(self) -> None:
-        """Raise ActuatorFaultError where a fault is latched or the sender is gone."""
-        self._unfaulted_status(self._opened())
+        """Raise ActuatorFaultError if a fault is latched or the sender has ended."""
+        self._require_faultless_status(self._opened())
 
     def problems(self) -> tuple[str, ...]:
-        """Why the actuator could not be armed right now, each with the next step; empty where nothing is wrong."""
+        """Conditions that prevent arming, each with its remedy; empty if there are none."""
         if not self.is_open or self._sender is None:
-            return ("the actuator is not open.",)
+            return ("the actuator is not open; call open() first.",)
         if not self._is_sender_alive():
             return ("the sender process has ended; close the car and open it again.",)
         status = self._sender.status()
@@ -172,7 +172,7 @@ class Actuator:
         return tuple(found)
 
     def health(self) -> Health:
-        """Link, firmware and timing."""
+        """Condition of link, firmware and timing."""
         problems = self.problems()
         if not self.is_open or self._sender is None:
             return Health(False, problems)
@@ -202,7 +202,7 @@ class Actuator:
         return Health(not problems, problems, {name: value for name, value in readings.items() if math.isfinite(value)})
 
     def close(self) -> None:
-        """Neutral at least three times, then disconnect; bounded in time, idempotent, safe after any failure."""
+        """Send neutral at least three times, then disconnect; bounded in time, idempotent, safe after any failure."""
         sender = self._sender
         if sender is None:
             return
@@ -211,7 +211,7 @@ class Actuator:
             return
         try:
             if sender.is_alive():
-                self._post_wish(Wish.SHUT_DOWN)
+                self._post_request(Request.SHUT_DOWN)
                 sender.join(ANSWER_TIMEOUT_S)
         finally:
             self._sender = None
@@ -229,28 +229,28 @@ class Actuator:
         if self._sender is None:
             raise NotOpenError("The actuator is not open; call open() first, or use it in a with block.")
         if self._owner_pid != os.getpid():
-            raise NotOpenError("The actuator was opened by another process; make a new one after a fork.")
+            raise NotOpenError("The actuator was opened by another process; create a new Actuator after a fork.")
         return self._sender
 
     def _is_sender_alive(self) -> bool:
         return self._sender is not None and self._sender.is_alive()
 
-    def _living_status(self, sender: Sender) -> SenderStatus:
-        """The status of a sender that lives and reacts; one that hangs is a fault even if it comes back."""
+    def _require_live_status(self, sender: Sender) -> SenderStatus:
+        """Status of a running sender; a sender that hangs is a fault, even if it resumes."""
         status, name = sender.status(), self.config.device_kind.name
         if not sender.is_alive():
             raise ActuatorFaultError(
                 status.fault
-                or f"The sender process has ended; the {name}'s own time-out stops the motor. Open the car anew."
+                or f"The sender process has ended; the {name}'s own time-out stops the motor. Open the car again."
             )
         if _hangs(status):
             raise self._latch(
-                f"The sender process hangs; the {name}'s own time-out stops the motor. Open the car anew."
+                f"The sender process hangs; the {name}'s own time-out stops the motor. Open the car again."
             )
         return status
 
-    def _unfaulted_status(self, sender: Sender) -> SenderStatus:
-        status = self._living_status(sender)
+    def _require_faultless_status(self, sender: Sender) -> SenderStatus:
+        status = self._require_live_status(sender)
         if status.state == SenderState.FAULT:
             raise ActuatorFaultError(status.fault)
         if self._latched:
@@ -258,22 +258,22 @@ class Actuator:
         return status
 
     def _latch(self, text: str) -> ActuatorFaultError:
-        """Remember a fault here and, for when it can hear again, tell the sender; returns the error to raise."""
+        """Latch a fault here and post it to the sender; returns the error to raise."""
         self._latched = self._latched or text
-        self._post_wish(Wish.STOP_AND_LATCH)
+        self._post_request(Request.STOP_AND_LATCH)
         return ActuatorFaultError(text)
 
-    def _post_wish(self, wish: Wish) -> int:
+    def _post_request(self, request: Request) -> int:
         sender = self._opened()
         with self._lock:
             self._epoch += 1
             self._number = 0
             neutral: DeviceCommand = self.calibration.neutral
-            sender.post(Order(self._epoch, wish, 0, time.monotonic(), neutral))
+            sender.post(Order(self._epoch, request, 0, time.monotonic(), neutral))
             return self._epoch
 
     def _await(self, is_met: Callable[[SenderStatus], bool], timeout_s: float) -> SenderStatus:
-        """The first status that meets the condition, or the newest one after ``timeout_s`` or the sender's end."""
+        """First status that meets the condition; the newest status after ``timeout_s`` or the end of the sender."""
         sender = self._opened()
         until_s = time.monotonic() + timeout_s
         while not is_met(status := sender.status()):
@@ -285,7 +285,7 @@ class Actuator:
     def _await_epoch(self, epoch: int) -> SenderStatus:
         status = self._await(lambda s: s.epoch >= epoch or s.is_ended, ANSWER_TIMEOUT_S)
         if status.epoch < epoch:
-            raise self._latch(status.fault or "The sender process does not answer; close the car, open it again.")
+            raise self._latch(status.fault or "The sender process does not answer; close the car and open it again.")
         return status
 
     def _await_connection(self) -> None:
@@ -293,7 +293,7 @@ class Actuator:
         status = self._await(lambda s: s.t_published_s > 0.0 or s.is_ended, START_TIMEOUT_S)
         if status.t_published_s == 0.0:
             raise NotReadyError(
-                what, ("the sender process did not start; run 'python -m drivers.sender.process' by hand.",)
+                what, ("the sender process did not start; run 'python -m drivers.sender.process' by hand to see why.",)
             )
         settled = (SenderState.CONNECTED, SenderState.FAULT)
         status = self._await(lambda s: s.is_ended or s.state in settled, self.config.open_timeout_s)
@@ -304,13 +304,13 @@ class Actuator:
     def _silence(self, status: SenderStatus) -> str:
         kind = self.config.device_kind
         if status.firmware_major:
-            return "it says its version but sends no telemetry; restart it and check its app settings."
-        heard = status.garbage_bytes + status.crc_errors
-        if heard and kind.garbage_hint:
-            return f"what answers is no {kind.name} ({heard} bytes of garbage); {kind.garbage_hint}"
+            return "it reports its version but sends no telemetry; restart it and check its app settings."
+        garbage = status.garbage_bytes + status.crc_errors
+        if garbage and kind.garbage_hint:
+            return f"the device that answers is not a {kind.name} ({garbage} bytes of garbage); {kind.garbage_hint}"
         return kind.silent_hint
 
 
 def _hangs(status: SenderStatus) -> bool:
-    """Whether a sender has published nothing for so long that it must hang."""
+    """Whether the sender has published no status for ``SILENT_SENDER_S``."""
     return time.monotonic() - status.t_published_s > SILENT_SENDER_S

@@ -1,4 +1,4 @@
-"""What a normalised command means on one car: servo trim, ends and sign, motor mode and limits. Pure."""
+"""Calibration of one car for normalised commands: servo trim, end stops and sign, motor mode, limits. Pure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CURRENT_SCALE, DUTY_SCALE, SERVO_SCALE = 1e3, 1e5, 1e3
 
 
 class MotorKind(enum.IntEnum):
-    """What the motor number of a command is."""
+    """Quantity that the motor number of a command sets."""
 
     CURRENT = 0
     BRAKE = 1
@@ -46,13 +46,13 @@ class DeviceCommand:
 
 @dataclass(frozen=True, slots=True)
 class ActuatorCalibration:
-    """Calibration of a car, the table ``[hardware.calibration]``.
+    """Calibration of a car: the table ``[hardware.calibration]``.
 
-    The servo stands at ``servo_centre`` for steering 0, ``servo_range_left`` away for +1 (full left) and
-    ``servo_range_right`` the other way for -1; ``steering_sign`` is +1 where a larger servo position turns left.
+    The servo position is ``servo_centre`` for steering 0, ``servo_range_left`` away from it for +1 (full left) and
+    ``servo_range_right`` away on the other side for -1; ``steering_sign`` is +1 if a larger servo position turns left.
     ``throttle_mode`` "current" drives with ``max_current_a`` at full throttle, "duty" with ``max_duty``; a negative
-    throttle drives backwards. ``throttle_sign`` is -1 where the motor is wired backwards. ``throttle_dead_band`` is
-    the share of full throttle that the car needs before it moves: it is added to any throttle that is not zero.
+    throttle drives backwards. ``throttle_sign`` is -1 if the motor is wired backwards. ``throttle_dead_band`` is the
+    share of full throttle that the car needs before it moves; it is added to every throttle that is not zero.
     Neutral is zero current, or ``neutral_brake_a`` of brake current (at most ``max_brake_a``), and the centred servo.
     """
 
@@ -71,7 +71,7 @@ class ActuatorCalibration:
     throttle_dead_band: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a calibration that would leave its own limits."""
+        """Raise ConfigError for a calibration whose commands exceed its limits."""
         if not 0.0 <= self.servo_min < self.servo_max <= 1.0:
             raise ConfigError(
                 f"servo_min {self.servo_min:g} and servo_max {self.servo_max:g} must satisfy 0 <= min < max <= 1."
@@ -100,14 +100,14 @@ class ActuatorCalibration:
 
     @property
     def neutral(self) -> DeviceCommand:
-        """Motor without drive (or braking by ``neutral_brake_a``), servo at its centre."""
+        """Neutral: no motor current (or the brake current ``neutral_brake_a``), servo at its centre."""
         servo = round(self.servo_centre * SERVO_SCALE)
         if self.neutral_brake_a > 0.0:
             return DeviceCommand(MotorKind.BRAKE, round(self.neutral_brake_a * CURRENT_SCALE), servo)
         return DeviceCommand(MotorKind.CURRENT, 0, servo)
 
     def to_device(self, action: Action) -> DeviceCommand:
-        """Device steps for an action, clamped to [-1, 1] and to the limits.
+        """Convert an action to device steps, clamped to [-1, 1] and to the limits.
 
         Raises ActionOutOfRangeError for an action that is not a number.
         """
@@ -126,7 +126,7 @@ class ActuatorCalibration:
         return DeviceCommand(self._motor_kind, motor_steps, servo_steps)
 
     def from_device(self, command: DeviceCommand) -> Action:
-        """The action that a device command amounts to: the inverse of ``to_device`` within one device step."""
+        """Convert a device command to an action: the inverse of ``to_device`` within one device step."""
         return Action(
             self.steering_of(command.servo_position), self.throttle_of(command.motor_kind, command.motor_steps)
         )
@@ -138,7 +138,7 @@ class ActuatorCalibration:
         return min(1.0, max(-1.0, steering))
 
     def throttle_of(self, kind: MotorKind, steps: float) -> float:
-        """Throttle in [-1, 1] of a motor command in device steps; a brake has none."""
+        """Throttle in [-1, 1] of a motor command in device steps; 0 for a brake command."""
         if kind != self._motor_kind or steps == 0:
             return 0.0
         drive = self.throttle_sign * steps / self._full_steps
@@ -147,7 +147,7 @@ class ActuatorCalibration:
         return math.copysign(min(1.0, throttle), drive) if throttle else 0.0
 
     def is_within_limits(self, command: DeviceCommand) -> bool:
-        """Whether a device command respects every limit of this calibration (the sender's own check)."""
+        """Whether a device command respects every limit of this calibration; the sender checks each command."""
         low, high = round(self.servo_min * SERVO_SCALE), round(self.servo_max * SERVO_SCALE)
         if not low <= command.servo_steps <= high:
             return False

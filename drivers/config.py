@@ -1,4 +1,4 @@
-"""Configuration of the hardware of a car: what stands in ``[hardware]`` of its file."""
+"""Configuration of a car's hardware: the table ``[hardware]`` of the car file."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ MULTICAST_GROUP = "239.74.163.2"
 
 @dataclass(frozen=True, slots=True)
 class ActuatorConfig:
-    """The actuator, the table ``[hardware.actuator]``.
+    """Configuration of the actuator: the table ``[hardware.actuator]``.
 
     ``kind`` names an entry of ``DEVICE_KINDS``. A serial kind uses ``port`` and ``baud`` (ignored on USB). A bus uses
     ``interface`` (any of python-can: socketcan, slcan, pcan, ..., ``udp_multicast`` between processes, ``virtual``
-    within one), ``channel``, ``bitrate``, the ``controller_id`` and a ``host_id`` that nobody else has. The sender
-    sends at ``rate_hz``; a command older than ``watchdog_s`` becomes neutral and one older than ``latch_s`` a
-    latched fault. Telemetry is polled at ``telemetry_rate_hz``; older than ``telemetry_stale_s`` means neutral,
-    older than ``telemetry_lost_s`` a latched fault. ``realtime_priority`` asks for SCHED_FIFO and goes on without
-    it.
+    within one), ``channel``, ``bitrate``, the ``controller_id`` and a ``host_id`` that is unique on the bus. The sender
+    sends at ``rate_hz``. It replaces a command older than ``watchdog_s`` by neutral; a command older than ``latch_s``
+    latches a fault. It polls telemetry at ``telemetry_rate_hz``; telemetry older than ``telemetry_stale_s`` gives
+    neutral, older than ``telemetry_lost_s`` latches a fault. ``realtime_priority`` requests SCHED_FIFO; the sender
+    runs without it if the system refuses.
     """
 
     kind: str = "vesc_serial"
@@ -42,7 +42,7 @@ class ActuatorConfig:
     realtime_priority: bool = True
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for an unknown kind, or for numbers that could not work together."""
+        """Raise ConfigError for an unknown kind or inconsistent numbers."""
         if self.kind not in DEVICE_KINDS:
             raise ConfigError(f"kind of the actuator is {self.kind!r}; it must be one of {', '.join(DEVICE_KINDS)}.")
         if not 10.0 <= self.rate_hz <= 500.0:
@@ -70,7 +70,7 @@ class ActuatorConfig:
 
     @property
     def address(self) -> str:
-        """Where the actuator is, in words for messages."""
+        """Address of the actuator for messages."""
         if not self.device_kind.is_bus:
             return self.port
         return f"controller {self.controller_id} on {self.interface} {self.channel}"
@@ -78,7 +78,7 @@ class ActuatorConfig:
 
 @dataclass(frozen=True, slots=True)
 class HardwareConfig:
-    """What the drivers need of ``[hardware]``, and when the car may be armed."""
+    """The drivers' part of ``[hardware]``, with the conditions for arming."""
 
     actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
     calibration: ActuatorCalibration = field(default_factory=ActuatorCalibration)

@@ -1,4 +1,4 @@
-"""What the sender needs of a motor controller, whatever protocol it speaks: commands out, telemetry in."""
+"""Protocol-independent interface of a motor controller for the sender: commands out, telemetry in."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.calibration import DeviceCommand
 
 @dataclass(frozen=True, slots=True)
 class FirmwareIdentity:
-    """What the firmware says that it is; ``uuid`` is empty where it does not identify the board."""
+    """Version and board that the firmware reports; ``uuid`` is empty if it does not identify the board."""
 
     major: int
     minor: int
@@ -19,12 +19,12 @@ class FirmwareIdentity:
     uuid: bytes = b""
 
     def refusal(self) -> str | None:
-        """Why this firmware cannot be driven, or None."""
+        """Reason why this firmware cannot be used, with the remedy; None if it can."""
         return None
 
 
 class Telemetry(Protocol):
-    """What the motor controller measures. A field that has not been received is None."""
+    """Measurements of the motor controller. A field that has not been received is None."""
 
     @property
     def erpm(self) -> float | None:
@@ -40,17 +40,17 @@ class Telemetry(Protocol):
 
     @property
     def fault_code(self) -> int | None:
-        """Fault code of the firmware; 0 where there is none."""
+        """Fault code of the firmware; 0 for no fault."""
 
     @property
     def motor_timeout_active(self) -> bool:
-        """Whether the firmware has released the motor because no command came."""
+        """Whether the firmware has released the motor because it received no command in time."""
 
     def fault(self) -> str:
-        """Why the firmware forbids driving, with the remedy; empty where it does not."""
+        """Reason why the firmware forbids driving, with the remedy; empty if there is none."""
 
     def updated(self, newer: Self) -> Self:
-        """These values with every field that ``newer`` carries replaced."""
+        """Copy with every field replaced that ``newer`` holds."""
 
 
 Reply = FirmwareIdentity | Telemetry
@@ -58,7 +58,7 @@ Reply = FirmwareIdentity | Telemetry
 
 @dataclass(slots=True)
 class DeviceCounters:
-    """Errors of reception; a reply of an unknown layout counts as garbage, byte by byte."""
+    """Reception errors; every byte of a reply of unknown layout counts as garbage."""
 
     crc_errors: int = 0
     garbage_bytes: int = 0
@@ -74,7 +74,7 @@ class Device(Protocol):
 
     @property
     def counters(self) -> DeviceCounters:
-        """Errors of reception since construction."""
+        """Reception errors since construction."""
 
     def open(self) -> None:
         """Open the link; raises NotReadyError."""
@@ -83,10 +83,10 @@ class Device(Protocol):
         """Write motor and servo commands."""
 
     def request_firmware(self) -> None:
-        """Ask the firmware what it is."""
+        """Request version and board of the firmware."""
 
     def request_telemetry(self) -> None:
-        """Ask for the telemetry that control needs; called once the firmware is known."""
+        """Request the telemetry that control needs; the sender calls it once the firmware is known."""
 
     def receive(self, now_s: float) -> Sequence[Reply]:
         """Replies that have arrived, oldest first; never blocks."""

@@ -1,4 +1,4 @@
-"""Registry of the motor controllers that ``kind`` in ``[hardware.actuator]`` can name."""
+"""Registry of motor controllers by the values of ``kind`` in ``[hardware.actuator]``."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from drivers.device import Device
 class DeviceKind:
     """A protocol over a kind of link.
 
-    ``factory`` is the import path ``module:function`` of a function from an ActuatorConfig to a Device: the sender
-    process imports it, the main process does not. ``name`` stands in messages and, in lower case, in names of readings.
-    ``silent_hint`` is the remedy where nothing answers and ``garbage_hint`` the one where only garbage does.
+    ``factory`` is the import path ``module:function`` of a function from an ActuatorConfig to a Device; only the sender
+    process imports it. ``name`` appears in messages and, in lower case, in the names of readings. ``silent_hint`` is
+    the remedy if no device answers, ``garbage_hint`` the remedy if the bytes that arrive are no valid frames.
     """
 
     factory: str
@@ -35,15 +35,15 @@ DEVICE_KINDS: dict[str, DeviceKind] = {
     "vesc_serial": DeviceKind(
         factory="drivers.vesc.serial_device:make_device",
         name="VESC",
-        silent_hint="the port opens but nothing answers; switch the VESC on and check that 'port' is the VESC's.",
+        silent_hint="the port opens but no device answers; switch the VESC on and check that 'port' is the VESC's.",
         garbage_hint="check 'port' and 'baud' in [hardware.actuator].",
     ),
     "vesc_can": DeviceKind(
         factory="drivers.vesc.can_device:make_device",
         name="VESC",
-        silent_hint="nothing answers there; check power, termination, the bitrate, and that controller_id in "
+        silent_hint="no device answers; check power, termination, the bitrate, and that controller_id in "
         "[hardware.actuator] is the VESC's id and its CAN mode is VESC.",
         is_bus=True,
     ),
 }
-"""Device kinds by the name that a car file gives them; add a protocol here."""
+"""Device kinds by their name in car files; add a protocol here."""

@@ -1,4 +1,4 @@
-"""A car whose inputs are real and whose commands go nowhere."""
+"""A car with real observations that sends no commands."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from carlab.core.quantities import NEUTRAL, Action, CarState, Health, Observatio
 
 
 class DryRunCar(Car):
-    """Wraps any car: observations are passed on, commands are checked and discarded.
+    """Wrapper of any car: it forwards observations, checks commands and discards them.
 
-    The wrapped car is never armed; it keeps sending neutral. ``as_sent`` turns an action into what the car would
-    have sent (a calibration's rounding, for example) and is the identity unless given.
+    The wrapped car is never armed; it keeps sending neutral. ``as_sent`` maps an action to the action that the car
+    would have sent (for example with the rounding of its calibration); by default it is the identity.
     """
 
     def __init__(self, car: Car, as_sent: Callable[[Action], Action] | None = None) -> None:
@@ -33,18 +33,18 @@ class DryRunCar(Car):
         self._is_open = True
 
     def observe(self) -> Observation:
-        """What the car sees."""
+        """Observation of the wrapped car."""
         return self.car.observe()
 
     def arm(self) -> None:
-        """Arm the pretence only."""
+        """Arm the dry run; the wrapped car stays disarmed."""
         self._require_open()
         if self._is_latched:
             raise ActuatorFaultError("The dry run was stopped for safety; reset the fault first.")
         self._is_armed = True
 
     def command(self, action: Action) -> Action:
-        """Check the action and say what would have been sent."""
+        """Check the action and return the action that would have been sent."""
         self._require_open()
         self.check(action)
         if not self._is_armed:
@@ -54,23 +54,23 @@ class DryRunCar(Car):
         return action if self._as_sent is None else self._as_sent(action)
 
     def stop(self, *, planned: bool) -> None:
-        """Disarm; the wrapped car stops as well."""
+        """Disarm, and stop the wrapped car."""
         self._is_armed = False
         self._is_latched = self._is_latched or not planned
         self.car.stop(planned=planned)
 
     def reset_fault(self) -> None:
-        """Clear the latch here and in the car."""
+        """Clear the latched fault here and in the wrapped car."""
         self._require_open()
         self.car.reset_fault()
         self._is_latched = False
 
     def health(self) -> Health:
-        """The car's."""
+        """Health of the wrapped car."""
         return self.car.health()
 
     def place(self, state: CarState) -> bool:
-        """The car's."""
+        """Place the wrapped car."""
         return self.car.place(state)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A car made of an actuator and motion capture: real, or emulated on the wire."""
+"""A car with an actuator and motion capture: real, or emulated at the wire."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from carlab.core.state_estimator import StateEstimator
 from drivers.actuator import Actuator
 from drivers.config import HardwareConfig
 
-POSES_KEPT = 4096
+MAX_POSES = 4096
 PLACE_TIMEOUT_S = 1.0
 ARM_WAIT_S = 0.5
-"""How long arming waits for poses that are fresh, and enough to know a speed from, before it gives up."""
+"""Longest time that arming waits for enough fresh poses for a speed estimate [s]."""
 CAPTURE_STAMP_ERROR_S = 0.005
-"""How far a capture stamp, carried over from the camera's clock, may be ahead of the host's."""
+"""Largest error of a capture stamp that was converted from the camera's clock to the host's [s]."""
 
 
 class HardwareCar(Car):
-    """Actuator, pose source and state estimator behind the one contract.
+    """Actuator, pose source and state estimator behind the ``Car`` interface.
 
     Args:
         name: Name of the car.
-        actuator: Where commands go.
-        pose_source: Where poses come from; opened and closed with the car.
-        estimator: Makes states of poses.
-        config: When the car may be armed.
-        reality: REAL, or EMULATED where the wire ends in emulators.
+        actuator: Receives the commands.
+        pose_source: Delivers the poses; opened and closed with the car.
+        estimator: Estimates states from poses.
+        config: Conditions for arming.
+        reality: REAL, or EMULATED if emulators are at the other end of the wire.
         limits: Largest commands that are accepted.
-        clock: The clock of poses and commands; the host's monotonic one unless given.
-        place: Puts an emulated car somewhere; returns whether it could.
+        clock: Clock of poses and commands; by default the host's monotonic clock.
+        place: Moves an emulated car to a state; returns whether it succeeded.
     """
 
     def __init__(
@@ -64,10 +64,10 @@ class HardwareCar(Car):
         self._placed_s = float("-inf")
         self._sequence = -1
         self._newest: PoseSample | None = None
-        self._unseen: deque[PoseSample] = deque(maxlen=POSES_KEPT)
+        self._unseen: deque[PoseSample] = deque(maxlen=MAX_POSES)
 
     def open(self) -> None:
-        """Open motion capture and actuator; raises NotReadyError with the reasons of both."""
+        """Open motion capture and actuator. Raises NotReadyError with the reasons of both."""
         if self._is_open:
             return
         reasons: list[str] = []
@@ -87,7 +87,7 @@ class HardwareCar(Car):
         self._is_open = True
 
     def observe(self) -> Observation:
-        """Newest state and the raw poses since the last call; ``tracked`` is that of the newest sample."""
+        """Newest state and the raw poses since the last call; ``tracked`` belongs to the newest sample."""
         self._require_open()
         self._take_poses()
         estimate = self.estimator.estimate()
@@ -112,9 +112,9 @@ class HardwareCar(Car):
         )
 
     def arm(self) -> None:
-        """Arm the actuator if it, motion capture and the standstill of the car allow it.
+        """Arm the actuator if actuator and motion capture are ready and the car is at rest.
 
-        Poses that are late for a moment, as on a host that is busy, are waited for (half a second at most).
+        Waits half a second at most for late poses (a busy host).
         """
         self._require_open()
         self.actuator.require_no_fault()
@@ -122,46 +122,46 @@ class HardwareCar(Car):
         reasons = [*self.actuator.problems(), *self._pose_problems()]
         estimate = self.estimator.estimate()
         if estimate is not None and not self.estimator.velocity_valid:
-            reasons.append("too few poses have come to know whether the car stands; try again at once.")
+            reasons.append("too few poses arrived to estimate the speed; try again.")
         elif estimate is not None and not (speed_mps := estimate[0].speed_mps) <= self.config.arm_max_speed_mps:
-            reasons.append(f"the car moves at {speed_mps:.2f} m/s; wait until it stands still.")
+            reasons.append(f"the car moves at {speed_mps:.2f} m/s; wait until it is at rest.")
         erpm = abs(self.actuator.status().erpm)
         if math.isnan(erpm):
-            reasons.append("the motor controller has not said how fast the motor turns; check its app settings.")
+            reasons.append("the motor controller reports no motor speed; check its app settings.")
         elif erpm > self.config.arm_max_erpm:
-            reasons.append(f"the motor turns at {erpm:.0f} eRPM; wait until it stands still.")
+            reasons.append(f"the motor turns at {erpm:.0f} eRPM; wait until it is at rest.")
         if reasons:
             raise NotReadyError(f"{self.name} cannot be armed", reasons)
         self.actuator.arm()
 
     def command(self, action: Action) -> Action:
-        """Check and hand over; returns what will be on the wire."""
+        """Check and post a command; returns the command on the wire."""
         self._require_open()
         self.check(action)
         return self.actuator.command(action)
 
     def stop(self, *, planned: bool) -> None:
-        """Neutral at least three times, and disarm."""
+        """Send neutral at least three times, and disarm."""
         self.actuator.stop(planned=planned)
 
     def reset_fault(self) -> None:
-        """Clear a latched fault; raises ActuatorFaultError where the cause persists."""
+        """Clear a latched fault. Raises ActuatorFaultError if the cause persists."""
         self._require_open()
         self.actuator.reset_fault()
 
     def health(self) -> Health:
-        """Actuator, firmware and motion capture in one."""
+        """Condition of actuator, firmware and motion capture."""
         if not self._is_open:
-            return Health(False, (f"{self.name} is not open.",))
+            return Health(False, (f"{self.name} is not open; call open() first.",))
         actuator = self.actuator.health()
         problems = (*actuator.problems, *self._pose_problems())
         readings = {**actuator.readings, **{f"mocap_{k}": v for k, v in self.pose_source.statistics().items()}}
         return Health(not problems, problems, readings)
 
     def place(self, state: CarState) -> bool:
-        """Ask the emulator, where there is one, and wait for a pose taken after that (a second at most).
+        """Move an emulated car to ``state`` and wait for a pose captured afterwards (a second at most).
 
-        Poses taken before, which are still on their way, no longer count; the estimator starts anew.
+        Poses captured before are discarded, and the estimator is reset. Returns False for a real car.
         """
         if self._place is None or not self._place(state):
             return False
@@ -176,7 +176,7 @@ class HardwareCar(Car):
         return True
 
     def close(self) -> None:
-        """Neutral, then disconnect both; the second is closed whatever the first one does."""
+        """Send neutral, then disconnect actuator and motion capture, each even if closing the other one fails."""
         self._is_open = False
         try:
             self.actuator.close()
@@ -184,12 +184,12 @@ class HardwareCar(Car):
             self.pose_source.close()
 
     def _motor_is_turning(self) -> bool | None:
-        """Whether the measured motor speed is above that at which the car may be armed; None if it is not measured."""
+        """Whether the measured motor speed exceeds the limit for arming; None if it is not measured."""
         erpm = self.actuator.status().erpm
         return None if math.isnan(erpm) else abs(erpm) > self.config.arm_max_erpm
 
     def _await_poses(self) -> None:
-        """Take poses until they say whether the car stands, or none comes any more."""
+        """Read poses until the speed can be estimated, ``ARM_WAIT_S`` at most."""
         until_s = self.clock.now_s() + ARM_WAIT_S
         self._take_poses()
         while self._pose_problems() or not self.estimator.velocity_valid:
@@ -199,7 +199,7 @@ class HardwareCar(Car):
             self._take_poses()
 
     def _take_poses(self) -> None:
-        """Feed the estimator with what has arrived; a source that counts anew is followed."""
+        """Update the estimator with the poses that have arrived, also after the source has restarted its count."""
         latest = self.pose_source.latest()
         if latest is not None and latest.sequence < self._sequence:
             self._sequence = latest.sequence - 1

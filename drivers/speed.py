@@ -1,4 +1,4 @@
-"""How punctual the sender is, idle and while Python in the main process keeps a core busy."""
+"""Benchmark of the sender's lateness, idle and with a CPU-bound Python thread in the main process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_LOADED_RATIO = 1.5
 
 @contextmanager
 def firmware_process() -> Iterator[str]:
-    """A fake VESC in a process of its own; yields its port."""
+    """Run an emulated VESC in a separate process; yields its port."""
     with tempfile.TemporaryDirectory() as folder:
         link = Path(folder) / "vesc"
         process = subprocess.Popen(
@@ -36,7 +36,10 @@ def firmware_process() -> Iterator[str]:
             assert process.stdout is not None
             port = process.stdout.readline().decode().strip()
             if not port:
-                raise NotReadyError("The fake firmware did not start", ("run it by hand to see why.",))
+                raise NotReadyError(
+                    "The emulated firmware did not start",
+                    ("run drivers.emulators.serial_firmware by hand.",),
+                )
             yield port
         finally:
             process.communicate()
@@ -44,7 +47,7 @@ def firmware_process() -> Iterator[str]:
 
 @contextmanager
 def busy_thread(is_busy: bool) -> Iterator[None]:
-    """A thread of pure Python that never rests, or none."""
+    """Run a CPU-bound Python thread if ``is_busy``."""
     done = threading.Event()
 
     def burn() -> None:
@@ -64,7 +67,7 @@ def busy_thread(is_busy: bool) -> Iterator[None]:
 
 
 def _drive(port: str, rate_hz: float, seconds: float, *, is_busy: bool, realtime_priority: bool) -> SenderStatus:
-    """Drive at 30 Hz for some seconds and return the sender's own account of its lateness."""
+    """Drive at 30 Hz for some seconds and return the sender's status with its lateness."""
     config = ActuatorConfig(
         port=port,
         rate_hz=rate_hz,
@@ -85,11 +88,11 @@ def _drive(port: str, rate_hz: float, seconds: float, *, is_busy: bool, realtime
 def sender_lateness(
     seconds: float = 5.0, rates_hz: Sequence[float] = (30.0, 100.0), *, realtime_priority: bool = True
 ) -> dict[str, float]:
-    """Lateness of the sender's wake-ups against a fake firmware in another process.
+    """Measure the lateness of the sender's deadlines with an emulated firmware in another process.
 
     For every rate R and condition C (``idle``, and ``loaded`` with a CPU-bound Python thread in this process):
     ``sender_R_hz_C_late_p50_ms``, ``..._p99_ms``, ``..._max_ms``; per rate ``sender_R_hz_loaded_to_idle_p99_ratio``;
-    and ``sender_realtime_flag``, 1 where the sender got SCHED_FIFO. Takes ``2 len(rates_hz) seconds`` and a little.
+    and ``sender_realtime_flag``, 1 if the sender got SCHED_FIFO. Takes about ``2 len(rates_hz) seconds``.
     """
     figures: dict[str, float] = {}
     with firmware_process() as port:

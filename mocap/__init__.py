@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mocap.rigid_body import RigidBodyPoseSource
     from mocap.time_alignment import ClockAlignment
 
-_HOMES = {
+_MODULES = {
     "ClockAlignment": "time_alignment",
     "FoundServer": "natnet.discovery",
     "MocapConfig": "config",
@@ -28,6 +28,6 @@ __all__ = ["ClockAlignment", "FoundServer", "MocapConfig", "NatNetClient", "Rigi
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'mocap' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"mocap.{_HOMES[name]}"), name)
+    return getattr(importlib.import_module(f"mocap.{_MODULES[name]}"), name)

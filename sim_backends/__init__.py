@@ -31,7 +31,7 @@ __all__ = [
     "rollout",
 ]
 
-_HOME = {
+_MODULES = {
     "CarParameters": "car_parameters",
     "MocapParameters": "car_parameters",
     "SimulatorConfig": "car_parameters",
@@ -50,6 +50,6 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"sim_backends.{_HOME[name]}"), name)
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"sim_backends.{_MODULES[name]}"), name)
     raise AttributeError(f"module 'sim_backends' has no attribute '{name}'")

@@ -31,7 +31,7 @@ __all__ = [
     "write_scores",
 ]
 
-_HOME = {
+_MODULES = {
     "EFFECT_IDS": "effects.catalogue",
     "BaseCar": "world.base_car",
     "Case": "cases.case",
@@ -50,6 +50,6 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"carlab.benchmark.{_HOME[name]}"), name)
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"carlab.benchmark.{_MODULES[name]}"), name)
     raise AttributeError(f"module 'carlab.benchmark' has no attribute '{name}'")

@@ -29,7 +29,7 @@ from drivers.calibration import MOTOR_SCALES, ActuatorCalibration, MotorKind
 from drivers.emulators.can_firmware import CanFirmware
 from drivers.emulators.command_log import CommandLog
 from drivers.emulators.serial_firmware import SerialFirmware
-from drivers.emulators.vesc_firmware import RESTING, VescFirmware
+from drivers.emulators.vesc_firmware import VALUES_AT_REST, VescFirmware
 from drivers.vesc.payloads import MotorValues
 from mocap.emulators.faults import ServerFaults
 from mocap.emulators.natnet_server import NatNetServer
@@ -188,7 +188,7 @@ class World:
     def _readings(self, t_s: float) -> MotorValues:
         with self._lock:
             speed_mps = self._plant.advance(t_s).vx_mps
-        return dataclasses.replace(RESTING, erpm=ERPM_PER_MPS * speed_mps)
+        return dataclasses.replace(VALUES_AT_REST, erpm=ERPM_PER_MPS * speed_mps)
 
     def _poses(self, t_s: float) -> Sequence[RigidBodySample | None]:
         with self._lock:

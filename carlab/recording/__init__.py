@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from carlab.recording.run_folder import RunDirectory
     from carlab.recording.sink import Sink
 
-_HOMES = {
+_MODULES = {
     "McapSink": "mcap.sink",
     "Recorder": "recorder",
     "RerunSink": "rerun.sink",
@@ -55,6 +55,6 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used: rerun, pyarrow and matplotlib are heavy."""
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"carlab.recording.{_HOMES[name]}"), name)
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"carlab.recording.{_MODULES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

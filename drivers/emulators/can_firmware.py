@@ -1,7 +1,7 @@
-"""A fake VESC on a CAN bus of python-can: ``virtual`` within a process, ``udp_multicast`` between processes.
+"""An emulated VESC on a CAN bus of python-can: ``virtual`` within a process, ``udp_multicast`` between processes.
 
-Run as ``python -m drivers.emulators.can_firmware --interface udp_multicast --channel 239.74.163.2`` for one in a
-process of its own; it leaves when standard input ends.
+``python -m drivers.emulators.can_firmware --interface udp_multicast --channel 239.74.163.2`` runs it in a separate
+process, which ends when standard input ends.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.links.can_link import open_bus
 from drivers.links.link import CanFrame
 from drivers.vesc import can_codec as vesc_can_codec
-from drivers.vesc.can_codec import CanReassembler, Packet, Send
+from drivers.vesc.can_codec import CanReassembler, Packet, ReplyMode
 
 POLL_S = 0.005
 STATUS_PACKETS = (Packet.STATUS_1, Packet.STATUS_4, Packet.STATUS_5)
@@ -36,14 +36,14 @@ _SIMPLE = {
 
 
 class CanFirmware:
-    """Puts a ``VescFirmware`` on a CAN bus, served by one thread between ``open`` and ``close``.
+    """A ``VescFirmware`` on a CAN bus; one thread serves it between ``open`` and ``close``.
 
     Args:
         firmware: The firmware; its callbacks run in the serving thread.
         interface: python-can interface.
-        channel: Its channel; for ``udp_multicast`` GROUP or GROUP:PORT, kept on this host.
-        status_rate_hz: Rate of status broadcasts 1, 4 and 5; 0 for none, as a new VESC comes.
-        faults: Switches for a bad wire.
+        channel: Channel of the interface; for ``udp_multicast`` GROUP or GROUP:PORT on this host's loopback.
+        status_rate_hz: Rate of status broadcasts 1, 4 and 5; 0 for none, the default of a new VESC.
+        faults: Faults of the wire.
     """
 
     def __init__(
@@ -65,11 +65,11 @@ class CanFirmware:
         self._bus: can.BusABC | None = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._has_heard = False
+        self._has_received = False
         self._next_status_s = 0.0
 
     def open(self) -> None:
-        """Join the bus and start to serve. Idempotent."""
+        """Join the bus and start serving. Idempotent."""
         if self._thread is not None:
             return
         self.log.open()
@@ -103,8 +103,8 @@ class CanFirmware:
             now_s = time.monotonic()
             if message is not None and message.is_extended_id and not message.is_error_frame:
                 frame = CanFrame(message.arbitration_id, bytes(message.data))
-                if self.faults.pass_on(frame.data) == frame.data:  # a frame with a flipped bit is lost on CAN
-                    self._hear(bus, frame, now_s)
+                if self.faults.transmit(frame.data) == frame.data:  # a frame with a flipped bit is lost on CAN
+                    self._handle_frame(bus, frame, now_s)
             self.firmware.poll(now_s)
             if self.status_rate_hz > 0.0 and now_s >= self._next_status_s:
                 self._next_status_s = now_s + 1.0 / self.status_rate_hz
@@ -112,7 +112,7 @@ class CanFirmware:
                 for packet in STATUS_PACKETS:
                     self._send(bus, vesc_can_codec.encode_status(packet, self.firmware.controller_id, values))
 
-    def _hear(self, bus: can.BusABC, frame: CanFrame, now_s: float) -> None:
+    def _handle_frame(self, bus: can.BusABC, frame: CanFrame, now_s: float) -> None:
         own_id = self.firmware.controller_id
         if vesc_can_codec.controller_of(frame) not in (own_id, vesc_can_codec.BROADCAST_ID):
             return
@@ -126,27 +126,27 @@ class CanFirmware:
         elif (packet := self._reassembler.feed(frame)) is not None:
             self._note_first(frame, now_s)
             reply = self.firmware.handle(packet.payload, now_s)
-            if reply is not None and packet.send == Send.REPLY_TO_SENDER:
-                for answer in vesc_can_codec.encode_payload(packet.sender_id, own_id, reply, Send.IS_REPLY):
+            if reply is not None and packet.send == ReplyMode.REPLY_TO_SENDER:
+                for answer in vesc_can_codec.encode_payload(packet.sender_id, own_id, reply, ReplyMode.IS_REPLY):
                     self._send(bus, answer)
 
     def _note_first(self, frame: CanFrame, now_s: float) -> None:
-        if not self._has_heard:
-            self._has_heard = True
+        if not self._has_received:
+            self._has_received = True
             self.log.add(now_s, "first_byte", float(vesc_can_codec.packet_of(frame)))
 
     def _send(self, bus: can.BusABC, frame: CanFrame) -> None:
-        data = self.faults.pass_on(frame.data)
-        if not self.faults.is_silent and data == frame.data:
+        data = self.faults.transmit(frame.data)
+        if not self.faults.drops_replies and data == frame.data:
             bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=True))
 
 
 def main() -> int:
     """Serve until standard input ends."""
-    parser = argparse.ArgumentParser(description="Fake VESC on a CAN bus.")
+    parser = argparse.ArgumentParser(description="Emulated VESC on a CAN bus.")
     parser.add_argument("--interface", default="udp_multicast", help="python-can interface")
-    parser.add_argument("--channel", default=MULTICAST_GROUP, help="its channel; GROUP or GROUP:PORT for udp_multicast")
-    parser.add_argument("--log", type=Path, help="JSON lines of what was heard and done")
+    parser.add_argument("--channel", default=MULTICAST_GROUP, help="channel; GROUP or GROUP:PORT for udp_multicast")
+    parser.add_argument("--log", type=Path, help="log of commands and events as JSON lines")
     parser.add_argument("--motor-timeout", type=float, default=1.0, help="motor time-out [s]")
     parser.add_argument("--controller-id", type=int, default=23, help="id on the bus")
     options = parser.parse_args()

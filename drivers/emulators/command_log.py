@@ -1,4 +1,4 @@
-"""What a fake firmware heard and did, with times on the host's monotonic clock."""
+"""Log of the commands and events of an emulated firmware, with times on the host's monotonic clock."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TextIO
 
 logger = logging.getLogger(__name__)
 
-ENTRIES_KEPT = 500_000
+MAX_ENTRIES = 500_000
 MOTOR_NAMES = frozenset({"current", "brake", "duty", "rpm"})
 
 
@@ -29,19 +29,19 @@ class LogEntry:
 
 
 class CommandLog:
-    """Entries in memory and, where a path is given, as JSON lines flushed one by one, so that a kill loses none.
+    """Entries in memory and, if a path is given, in a file of JSON lines; each line is flushed, so a kill loses none.
 
-    The file is for people to read. If it cannot be written, one warning names it, and the firmware goes on without it.
+    The file is for people. If it cannot be written, the log warns once and continues in memory.
     """
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
-        self._entries: deque[LogEntry] = deque(maxlen=ENTRIES_KEPT)
+        self._entries: deque[LogEntry] = deque(maxlen=MAX_ENTRIES)
         self._lock = threading.Condition()
         self._file: TextIO | None = None
 
     def open(self) -> None:
-        """Open the file, where there is one; entries are appended."""
+        """Open the file if a path was given; entries are appended."""
         if self.path is not None and self._file is None:
             try:
                 self._file = self.path.open("a", encoding="utf-8")
@@ -62,7 +62,7 @@ class CommandLog:
             self._lock.notify_all()
 
     def entries(self, *names: str, since_s: float = float("-inf")) -> list[LogEntry]:
-        """Entries with one of ``names`` (all where none is given) from ``since_s`` on, oldest first."""
+        """Entries with one of ``names`` (all if none is given) from ``since_s`` on, oldest first."""
         with self._lock:
             return [e for e in self._entries if (not names or e.name in names) and e.t_s >= since_s]
 
@@ -71,7 +71,7 @@ class CommandLog:
         return self.entries(*MOTOR_NAMES, since_s=since_s)
 
     def wait_for(self, name: str, timeout_s: float, since_s: float = float("-inf")) -> LogEntry | None:
-        """The first entry of that name from ``since_s`` on, waited for; None after ``timeout_s``."""
+        """Wait for the first entry of that name from ``since_s`` on; None after ``timeout_s``."""
         with self._lock:
             self._lock.wait_for(lambda: self._first(name, since_s) is not None, timeout_s)
             return self._first(name, since_s)
@@ -86,7 +86,7 @@ class CommandLog:
 
     def _give_up_file(self, error: OSError) -> None:
         logger.warning(
-            "The log of the fake firmware cannot be written to %s (%s); free some disk space.",
+            "The log of the emulated firmware cannot be written to %s (%s); free some disk space.",
             self.path,
             error.strerror or error,
         )
@@ -100,6 +100,6 @@ class CommandLog:
 
 
 def read_log(path: Path) -> list[LogEntry]:
-    """Entries of a JSON-lines file, also while it is being written (a last line cut short is left out)."""
+    """Read the entries of a JSON-lines file, also while it is being written (an incomplete last line is ignored)."""
     lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
     return [LogEntry(**json.loads(line)) for line in lines]

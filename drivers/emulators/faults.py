@@ -1,4 +1,4 @@
-"""Faults of a wire, switched on and off while an emulator runs."""
+"""Faults of a wire that can be switched while an emulator runs."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from drivers.links.link import CanFrame, FrameLink, LinkStatistics
 
 @dataclass(slots=True)
 class WireFaults:
-    """What is wrong with the wire between host and firmware. Shares are of frames, both ways.
+    """Faults of the wire between host and firmware. Shares count frames in both directions.
 
-    ``is_silent`` swallows what the firmware says, ``is_deaf`` leaves unread what the host says (it backs up),
-    ``drop_share`` loses frames, ``corrupt_share`` flips a bit in them, ``reply_delay_s`` holds replies back.
+    ``drops_replies`` drops all replies of the firmware, ``stops_reading`` leaves the bytes of the host unread until
+    its buffer is full, ``drop_share`` loses frames, ``corrupt_share`` flips one bit, ``reply_delay_s`` delays replies.
     """
 
-    is_silent: bool = False
-    is_deaf: bool = False
+    drops_replies: bool = False
+    stops_reading: bool = False
     drop_share: float = 0.0
     corrupt_share: float = 0.0
     reply_delay_s: float = 0.0
@@ -28,11 +28,11 @@ class WireFaults:
     _random: random.Random = field(init=False)
 
     def __post_init__(self) -> None:
-        """Seed the dice."""
+        """Seed the random numbers."""
         self._random = random.Random(self.seed)
 
-    def pass_on(self, data: bytes) -> bytes:
-        """What is left of a frame after the wire: itself, one with a flipped bit, or nothing."""
+    def transmit(self, data: bytes) -> bytes:
+        """Transmit a frame: unchanged, with one flipped bit, or lost (empty)."""
         if self.drop_share and self._random.random() < self.drop_share:
             self.dropped += 1
             return b""
@@ -45,7 +45,7 @@ class WireFaults:
 
 
 class FaultyFrameLink:
-    """A frame link with a switch: while ``failure`` is set every write and read raises it, as an unplugged bus does."""
+    """A frame link whose writes and reads raise ActuatorFaultError while ``failure`` is set, like an unplugged bus."""
 
     def __init__(self, link: FrameLink) -> None:
         self.link = link
@@ -57,12 +57,12 @@ class FaultyFrameLink:
         self.link.open()
 
     def write(self, frame: CanFrame) -> None:
-        """Write, or fail as switched."""
+        """Write, or raise the failure."""
         self._fail()
         self.link.write(frame)
 
     def read(self) -> list[CanFrame]:
-        """Read, or fail as switched."""
+        """Read, or raise the failure."""
         self._fail()
         return self.link.read()
 

@@ -1,7 +1,7 @@
-"""A fake VESC on a pseudo-terminal: a host opens its port like that of a real one.
+"""An emulated VESC on a pseudo-terminal: a host opens its port like that of a real VESC.
 
-Run as ``python -m drivers.emulators.serial_firmware --link PATH --log FILE`` for one in a process of its own; it says
-its port on standard output and leaves when standard input ends.
+``python -m drivers.emulators.serial_firmware --link PATH --log FILE`` runs it in a separate process, which prints its
+port on standard output and ends when standard input ends.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.vesc.serial_codec import VescFrameDecoder, encode_frame
 
 POLL_S = 0.005
-BITS_A_BYTE = 10
+BITS_PER_BYTE = 10
 
 
 class SerialFirmware:
-    """Puts a ``VescFirmware`` behind a pseudo-terminal, served by one thread between ``open`` and ``close``.
+    """A ``VescFirmware`` behind a pseudo-terminal; one thread serves it between ``open`` and ``close``.
 
     Args:
         firmware: The firmware; its callbacks run in the serving thread.
-        link: Where to put a symbolic link to the terminal, so that the port keeps its name after ``replug``.
-        baud: Pace bytes like a line of that speed (8N1); None for no pacing, as on USB.
-        faults: Switches for a bad wire.
+        link: Path of a symbolic link to the terminal, so that the port keeps its name after ``replug``.
+        baud: Line speed (8N1) at which bytes are paced; None for no pacing, as on USB.
+        faults: Faults of the wire.
 
-    A host may come, go and come back. The decoder is the firmware's: one-byte resynchronisation, no time-out.
+    Hosts may connect repeatedly. The decoder works like the firmware's: one-byte resynchronisation, no time-out.
     """
 
     def __init__(
@@ -58,10 +58,10 @@ class SerialFirmware:
         self._terminal = ""
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._is_host_there = False
-        self._has_heard = False
-        self._arriving: deque[tuple[float, bytes]] = deque()
-        self._leaving: deque[tuple[float, bytes]] = deque()
+        self._has_host = False
+        self._has_received = False
+        self._received: deque[tuple[float, bytes]] = deque()
+        self._outgoing: deque[tuple[float, bytes]] = deque()
         self._t_line_in_s = self._t_line_out_s = 0.0
 
     @property
@@ -70,7 +70,7 @@ class SerialFirmware:
         return str(self.link) if self.link is not None else self._terminal
 
     def open(self) -> None:
-        """Create the terminal and start to serve. Idempotent."""
+        """Create the terminal and start serving. Idempotent."""
         if self._thread is not None:
             return
         self.log.open()
@@ -80,19 +80,19 @@ class SerialFirmware:
         self._thread.start()
 
     def unplug(self) -> None:
-        """Pull the plug: the terminal vanishes under the host. The firmware goes on and times out."""
+        """Remove the terminal, as an unplugged cable does. The firmware keeps running and times out."""
         with self._lock:
             if self._master is None:
                 return
             os.close(self._master)
             self._master = None
-            self._is_host_there = False
+            self._has_host = False
             self.log.add(time.monotonic(), "unplug")
             if self.link is not None:
                 self.link.unlink(missing_ok=True)
 
     def replug(self) -> None:
-        """Plug in (again): a new terminal, under the old name where ``link`` was given."""
+        """Create a new terminal, under the old name if ``link`` was given."""
         with self._lock:
             if self._master is not None:
                 return
@@ -105,9 +105,9 @@ class SerialFirmware:
                 self.link.unlink(missing_ok=True)
                 self.link.symlink_to(self._terminal)
             self.decoder.clear()
-            self._arriving.clear()
-            self._leaving.clear()
-            self._has_heard = False
+            self._received.clear()
+            self._outgoing.clear()
+            self._has_received = False
             self._master = master
             self.log.add(time.monotonic(), "replug" if self._thread is not None else "open")
 
@@ -132,8 +132,8 @@ class SerialFirmware:
     def __exit__(self, *exc_info: object) -> None:
         self.close()
 
-    def say(self, data: bytes) -> None:
-        """Put raw bytes on the line to the host, garbage for example."""
+    def send_raw(self, data: bytes) -> None:
+        """Send raw bytes to the host, for example garbage."""
         with self._lock:
             self._send(data, time.monotonic())
 
@@ -141,80 +141,80 @@ class SerialFirmware:
         while not self._stop.is_set():
             with self._lock:
                 now_s = time.monotonic()
-                wait_s = self._work(now_s)
+                wait_s = self._step(now_s)
                 master = self._master
-                watched = [master] if master is not None and self._is_host_there and not self.faults.is_deaf else []
+                watched = [master] if master is not None and self._has_host and not self.faults.stops_reading else []
             if wait_s > 0.0:
                 try:
                     select.select(watched, [], [], wait_s)
                 except (OSError, ValueError):
-                    self._stop.wait(POLL_S)  # the plug was pulled while waiting
+                    self._stop.wait(POLL_S)  # the terminal was removed while waiting
 
-    def _work(self, now_s: float) -> float:
-        """Do what is due and return how long to wait [s]."""
-        if self._master is not None and not self.faults.is_deaf:
-            self._hear(self._master, now_s)
-        while self._arriving and self._arriving[0][0] <= now_s:
-            t_s, data = self._arriving.popleft()
+    def _step(self, now_s: float) -> float:
+        """Process received and outgoing bytes that are due; return the time to wait [s]."""
+        if self._master is not None and not self.faults.stops_reading:
+            self._read(self._master, now_s)
+        while self._received and self._received[0][0] <= now_s:
+            t_s, data = self._received.popleft()
             for payload in self.decoder.feed(data, t_s):
-                self._obey(payload, t_s)
-        while self._leaving and self._leaving[0][0] <= now_s:
-            self._put(self._leaving.popleft()[1])
+                self._handle_payload(payload, t_s)
+        while self._outgoing and self._outgoing[0][0] <= now_s:
+            self._write(self._outgoing.popleft()[1])
         self.firmware.poll(now_s)
-        due = [queue[0][0] - now_s for queue in (self._arriving, self._leaving) if queue]
+        due = [queue[0][0] - now_s for queue in (self._received, self._outgoing) if queue]
         return max(0.0, min([POLL_S, *due]))
 
-    def _hear(self, master: int, now_s: float) -> None:
+    def _read(self, master: int, now_s: float) -> None:
         try:
             data = os.read(master, 4096)
         except BlockingIOError:
-            self._is_host_there = True
+            self._has_host = True
             return
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
-            if self._is_host_there:
-                self._is_host_there = False
+            if self._has_host:
+                self._has_host = False
                 self.log.add(now_s, "hang_up")
                 self.decoder.clear()
             return
-        self._is_host_there = True
-        if data and not self._has_heard:
-            self._has_heard = True
+        self._has_host = True
+        if data and not self._has_received:
+            self._has_received = True
             self.log.add(now_s, "first_byte", float(data[0]))
         self._t_line_in_s = max(now_s, self._t_line_in_s) + self._wire_s(len(data))
-        self._arriving.append((self._t_line_in_s, data))
+        self._received.append((self._t_line_in_s, data))
 
-    def _obey(self, payload: bytes, t_s: float) -> None:
-        frame = self.faults.pass_on(payload)
+    def _handle_payload(self, payload: bytes, t_s: float) -> None:
+        frame = self.faults.transmit(payload)
         reply = self.firmware.handle(frame, t_s) if frame == payload else None  # a flipped bit fails the CRC
-        if reply is not None and not self.faults.is_silent:
-            self._send(self.faults.pass_on(encode_frame(reply)), t_s)
+        if reply is not None and not self.faults.drops_replies:
+            self._send(self.faults.transmit(encode_frame(reply)), t_s)
 
     def _send(self, data: bytes, t_s: float) -> None:
         self._t_line_out_s = max(t_s + self.faults.reply_delay_s, self._t_line_out_s) + self._wire_s(len(data))
-        self._leaving.append((self._t_line_out_s, data))
+        self._outgoing.append((self._t_line_out_s, data))
 
-    def _put(self, data: bytes) -> None:
-        if self._master is None or not self._is_host_there:
+    def _write(self, data: bytes) -> None:
+        if self._master is None or not self._has_host:
             return
         try:
             os.write(self._master, data)
         except OSError as error:
-            if error.errno not in (errno.EIO, errno.EAGAIN):  # nobody there, or nobody reads: lost, as on a real line
+            if error.errno not in (errno.EIO, errno.EAGAIN):  # no host, or it does not read: lost, as on a line
                 raise
 
     def _wire_s(self, count: int) -> float:
-        return 0.0 if self.baud is None else count * BITS_A_BYTE / self.baud
+        return 0.0 if self.baud is None else count * BITS_PER_BYTE / self.baud
 
 
 def main() -> int:
     """Serve until standard input ends."""
-    parser = argparse.ArgumentParser(description="Fake VESC on a pseudo-terminal.")
+    parser = argparse.ArgumentParser(description="Emulated VESC on a pseudo-terminal.")
     parser.add_argument("--link", type=Path, help="symbolic link to the terminal")
-    parser.add_argument("--log", type=Path, help="JSON lines of what was heard and done")
+    parser.add_argument("--log", type=Path, help="log of commands and events as JSON lines")
     parser.add_argument("--motor-timeout", type=float, default=1.0, help="motor time-out [s]")
-    parser.add_argument("--baud", type=int, help="pace bytes like a line of this speed")
+    parser.add_argument("--baud", type=int, help="line speed at which bytes are paced")
     options = parser.parse_args()
     firmware = VescFirmware(CommandLog(options.log), motor_timeout_s=options.motor_timeout)
     with SerialFirmware(firmware, link=options.link, baud=options.baud) as served:

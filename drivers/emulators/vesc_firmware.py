@@ -1,8 +1,8 @@
-"""What the firmware of a VESC does with payloads, whatever wire they come over. Pure but for its callbacks and log.
+"""Emulation of a VESC's firmware at the level of payloads. Pure except for its callbacks and log.
 
-Behaviour (vedderb/bldc comm/commands.c, timeout.c): SET_* and ALIVE are not answered and reset the motor's time-out;
-the servo does not and has none; reading values resets nothing. After a time-out the motor is released, and the next
-SET_* works at once.
+Behaviour (vedderb/bldc comm/commands.c, timeout.c): SET_* and ALIVE have no reply and reset the motor's time-out;
+servo commands and requests for values do not reset it; the servo has no time-out. A time-out releases the motor; the
+next SET_* acts at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from drivers.vesc.payloads import (
 MotorCallback = Callable[[float, str, float], None]
 ServoCallback = Callable[[float, float], None]
 EMULATED_VERSION = FirmwareVersion(6, 5, "EMULATED", bytes.fromhex("e0e0e0e0e0e0e0e0e0e0e001"))
-RESTING = MotorValues(temp_fet_c=25.0, temp_motor_c=25.0, erpm=0.0, input_v=11.1, fault_code=0)
+VALUES_AT_REST = MotorValues(temp_fet_c=25.0, temp_motor_c=25.0, erpm=0.0, input_v=11.1, fault_code=0)
 
 _SETTERS = {
     Command.SET_CURRENT: ("current", CURRENT_SCALE),
@@ -39,7 +39,7 @@ _SETTERS = {
 
 
 def _telemetry_bytes(values: MotorValues, mask: int) -> bytes:
-    """Telemetry bytes; numbers that do not fit, from a plant that has diverged, go out as zero."""
+    """Telemetry bytes; values out of range (from a diverged plant) are encoded as zero."""
     try:
         return encode_values(values, mask)
     except ProtocolError:
@@ -47,17 +47,17 @@ def _telemetry_bytes(values: MotorValues, mask: int) -> bytes:
 
 
 class VescFirmware:
-    """State of a fake VESC: motor, servo and motor time-out. Time comes with every call.
+    """State of an emulated VESC: motor, servo and motor time-out. Time is an argument of every call.
 
     Args:
-        log: Where commands and events go.
+        log: Log of commands and events.
         on_motor: Called with time [s], kind (``current`` [A], ``brake`` [A], ``duty``, ``rpm`` or ``release``) and
             value for every motor command, and when the time-out releases the motor.
         on_servo: Called with time [s] and position in [0, 1].
-        readings: What the motor measures at a time [s]; values of a resting car unless given.
-        motor_timeout_s: Silence after which the motor is released.
-        version: What it says it is.
-        controller_id: Its id on CAN.
+        readings: Measurements of the motor controller at a time [s]; by default those of a car at rest.
+        motor_timeout_s: Time without a motor command after which the motor is released [s].
+        version: Version that it reports.
+        controller_id: Controller id on CAN.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class VescFirmware:
         self._is_timed_out = True
 
     def handle(self, payload: bytes, t_s: float) -> bytes | None:
-        """Obey a payload that arrived at ``t_s`` and return the reply, where it has one. Nonsense is ignored."""
+        """Execute a payload that arrived at ``t_s`` and return its reply or None. Invalid payloads are ignored."""
         if not payload:
             return None
         command, data = payload[0], payload[1:]
@@ -109,7 +109,7 @@ class VescFirmware:
         return None
 
     def set_motor(self, name: str, value: float, t_s: float) -> None:
-        """A motor command, already decoded (simple CAN frames come this way)."""
+        """Execute a decoded motor command (simple CAN frames use this)."""
         self.log.add(t_s, name, value)
         self._feed(t_s)
         if self.on_motor is not None:
@@ -117,7 +117,7 @@ class VescFirmware:
 
     def values(self, t_s: float) -> MotorValues:
         """Telemetry at ``t_s``."""
-        read = RESTING if self.readings is None else self.readings(t_s)
+        read = VALUES_AT_REST if self.readings is None else self.readings(t_s)
         status = int(self._is_timed_out) | int(self.kill_switch) << 1
         return dataclasses.replace(
             read,
@@ -127,7 +127,7 @@ class VescFirmware:
         )
 
     def poll(self, t_s: float) -> None:
-        """Let time pass: the motor is released once nobody has fed it for long enough."""
+        """Advance the time; the motor is released after ``motor_timeout_s`` without a motor command."""
         if self._is_timed_out or self._t_fed_s is None or t_s - self._t_fed_s <= self.motor_timeout_s:
             return
         self._is_timed_out = True

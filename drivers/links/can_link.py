@@ -1,4 +1,4 @@
-"""A CAN bus as a frame link (python-can, any of its interfaces)."""
+"""A CAN bus as a frame link (any interface of python-can)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.links.link import CanFrame, LinkStatistics
 
 BUS_OFF: Final = 0x40
 """Bit of a Linux CAN error frame's identifier (CAN_ERR_BUSOFF)."""
-MAX_FRAMES_A_READ: Final = 256
+MAX_FRAMES_PER_READ: Final = 256
 BITRATE_INTERFACES: Final = frozenset({"slcan", "pcan", "kvaser", "vector", "ixxat", "gs_usb", "usb2can", "canalystii"})
 
 
@@ -41,10 +41,10 @@ def _is_ipv4(channel: str) -> bool:
 
 
 class CanLink:
-    """Frames sent at once or not at all; an error of the bus closes nothing but is raised as a fault.
+    """Frame link on a CAN bus: a frame is sent at once or an ActuatorFaultError is raised.
 
-    A frame that the controller cannot send now must not be sent later: each send has a time-out of zero, and after an
-    error the device closes the link, which drops what the adapter still holds, and opens it anew.
+    A frame that the controller cannot send now must not be sent later. Each send has a time-out of zero; after an
+    error the device closes the link, which drops the frames in the adapter's queue, and opens it again.
     """
 
     def __init__(self, interface: str, channel: str, bitrate: int = 500_000) -> None:
@@ -56,14 +56,14 @@ class CanLink:
         self._descriptor: int | None = None
 
     def open(self) -> None:
-        """Open the bus; raises NotReadyError with the next step."""
+        """Open the bus. Raises NotReadyError with the remedy."""
         if self._bus is not None:
             return
         try:
             self._bus = self._open_bus()
         except (can.CanError, OSError, ValueError, ImportError) as error:
             raise NotReadyError(
-                f"CAN bus {self.interface} {self.channel} does not open", (self._reason(error),)
+                f"CAN bus {self.interface} {self.channel} cannot be opened", (self._reason(error),)
             ) from error
         try:
             self._descriptor = self._bus.fileno()
@@ -74,7 +74,7 @@ class CanLink:
         self.statistics.opens += 1
 
     def write(self, frame: CanFrame) -> None:
-        """Send a data frame with a 29-bit identifier; raises ActuatorFaultError where the bus does not take it."""
+        """Send a data frame with a 29-bit identifier. Raises ActuatorFaultError if the bus does not accept it."""
         message = can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=True)
         try:
             self._opened().send(message, timeout=0)
@@ -85,10 +85,10 @@ class CanLink:
         self.statistics.bytes_out += len(frame.data)
 
     def read(self) -> list[CanFrame]:
-        """Frames that have arrived; raises ActuatorFaultError on bus-off or a lost adapter."""
+        """Frames that have arrived. Raises ActuatorFaultError on bus-off or a lost adapter."""
         bus = self._opened()
         frames: list[CanFrame] = []
-        for _ in range(MAX_FRAMES_A_READ):
+        for _ in range(MAX_FRAMES_PER_READ):
             try:
                 message = bus.recv(0)
             except (can.CanError, OSError, ValueError) as error:
@@ -107,11 +107,11 @@ class CanLink:
         return frames
 
     def fileno(self) -> int | None:
-        """The bus's descriptor, where its interface has one."""
+        """File descriptor of the bus, or None if its interface has none."""
         return self._descriptor
 
     def close(self) -> None:
-        """Shut the bus down; what it has not sent is dropped."""
+        """Shut the bus down and drop unsent frames."""
         bus, self._bus, self._descriptor = self._bus, None, None
         if bus is not None:
             bus.shutdown()
@@ -121,13 +121,13 @@ class CanLink:
 
     def _opened(self) -> can.BusABC:
         if self._bus is None:
-            raise ActuatorFaultError(f"CAN bus {self.interface} {self.channel} is not open.")
+            raise ActuatorFaultError(f"CAN bus {self.interface} {self.channel} is not open; open the car first.")
         return self._bus
 
     def _flush(self) -> None:
         if self._bus is None:
             return
-        with contextlib.suppress(NotImplementedError, can.CanError, OSError):  # no queue, or gone with its queue
+        with contextlib.suppress(NotImplementedError, can.CanError, OSError):  # no queue, or the adapter was removed
             self._bus.flush_tx_buffer()
 
     def _failed(self, error: object) -> ActuatorFaultError:
@@ -140,7 +140,7 @@ class CanLink:
         cause = error.__cause__ or error
         if self.interface == "socketcan":
             found = sorted(path.name for path in Path("/sys/class/net").glob("*can*"))
-            there = f"the CAN interfaces that exist are {', '.join(found)}" if found else "there is no CAN interface"
+            there = f"the available CAN interfaces are {', '.join(found)}" if found else "there is no CAN interface"
             return (
                 f"{cause}; {there}. Bring it up with 'ip link set {self.channel} up type can bitrate {self.bitrate} "
                 "restart-ms 100' and set 'channel' in [hardware.actuator]."

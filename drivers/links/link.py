@@ -1,4 +1,4 @@
-"""What a wire offers to a device: bytes or frames, and what has passed over it."""
+"""Interfaces of links: byte streams and frame buses, with counts of their traffic."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class CanFrame:
 
 @dataclass(slots=True)
 class LinkStatistics:
-    """Counts since the link was constructed."""
+    """Traffic counts since construction."""
 
     bytes_out: int = 0
     bytes_in: int = 0
@@ -29,33 +29,33 @@ class LinkStatistics:
 
 
 class ByteLink(Protocol):
-    """A stream of bytes. Constructing does nothing. Every failure after ``open`` is an ActuatorFaultError."""
+    """A byte stream. Constructing does nothing. Every failure after ``open`` is an ActuatorFaultError."""
 
     statistics: LinkStatistics
 
     def open(self) -> None:
-        """Connect; raises NotReadyError with the next step."""
+        """Connect. Raises NotReadyError with the remedy."""
 
     def write(self, data: bytes) -> None:
-        """Hand over all bytes within the link's write time-out, or raise; never leaves old bytes waiting."""
+        """Write all bytes within the write time-out, or raise; unsent bytes are discarded."""
 
     def read(self) -> bytes:
-        """What has arrived; empty where there is nothing. Never blocks."""
+        """Bytes that have arrived; may be empty. Never blocks."""
 
     def fileno(self) -> int | None:
-        """A descriptor that becomes readable when bytes arrive; None where there is none."""
+        """File descriptor that becomes readable when bytes arrive; None if there is none."""
 
     def close(self) -> None:
         """Disconnect in bounded time. Idempotent; safe after a failure."""
 
 
 class FrameLink(Protocol):
-    """A bus of frames, like ``ByteLink``."""
+    """A frame bus, otherwise like ``ByteLink``."""
 
     statistics: LinkStatistics
 
     def open(self) -> None:
-        """Connect; raises NotReadyError with the next step."""
+        """Connect. Raises NotReadyError with the remedy."""
 
     def write(self, frame: CanFrame) -> None:
         """Send a frame at once or raise; never queue it for later."""
@@ -64,7 +64,7 @@ class FrameLink(Protocol):
         """Frames that have arrived, oldest first. Never blocks."""
 
     def fileno(self) -> int | None:
-        """A descriptor that becomes readable when frames arrive; None where there is none."""
+        """File descriptor that becomes readable when frames arrive; None if there is none."""
 
     def close(self) -> None:
         """Disconnect in bounded time. Idempotent; safe after a failure."""

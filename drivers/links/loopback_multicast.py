@@ -1,4 +1,4 @@
-"""python-can's UDP multicast bus kept on this host: it works without a network and lets no command out of the host.
+"""python-can's UDP multicast bus on the loopback interface: it needs no network, and no command leaves the host.
 
 python-can joins the group on the default route's interface, which fails where there is none (a container without a
 network) and sends every frame to the local network otherwise. Here the group is joined and sent to on 127.0.0.1.
@@ -16,7 +16,7 @@ DEFAULT_PORT = 43113
 
 
 class _LoopbackSocket(GeneralPurposeUdpMulticastBus):
-    """The same datagrams on the loopback interface."""
+    """The base class's socket on the loopback interface."""
 
     def _create_socket(self, address_family: socket.AddressFamily) -> socket.socket:
         timestamp_nanoseconds = 35  # SO_TIMESTAMPNS, which the base class reads back with each datagram

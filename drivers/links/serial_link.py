@@ -17,11 +17,11 @@ from drivers.links.link import LinkStatistics
 WRITE_TIMEOUT_S: Final = 0.04
 DRAIN_S: Final = 0.02
 BACKLOG_LIMIT_BYTES: Final = 96
-"""More than this still unsent means that the device has stopped taking bytes (about two ticks' worth)."""
+"""A larger backlog means that the device has stopped reading (about two ticks of commands)."""
 
 
 def serial_ports() -> list[str]:
-    """Serial ports that exist, each with what it calls itself."""
+    """Available serial ports, each with its description."""
     return sorted(
         port.device if port.description in ("n/a", "", None) else f"{port.device} ({port.description})"
         for port in list_ports.comports()
@@ -29,7 +29,7 @@ def serial_ports() -> list[str]:
 
 
 class SerialLink:
-    """Exclusive use of a serial port, read without blocking and written with a time-out."""
+    """A serial port opened exclusively, with non-blocking reads and a time-out on writes."""
 
     def __init__(self, port: str, baud: int = 115200, write_timeout_s: float = WRITE_TIMEOUT_S) -> None:
         self.port = port
@@ -39,7 +39,7 @@ class SerialLink:
         self._serial: serial.Serial | None = None
 
     def open(self) -> None:
-        """Open the port; raises NotReadyError that lists the ports that exist."""
+        """Open the port. Raises NotReadyError with a list of the available ports."""
         if self._serial is not None:
             return
         try:
@@ -47,13 +47,13 @@ class SerialLink:
                 self.port, self.baud, timeout=0, write_timeout=self.write_timeout_s, exclusive=True
             )
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
-            raise NotReadyError(f"Serial port {self.port} does not open", (self._reason(error),)) from error
+            raise NotReadyError(f"Serial port {self.port} cannot be opened", (self._reason(error),)) from error
         self.statistics.opens += 1
 
     def write(self, data: bytes) -> None:
-        """Write all of ``data``; raises ActuatorFaultError on a time-out or a lost port.
+        """Write all of ``data``. Raises ActuatorFaultError on a time-out or a lost port.
 
-        Where the device has stopped taking bytes, those that wait are thrown away: they are commands of the past.
+        If the device has stopped reading, the unsent bytes are discarded, since they hold old commands.
         """
         port = self._opened()
         try:
@@ -65,7 +65,7 @@ class SerialLink:
         except serial.SerialTimeoutException as error:
             self._discard_output()
             raise ActuatorFaultError(
-                f"{self.port} takes no more bytes; check that the device is powered, then reset the fault."
+                f"{self.port} accepts no more bytes; check that the device is powered, then reset the fault."
             ) from error
         except (OSError, termios.error) as error:
             raise self._lost(error) from error
@@ -73,7 +73,7 @@ class SerialLink:
         self.statistics.writes += 1
 
     def read(self) -> bytes:
-        """Bytes that have arrived; raises ActuatorFaultError where the port is gone."""
+        """Bytes that have arrived. Raises ActuatorFaultError if the port was removed."""
         port = self._opened()
         try:
             waiting = port.in_waiting
@@ -84,11 +84,11 @@ class SerialLink:
         return data
 
     def fileno(self) -> int | None:
-        """The port's descriptor while it is open."""
+        """File descriptor of the open port; None while it is closed."""
         return None if self._serial is None else self._serial.fileno()
 
     def close(self) -> None:
-        """Close, throwing away what a device that does not listen has left unsent: the kernel would wait for it."""
+        """Close the port and discard unsent bytes; otherwise the kernel waits for a device that does not read."""
         port, self._serial = self._serial, None
         if port is None:
             return
@@ -98,13 +98,13 @@ class SerialLink:
             if port.out_waiting:
                 port.reset_output_buffer()
         except (OSError, termios.error):
-            return  # the port is gone, and its bytes with it
+            return  # the port was removed, with its bytes
         finally:
             port.close()
 
     def _opened(self) -> serial.Serial:
         if self._serial is None:
-            raise ActuatorFaultError(f"{self.port} is not open.")
+            raise ActuatorFaultError(f"{self.port} is not open; open the car first.")
         return self._serial
 
     def _discard_output(self) -> None:
@@ -120,7 +120,7 @@ class SerialLink:
     def _reason(self, error: BaseException) -> str:
         if not os.path.exists(self.port):
             found = serial_ports()
-            there = f"the ports that exist are {', '.join(found)}" if found else "there is no serial port at all"
+            there = f"the available ports are {', '.join(found)}" if found else "there is no serial port"
             return f"it does not exist; {there}. Plug the motor controller in and set 'port' in [hardware.actuator]."
         if (isinstance(error, OSError) and error.errno == errno.EACCES) or "Permission" in str(error):
             return "permission is denied; add yourself to its group (often 'dialout') and log in again."

@@ -1,1 +1,1 @@
-"""The sender process: decides and sends commands at fixed deadlines, with watchdog and latch."""
+"""The sender process: it sends commands at fixed deadlines, with watchdog and latched faults."""

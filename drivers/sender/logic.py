@@ -1,4 +1,4 @@
-"""When the sender sends what: arming, watchdog, latch and neutral. Pure; time is an argument."""
+"""State machine of the sender: arming, watchdog, latched faults and neutral. Pure; time is an argument."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NEUTRAL_SPAN_S = 0.06
 
 
 class SenderState(enum.IntEnum):
-    """State of the sender. Only ARMED lets a command through."""
+    """State of the sender. It sends commands in ARMED only, otherwise neutral."""
 
     DISCONNECTED = 0
     CONNECTED = 1
@@ -24,8 +24,8 @@ class SenderState(enum.IntEnum):
     FAULT = 4
 
 
-class Wish(enum.IntEnum):
-    """What the main process wants. Each new wish has a higher epoch than the one before."""
+class Request(enum.IntEnum):
+    """Request of the main process. Each new request has a higher epoch."""
 
     NONE = 0
     ARM = 1
@@ -40,13 +40,13 @@ _ORDER = struct.Struct("<QBQdBii")
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """The newest word of the main process: its last wish, and the newest command since.
+    """Message of the main process to the sender: its last request, and the newest command since.
 
-    The command counts only while the wish is ARM; its ``number`` is 0 until the first command of an epoch.
+    The command is used only if the request is ARM; its ``number`` is 0 until the first command of an epoch.
     """
 
     epoch: int
-    wish: Wish
+    request: Request
     number: int
     t_issued_s: float
     command: DeviceCommand
@@ -55,14 +55,14 @@ class Order:
         """Bytes for a slot."""
         c = self.command
         return _ORDER.pack(
-            self.epoch, self.wish, self.number, self.t_issued_s, c.motor_kind, c.motor_steps, c.servo_steps
+            self.epoch, self.request, self.number, self.t_issued_s, c.motor_kind, c.motor_steps, c.servo_steps
         )
 
     @classmethod
     def unpack(cls, data: bytes) -> Order:
         """Inverse of ``pack``."""
-        epoch, wish, number, t_issued_s, kind, motor, servo = _ORDER.unpack(data)
-        return cls(epoch, Wish(wish), number, t_issued_s, DeviceCommand(MotorKind(kind), motor, servo))
+        epoch, request, number, t_issued_s, kind, motor, servo = _ORDER.unpack(data)
+        return cls(epoch, Request(request), number, t_issued_s, DeviceCommand(MotorKind(kind), motor, servo))
 
 
 ORDER_SIZE = _ORDER.size
@@ -71,10 +71,10 @@ ORDER_SIZE = _ORDER.size
 class SenderLogic:
     """The state machine of the sender.
 
-    Feed it what happens (``link_up``, ``firmware``, ``telemetry``, ``link_failed``, ``order``, ``main_lost``) and ask
-    ``decide`` what to write. Whatever happens, ``decide`` returns neutral unless the sender is ARMED, the command was
-    issued in this very epoch, is younger than the watchdog's deadline, lies within the calibration's limits, and the
-    telemetry is fresh. A fault stays until ``RESET_FAULT``, and arming again takes a new ARM on top.
+    The methods ``link_up``, ``firmware``, ``telemetry``, ``link_failed``, ``order`` and ``main_lost`` are its events;
+    ``decide`` returns the command to write. It returns neutral unless the sender is ARMED, the command was issued in
+    the current epoch, is younger than the watchdog's deadline, lies within the calibration's limits, and the
+    telemetry is fresh. A fault stays latched until ``RESET_FAULT``; then a new ARM is needed.
     """
 
     def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> None:
@@ -98,7 +98,7 @@ class SenderLogic:
         self._order: Order | None = None
         self._decided: Order | None = None
         self._t_armed_s = 0.0
-        self._is_watchdog_biting = False
+        self._is_watchdog_tripped = False
         self._t_first_neutral_s: float | None = None
         self._neutral_run = 0
         self._is_neutral_settled = False
@@ -106,7 +106,7 @@ class SenderLogic:
 
     @property
     def is_ready_to_send(self) -> bool:
-        """Whether anything but a version request may be sent: the firmware is known and its ids are ours."""
+        """Whether more than a version request may be sent: the link is open and the firmware is supported."""
         return self._is_link_up and self.version is not None and self.version.refusal() is None
 
     @property
@@ -115,11 +115,11 @@ class SenderLogic:
         return self._is_neutral_settled
 
     def link_up(self) -> None:
-        """The link is open; the firmware has yet to say what it is."""
+        """Event: the link is open, the firmware is still unknown."""
         self._is_link_up = True
 
     def link_failed(self, text: str) -> None:
-        """The link is gone: a latched fault, unless the sender was leaving anyway."""
+        """Event: the link has failed; latches a fault, except during shutdown."""
         self._is_link_up = False
         self.t_values_s = None
         self._latch(text)
@@ -127,17 +127,17 @@ class SenderLogic:
             self.is_finished = True
 
     def firmware(self, version: FirmwareIdentity) -> None:
-        """The firmware's answer; another board than before, or one that is too old, is a latched fault."""
+        """Event: version received; a different board or an unsupported version latches a fault."""
         if self.version is not None and version.uuid != self.version.uuid:
             self._is_link_up = False
-            self._latch(f"another {self.config.device_kind.name} answers than before; close the car and open it again.")
+            self._latch(f"a different {self.config.device_kind.name} answers; close the car and open it again.")
             return
         self.version = version
         if (refusal := version.refusal()) is not None:
             self._latch(refusal)
 
     def telemetry(self, t_s: float, values: Telemetry) -> None:
-        """Fresh telemetry. A fault of the firmware or its kill switch latches."""
+        """Event: telemetry received; a fault of the firmware or its kill switch latches a fault."""
         self.values = values if self.values is None else self.values.updated(values)
         self.t_values_s = t_s
         if self.state == SenderState.DISCONNECTED and self.is_ready_to_send:
@@ -146,26 +146,26 @@ class SenderLogic:
             self._latch(cause)
 
     def telemetry_age_s(self, now_s: float) -> float:
-        """Age of the newest telemetry; infinite before the first."""
+        """Age of the newest telemetry [s]; infinite before the first."""
         return float("inf") if self.t_values_s is None else now_s - self.t_values_s
 
     def main_lost(self) -> None:
-        """The main process is gone: neutral, then leave."""
+        """Event: the main process has ended; the sender sends neutral and shuts down."""
         self._shut_down()
 
     def order(self, now_s: float, order: Order) -> None:
-        """Take the newest word of the main process; void with an older epoch, or once leaving."""
+        """Event: order received; ignored if its epoch is older, and during shutdown."""
         if order.epoch < self.epoch or self._is_shutting_down:
             return
         if order.epoch > self.epoch:
             self.epoch = order.epoch
             self._order = None
-            self._obey(now_s, order)
-        if order.wish == Wish.ARM and order.number > 0:
+            self._handle_request(now_s, order)
+        if order.request == Request.ARM and order.number > 0:
             self._order = order
 
     def decide(self, now_s: float) -> DeviceCommand | None:
-        """Return what to write now; None if nothing may be sent. What is then written is reported to ``written``."""
+        """Return the command to write now, or None if none may be sent; report the written command to ``written``."""
         self._decided = None
         self._watch_telemetry(now_s)
         if not self.is_ready_to_send:
@@ -175,7 +175,7 @@ class SenderLogic:
         return self._command(now_s)
 
     def written(self, now_s: float, command: DeviceCommand) -> None:
-        """Count a command that was written; a decision that was replaced before the write does not count."""
+        """Count a written command; a decision that was replaced before the write does not count."""
         self.frames += 1
         order = self._decided
         if order is not None and command is order.command:
@@ -188,46 +188,46 @@ class SenderLogic:
             return self.neutral
         age_s = now_s - order.t_issued_s
         if not self.calibration.is_within_limits(order.command):
-            self._latch(f"a command beyond the calibration's limits reached the sender: {order.command}.")
+            self._latch(f"a command beyond the calibration's limits reached the sender ({order.command}).")
         elif age_s > self.config.latch_s:
-            self._bite()
+            self._trip_watchdog()
             self._latch(
-                f"no command came for {self.config.latch_s:g} s while armed; see what held the control loop up, "
+                f"no command arrived for {self.config.latch_s:g} s while armed; find what delayed the control loop, "
                 "then reset the fault and arm again."
             )
         elif not -self.config.watchdog_s <= age_s <= self.config.watchdog_s:
-            self._bite()
+            self._trip_watchdog()
         elif self.telemetry_age_s(now_s) <= self.config.telemetry_stale_s:
-            self._is_watchdog_biting = False
+            self._is_watchdog_tripped = False
             self._decided = order
             return order.command
         return self.neutral
 
-    def _obey(self, now_s: float, order: Order) -> None:
+    def _handle_request(self, now_s: float, order: Order) -> None:
         self.refusal = ""
-        if order.wish == Wish.ARM:
+        if order.request == Request.ARM:
             self.refusal = self._arming_refusal(now_s)
             if not self.refusal:
                 self.state = SenderState.ARMED
-                self._is_watchdog_biting = False
-        elif order.wish == Wish.STOP:
+                self._is_watchdog_tripped = False
+        elif order.request == Request.STOP:
             if self.state in (SenderState.ARMED, SenderState.CONNECTED, SenderState.STOPPING):
                 self._begin_neutral(SenderState.STOPPING)
             else:
                 self._begin_neutral(self.state)
-        elif order.wish == Wish.STOP_AND_LATCH:
+        elif order.request == Request.STOP_AND_LATCH:
             self._begin_neutral(self.state)
-            self._latch("The car was stopped for safety; look at it, then reset the fault and arm again.")
-        elif order.wish == Wish.RESET_FAULT:
+            self._latch("The car was stopped for safety; check the car, then reset the fault and arm again.")
+        elif order.request == Request.RESET_FAULT:
             self._reset_fault(now_s)
-        elif order.wish == Wish.SHUT_DOWN:
+        elif order.request == Request.SHUT_DOWN:
             self._shut_down()
 
     def _arming_refusal(self, now_s: float) -> str:
         if self.state == SenderState.FAULT:
             return self.fault
         if self.state != SenderState.CONNECTED:
-            return f"the sender is {self.state.name.lower()}; wait for it to be connected."
+            return f"the sender is {self.state.name.lower()}; wait until it is connected."
         if self.telemetry_age_s(now_s) > self.config.telemetry_stale_s:
             return f"the {self.config.device_kind.name}'s telemetry is stale; check the link."
         return ""
@@ -255,14 +255,14 @@ class SenderLogic:
     def _begin_neutral(self, state: SenderState) -> None:
         self.state = state
         self._order = None
-        self._forget_neutral()
+        self._reset_neutral_count()
 
-    def _forget_neutral(self) -> None:
+    def _reset_neutral_count(self) -> None:
         self._t_first_neutral_s, self._neutral_run, self._is_neutral_settled = None, 0, False
 
     def _count_neutral(self, now_s: float, command: DeviceCommand) -> None:
         if command != self.neutral:
-            self._forget_neutral()
+            self._reset_neutral_count()
             return
         self.neutral_frames += 1
         self._neutral_run += 1
@@ -285,9 +285,9 @@ class SenderLogic:
     def _firmware_cause(self) -> str:
         return "" if self.values is None else self.values.fault()
 
-    def _bite(self) -> None:
-        if not self._is_watchdog_biting:
-            self._is_watchdog_biting = True
+    def _trip_watchdog(self) -> None:
+        if not self._is_watchdog_tripped:
+            self._is_watchdog_tripped = True
             self.watchdog_trips += 1
 
     def _latch(self, text: str) -> None:

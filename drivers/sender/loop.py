@@ -1,6 +1,6 @@
-"""The sender: one loop that owns the device, sends at absolute deadlines and never shares an interpreter's lock.
+"""The loop of the sender: it owns the device and sends at absolute deadlines.
 
-It runs in a process of its own (``sender_process``); only a bus that exists within one process needs it in a thread.
+It runs in a separate process without other threads (``process``); for a bus within one process it runs in a thread.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from drivers.sender.slots import Slot
 from drivers.sender.status import SenderStatus
 
 MAX_RATE_FACTOR = 4
-"""However often the main process wakes the sender, it sends at most this many times its rate."""
+"""Upper limit of the send rate, as a multiple of ``rate_hz``, if the main process wakes the sender often."""
 MAX_DECISION_AGE_S = 0.01
-"""Oldest decision [s] that may be written. If it is older, the process was stopped between decision and write."""
+"""Largest age of a decision that may be written [s]; an older one means that the process was suspended in between."""
 MAX_DECISIONS = 3
-"""Decisions in one tick before neutral is written instead."""
+"""Number of decisions in one tick after which neutral is written."""
 HANDSHAKE_PERIOD_S = 0.1
 RECONNECT_PERIODS_S = (0.1, 0.2, 0.5, 1.0, 2.0)
-LATENESS_KEPT = 4096
-LATENESS_EVERY_DEADLINES = 50
+LATENESS_WINDOW = 4096
+LATENESS_UPDATE_DEADLINES = 50
 
 
 class SenderLoop:
-    """Sends what ``SenderLogic`` says, over a device, until the main process asks it to stop or is gone."""
+    """Sends the decisions of ``SenderLogic`` over a device until the main process requests shutdown or has ended."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class SenderLoop:
         self._next_connect_s = 0.0
         self._failed_connects = 0
         self._t_written_s = float("nan")
-        self._late_s = np.zeros(LATENESS_KEPT)
+        self._late_s = np.zeros(LATENESS_WINDOW)
         self._late_ms = (0.0, 0.0, 0.0)
         self._ticks = 0
         self._deadlines = 0
@@ -72,12 +72,12 @@ class SenderLoop:
         self._needs_version = False
 
     def run(self) -> None:
-        """Connect and send until done; the device is closed and the last status published on every way out."""
+        """Connect and send until shutdown; always closes the device and publishes a last status."""
         try:
             self._run()
         except Exception as error:
             self.logic.link_failed(
-                f"the sender failed ({type(error).__name__}: {error}); close the car, open it again."
+                f"the sender failed ({type(error).__name__}: {error}); close the car and open it again."
             )
             raise
         finally:
@@ -99,14 +99,14 @@ class SenderLoop:
             self._tick(now_s)
             if is_deadline:
                 self._note_lateness(now_s - deadline_s)
-            # A deadline closer than the shortest gap has just been served; missed ones are skipped, never made up.
+            # A deadline within the shortest period has just been served; missed deadlines are skipped.
             if is_deadline or deadline_s - now_s < self._period_s / MAX_RATE_FACTOR:
                 missed = max(0, int((now_s - deadline_s) / self._period_s))
                 self._skipped += missed
                 deadline_s += (missed + 1) * self._period_s
 
     def _wait(self, deadline_s: float) -> bool:
-        """Sleep to the deadline, True, or to an order that may be sent before it, False; replies are read meanwhile."""
+        """Wait for the deadline (True) or for an order that may be sent earlier (False); reads replies meanwhile."""
         earliest_s = time.monotonic() + self._period_s / MAX_RATE_FACTOR
         while (now_s := time.monotonic()) < deadline_s:
             if self._is_woken and now_s >= earliest_s:
@@ -166,10 +166,10 @@ class SenderLoop:
             self.logic.order(now_s, Order.unpack(newest[1]))
 
     def _decide(self) -> tuple[DeviceCommand | None, float]:
-        """Return what to write and the time just before the write.
+        """Return the command to write and the time just before the write.
 
-        The process may be stopped between decision and write (SIGSTOP, a busy host). The command may then be too old,
-        and the main process may have latched a fault. A new decision from the newest order replaces an old one.
+        The process may be suspended between decision and write (SIGSTOP, a busy host). Then the command may be too
+        old, or the main process may have latched a fault; a new decision from the newest order replaces the old one.
         """
         for _ in range(MAX_DECISIONS):
             decided_s = time.monotonic()
@@ -214,7 +214,7 @@ class SenderLoop:
         self._next_connect_s = time.monotonic() + RECONNECT_PERIODS_S[0]
 
     def _reconnect(self, now_s: float) -> None:
-        """Look for a lost link again; the fault stays latched, and nothing but a version request is sent at first."""
+        """Try to open a lost link again; the fault stays latched, and only a version request is sent at first."""
         if self._is_link_open or now_s < self._next_connect_s or self.logic.is_finished:
             return
         try:
@@ -229,11 +229,11 @@ class SenderLoop:
         self._next_poll_s = now_s
 
     def _note_lateness(self, late_s: float) -> None:
-        """Keep how late a deadline was met; the percentiles are renewed now and then, right after a deadline."""
-        self._late_s[self._deadlines % LATENESS_KEPT] = late_s
+        """Record the lateness of a deadline [s]; update the percentiles every ``LATENESS_UPDATE_DEADLINES``."""
+        self._late_s[self._deadlines % LATENESS_WINDOW] = late_s
         self._deadlines += 1
-        if self._deadlines % LATENESS_EVERY_DEADLINES == 1:
-            kept = self._late_s[: min(self._deadlines, LATENESS_KEPT)]
+        if self._deadlines % LATENESS_UPDATE_DEADLINES == 1:
+            kept = self._late_s[: min(self._deadlines, LATENESS_WINDOW)]
             p50, p99, top = (float(v) * 1e3 for v in np.percentile(kept, (50, 99, 100)))
             self._late_ms = (p50, p99, top)
 
@@ -284,6 +284,6 @@ def _known(value: float | None) -> float:
 
 
 def parent_watch() -> Callable[[], bool]:
-    """A check that this process still has the parent it was started by (a forked sibling may hold its pipe open)."""
+    """Return a check that the parent process still runs (a forked sibling may hold the pipe open)."""
     parent = os.getppid()
     return lambda: os.getppid() == parent

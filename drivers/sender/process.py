@@ -1,9 +1,8 @@
-"""The sender in a process of its own: a fresh interpreter in a session of its own, fed by newest-value slots.
+"""The sender in a separate process and session; newest-value slots carry orders and statuses.
 
-It is started as ``python -m drivers.sender.process`` rather than by ``multiprocessing``: nothing of the main program is
-imported again, no shared name can leak, and a terminal's ^C does not reach it. It ignores SIGINT, SIGTERM and SIGHUP;
-it leaves on request, or when the main process is gone, and in both cases only after neutral has been sent at least
-three times over at least 60 ms.
+It is started as ``python -m drivers.sender.process`` and not by ``multiprocessing``: the main program is not imported
+again, no shared name can leak, and a terminal's ^C does not reach it. It ignores SIGINT, SIGTERM and SIGHUP. It ends
+on request, or when the main process has ended, and always after at least three neutral frames over at least 60 ms.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ REALTIME_PRIORITY = 20
 
 
 class Sender(Protocol):
-    """A started sender as the main process sees it."""
+    """Interface of a started sender in the main process."""
 
     def post(self, order: Order) -> None:
         """Publish the newest order and wake the sender; never blocks."""
@@ -47,14 +46,14 @@ class Sender(Protocol):
         """Whether the sender still runs."""
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the sender to end by itself; False where it has not."""
+        """Wait for the sender to end; returns whether it has ended."""
 
     def close(self) -> None:
-        """Cut the sender's line, which makes it send neutral and leave, wait for it in bounded time, free all."""
+        """Close the wake line (the sender sends neutral and ends), wait for a bounded time, and free all resources."""
 
 
 class _Channel:
-    """Slots and wake line, main side."""
+    """Slots and wake line on the side of the main process."""
 
     def __init__(self) -> None:
         self.orders = Slot.create(ORDER_SIZE)
@@ -64,21 +63,21 @@ class _Channel:
         self._last = SenderStatus()
 
     def post(self, order: Order) -> None:
-        """Write, then wake; a full line, a sender that is gone or a channel closed meanwhile is noticed elsewhere."""
+        """Write the order, then wake the sender; errors are ignored here since the status shows an ended sender."""
         with contextlib.suppress(OSError, ValueError):
             self.orders.write(order.pack())
             self.wake.send(b"\1")
 
     def status(self) -> SenderStatus:
-        """Newest status, or the last one read where the slot is being written or was closed by another thread."""
+        """Newest status; the last one read if the slot is being written or another thread has closed it."""
         with contextlib.suppress(ValueError):
             newest = self.statuses.read()
             if newest is not None:
                 self._last = SenderStatus.unpack(newest[1])
         return self._last
 
-    def hang_up(self) -> None:
-        """Close the wake line: the sender takes it as the end of the main process."""
+    def close_wake_line(self) -> None:
+        """Close the wake line; for the sender this is the end of the main process."""
         self.wake.close()
 
     def close(self) -> None:
@@ -90,7 +89,7 @@ class _Channel:
 
 
 class SenderProcess:
-    """Starts the sender's process on construction; owned by ``Actuator``, which closes it."""
+    """The sender's process, started on construction; ``Actuator`` owns and closes it."""
 
     def __init__(self, config: ActuatorConfig, calibration: ActuatorCalibration) -> None:
         self._channel = _Channel()
@@ -144,8 +143,8 @@ class SenderProcess:
         return True
 
     def close(self) -> None:
-        """Hang up, wait, and kill only a process that does not react: then the firmware's time-out stops the motor."""
-        self._channel.hang_up()
+        """Close the wake line and wait; kill a process that does not end (the firmware's time-out stops the motor)."""
+        self._channel.close_wake_line()
         if not self.join(2.0):
             self._process.kill()
             self._process.wait()
@@ -189,14 +188,14 @@ class SenderThread:
         return not self._thread.is_alive()
 
     def close(self) -> None:
-        """Hang up and wait; the memory of a thread that does not end is left to it."""
-        self._channel.hang_up()
+        """Close the wake line and wait; a thread that does not end keeps its memory."""
+        self._channel.close_wake_line()
         if self.join(5.0):
             self._channel.close()
 
 
 def start_sender(config: ActuatorConfig, calibration: ActuatorCalibration) -> Sender:
-    """Start a sender: a process, or a thread for the ``virtual`` bus, which no other process could reach."""
+    """Start a sender: a process, or a thread for the ``virtual`` bus, which exists within one process only."""
     if config.device_kind.is_bus and config.interface == "virtual":
         return SenderThread(config, calibration)
     return SenderProcess(config, calibration)
@@ -211,7 +210,7 @@ def _try_realtime() -> bool:
 
 
 def main(arguments: list[str]) -> int:
-    """Entry of the sender's process: descriptors of orders, statuses and wake line, then the settings as JSON."""
+    """Run the sender's process. Arguments: descriptors of orders, statuses and wake line, then settings as JSON."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     is_main_alive = parent_watch()

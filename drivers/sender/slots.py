@@ -1,9 +1,9 @@
-"""Newest-value slots in memory shared by two processes: no queue, so that nothing old can play out later.
+"""Newest-value slots in memory shared by two processes: there is no queue, so no old value can be read later.
 
-A slot holds two copies; the writer fills the one that is not the newest, each with a sequence number and a CRC32. A
-reader takes the valid copy with the higher number: a copy that is torn, because its writer is in the middle or died
-there, fails its CRC and the other one stands. The memory is an anonymous file passed by descriptor: it has no name
-that could collide or leak, and vanishes with the last process, whatever kills it.
+A slot holds two copies, each with a sequence number and a CRC32; the writer overwrites the older copy. A reader takes
+the valid copy with the higher number: an incomplete copy (its writer is busy, or died) fails its CRC, and the other
+copy is used. The memory is an anonymous file passed by descriptor: it has no name that could collide or leak, and the
+system frees it with the last process.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ class Slot:
 
     @classmethod
     def attach(cls, descriptor: int, capacity: int) -> Self:
-        """Map a slot whose descriptor was inherited or duplicated; the slot owns it from now on."""
+        """Map a slot by an inherited or duplicated descriptor; the slot then owns the descriptor."""
         return cls(descriptor, capacity)
 
     def write(self, value: bytes) -> None:
-        """Publish ``value``; readers see it whole or not at all."""
+        """Publish ``value`` atomically for readers."""
         memory = self._memory
         if memory is None:
             raise ValueError("The slot is closed.")
@@ -66,7 +66,7 @@ class Slot:
         self._sequence = sequence
 
     def read(self) -> tuple[int, bytes] | None:
-        """Sequence number and value of the newest whole copy; None before the first, or while both are torn."""
+        """Sequence number and value of the newest valid copy; None if no copy is valid."""
         for _ in range(READ_ATTEMPTS):
             copies = [copy for half in (0, 1) if (copy := self._read_half(half)) is not None]
             if copies:

@@ -1,4 +1,4 @@
-"""What the sender publishes for the main process to read."""
+"""Status of the sender, published for the main process."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ NAME_BYTES = 64
 
 @dataclass(frozen=True, slots=True)
 class SenderStatus:
-    """A snapshot of the sender. Times are on the host's monotonic clock; NaN where there is nothing to tell.
+    """A snapshot of the sender. Times are on the host's monotonic clock; NaN means unknown.
 
-    ``epoch`` is the last wish obeyed; ``refusal`` says why it could not be. ``sent_number``, ``t_issued_s`` and
-    ``t_written_s`` (when its writing began) belong to the newest command written. ``is_sending`` is False where the
-    link or the firmware is not there to be sent to. ``is_motor_released``: the firmware's time-out has struck.
-    ``late_*`` is how late the sender woke for its deadlines.
+    ``epoch`` is that of the last request handled; ``refusal`` is the reason if it was refused. ``sent_number``,
+    ``t_issued_s`` and ``t_written_s`` (start of the write) belong to the newest command written. ``is_sending`` is
+    False while the link is closed or the firmware unknown. ``is_motor_released``: the firmware's time-out has
+    released the motor. ``late_*`` is the lateness of the sender's deadlines.
     """
 
     t_published_s: float = 0.0
@@ -58,7 +58,7 @@ class SenderStatus:
     refusal: str = ""
 
     def pack(self) -> bytes:
-        """Bytes for a slot; texts that are too long are cut."""
+        """Bytes for a slot; long texts are truncated."""
         values = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)

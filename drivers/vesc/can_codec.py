@@ -1,4 +1,4 @@
-"""VESC over CAN: commands to frames and frames back to telemetry and payloads. Pure.
+"""VESC over CAN: encode commands to frames, decode frames to telemetry and payloads. Pure functions.
 
 Facts (vedderb/bldc comm/comm_can.c, documentation/comm_can.md): 29-bit identifiers, ``(packet << 8) | controller``;
 messages of fixed layout are in ``dbc/vesc.dbc``; every other command goes through a small transport: up to 6 bytes in
@@ -52,8 +52,8 @@ class Packet(enum.IntEnum):
 STATUS_PACKETS = frozenset(p for p in Packet if p.name.startswith("STATUS"))
 
 
-class Send(enum.IntEnum):
-    """What the receiver of a transported payload does with it."""
+class ReplyMode(enum.IntEnum):
+    """How the receiver of a transported payload replies."""
 
     REPLY_TO_SENDER = 0
     IS_REPLY = 1
@@ -66,13 +66,13 @@ def packet_of(frame: CanFrame) -> int:
 
 
 def controller_of(frame: CanFrame) -> int:
-    """The controller that is addressed, or that a status comes from."""
+    """Id of the addressed controller, or of the sender of a status."""
     return frame.identifier & CONTROLLER_MASK
 
 
 @functools.cache
 def database() -> cantools.database.Database:
-    """The messages of ``dbc/vesc.dbc``, found by identifier whatever the controller id."""
+    """The messages of ``dbc/vesc.dbc``, by identifier without the controller id."""
     text = importlib.resources.files("drivers").joinpath("dbc/vesc.dbc").read_text(encoding="utf-8")
     loaded = cantools.database.load_string(text, "dbc", frame_id_mask=MESSAGE_MASK)
     return cast("cantools.database.Database", loaded)
@@ -86,7 +86,7 @@ def _identifier(packet: int, controller_id: int) -> int:
 
 def _simple(packet: Packet, controller_id: int, signal: str, value: float) -> CanFrame:
     if not math.isfinite(value):
-        raise ProtocolError(f"{signal} is {value}, which is not a number that can be sent.")
+        raise ProtocolError(f"{signal} is {value}; it must be a finite number.")
     message = database().get_message_by_name(f"VESC_{packet.name}")
     try:
         data = message.encode({signal: value})
@@ -96,33 +96,33 @@ def _simple(packet: Packet, controller_id: int, signal: str, value: float) -> Ca
 
 
 def set_duty(controller_id: int, duty: float) -> CanFrame:
-    """Duty cycle in [-1, 1]."""
+    """Frame that sets the duty cycle in [-1, 1]."""
     return _simple(Packet.SET_DUTY, controller_id, "duty", duty)
 
 
 def set_current(controller_id: int, current_a: float) -> CanFrame:
-    """Motor current [A]; always four bytes."""
+    """Frame that sets the motor current [A]; four bytes of data."""
     return _simple(Packet.SET_CURRENT, controller_id, "current_a", current_a)
 
 
 def set_current_brake(controller_id: int, current_a: float) -> CanFrame:
-    """Brake current [A]."""
+    """Frame that sets the brake current [A]."""
     return _simple(Packet.SET_CURRENT_BRAKE, controller_id, "current_a", current_a)
 
 
 def set_rpm(controller_id: int, erpm: float) -> CanFrame:
-    """Electrical revolutions per minute."""
+    """Frame that sets the speed in electrical revolutions per minute."""
     return _simple(Packet.SET_RPM, controller_id, "erpm", erpm)
 
 
 def set_servo_position(controller_id: int, host_id: int, position: float) -> CanFrame:
-    """Servo position in [0, 1]; there is no simple message for it, so it travels in a short buffer without reply."""
-    (frame,) = encode_payload(controller_id, host_id, vesc_payloads.set_servo_position(position), Send.NO_REPLY)
+    """Frame that sets the servo position in [0, 1], as a short buffer without reply (there is no simple message)."""
+    (frame,) = encode_payload(controller_id, host_id, vesc_payloads.set_servo_position(position), ReplyMode.NO_REPLY)
     return frame
 
 
 def ping(controller_id: int, host_id: int) -> CanFrame:
-    """Ask a controller to answer with PONG."""
+    """Frame that requests a PONG from a controller."""
     return CanFrame(_identifier(Packet.PING, controller_id), bytes((host_id,)))
 
 
@@ -131,7 +131,7 @@ def pong(host_id: int, controller_id: int, hardware_type: int = 0) -> CanFrame:
     return CanFrame(_identifier(Packet.PONG, host_id), bytes((controller_id, hardware_type)))
 
 
-def encode_payload(receiver_id: int, sender_id: int, payload: bytes, send: Send) -> list[CanFrame]:
+def encode_payload(receiver_id: int, sender_id: int, payload: bytes, send: ReplyMode) -> list[CanFrame]:
     """Transport a payload of 1 to 512 bytes from ``sender_id`` to ``receiver_id``."""
     if not 1 <= len(payload) <= MAX_PAYLOAD:
         raise ProtocolError(f"A payload has 1 to {MAX_PAYLOAD} bytes, not {len(payload)}.")
@@ -155,7 +155,7 @@ def encode_payload(receiver_id: int, sender_id: int, payload: bytes, send: Send)
 
 @dataclass(frozen=True, slots=True)
 class TransportedPayload:
-    """A payload that came through the transport, from whom, and what is to be done with it."""
+    """A transported payload with its sender and reply mode."""
 
     sender_id: int
     send: int
@@ -164,7 +164,7 @@ class TransportedPayload:
 
 @dataclass(slots=True)
 class CanReassembler:
-    """Collects transport frames addressed to ``own_id``; ``errors`` counts packets that were dropped."""
+    """Reassembles transport frames addressed to ``own_id``; ``errors`` counts dropped packets."""
 
     own_id: int
     errors: int = 0
@@ -172,7 +172,7 @@ class CanReassembler:
     _filled: int = 0
 
     def feed(self, frame: CanFrame) -> TransportedPayload | None:
-        """Take a frame; return a payload where it completes one. Frames for others are ignored."""
+        """Add a frame; returns the payload if the frame completes one. Frames for other ids are ignored."""
         if controller_of(frame) != self.own_id:
             return None
         if packet_of(frame) == Packet.PROCESS_SHORT_BUFFER:
@@ -192,7 +192,7 @@ class CanReassembler:
         if offset == 0:
             self._filled = 0
         if offset != self._filled or offset + len(piece) > MAX_PAYLOAD:
-            self._filled = -1  # a piece is missing: nothing fits until the next packet starts
+            self._filled = -1  # a piece is missing: later pieces are rejected until the next packet starts
             return
         self._buffer[offset : offset + len(piece)] = piece
         self._filled = offset + len(piece)
@@ -214,7 +214,7 @@ _VALUE_NAMES = frozenset(f.name for f in fields(MotorValues))
 
 
 def decode_status(frame: CanFrame) -> MotorValues | None:
-    """Telemetry of a STATUS_1 ... 6 broadcast; None for another frame (STATUS_6 holds inputs only: no field is set).
+    """Decode a STATUS_1 ... 6 broadcast; None for other frames (STATUS_6 has inputs only: no field is set).
 
     Raises ProtocolError for a status of the wrong length.
     """
@@ -225,18 +225,18 @@ def decode_status(frame: CanFrame) -> MotorValues | None:
 
 
 def decode_status_signals(frame: CanFrame) -> dict[str, float] | None:
-    """All signals of a STATUS_1 ... 6 broadcast by their name in the DBC; None for another frame."""
+    """Decode all signals of a STATUS_1 ... 6 broadcast by their names in the DBC; None for other frames."""
     if packet_of(frame) not in STATUS_PACKETS:
         return None
     message = database().get_message_by_frame_id(frame.identifier)
     if len(frame.data) < message.length:
-        raise ProtocolError(f"{message.name} has {len(frame.data)} bytes where {message.length} belong.")
+        raise ProtocolError(f"{message.name} has {len(frame.data)} bytes, not {message.length}.")
     decoded = cast("dict[str, Any]", message.decode(frame.data[: message.length], decode_choices=False))
     return {name: float(value) for name, value in decoded.items()}
 
 
 def encode_status(packet: Packet, controller_id: int, values: MotorValues) -> CanFrame:
-    """A status broadcast as the firmware sends it; fields that are None go out as zero."""
+    """Encode a status broadcast as the firmware does; fields that are None become zero."""
     message = database().get_message_by_name(f"VESC_{packet.name}")
     signals = {s.name: getattr(values, s.name, None) or 0 for s in message.signals}
     data = bytes(message.encode(signals, strict=False)).ljust(8, b"\0")

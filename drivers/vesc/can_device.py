@@ -10,7 +10,7 @@ from drivers.links.can_link import CanLink
 from drivers.links.link import CanFrame, FrameLink
 from drivers.vesc import can_codec as vesc_can_codec
 from drivers.vesc import payloads as vesc_payloads
-from drivers.vesc.can_codec import CanReassembler, Send
+from drivers.vesc.can_codec import CanReassembler, ReplyMode
 from drivers.vesc.payloads import FirmwareVersion, MotorValues
 
 
@@ -55,7 +55,7 @@ class VescCanDevice:
         self._ask(vesc_payloads.telemetry_request(self._version))
 
     def receive(self, now_s: float) -> list[Reply]:
-        """Decode status broadcasts and transported replies; ``now_s`` is not needed for whole frames."""
+        """Decode status broadcasts and transported replies; ``now_s`` is unused since CAN frames are complete."""
         replies: list[Reply] = []
         for frame in self.link.read():
             try:
@@ -78,7 +78,9 @@ class VescCanDevice:
         self.link.close()
 
     def _ask(self, payload: bytes) -> None:
-        for frame in vesc_can_codec.encode_payload(self.controller_id, self.host_id, payload, Send.REPLY_TO_SENDER):
+        for frame in vesc_can_codec.encode_payload(
+            self.controller_id, self.host_id, payload, ReplyMode.REPLY_TO_SENDER
+        ):
             self.link.write(frame)
 
     def _decode(self, frame: CanFrame) -> FirmwareVersion | MotorValues | None:
@@ -87,13 +89,13 @@ class VescCanDevice:
             self.status_frames += 1
             return values
         packet = self._reassembler.feed(frame)
-        if packet is None or packet.send != Send.IS_REPLY or packet.sender_id != self.controller_id:
+        if packet is None or packet.send != ReplyMode.IS_REPLY or packet.sender_id != self.controller_id:
             return None
         return vesc_payloads.decode_reply(packet.payload)
 
 
 def make_device(config: ActuatorConfig) -> VescCanDevice:
-    """The VESC on the bus that a configuration names; nothing is opened."""
+    """Create the VESC of a configuration without opening its bus."""
     return VescCanDevice(
         CanLink(config.interface, config.channel, config.bitrate), config.controller_id, config.host_id
     )

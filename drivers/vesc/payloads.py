@@ -1,8 +1,8 @@
-"""VESC command payloads: what is inside a serial frame or a CAN transport packet. Pure.
+"""VESC command payloads: the contents of serial frames and CAN transport packets. Pure functions.
 
 Facts: the open VESC firmware (vedderb/bldc: comm/commands.c, util/buffer.c, datatypes.h). Byte 0 of a payload is the
-command id; integers are big-endian two's complement. The firmware truncates scaled numbers, this side rounds. The ids
-hold from firmware 3.07 on; before it 12 meant something else, so that an older firmware is refused.
+command id; integers are big-endian two's complement. The firmware truncates scaled numbers, this module rounds. The ids
+hold from firmware 3.07 on; in older firmware id 12 is another command, so older firmware is refused.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ FAULT_NAMES = {
 
 
 def fault_name(code: int) -> str:
-    """Plain words for a fault code of the firmware."""
+    """Name of a fault code of the firmware."""
     return FAULT_NAMES.get(code, f"code {code}")
 
 
 def scaled_integer(value: float, scale: float, bits: int, name: str) -> int:
     """Round ``value * scale`` to a signed integer of ``bits`` bits.
 
-    Raises ProtocolError for NaN, infinities and numbers that do not fit; nothing else reaches ``int``.
+    Raises ProtocolError for NaN, infinities and numbers out of range.
     """
     scaled = value * scale
     if not math.isfinite(scaled):
-        raise ProtocolError(f"{name} is {value}, which is not a number that can be sent.")
+        raise ProtocolError(f"{name} is {value}; it must be a finite number.")
     limit = 2 ** (bits - 1)
     if not -limit - 0.5 < scaled < limit - 0.5:
         raise ProtocolError(f"{name} {value:g} does not fit into {bits} bits.")
@@ -96,7 +96,7 @@ def set_rpm(erpm: float) -> bytes:
 
 
 def set_servo_position(position: float) -> bytes:
-    """SET_SERVO_POS in [0, 1], 0.001 resolution. It has no time-out in the firmware and does not reset the motor's."""
+    """SET_SERVO_POS in [0, 1], 0.001 resolution. The servo has no time-out and does not reset the motor's."""
     if not 0.0 <= position <= 1.0:
         raise ProtocolError(f"servo position {position} is outside [0, 1].")
     return struct.pack(">Bh", Command.SET_SERVO_POS, scaled_integer(position, SERVO_SCALE, 16, "servo position"))
@@ -108,7 +108,7 @@ def get_values() -> bytes:
 
 
 def get_values_selective(mask: int = CONTROL_MASK) -> bytes:
-    """GET_VALUES_SELECTIVE request (firmware 3.48 and later). Averages (bits 2-5, 19, 20) are reset by reading."""
+    """GET_VALUES_SELECTIVE request (firmware 3.48 and later). Reading resets the averages (bits 2-5, 19, 20)."""
     return struct.pack(">BI", Command.GET_VALUES_SELECTIVE, mask)
 
 
@@ -118,7 +118,7 @@ def get_firmware_version() -> bytes:
 
 
 def forward_can(controller_id: int, payload: bytes) -> bytes:
-    """FORWARD_CAN: ``payload`` for another controller on this one's CAN bus."""
+    """FORWARD_CAN: ``payload`` for another controller on the CAN bus of this controller."""
     if not 0 <= controller_id <= 254:
         raise ProtocolError(f"controller id {controller_id} is outside 0 ... 254.")
     return bytes((Command.FORWARD_CAN, controller_id)) + payload
@@ -126,7 +126,7 @@ def forward_can(controller_id: int, payload: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class MotorValues:
-    """Telemetry. A field that the firmware did not send is None. Field order is the order of the wire."""
+    """Telemetry. A field that the firmware did not send is None. The fields are in wire order."""
 
     temp_fet_c: float | None = None
     temp_motor_c: float | None = None
@@ -155,16 +155,16 @@ class MotorValues:
 
     @property
     def motor_timeout_active(self) -> bool:
-        """True where the firmware says that its motor time-out has struck (firmware 6.00 and later)."""
+        """Whether the firmware reports that its time-out has released the motor (firmware 6.00 and later)."""
         return bool((self.status_bits or 0) & 1)
 
     @property
     def kill_switch_active(self) -> bool:
-        """True where the firmware says that its kill switch is pressed (firmware 6.00 and later)."""
+        """Whether the firmware reports that its kill switch is pressed (firmware 6.00 and later)."""
         return bool((self.status_bits or 0) & 2)
 
     def fault(self) -> str:
-        """Why the firmware forbids driving, with the remedy; empty where it does not."""
+        """Reason why the firmware forbids driving, with the remedy; empty if there is none."""
         if self.fault_code:
             return f"the VESC reports {fault_name(self.fault_code)}; remedy it, then reset the fault."
         if self.kill_switch_active:
@@ -172,12 +172,12 @@ class MotorValues:
         return ""
 
     def updated(self, newer: MotorValues) -> MotorValues:
-        """These values with every field that ``newer`` carries replaced."""
+        """Copy with every field replaced that ``newer`` holds."""
         fields = {f.name: getattr(newer, f.name) for f in dataclasses.fields(newer)}
         return dataclasses.replace(self, **{name: value for name, value in fields.items() if value is not None})
 
 
-# One row a mask bit: struct format, scale, fields.
+# One row per mask bit: struct format, scale, fields.
 VALUE_ROWS: tuple[tuple[str, float, tuple[str, ...]], ...] = (
     ("h", 10, ("temp_fet_c",)), ("h", 10, ("temp_motor_c",)), ("i", 100, ("motor_current_a",)),
     ("i", 100, ("input_current_a",)), ("i", 100, ("id_a",)), ("i", 100, ("iq_a",)), ("h", 1000, ("duty",)),
@@ -192,7 +192,7 @@ OLD_LAYOUT_LENGTH = 56
 
 
 def encode_values(values: MotorValues, mask: int) -> bytes:
-    """Telemetry fields of the ``mask`` bits as the firmware sends them; None goes out as zero."""
+    """Encode the telemetry fields of the ``mask`` bits as the firmware does; None becomes zero."""
     out = bytearray()
     for bit, (form, scale, names) in enumerate(VALUE_ROWS):
         if mask >> bit & 1:
@@ -223,19 +223,19 @@ def _decode_fields(data: bytes, mask: int, what: str) -> MotorValues:
 
 
 def decode_get_values(payload: bytes) -> MotorValues:
-    """Decode a GET_VALUES reply by its length; fields of newer firmwares at the end are ignored.
+    """Decode a GET_VALUES reply by its length; further fields of newer firmware are ignored.
 
     Raises ProtocolError for the layout of firmware 3.00 and older and for a length that ends inside a field.
     """
     if len(payload) == OLD_LAYOUT_LENGTH:
         raise ProtocolError("GET_VALUES reply of firmware 3.00 or older; update the VESC's firmware with VESC Tool.")
     if len(payload) < 54:
-        raise ProtocolError(f"GET_VALUES reply of {len(payload)} bytes is too short; 54 is the least.")
+        raise ProtocolError(f"GET_VALUES reply of {len(payload)} bytes is too short; the minimum is 54.")
     return _decode_fields(payload[1:], FULL_MASK, "GET_VALUES reply")
 
 
 def decode_get_values_selective(payload: bytes) -> MotorValues:
-    """Decode a GET_VALUES_SELECTIVE reply by the mask it carries. Raises ProtocolError for one cut short."""
+    """Decode a GET_VALUES_SELECTIVE reply by its mask. Raises ProtocolError for a truncated reply."""
     if len(payload) < 5:
         raise ProtocolError(f"GET_VALUES_SELECTIVE reply of {len(payload)} bytes has no mask.")
     (mask,) = struct.unpack_from(">I", payload, 1)
@@ -244,7 +244,7 @@ def decode_get_values_selective(payload: bytes) -> MotorValues:
 
 @dataclass(frozen=True, slots=True)
 class FirmwareVersion(FirmwareIdentity):
-    """Reply to FW_VERSION; all but the number is optional (it came with later firmwares)."""
+    """Reply to FW_VERSION; fields other than the version number are optional (later firmware only)."""
 
     @property
     def text(self) -> str:
@@ -252,7 +252,7 @@ class FirmwareVersion(FirmwareIdentity):
         return f"{self.major}.{self.minor:02d}"
 
     def refusal(self) -> str | None:
-        """Why this firmware cannot be driven, or None."""
+        """Reason why this firmware cannot be used, with the remedy; None if it can."""
         if (self.major, self.minor) < MINIMUM_FIRMWARE:
             return (
                 f"firmware {self.text} is older than 3.07 and numbers its commands differently; "
@@ -262,14 +262,14 @@ class FirmwareVersion(FirmwareIdentity):
 
 
 def telemetry_request(version: FirmwareVersion | None) -> bytes:
-    """The request for the fields that control needs, or for all where the firmware cannot select."""
+    """Request for the fields that control needs; for all fields if the firmware cannot select."""
     if version is not None and (version.major, version.minor) >= SELECTIVE_FIRMWARE:
         return get_values_selective()
     return get_values()
 
 
 def decode_firmware_version(payload: bytes) -> FirmwareVersion:
-    """Decode a FW_VERSION reply; raises ProtocolError where even the number is missing."""
+    """Decode a FW_VERSION reply. Raises ProtocolError if the version number is missing."""
     if len(payload) < 3:
         raise ProtocolError(f"FW_VERSION reply of {len(payload)} bytes has no version number.")
     name, terminator, rest = payload[3:].partition(b"\0")
@@ -278,15 +278,15 @@ def decode_firmware_version(payload: bytes) -> FirmwareVersion:
 
 
 def encode_firmware_version(version: FirmwareVersion) -> bytes:
-    """A FW_VERSION reply with hardware name and UUID and zeros behind, as firmware 6.05 sends it."""
+    """Encode a FW_VERSION reply with hardware name, UUID and trailing zeros, as firmware 6.05 does."""
     head = bytes((Command.FW_VERSION, version.major, version.minor)) + version.hardware.encode("ascii") + b"\0"
     return head + version.uuid.ljust(12, b"\0")[:12] + bytes(8) + b"\0" + bytes(4)
 
 
 def decode_reply(payload: bytes) -> MotorValues | FirmwareVersion | None:
-    """Decode a reply by its command id; None for one that is not used here (asynchronous prints and the like).
+    """Decode a reply by its command id; None for an unused id (asynchronous prints, for example).
 
-    Raises ProtocolError where the id is known and the rest does not follow it.
+    Raises ProtocolError if the id is known and the layout is wrong.
     """
     if not payload:
         raise ProtocolError("A payload without a command id.")

@@ -1,4 +1,4 @@
-"""VESC serial framing: payloads to bytes and a byte stream back to payloads. Pure; time is an argument.
+"""VESC serial framing: encode payloads to bytes, decode a byte stream to payloads. Pure; time is an argument.
 
 Frame (vedderb/bldc comm/packet.c): ``02 LEN payload CRC16 03`` for 1 to 255 bytes, ``03 LEN_HI LEN_LO payload CRC16
 03`` for more, at most 512. The CRC is CRC-16/XMODEM over the payload, high byte first.
@@ -21,7 +21,7 @@ def crc16(payload: bytes) -> int:
 
 
 def encode_frame(payload: bytes) -> bytes:
-    """Frame a payload of 1 to 512 bytes; raises ProtocolError for another length."""
+    """Frame a payload of 1 to 512 bytes. Raises ProtocolError for other lengths."""
     if not 1 <= len(payload) <= MAX_PAYLOAD:
         raise ProtocolError(f"A payload has 1 to {MAX_PAYLOAD} bytes, not {len(payload)}.")
     if len(payload) <= 255:
@@ -33,11 +33,11 @@ def encode_frame(payload: bytes) -> bytes:
 
 @dataclass(slots=True)
 class VescFrameDecoder:
-    """Bytes in, payloads out, with one-byte resynchronisation like the firmware's own decoder.
+    """Decoder from bytes to payloads, with one-byte resynchronisation like the firmware's decoder.
 
-    Whatever does not continue a valid frame costs one byte, after which the search goes on at the next; so a false
-    start never hides a valid frame for longer than its own bogus length. That length can be 512 bytes: where no byte
-    comes for ``inter_byte_timeout_s`` the unfinished frame is given up the same way, and valid frames inside come out.
+    If the buffer does not begin with a valid frame, one byte is dropped and the search continues at the next byte. A
+    false start byte hides a valid frame for at most its false length of up to 512 bytes. If no byte arrives for
+    ``inter_byte_timeout_s`` the unfinished frame is dropped in the same way, and valid frames inside it are decoded.
     """
 
     inter_byte_timeout_s: float | None = 0.03
@@ -54,7 +54,7 @@ class VescFrameDecoder:
         return len(self._buffer)
 
     def feed(self, data: bytes, t_s: float) -> list[bytes]:
-        """Take bytes that arrived at ``t_s`` (any monotonic clock; ``data`` may be empty) and return whole payloads."""
+        """Add bytes that arrived at ``t_s`` (any monotonic clock; may be empty) and return complete payloads."""
         payloads: list[bytes] = []
         if self._is_overdue(t_s):
             self.timeouts += 1
@@ -68,7 +68,7 @@ class VescFrameDecoder:
         return payloads
 
     def clear(self) -> None:
-        """Forget an unfinished frame, after the link was opened anew."""
+        """Drop an unfinished frame, after the link was opened again."""
         self._buffer.clear()
 
     def _is_overdue(self, t_s: float) -> bool:
@@ -89,7 +89,7 @@ class VescFrameDecoder:
             del self._buffer[: end + 3]
 
     def _frame_span(self) -> tuple[int, int] | None:
-        """Payload's place of a whole frame at the front; (0, 0) where none can start there; None if bytes lack."""
+        """Start and end of the payload of a frame at the front; (0, 0) if no frame starts there; None if incomplete."""
         buffer = self._buffer
         if buffer[0] == SHORT_START:
             start = 2

@@ -43,12 +43,12 @@ class VescSerialDevice:
         )
 
     def open(self) -> None:
-        """Open the port and forget what an earlier connection left half said."""
+        """Open the port and drop an unfinished frame of an earlier connection."""
         self._decoder.clear()
         self.link.open()
 
     def send(self, command: DeviceCommand) -> None:
-        """Motor and servo frame in one write."""
+        """Write motor and servo frame in one write."""
         servo = vesc_payloads.set_servo_position(command.servo_position)
         self.link.write(encode_frame(_motor_payload(command)) + encode_frame(servo))
 
@@ -85,5 +85,5 @@ class VescSerialDevice:
 
 
 def make_device(config: ActuatorConfig) -> VescSerialDevice:
-    """The VESC at the port that a configuration names; nothing is opened."""
+    """Create the VESC of a configuration without opening its port."""
     return VescSerialDevice(SerialLink(config.port, config.baud))

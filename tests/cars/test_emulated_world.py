@@ -21,7 +21,7 @@ from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action, CarState
 from carlab.core.safety import SafeCar, SafetyEnvelope, SafetyStop
 
-PATIENT_S = 20.0
+TIMEOUT_S = 20.0
 
 
 def config() -> WorldConfig:
@@ -131,7 +131,7 @@ def test_killed_at_any_moment_of_opening_or_placing_it_leaves_no_process(after_s
         process.wait()
         if process.stdout is not None:
             process.stdout.close()
-    end_s = time.monotonic() + PATIENT_S
+    end_s = time.monotonic() + TIMEOUT_S
     while left := marked(marker):
         assert time.monotonic() < end_s, f"left behind: {left}"
         time.sleep(0.05)

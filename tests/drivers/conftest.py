@@ -1,4 +1,4 @@
-"""Fixtures for the drivers: shared vectors, and a fake VESC on a pseudo-terminal."""
+"""Fixtures for the drivers: shared vectors, and an emulated VESC on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -27,6 +27,6 @@ def vesc_vectors() -> list[dict[str, Any]]:
 
 @pytest.fixture
 def serial_firmware(tmp_path: Path) -> Iterator[SerialFirmware]:
-    """A fake VESC on a pseudo-terminal with a stable name."""
+    """An emulated VESC on a pseudo-terminal with a stable name."""
     with SerialFirmware(VescFirmware(CommandLog()), link=tmp_path / "vesc") as firmware:
         yield firmware

@@ -1,4 +1,4 @@
-"""Actuator and fake firmware over CAN: python-can's virtual bus within a process, UDP multicast between processes."""
+"""Actuator and emulated firmware over CAN: virtual bus within a process, UDP multicast between processes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from drivers.vesc.can_device import VescCanDevice
 ROOT = Path(__file__).resolve().parents[2]
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)
-PATIENT_S = 20.0
+TIMEOUT_S = 20.0
 CHILD = """
 import sys, time
 from carlab.core.quantities import Action
@@ -68,7 +68,7 @@ def config_for(interface: str, channel: str, **changes: Any) -> ActuatorConfig:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + PATIENT_S
+    end_s = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < end_s, "waited in vain"
         time.sleep(0.002)
@@ -79,7 +79,7 @@ def channel_name() -> str:
 
 
 def multicast_channel() -> str:
-    """A port of its own for each test, so that parallel runs do not hear one another."""
+    """A separate port for each test, so that parallel runs do not receive each other's frames."""
     return f"239.74.163.2:{20000 + uuid.uuid4().int % 20000}"
 
 
@@ -104,13 +104,13 @@ def test_drive_and_stop(interface: str, status_rate_hz: float) -> None:
         assert {e.name for e in neutral} == {"current"}
         assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
         assert served.log.entries("servo")[-1].value == 0.5
-        assert served.log.wait_for("motor_timeout", PATIENT_S) is not None
+        assert served.log.wait_for("motor_timeout", TIMEOUT_S) is not None
 
 
-def test_lost_frames_are_survived() -> None:
+def test_driving_continues_despite_lost_frames() -> None:
     channel = channel_name()
     faults = WireFaults(drop_share=0.1, corrupt_share=0.1, seed=1)
-    config = config_for("virtual", channel, open_timeout_s=PATIENT_S)
+    config = config_for("virtual", channel, open_timeout_s=TIMEOUT_S)
     served = CanFirmware(VescFirmware(CommandLog()), "virtual", channel, faults=faults)
     with served, Actuator(config, CALIBRATION) as actuator:
         actuator.arm()
@@ -121,8 +121,8 @@ def test_lost_frames_are_survived() -> None:
         assert faults.dropped > 5
 
 
-def test_nobody_on_the_bus_and_no_such_bus() -> None:
-    with pytest.raises(NotReadyError, match="nothing answers there; check power, termination"):
+def test_missing_controller_and_missing_bus_are_not_ready() -> None:
+    with pytest.raises(NotReadyError, match="no device answers; check power, termination"):
         Actuator(config_for("virtual", channel_name(), open_timeout_s=0.4), CALIBRATION).open()
     with pytest.raises(NotReadyError, match="ip link set nocan7 up"):
         Actuator(config_for("socketcan", "nocan7"), CALIBRATION).open()
@@ -142,7 +142,7 @@ def test_ping_is_answered() -> None:
         link.close()
 
 
-def test_a_failing_bus_is_a_latched_fault_and_the_firmwares_timeout() -> None:
+def test_bus_failure_latches_a_fault_and_the_firmware_times_out() -> None:
     channel = channel_name()
     config = config_for("virtual", channel)
     link = FaultyFrameLink(CanLink("virtual", channel))
@@ -156,11 +156,11 @@ def test_a_failing_bus_is_a_latched_fault_and_the_firmwares_timeout() -> None:
             until(lambda: actuator.status().state == SenderState.FAULT)
             with pytest.raises(ActuatorFaultError, match="the bus is off"):
                 actuator.command(MOVING)
-            assert served.log.wait_for("motor_timeout", PATIENT_S) is not None
+            assert served.log.wait_for("motor_timeout", TIMEOUT_S) is not None
             link.failure = None
             t_s = time.monotonic()
             until(lambda: len(served.log.motor(t_s)) > 10)
-            assert all(e.value == 0.0 for e in served.log.motor(t_s)), "back on the bus, but only with neutral"
+            assert all(e.value == 0.0 for e in served.log.motor(t_s)), "after the reconnection only neutral is sent"
             with pytest.raises(ActuatorFaultError):
                 actuator.arm()
             actuator.reset_fault()
@@ -168,7 +168,7 @@ def test_a_failing_bus_is_a_latched_fault_and_the_firmwares_timeout() -> None:
 
 
 class BrokenBus(VirtualBus):
-    """A virtual bus that fails as real ones do."""
+    """A virtual bus with the failures of a real bus."""
 
     failure: Exception | None = None
     received: can.Message | None = None
@@ -191,7 +191,7 @@ class BrokenBus(VirtualBus):
 
 
 class BrokenLink(CanLink):
-    """A CAN link on such a bus."""
+    """A CAN link on a ``BrokenBus``."""
 
     bus: BrokenBus
 
@@ -208,7 +208,7 @@ class BrokenLink(CanLink):
         OSError(errno.ENETDOWN, "network is down"),
     ],
 )
-def test_errors_of_the_bus_are_faults_and_drop_what_waits(failure: Exception) -> None:
+def test_bus_errors_raise_faults_and_flush_the_queue(failure: Exception) -> None:
     link = BrokenLink("virtual", channel_name())
     link.open()
     link.bus.failure = failure
@@ -236,7 +236,7 @@ def test_error_frames_are_counted_and_bus_off_is_a_fault() -> None:
 
 
 @pytest.mark.parametrize("victim", ["main", "sender"])
-def test_sudden_death_across_processes(tmp_path: Path, victim: str) -> None:
+def test_killed_process_ends_in_neutral_or_firmware_timeout(tmp_path: Path, victim: str) -> None:
     channel = multicast_channel()
     log = tmp_path / "log.jsonl"
     firmware = subprocess.Popen(
@@ -256,12 +256,12 @@ def test_sudden_death_across_processes(tmp_path: Path, victim: str) -> None:
         sender_pid = int(main.stdout.readline())
         until(lambda: any(e.value == 3.0 for e in read_log(log)))
         os.kill(main.pid if victim == "main" else sender_pid, signal.SIGKILL)
-        main.communicate(timeout=PATIENT_S)
+        main.communicate(timeout=TIMEOUT_S)
         until(lambda: any(e.name == "motor_timeout" for e in read_log(log)))
     finally:
         main.kill()
         main.communicate()
-        firmware.communicate(timeout=PATIENT_S)
+        firmware.communicate(timeout=TIMEOUT_S)
     entries = read_log(log)
     motor = [e for e in entries if e.name in ("current", "brake", "duty", "rpm")]
     if victim == "main":
@@ -270,4 +270,4 @@ def test_sudden_death_across_processes(tmp_path: Path, victim: str) -> None:
         assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
         assert [e.value for e in entries if e.name == "servo"][-3:] == [0.5] * 3
     else:
-        assert motor[-1].value == 3.0, "nobody is left to send neutral: the firmware's time-out does it"
+        assert motor[-1].value == 3.0, "no process is left to send neutral: the firmware's time-out stops the motor"

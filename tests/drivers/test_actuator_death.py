@@ -1,4 +1,4 @@
-"""Kill tests: whatever happens to main process or sender, the firmware's log ends in neutral or its time-out."""
+"""Kill tests: however main process or sender end, the firmware's log ends in neutral or its time-out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.sender.process import SenderProcess
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENT_S = 20.0
+TIMEOUT_S = 20.0
 MOTOR_TIMEOUT_S = 0.4
 
 CHILD = """
@@ -103,7 +103,7 @@ main()
 
 
 class Drive:
-    """A child process that drives at 50 Hz, and the fake firmware it drives."""
+    """A child process that drives at 50 Hz, and its emulated firmware."""
 
     def __init__(self, firmware: SerialFirmware, way: str) -> None:
         self.log = firmware.log
@@ -121,13 +121,13 @@ class Drive:
         wait_for(lambda: any(e.value == 3.0 for e in self.log.motor()))
 
     def end(self) -> str:
-        """Wait for the child to end and return what it still said."""
-        said, _ = self.process.communicate(timeout=PATIENT_S)
+        """Wait for the child to end and return its remaining output."""
+        said, _ = self.process.communicate(timeout=TIMEOUT_S)
         return str(said)
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + PATIENT_S
+    end_s = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < end_s, "waited in vain"
         time.sleep(0.005)
@@ -141,8 +141,8 @@ def firmware(tmp_path: Path) -> SerialFirmware:
 
 
 def assert_ended_in_neutral(log: CommandLog) -> list[LogEntry]:
-    """Three neutral motor commands or more over 60 ms and a centred servo are the last words before the hang-up."""
-    assert log.wait_for("hang_up", PATIENT_S) is not None
+    """The last commands are three or more neutral motor commands over 60 ms and a centred servo."""
+    assert log.wait_for("hang_up", TIMEOUT_S) is not None
     motor = log.motor()
     last_moving = max(i for i, e in enumerate(motor) if e.value != 0.0)
     neutral = motor[last_moving + 1 :]
@@ -151,12 +151,12 @@ def assert_ended_in_neutral(log: CommandLog) -> list[LogEntry]:
     assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
     servo = log.entries("servo")
     assert [e.value for e in servo[-3:]] == [0.5] * 3
-    assert log.wait_for("motor_timeout", PATIENT_S) is not None, "and then the firmware lets the motor go"
+    assert log.wait_for("motor_timeout", TIMEOUT_S) is not None, "then the firmware releases the motor"
     return neutral
 
 
 @pytest.mark.parametrize("way", ["exception", "os_exit", "sys_exit", "no_close", "fork", "forked_worker_then_sigkill"])
-def test_every_way_out_from_within_ends_in_neutral(firmware: SerialFirmware, way: str) -> None:
+def test_every_exit_of_the_main_process_ends_in_neutral(firmware: SerialFirmware, way: str) -> None:
     with firmware:
         drive = Drive(firmware, way)
         if way == "fork":
@@ -166,7 +166,7 @@ def test_every_way_out_from_within_ends_in_neutral(firmware: SerialFirmware, way
             drive.process.send_signal(signal.SIGINT)
         if way == "forked_worker_then_sigkill":
             worker = int(drive.lines.readline())
-            drive.process.wait(PATIENT_S)
+            drive.process.wait(TIMEOUT_S)
         else:
             drive.end()
         try:
@@ -188,7 +188,7 @@ def test_every_signal_to_the_main_process_ends_in_neutral(firmware: SerialFirmwa
         assert neutral[0].t_s - t_s < 1.0
 
 
-def test_a_stopped_main_process_ends_in_neutral_and_may_not_go_on(firmware: SerialFirmware) -> None:
+def test_suspended_main_process_ends_in_neutral_and_is_refused_after_resuming(firmware: SerialFirmware) -> None:
     with firmware:
         drive = Drive(firmware, "forever")
         drive.process.send_signal(signal.SIGSTOP)
@@ -218,7 +218,7 @@ def test_a_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: Serial
         assert all(e.value == 0.0 for e in later)
 
 
-def test_a_killed_sender_leaves_the_motor_to_the_firmwares_timeout(firmware: SerialFirmware) -> None:
+def test_firmware_timeout_stops_the_motor_after_the_sender_is_killed(firmware: SerialFirmware) -> None:
     with firmware:
         drive = Drive(firmware, "forever")
         os.kill(drive.sender_pid, signal.SIGKILL)
@@ -226,16 +226,16 @@ def test_a_killed_sender_leaves_the_motor_to_the_firmwares_timeout(firmware: Ser
         said = drive.end()
         assert "error ActuatorFaultError The sender process has ended" in said
         assert said.count("refused ActuatorFaultError") == 2
-        timeout = firmware.log.wait_for("motor_timeout", PATIENT_S)
+        timeout = firmware.log.wait_for("motor_timeout", TIMEOUT_S)
         assert timeout is not None
         assert not [e for e in firmware.log.motor() if e.t_s > max(timeout.t_s, t_s + 0.5)]
 
 
-def test_a_stopped_sender_is_noticed_and_cannot_move_the_car_later(firmware: SerialFirmware) -> None:
+def test_suspended_sender_is_detected_and_cannot_move_the_car_later(firmware: SerialFirmware) -> None:
     with firmware:
         drive = Drive(firmware, "retry_on_request")
         os.kill(drive.sender_pid, signal.SIGSTOP)
-        assert firmware.log.wait_for("motor_timeout", PATIENT_S) is not None
+        assert firmware.log.wait_for("motor_timeout", TIMEOUT_S) is not None
         line = drive.lines.readline()
         assert "error ActuatorFaultError The sender process hangs" in line
         t_s = time.monotonic()
@@ -248,7 +248,7 @@ def test_a_stopped_sender_is_noticed_and_cannot_move_the_car_later(firmware: Ser
         assert all(e.value == 0.0 for e in firmware.log.motor(t_s))
 
 
-def test_unplugged_is_a_latched_fault_and_the_firmwares_timeout(firmware: SerialFirmware) -> None:
+def test_unplugging_latches_a_fault_and_the_firmware_times_out(firmware: SerialFirmware) -> None:
     with firmware:
         drive = Drive(firmware, "forever")
         firmware.unplug()
@@ -256,15 +256,15 @@ def test_unplugged_is_a_latched_fault_and_the_firmwares_timeout(firmware: Serial
         assert "error ActuatorFaultError" in said
         assert "was lost" in said
         assert said.count("refused ActuatorFaultError") == 2
-        assert firmware.log.wait_for("motor_timeout", PATIENT_S) is not None
+        assert firmware.log.wait_for("motor_timeout", TIMEOUT_S) is not None
         unplugged_s = firmware.log.entries("unplug")[0].t_s
         assert not [e for e in firmware.log.motor() if e.t_s > unplugged_s + 0.5]
 
 
-def test_a_sender_that_is_hung_up_on_sends_neutral_and_leaves(firmware: SerialFirmware) -> None:
+def test_sender_whose_wake_line_closes_sends_neutral_and_ends(firmware: SerialFirmware) -> None:
     with firmware:
         sender = SenderProcess(ActuatorConfig(port=firmware.port), ActuatorCalibration())
         wait_for(lambda: len(firmware.log.motor()) > 3)
         sender.close()
-        assert sender._process.returncode == 0, "by itself: it was not killed"
-        assert firmware.log.wait_for("hang_up", PATIENT_S) is not None
+        assert sender._process.returncode == 0, "the sender ended by itself"
+        assert firmware.log.wait_for("hang_up", TIMEOUT_S) is not None

@@ -1,4 +1,4 @@
-"""Actuator, sender process and fake firmware end to end over a pseudo-terminal."""
+"""Actuator, sender process and emulated firmware end to end over a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from drivers.vesc.serial_codec import encode_frame
 
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)  # 3 A, servo 0.65
-PATIENT_S = 20.0
+TIMEOUT_S = 20.0
 
 
 def config_for(firmware: SerialFirmware, **changes: object) -> ActuatorConfig:
-    """Watchdog times that a stalling test machine cannot trip by accident."""
+    """Configuration with watchdog times that a busy test machine does not exceed."""
     config = ActuatorConfig(
         port=firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0
     )
@@ -46,8 +46,8 @@ def config_for(firmware: SerialFirmware, **changes: object) -> ActuatorConfig:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition; fail after much more time than it can take."""
-    end_s = time.monotonic() + PATIENT_S
+    """Wait for a condition; fail after ``TIMEOUT_S``."""
+    end_s = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < end_s, "waited in vain"
         time.sleep(0.002)
@@ -85,7 +85,7 @@ def test_commands_arrive_as_returned_and_stop_ends_in_neutral(
 
 
 def test_a_command_is_on_the_wire_before_the_next_deadline(serial_firmware: SerialFirmware) -> None:
-    """At 10 Hz a command that waited for a deadline would be 50 ms late on average; it is sent on the wake instead."""
+    """At 10 Hz a command that waits for a deadline is 50 ms late on average; it is sent at the wake-up instead."""
     with Actuator(config_for(serial_firmware, rate_hz=10.0, telemetry_rate_hz=10.0), CALIBRATION) as actuator:
         actuator.arm()
         delays = []
@@ -97,7 +97,7 @@ def test_a_command_is_on_the_wire_before_the_next_deadline(serial_firmware: Seri
         assert sorted(delays)[7] < 0.035
 
 
-def test_a_flood_of_commands_does_not_flood_the_wire(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+def test_send_rate_is_limited_for_frequent_commands(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
     actuator.arm()
     t_start_s = time.monotonic()
     posted = 0
@@ -110,7 +110,7 @@ def test_a_flood_of_commands_does_not_flood_the_wire(actuator: Actuator, serial_
     assert frames <= 4.0 * 100.0 * elapsed_s + 5
 
 
-def test_not_a_number_never_leaves(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+def test_nan_command_is_never_sent(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
     actuator.arm()
     for bad in (Action(float("nan"), 0.0), Action(0.0, float("inf")), Action(float("-inf"), float("nan"))):
         with pytest.raises(ActionOutOfRangeError):
@@ -170,12 +170,12 @@ def test_firmware_fault_stops_and_persists(actuator: Actuator, serial_firmware: 
     actuator.reset_fault()
 
 
-def test_silence_becomes_neutral_then_a_fault(serial_firmware: SerialFirmware) -> None:
+def test_missing_telemetry_gives_neutral_then_a_fault(serial_firmware: SerialFirmware) -> None:
     config = config_for(serial_firmware, telemetry_stale_s=0.25, telemetry_lost_s=1.0)
     with Actuator(config, CALIBRATION) as actuator:
         actuator.arm()
         until(lambda: not actuator.command(MOVING).is_neutral)
-        serial_firmware.faults.is_silent = True
+        serial_firmware.faults.drops_replies = True
         said: list[tuple[float, bool]] = []
         while actuator.status().state == SenderState.ARMED:
             try:
@@ -187,10 +187,10 @@ def test_silence_becomes_neutral_then_a_fault(serial_firmware: SerialFirmware) -
         assert "stopped answering" in actuator.status().fault
         moving = [e.t_s for e in serial_firmware.log.motor() if e.value == 3.0]
         neutral = [e for e in serial_firmware.log.motor() if e.t_s > moving[-1]]
-        assert neutral[-1].t_s - neutral[0].t_s > 0.4, "neutral long before the fault"
-        told_from_s = next(t_s for t_s, is_neutral in said if is_neutral)
-        assert all(is_neutral for t_s, is_neutral in said if t_s > told_from_s)
-        assert abs(told_from_s - moving[-1]) < 0.25, "and what is said to be sent is neutral from then on, too"
+        assert neutral[-1].t_s - neutral[0].t_s > 0.4, "neutral is sent well before the fault"
+        neutral_from_s = next(t_s for t_s, is_neutral in said if is_neutral)
+        assert all(is_neutral for t_s, is_neutral in said if t_s > neutral_from_s)
+        assert abs(neutral_from_s - moving[-1]) < 0.25, "the reported command is neutral from then on, too"
 
 
 def test_unplugged_then_plugged_in_again(serial_firmware: SerialFirmware) -> None:
@@ -205,7 +205,7 @@ def test_unplugged_then_plugged_in_again(serial_firmware: SerialFirmware) -> Non
             actuator.command(MOVING)
         with pytest.raises(ActuatorFaultError, match="was lost"):
             actuator.reset_fault()
-        assert serial_firmware.log.wait_for("motor_timeout", PATIENT_S) is not None
+        assert serial_firmware.log.wait_for("motor_timeout", TIMEOUT_S) is not None
         serial_firmware.replug()
         t_replug_s = serial_firmware.log.entries("replug")[0].t_s
         until(lambda: len(serial_firmware.log.motor(t_replug_s)) > 10)
@@ -227,29 +227,29 @@ def test_another_board_on_the_same_port_stays_a_fault(serial_firmware: SerialFir
         serial_firmware.firmware.version = FirmwareVersion(6, 5, "OTHER", b"another board")
         serial_firmware.replug()
         t_replug_s = serial_firmware.log.entries("replug")[0].t_s
-        assert serial_firmware.log.wait_for("firmware", PATIENT_S, t_replug_s) is not None
+        assert serial_firmware.log.wait_for("firmware", TIMEOUT_S, t_replug_s) is not None
         time.sleep(0.3)
         with pytest.raises(ActuatorFaultError):
             actuator.reset_fault()
         assert not serial_firmware.log.motor(t_replug_s)
 
 
-def test_a_device_that_reads_nothing_is_a_fault(serial_firmware: SerialFirmware) -> None:
+def test_device_that_stops_reading_is_a_fault(serial_firmware: SerialFirmware) -> None:
     config = config_for(serial_firmware, rate_hz=500.0)
     with Actuator(config, CALIBRATION) as actuator:
         actuator.arm()
-        serial_firmware.faults.is_deaf = True
+        serial_firmware.faults.stops_reading = True
         until(lambda: actuator.status().state == SenderState.FAULT)
-        assert "takes no more bytes" in actuator.status().fault
+        assert "accepts no more bytes" in actuator.status().fault
 
 
-def test_garbage_lost_and_broken_frames_are_survived_and_counted(tmp_path: Path) -> None:
+def test_garbage_lost_and_broken_frames_are_tolerated_and_counted(tmp_path: Path) -> None:
     faults = WireFaults(drop_share=0.05, corrupt_share=0.2, seed=3)
     firmware = SerialFirmware(VescFirmware(CommandLog()), faults=faults)
-    with firmware, Actuator(config_for(firmware, open_timeout_s=PATIENT_S), CALIBRATION) as actuator:
+    with firmware, Actuator(config_for(firmware, open_timeout_s=TIMEOUT_S), CALIBRATION) as actuator:
         actuator.arm()
-        firmware.say(bytes((i * 73 + i // 7) & 255 for i in range(3000)) + encode_frame(set_current(9.0))[:5])
-        firmware.say(encode_frame(get_values() + bytes(20)))  # a reply of no known layout
+        firmware.send_raw(bytes((i * 73 + i // 7) & 255 for i in range(3000)) + encode_frame(set_current(9.0))[:5])
+        firmware.send_raw(encode_frame(get_values() + bytes(20)))  # a reply of no known layout
         until(lambda: actuator.status().crc_errors >= 3)
         status = actuator.status()
         assert status.garbage_bytes >= 1000
@@ -259,7 +259,7 @@ def test_garbage_lost_and_broken_frames_are_survived_and_counted(tmp_path: Path)
         assert {e.value for e in firmware.log.motor()} <= {0.0, 3.0}
 
 
-def test_paced_line_at_115200_keeps_up(tmp_path: Path) -> None:
+def test_line_at_115200_baud_builds_no_backlog(tmp_path: Path) -> None:
     firmware = SerialFirmware(VescFirmware(CommandLog()), baud=115_200)
     with firmware, Actuator(config_for(firmware), CALIBRATION) as actuator:
         actuator.arm()
@@ -272,7 +272,7 @@ def test_paced_line_at_115200_keeps_up(tmp_path: Path) -> None:
         assert time.monotonic() - t_s < 1.0, "no backlog builds up"
 
 
-def test_telemetry_is_the_firmwares(tmp_path: Path) -> None:
+def test_readings_are_those_of_the_firmware(tmp_path: Path) -> None:
     firmware = VescFirmware(CommandLog(), readings=lambda t_s: MotorValues(erpm=1234.0, input_v=7.4))
     with SerialFirmware(firmware) as served, Actuator(config_for(served), CALIBRATION) as actuator:
         readings = actuator.health().readings
@@ -289,20 +289,20 @@ def test_wrong_port_lists_what_exists(tmp_path: Path) -> None:
     assert "\nTraceback" not in str(caught.value)
 
 
-def test_port_in_use_silent_port_and_old_firmware(serial_firmware: SerialFirmware) -> None:
+def test_port_in_use_port_without_device_and_old_firmware(serial_firmware: SerialFirmware) -> None:
     with Actuator(config_for(serial_firmware), CALIBRATION), pytest.raises(NotReadyError, match="another program"):
         Actuator(config_for(serial_firmware), CALIBRATION).open()
-    serial_firmware.faults.is_silent = True
-    with pytest.raises(NotReadyError, match="nothing answers"):
+    serial_firmware.faults.drops_replies = True
+    with pytest.raises(NotReadyError, match="no device answers"):
         Actuator(config_for(serial_firmware, open_timeout_s=0.5), CALIBRATION).open()
-    serial_firmware.faults.is_silent = False
+    serial_firmware.faults.drops_replies = False
     serial_firmware.firmware.version = FirmwareVersion(3, 0)
     with pytest.raises(NotReadyError, match=r"3\.00 is older than 3\.07"):
         Actuator(config_for(serial_firmware), CALIBRATION).open()
     assert not serial_firmware.log.motor(serial_firmware.log.entries("firmware")[-1].t_s), "no command to an old one"
 
 
-def test_closed_and_half_opened_are_harmless(serial_firmware: SerialFirmware) -> None:
+def test_calls_on_a_closed_or_partly_opened_actuator_are_safe(serial_firmware: SerialFirmware) -> None:
     actuator = Actuator(config_for(serial_firmware), CALIBRATION)
     actuator.close()
     actuator.stop(planned=True)
@@ -319,9 +319,9 @@ def test_closed_and_half_opened_are_harmless(serial_firmware: SerialFirmware) ->
     actuator.close()
 
 
-def test_sender_is_light_and_ignores_signals(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+def test_sender_imports_little_and_ignores_signals(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
     pid = actuator._sender.pid  # type: ignore[union-attr]
-    assert os.getsid(pid) == pid, "in a session of its own: a terminal's ^C does not reach it"
+    assert os.getsid(pid) == pid, "the sender has a separate session: a terminal's ^C does not reach it"
     mapped = Path(f"/proc/{pid}/maps").read_text(encoding="ascii")
     assert "torch" not in mapped
     assert "rerun" not in mapped
@@ -331,15 +331,15 @@ def test_sender_is_light_and_ignores_signals(actuator: Actuator, serial_firmware
     until(lambda: len(serial_firmware.log.motor(t_s)) > 20)
 
 
-def test_import_is_light() -> None:
+def test_import_loads_no_heavy_modules() -> None:
     code = (
         "import sys, drivers; bad = {'torch','serial','can','rerun','cantools'} & set(sys.modules); sys.exit(bool(bad))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_stop_does_not_wait_for_a_sender_that_hangs(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
-    """Else the stop itself would look like a hung loop, and hide the reason of the end."""
+def test_stop_does_not_wait_for_a_hanging_sender(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+    """Otherwise the stop would be reported as a hung loop, which hides the true reason."""
     actuator.arm()
     assert actuator._sender is not None
     actuator.command(MOVING)
@@ -353,4 +353,4 @@ def test_a_stop_does_not_wait_for_a_sender_that_hangs(actuator: Actuator, serial
         t_resumed_s = time.monotonic()
         os.kill(actuator._sender.pid, signal.SIGCONT)  # type: ignore[attr-defined]
     until(lambda: actuator.status().state == SenderState.FAULT)
-    assert all(e.value == 0.0 for e in serial_firmware.log.motor(t_resumed_s)[1:]), "one frame may have been under way"
+    assert all(e.value == 0.0 for e in serial_firmware.log.motor(t_resumed_s)[1:]), "one frame may be in transmission"

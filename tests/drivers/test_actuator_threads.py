@@ -1,4 +1,4 @@
-"""One actuator in the hands of two threads: the loop that drives, and the watch that stops it."""
+"""One actuator used by two threads: the control loop, and the watchdog thread that stops it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.sender.logic import SenderState
 
 MOVING = Action(0.5, 0.3)
-PATIENT_S = 20.0
+TIMEOUT_S = 20.0
 
 
 def make(firmware: SerialFirmware) -> Actuator:
@@ -34,7 +34,7 @@ def actuator(serial_firmware: SerialFirmware) -> Iterator[Actuator]:
 
 
 def test_arming_does_not_overwrite_a_stop_of_another_thread(actuator: Actuator) -> None:
-    """The stop comes between arm()'s check and its order; in the slot of the sender only the newest order stands."""
+    """The stop comes between the check in arm() and its order; the sender's slot holds the newest order only."""
     waited = actuator._await
 
     def stopped_meanwhile(*arguments: object) -> object:
@@ -51,7 +51,7 @@ def test_arming_does_not_overwrite_a_stop_of_another_thread(actuator: Actuator) 
     assert actuator.status().state == SenderState.FAULT
 
 
-def test_closing_while_another_thread_uses_it_raises_nothing_strange(serial_firmware: SerialFirmware) -> None:
+def test_concurrent_close_raises_only_documented_errors(serial_firmware: SerialFirmware) -> None:
     for _ in range(3):
         actuator = make(serial_firmware)
         actuator.open()
@@ -73,7 +73,7 @@ def test_closing_while_another_thread_uses_it_raises_nothing_strange(serial_firm
         thread.start()
         time.sleep(0.3)
         actuator.close()
-        thread.join(PATIENT_S)
+        thread.join(TIMEOUT_S)
         assert not thread.is_alive()
         assert strange == []
         assert serial_firmware.log.motor()[-1].value == 0.0

@@ -1,4 +1,4 @@
-"""Calibration: what a command means on the car, and back."""
+"""Calibration: commands to device steps and back."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def calibrations(draw: st.DrawFn) -> ActuatorCalibration:
     )
 
 
-def test_meaning_by_hand() -> None:
+def test_device_steps_against_hand_calculation() -> None:
     calibration = ActuatorCalibration(
         servo_centre=0.53, servo_range_left=0.3, servo_range_right=0.25, steering_sign=-1, max_current_a=20.0
     )
@@ -44,7 +44,7 @@ def test_meaning_by_hand() -> None:
     assert calibration.to_device(Action(-1.0, -0.5)) == DeviceCommand(MotorKind.CURRENT, -10000, 780)
 
 
-def test_modes_signs_and_dead_band_by_hand() -> None:
+def test_modes_signs_and_dead_band_against_hand_calculation() -> None:
     duty = ActuatorCalibration(throttle_mode="duty", max_duty=0.5, throttle_sign=-1, throttle_dead_band=0.2)
     assert duty.to_device(Action(0.0, 0.5)) == DeviceCommand(MotorKind.DUTY, -30000, 500)  # -(0.2 + 0.8 / 2) / 2
     assert duty.to_device(Action(0.0, 0.0)).motor_steps == 0
@@ -91,7 +91,7 @@ def test_any_number_stays_within_limits_or_is_refused(calibration: ActuatorCalib
         DeviceCommand(MotorKind.DUTY, 100, 500),
     ],
 )
-def test_the_senders_own_check_refuses(command: DeviceCommand) -> None:
+def test_limit_check_refuses(command: DeviceCommand) -> None:
     assert not ActuatorCalibration().is_within_limits(command)
 
 
@@ -111,6 +111,6 @@ def test_the_senders_own_check_refuses(command: DeviceCommand) -> None:
         ({"max_current_a": float("inf")}, "positive"),
     ],
 )
-def test_bad_tables_are_refused_in_a_sentence(table: dict[str, float], message: str) -> None:
+def test_bad_tables_are_refused_with_one_sentence(table: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         from_table(ActuatorCalibration, table, "[hardware.calibration]")

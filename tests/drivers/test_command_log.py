@@ -1,4 +1,4 @@
-"""The log of a fake firmware on a disk that is full or missing: one warning, and the entries stay in memory."""
+"""The log of an emulated firmware on a full or missing disk: one warning, and the entries stay in memory."""
 
 import logging
 from pathlib import Path

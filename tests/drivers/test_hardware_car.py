@@ -1,4 +1,4 @@
-"""HardwareCar: the contract over a fake firmware and a pose source played by hand."""
+"""HardwareCar with an emulated firmware and a scripted pose source."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from drivers.vesc.payloads import MotorValues
 
 
 class HandPoses:
-    """A pose source whose samples the test makes."""
+    """A pose source with samples scripted by the test."""
 
     def __init__(self) -> None:
         self.samples: list[PoseSample] = []
@@ -45,7 +45,7 @@ class HandPoses:
         self.samples.append(PoseSample(number, now_s - 0.005, now_s, x_m, 1.0, 0.5, tracked=tracked))
 
     def stand(self) -> None:
-        """Three poses of a car at rest: as many as a speed takes."""
+        """Three poses of a car at rest: the number that a speed estimate needs."""
         for age_s in (0.02, 0.01, 0.0):
             self.show(age_s=age_s)
 
@@ -120,12 +120,12 @@ def test_observation_before_and_after_the_first_pose(car: HardwareCar, poses: Ha
     poses.show(9.0, tracked=False)
     lost = car.observe()
     assert not lost.tracked
-    assert (lost.state.x_m, lost.sequence, lost.t_receive_s) == (2.0, 2, first.t_receive_s), "age of what is known"
+    assert (lost.state.x_m, lost.sequence) == (2.0, 2), "time of the last tracked pose"
     assert [p.sequence for p in lost.poses] == [3]
     assert car.observe().poses == ()
 
 
-def test_a_source_that_counts_anew_is_followed(car: HardwareCar, poses: HandPoses) -> None:
+def test_restarted_sequence_numbers_are_accepted(car: HardwareCar, poses: HandPoses) -> None:
     poses.show(1.0, sequence=5000)
     car.observe()
     poses.samples.clear()
@@ -133,7 +133,7 @@ def test_a_source_that_counts_anew_is_followed(car: HardwareCar, poses: HandPose
     assert car.observe().state.x_m == 3.0
 
 
-def test_arming_gathers_every_reason(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
+def test_arming_reports_every_reason(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
     serial_firmware.firmware.readings = lambda t_s: MotorValues(erpm=3000.0, input_v=11.0)
     end_s = time.monotonic() + 20.0
     while not car.actuator.status().erpm > 200.0:
@@ -164,21 +164,21 @@ def test_arming_needs_a_fresh_tracked_pose_at_rest(
         car.arm()
 
 
-def test_poses_that_are_late_for_a_moment_are_waited_for(car: HardwareCar, poses: HandPoses) -> None:
-    poses.show(age_s=5.0)  # alone too old, and too few
+def test_arming_waits_for_late_poses(car: HardwareCar, poses: HandPoses) -> None:
+    poses.show(age_s=5.0)  # too old, and too few for a speed
     poses.on_their_way = 4
     car.arm()
-    assert poses.on_their_way == 1, "three poses make a speed"
+    assert poses.on_their_way == 1, "a speed estimate needs three poses"
     assert car.command(Action(0.1, 0.2)).throttle == pytest.approx(0.2)
 
 
-def test_a_car_whose_motor_does_not_say_how_fast_it_turns_is_not_armed(
+def test_car_without_measured_motor_speed_is_not_armed(
     car: HardwareCar, poses: HandPoses, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     poses.stand()
     silent = replace(car.actuator.status(), erpm=float("nan"))
     monkeypatch.setattr(car.actuator, "status", lambda: silent)
-    with pytest.raises(NotReadyError, match="has not said how fast the motor turns"):
+    with pytest.raises(NotReadyError, match="reports no motor speed"):
         car.arm()
 
 
@@ -186,11 +186,11 @@ def test_velocities_are_marked_as_unknown_until_there_are_three_poses(car: Hardw
     for age_s, known in ((0.02, False), (0.01, False), (0.0, True)):
         poses.show(1.0, age_s=age_s)
         assert car.observe().velocity_valid is known
-    poses.show(1.0, age_s=-1.0)  # After a gap of a second the speed is anybody's guess.
+    poses.show(1.0, age_s=-1.0)  # After a gap of a second the speed is unknown.
     assert not car.observe().velocity_valid
 
 
-def test_the_way_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
+def test_sequence_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
     assert car.reality is Reality.REAL
     assert car.command(NEUTRAL) == NEUTRAL
     with pytest.raises(NotArmedError):
@@ -220,7 +220,7 @@ def test_the_way_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmwa
     assert not car.place(CarState())
 
 
-def test_opening_gathers_the_reasons_of_actuator_and_mocap(tmp_path: Path, poses: HandPoses) -> None:
+def test_opening_reports_the_reasons_of_actuator_and_mocap(tmp_path: Path, poses: HandPoses) -> None:
     poses.failure = NotReadyError("Motion capture is not ready", ("nobody answers at 10.0.0.1; start it.",))
     car = make_car(str(tmp_path / "missing"), poses)
     with pytest.raises(NotReadyError) as caught:
@@ -259,7 +259,7 @@ def test_place_asks_the_emulator(serial_firmware: SerialFirmware, poses: HandPos
         assert car.observe().state == CarState(2.0, 1.0, 0.5)
 
 
-def test_dry_run_sees_and_swallows(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
+def test_dry_run_observes_and_discards_commands(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
     inner = make_car(serial_firmware.port, poses)
     calibration = replace(inner.config.calibration)
     with DryRunCar(inner, lambda a: calibration.from_device(calibration.to_device(a))) as car:

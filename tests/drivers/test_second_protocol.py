@@ -1,4 +1,4 @@
-"""A second protocol drives through the unchanged sender and actuator: process, arming, faults and neutral."""
+"""A second protocol with the unchanged sender and actuator: process, arming, faults and neutral."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from drivers.sender.process import SenderProcess
 
 CALIBRATION = ActuatorCalibration(max_current_a=10.0)
 MOVING = Action(0.5, 0.3)
-PATIENT_S = 20.0
+TIMEOUT_S = 20.0
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +43,7 @@ def config_for(port: str) -> ActuatorConfig:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + PATIENT_S
+    end_s = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < end_s, "the condition was not met in time"
         time.sleep(0.002)
@@ -66,7 +66,7 @@ def test_commands_reach_the_firmware_and_stop_ends_in_neutral(firmware: ToyFirmw
         assert [command[2] for command in firmware.commands[-3:]] == [0, 0, 0]
 
 
-def test_a_fault_of_the_firmware_latches_with_its_own_sentence(firmware: ToyFirmware) -> None:
+def test_firmware_fault_latches_with_its_message(firmware: ToyFirmware) -> None:
     with Actuator(config_for(firmware.port), CALIBRATION) as actuator:
         actuator.arm()
         actuator.command(MOVING)
@@ -90,7 +90,7 @@ def test_the_motor_stops_where_the_sender_is_killed(firmware: ToyFirmware) -> No
             actuator.command(MOVING)
 
 
-def test_nothing_that_answers_is_named_with_the_remedy_of_the_protocol() -> None:
+def test_missing_device_is_reported_with_the_remedy_of_the_protocol() -> None:
     master, slave = os.openpty()
     try:
         with pytest.raises(NotReadyError, match=r"The Toy at .* switch the toy on"):
@@ -100,6 +100,6 @@ def test_nothing_that_answers_is_named_with_the_remedy_of_the_protocol() -> None
         os.close(slave)
 
 
-def test_a_kind_that_is_not_registered_is_refused_with_those_that_are() -> None:
+def test_unknown_kind_is_refused_with_a_list_of_the_known_kinds() -> None:
     with pytest.raises(ConfigError, match="'vesk'; it must be one of vesc_serial, vesc_can, toy"):
         ActuatorConfig("vesk")

@@ -16,7 +16,7 @@ from carlab.core.quantities import Action
 from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
 from drivers.links.link import LinkStatistics
-from drivers.sender.logic import Order, SenderLogic, SenderState, Wish
+from drivers.sender.logic import Order, Request, SenderLogic, SenderState
 from drivers.vesc.payloads import FirmwareVersion, MotorValues
 from drivers.vesc.serial_codec import VescFrameDecoder
 from drivers.vesc.serial_device import VescSerialDevice
@@ -30,14 +30,14 @@ VERSION = FirmwareVersion(6, 5, "TEST", b"u" * 12)
 
 
 class Bench:
-    """A sender's logic with a fake clock and a main process played by hand."""
+    """The sender's logic with a fake clock and a scripted main process."""
 
     def __init__(self, config: ActuatorConfig = CONFIG, calibration: ActuatorCalibration = CALIBRATION) -> None:
         self.logic = SenderLogic(config, calibration)
         self.now_s = 100.0
         self.epoch = 0
         self.number = 0
-        self.wish = Wish.NONE
+        self.request = Request.NONE
         self.is_answering = True
 
     def connect(self) -> Bench:
@@ -47,14 +47,14 @@ class Bench:
         assert self.logic.state == SenderState.CONNECTED
         return self
 
-    def say(self, wish: Wish) -> None:
-        self.epoch, self.number, self.wish = self.epoch + 1, 0, wish
-        self.logic.order(self.now_s, Order(self.epoch, wish, 0, self.now_s, NEUTRAL))
+    def send_request(self, request: Request) -> None:
+        self.epoch, self.number, self.request = self.epoch + 1, 0, request
+        self.logic.order(self.now_s, Order(self.epoch, request, 0, self.now_s, NEUTRAL))
 
     def command(self, command: DeviceCommand = MOVING, t_issued_s: float | None = None) -> None:
         self.number += 1
         issued_s = self.now_s if t_issued_s is None else t_issued_s
-        self.logic.order(self.now_s, Order(self.epoch, self.wish, self.number, issued_s, command))
+        self.logic.order(self.now_s, Order(self.epoch, self.request, self.number, issued_s, command))
 
     def tick(self, dt_s: float = 0.01) -> DeviceCommand | None:
         self.now_s += dt_s
@@ -68,12 +68,12 @@ class Bench:
 
 def armed() -> Bench:
     bench = Bench().connect()
-    bench.say(Wish.ARM)
+    bench.send_request(Request.ARM)
     assert bench.logic.state == SenderState.ARMED
     return bench
 
 
-def test_silent_until_the_firmware_is_known_and_neutral_until_armed() -> None:
+def test_no_command_before_the_firmware_is_known_and_neutral_before_arming() -> None:
     bench = Bench()
     assert bench.tick() is None
     bench.logic.link_up()
@@ -82,17 +82,17 @@ def test_silent_until_the_firmware_is_known_and_neutral_until_armed() -> None:
     assert bench.tick() == NEUTRAL
     bench.command()
     assert bench.tick() == NEUTRAL
-    bench.say(Wish.ARM)
+    bench.send_request(Request.ARM)
     assert bench.tick() == NEUTRAL, "armed, and no command yet"
     bench.command()
     assert bench.tick() == MOVING
 
 
-def test_old_firmware_gets_no_command_at_all() -> None:
+def test_old_firmware_gets_no_command() -> None:
     bench = Bench()
     bench.logic.link_up()
     bench.logic.firmware(FirmwareVersion(2, 18))
-    bench.say(Wish.ARM)
+    bench.send_request(Request.ARM)
     bench.command()
     assert bench.tick() is None
     assert bench.logic.state == SenderState.FAULT
@@ -106,7 +106,7 @@ def test_watchdog_at_its_boundary_then_recovery_then_latch() -> None:
     assert bench.tick(0.002) == NEUTRAL
     assert (bench.logic.state, bench.logic.watchdog_trips) == (SenderState.ARMED, 1)
     bench.command()
-    assert bench.tick() == MOVING, "late once, not latched"
+    assert bench.tick() == MOVING, "one late command does not latch"
     assert bench.tick(0.48) == NEUTRAL
     assert bench.logic.state == SenderState.ARMED
     assert bench.tick(0.03) == NEUTRAL
@@ -114,50 +114,50 @@ def test_watchdog_at_its_boundary_then_recovery_then_latch() -> None:
     assert bench.logic.watchdog_trips == 2
     bench.command()
     assert bench.tick() == NEUTRAL, "latched"
-    bench.say(Wish.ARM)
+    bench.send_request(Request.ARM)
     bench.command()
     assert bench.tick() == NEUTRAL, "arming does not clear a fault"
     assert bench.logic.refusal == bench.logic.fault
-    bench.say(Wish.RESET_FAULT)
+    bench.send_request(Request.RESET_FAULT)
     assert bench.logic.state == SenderState.CONNECTED
     bench.command()
     assert bench.tick() == NEUTRAL, "reset does not arm"
-    bench.say(Wish.ARM)
+    bench.send_request(Request.ARM)
     assert bench.tick() == NEUTRAL, "the old command is gone"
     bench.command()
     assert bench.tick() == MOVING
 
 
-def test_a_command_that_waited_somewhere_is_never_sent() -> None:
+def test_delayed_command_is_never_sent() -> None:
     bench = armed()
     bench.command(t_issued_s=bench.now_s - 0.2)
     assert bench.tick() == NEUTRAL
     bench.command(t_issued_s=bench.now_s + 10.0)
-    assert bench.tick() == NEUTRAL, "from the future: a clock that lies"
+    assert bench.tick() == NEUTRAL, "a time of issue in the future"
 
 
-def test_an_order_of_an_older_epoch_is_void() -> None:
+def test_order_of_an_older_epoch_is_ignored() -> None:
     bench = armed()
-    stale = Order(bench.epoch, Wish.ARM, 7, bench.now_s, MOVING)
-    bench.say(Wish.STOP)
+    stale = Order(bench.epoch, Request.ARM, 7, bench.now_s, MOVING)
+    bench.send_request(Request.STOP)
     bench.logic.order(bench.now_s, stale)
     assert bench.tick() == NEUTRAL
     assert bench.logic.state == SenderState.STOPPING
     while bench.logic.state == SenderState.STOPPING:
         bench.tick()
-    bench.say(Wish.ARM)
+    bench.send_request(Request.ARM)
     bench.logic.order(bench.now_s, replace(stale, t_issued_s=bench.now_s))
-    assert bench.tick() == NEUTRAL, "armed anew, but not by that order"
+    assert bench.tick() == NEUTRAL, "armed again, but not by that order"
 
 
 @pytest.mark.parametrize("is_faulty", [False, True])
-def test_no_order_counts_once_leaving(is_faulty: bool) -> None:
+def test_orders_are_ignored_during_shutdown(is_faulty: bool) -> None:
     bench = armed()
     if is_faulty:
-        bench.say(Wish.STOP_AND_LATCH)
+        bench.send_request(Request.STOP_AND_LATCH)
     bench.logic.main_lost()
-    for wish in (Wish.RESET_FAULT, Wish.ARM):
-        bench.say(wish)
+    for request in (Request.RESET_FAULT, Request.ARM):
+        bench.send_request(request)
         bench.command()
         assert bench.tick() == NEUTRAL
 
@@ -167,7 +167,7 @@ def test_stop_settles_after_three_neutrals_over_sixty_milliseconds() -> None:
         bench = armed()
         bench.command()
         bench.tick()
-        bench.say(Wish.STOP)
+        bench.send_request(Request.STOP)
         times = []
         while bench.logic.state == SenderState.STOPPING:
             assert bench.tick(1.0 / rate_hz) == NEUTRAL
@@ -178,13 +178,13 @@ def test_stop_settles_after_three_neutrals_over_sixty_milliseconds() -> None:
         assert bench.logic.is_neutral_settled
 
 
-@pytest.mark.parametrize("way", ["wish", "main lost"])
-def test_leaving_takes_three_neutrals_over_sixty_milliseconds(way: str) -> None:
+@pytest.mark.parametrize("way", ["request", "main lost"])
+def test_shutdown_sends_three_neutrals_over_sixty_milliseconds(way: str) -> None:
     bench = armed()
     bench.command()
     assert bench.tick() == MOVING
-    if way == "wish":
-        bench.say(Wish.SHUT_DOWN)
+    if way == "request":
+        bench.send_request(Request.SHUT_DOWN)
     else:
         bench.logic.main_lost()
     times = []
@@ -198,9 +198,9 @@ def test_leaving_takes_three_neutrals_over_sixty_milliseconds(way: str) -> None:
 
 def test_unplanned_stop_latches_and_planned_stop_keeps_a_fault() -> None:
     bench = armed()
-    bench.say(Wish.STOP_AND_LATCH)
+    bench.send_request(Request.STOP_AND_LATCH)
     assert bench.logic.state == SenderState.FAULT
-    bench.say(Wish.STOP)
+    bench.send_request(Request.STOP)
     bench.tick()
     assert bench.logic.state == SenderState.FAULT
 
@@ -216,7 +216,7 @@ def test_stale_telemetry_gives_neutral_and_lost_telemetry_a_fault() -> None:
     assert seen[26:] == [NEUTRAL] * 84
     assert bench.logic.state == SenderState.FAULT
     assert "stopped answering" in bench.logic.fault
-    bench.say(Wish.RESET_FAULT)
+    bench.send_request(Request.RESET_FAULT)
     assert bench.logic.state == SenderState.FAULT
     assert "does not answer" in bench.logic.refusal
 
@@ -225,16 +225,16 @@ def test_stale_telemetry_gives_neutral_and_lost_telemetry_a_fault() -> None:
     ("values", "text"),
     [(MotorValues(fault_code=2), "under-voltage"), (MotorValues(status_bits=2), "kill switch")],
 )
-def test_the_firmwares_own_faults_latch(values: MotorValues, text: str) -> None:
+def test_firmware_faults_latch(values: MotorValues, text: str) -> None:
     bench = armed()
     bench.command()
     bench.logic.telemetry(bench.now_s, values)
     assert bench.logic.state == SenderState.FAULT
     assert text in bench.logic.fault
-    bench.say(Wish.RESET_FAULT)
+    bench.send_request(Request.RESET_FAULT)
     assert bench.logic.state == SenderState.FAULT, "the cause persists"
     bench.tick()
-    bench.say(Wish.RESET_FAULT)
+    bench.send_request(Request.RESET_FAULT)
     assert bench.logic.state == SenderState.CONNECTED
 
 
@@ -245,7 +245,7 @@ def test_another_board_after_a_lost_link_stays_a_fault() -> None:
     bench.logic.link_up()
     bench.logic.firmware(FirmwareVersion(6, 5, "TEST", b"v" * 12))
     bench.logic.telemetry(bench.now_s, HEALTHY)
-    bench.say(Wish.RESET_FAULT)
+    bench.send_request(Request.RESET_FAULT)
     assert bench.logic.state == SenderState.FAULT
     assert bench.tick() is None
 
@@ -258,13 +258,13 @@ def test_the_same_board_after_a_lost_link_gets_neutral_until_reset_and_armed() -
     bench.logic.firmware(VERSION)
     bench.command()
     assert bench.tick() == NEUTRAL
-    bench.say(Wish.RESET_FAULT)
+    bench.send_request(Request.RESET_FAULT)
     assert bench.logic.state == SenderState.CONNECTED
     assert bench.logic.fault == ""
 
 
 class RecordingLink:
-    """A byte link that keeps what is written."""
+    """A byte link that records the written bytes."""
 
     def __init__(self) -> None:
         self.statistics = LinkStatistics()
@@ -285,7 +285,7 @@ class RecordingLink:
 
 
 def motor_and_servo(data: bytes) -> tuple[int, int, int]:
-    """Command id, motor number and servo number of what was written, decoded by the layout in the protocol's table."""
+    """Command id, motor number and servo number of the written bytes, decoded by the protocol's layout."""
     motor, servo = VescFrameDecoder().feed(data, 0.0)
     (position,) = struct.unpack(">h", servo[1:])
     assert servo[0] == 12
@@ -296,7 +296,9 @@ STEP = st.one_of(
     st.tuples(st.just("action"), st.floats(width=32), st.floats(width=32)),
     st.tuples(st.just("hostile"), st.integers(-(2**31), 2**31 - 1), st.integers(-(2**15), 2**15 - 1)),
     st.tuples(st.just("late"), st.floats(-1.0, 1.0), st.floats(0.0, 2.0)),
-    st.sampled_from([(w.name, 0.0, 0.0) for w in (Wish.ARM, Wish.STOP, Wish.STOP_AND_LATCH, Wish.RESET_FAULT)]),
+    st.sampled_from(
+        [(w.name, 0.0, 0.0) for w in (Request.ARM, Request.STOP, Request.STOP_AND_LATCH, Request.RESET_FAULT)]
+    ),
     st.tuples(st.just("wait"), st.floats(0.0, 0.7), st.just(0.0)),
     st.just(("silence", 0.0, 0.0)),
     st.just(("fault code", 0.0, 0.0)),
@@ -305,7 +307,7 @@ STEP = st.one_of(
 
 @given(st.lists(STEP, max_size=40), st.sampled_from(["current", "duty"]))
 @settings(max_examples=250, deadline=None)
-def test_whatever_is_asked_every_frame_is_bounded_and_nothing_moves_unless_armed(
+def test_every_frame_is_within_limits_and_neutral_unless_armed(
     steps: list[tuple[str, float, float]], mode: str
 ) -> None:
     calibration = ActuatorCalibration(
@@ -319,7 +321,7 @@ def test_whatever_is_asked_every_frame_is_bounded_and_nothing_moves_unless_armed
     link = RecordingLink()
     device = VescSerialDevice(link)
     full = {6: 10_000, 5: 30_000}
-    may_move = False  # kept by hand: armed by an ARM that was accepted, taken away by any stop or fault
+    may_move = False  # expected: True after an accepted ARM, False after any stop or fault
     newest: tuple[float, DeviceCommand] | None = None
     for (kind, a, b), _ in zip(steps, itertools.count(), strict=False):
         if kind in ("action", "late"):
@@ -334,9 +336,9 @@ def test_whatever_is_asked_every_frame_is_bounded_and_nothing_moves_unless_armed
         elif kind == "hostile":
             newest = (bench.now_s, DeviceCommand(MotorKind.CURRENT, int(a), int(b)))
             bench.command(newest[1])
-        elif kind in Wish.__members__:
+        elif kind in Request.__members__:
             was_faulty = bench.logic.state == SenderState.FAULT
-            bench.say(Wish[kind])
+            bench.send_request(Request[kind])
             may_move = kind == "ARM" and not was_faulty and (may_move or bench.logic.state == SenderState.ARMED)
             newest = None
         elif kind == "silence":

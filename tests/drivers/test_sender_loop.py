@@ -1,4 +1,4 @@
-"""The sender's loop with a fake device and a fake clock: what is written after the process was stopped for a while."""
+"""The sender's loop with a fake device and a fake clock: commands written after the process was suspended."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from drivers.calibration import ActuatorCalibration, DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
 from drivers.device import DeviceCounters
 from drivers.sender import loop as loop_module
-from drivers.sender.logic import ORDER_SIZE, Order, SenderState, Wish
+from drivers.sender.logic import ORDER_SIZE, Order, Request, SenderState
 from drivers.sender.loop import SenderLoop
 from drivers.sender.slots import Slot
 from drivers.sender.status import STATUS_SIZE
@@ -25,7 +25,7 @@ STOPPED_S = 0.18
 
 
 class FakeDevice:
-    """Keeps what is written; answers nothing."""
+    """A device that records written commands and sends no replies."""
 
     def __init__(self) -> None:
         self.counters = DeviceCounters()
@@ -76,16 +76,16 @@ class Bench:
         self.loop.logic.link_up()
         self.loop.logic.firmware(FirmwareVersion(6, 5, "TEST", b"u" * 12))
         self.loop.logic.telemetry(self.time.now_s, HEALTHY)
-        self.order(1, Wish.ARM, 0)
+        self.order(1, Request.ARM, 0)
         self.loop._tick(self.time.now_s)
         assert self.loop.logic.state == SenderState.ARMED
-        self.order(1, Wish.ARM, 1)
+        self.order(1, Request.ARM, 1)
 
-    def order(self, epoch: int, wish: Wish, number: int) -> None:
-        self.orders.write(Order(epoch, wish, number, self.time.now_s, MOVING).pack())
+    def order(self, epoch: int, request: Request, number: int) -> None:
+        self.orders.write(Order(epoch, request, number, self.time.now_s, MOVING).pack())
 
     def stop_process_after_decision(self, meanwhile: Callable[[], None] = lambda: None) -> None:
-        """The next decision is followed by a pause of the process, in which the main process goes on."""
+        """Suspend the process after the next decision while the main process runs ``meanwhile``."""
         decide = self.loop.logic.decide
 
         def decide_then_pause(now_s: float) -> DeviceCommand | None:
@@ -124,27 +124,27 @@ def test_a_fresh_command_is_written(bench: Bench) -> None:
     assert bench.device.written[-1] == MOVING
 
 
-def test_a_command_that_grew_old_between_decision_and_write_is_not_written(bench: Bench) -> None:
+def test_command_that_is_too_old_at_the_write_is_not_written(bench: Bench) -> None:
     bench.stop_process_after_decision()
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == CALIBRATION.neutral
     assert MOVING not in bench.device.written
 
 
-def test_a_stop_that_came_between_decision_and_write_counts(bench: Bench) -> None:
-    bench.stop_process_after_decision(lambda: bench.order(2, Wish.STOP_AND_LATCH, 0))
+def test_stop_between_decision_and_write_takes_effect(bench: Bench) -> None:
+    bench.stop_process_after_decision(lambda: bench.order(2, Request.STOP_AND_LATCH, 0))
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == CALIBRATION.neutral
     assert MOVING not in bench.device.written
     assert bench.loop.logic.state == SenderState.FAULT
 
 
-def test_a_newer_command_that_came_meanwhile_is_written(bench: Bench) -> None:
+def test_newer_command_between_decision_and_write_is_written(bench: Bench) -> None:
     newer = DeviceCommand(MotorKind.CURRENT, 1000, 500)
 
     def meanwhile() -> None:
         issued_s = bench.time.now_s + STOPPED_S - 0.02
-        bench.orders.write(Order(1, Wish.ARM, 2, issued_s, newer).pack())
+        bench.orders.write(Order(1, Request.ARM, 2, issued_s, newer).pack())
         bench.loop.logic.telemetry(issued_s, HEALTHY)
 
     bench.stop_process_after_decision(meanwhile)
@@ -152,16 +152,16 @@ def test_a_newer_command_that_came_meanwhile_is_written(bench: Bench) -> None:
     assert bench.device.written[-1] == newer
 
 
-def test_a_process_that_is_stopped_again_and_again_writes_neutral(bench: Bench) -> None:
+def test_repeatedly_suspended_process_writes_neutral(bench: Bench) -> None:
     bench.pause_after_each_decision(0.02)
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == CALIBRATION.neutral
 
 
-def test_only_written_neutral_frames_count_before_the_sender_leaves(bench: Bench) -> None:
-    """Neutral is written at least three times before the sender ends, also if each decision is followed by a pause."""
+def test_only_written_neutral_frames_count_before_the_sender_ends(bench: Bench) -> None:
+    """At least three neutral frames are written before the sender ends, also with a pause after each decision."""
     bench.pause_after_each_decision(0.05)
-    bench.order(2, Wish.SHUT_DOWN, 0)
+    bench.order(2, Request.SHUT_DOWN, 0)
     bench.device.written.clear()
     while not bench.loop.logic.is_finished:
         bench.loop._tick(bench.time.now_s)
@@ -169,7 +169,7 @@ def test_only_written_neutral_frames_count_before_the_sender_leaves(bench: Bench
     assert set(bench.device.written) == {CALIBRATION.neutral}
 
 
-def test_a_command_that_neutral_replaced_is_not_reported_as_sent(bench: Bench) -> None:
+def test_command_replaced_by_neutral_is_not_reported_as_sent(bench: Bench) -> None:
     bench.pause_after_each_decision(0.02)
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == CALIBRATION.neutral

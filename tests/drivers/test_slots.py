@@ -1,4 +1,4 @@
-"""Newest-value slots: whole values or none, whatever the writer is doing."""
+"""Newest-value slots: readers get complete values only, with a concurrent or killed writer."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ while True:
 """
 
 
-def test_newest_value_wins_and_is_read_again() -> None:
+def test_newest_value_is_read_repeatedly() -> None:
     slot = Slot.create(16)
     assert slot.read() is None
     for n in range(1, 6):
@@ -39,8 +39,8 @@ def test_newest_value_wins_and_is_read_again() -> None:
 
 
 @pytest.mark.parametrize("offset", [0, 8, 12, 20, 27])
-def test_a_torn_copy_leaves_the_one_before(offset: int) -> None:
-    """Break any part of the newest copy by hand, as a writer that died in the middle would leave it."""
+def test_incomplete_copy_is_ignored_and_the_previous_copy_read(offset: int) -> None:
+    """Corrupt one byte of the newest copy, like a writer that died while writing."""
     slot = Slot.create(16)
     slot.write(b"first value 0000")
     slot.write(b"second value 111")
@@ -52,7 +52,7 @@ def test_a_torn_copy_leaves_the_one_before(offset: int) -> None:
     slot.close()
 
 
-def test_a_writer_that_attaches_goes_on_counting() -> None:
+def test_attached_writer_continues_the_sequence() -> None:
     slot = Slot.create(16)
     slot.write(b"a")
     other = Slot.attach(os.dup(slot.descriptor), 16)
@@ -62,7 +62,7 @@ def test_a_writer_that_attaches_goes_on_counting() -> None:
     slot.close()
 
 
-def test_no_mixed_value_under_a_racing_writer_and_after_its_sudden_death() -> None:
+def test_no_mixed_value_with_a_concurrent_or_killed_writer() -> None:
     slot = Slot.create(2048)
     command = [sys.executable, "-c", WRITER, str(slot.descriptor)]
     process = subprocess.Popen(command, cwd=ROOT, pass_fds=(slot.descriptor,))

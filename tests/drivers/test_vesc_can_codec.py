@@ -16,7 +16,7 @@ from carlab.core.errors import ProtocolError
 from drivers.links.link import CanFrame
 from drivers.vesc import can_codec as codec
 from drivers.vesc import payloads as payloads
-from drivers.vesc.can_codec import CanReassembler, Packet, Send
+from drivers.vesc.can_codec import CanReassembler, Packet, ReplyMode
 
 SHARED_DBC = Path(__file__).resolve().parents[2].parent / "shared" / "reference" / "vesc.dbc"
 
@@ -32,11 +32,11 @@ def test_transmit_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
             frame = codec.set_current(23, 51.0)
         elif "get_values" in meaning or "fw" in meaning:
             payload = payloads.get_values() if "get_values" in meaning else payloads.get_firmware_version()
-            (frame,) = codec.encode_payload(23, 42, payload, Send.REPLY_TO_SENDER)
-            expected = expected[:3]  # that implementation appends a CRC which the firmware neither sends nor wants
+            (frame,) = codec.encode_payload(23, 42, payload, ReplyMode.REPLY_TO_SENDER)
+            expected = expected[:3]  # that implementation appends a CRC that the firmware does not use
         elif "ping" in meaning:
             frame = codec.ping(23, 42)
-            expected = b"\x2a"  # that implementation sends no data; the firmware wants the sender's id
+            expected = b"\x2a"  # that implementation sends no data; the firmware needs the sender's id
         else:
             assert "handbrake" in meaning  # not used here
             continue
@@ -66,7 +66,7 @@ def test_status_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     assert not expected
 
 
-@pytest.mark.skipif(not SHARED_DBC.exists(), reason="the shared DBC is not there")
+@pytest.mark.skipif(not SHARED_DBC.exists(), reason="the shared DBC is missing")
 @pytest.mark.parametrize("controller_id", [0, 23, 254])
 def test_agrees_with_the_other_dbc_for_any_controller(controller_id: int) -> None:
     other = cantools.database.load_file(SHARED_DBC)
@@ -81,7 +81,7 @@ def test_agrees_with_the_other_dbc_for_any_controller(controller_id: int) -> Non
 
 @pytest.mark.parametrize("encode", [codec.set_current, codec.set_duty, codec.set_rpm, codec.set_current_brake])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
-def test_what_is_not_a_number_is_refused(encode: Any, value: float) -> None:
+def test_nan_and_infinity_are_refused(encode: Any, value: float) -> None:
     with pytest.raises(ProtocolError):
         encode(23, value)
 
@@ -98,17 +98,17 @@ def test_all_simple_commands_have_four_bytes() -> None:
 
 @given(st.binary(min_size=1, max_size=512))
 @settings(max_examples=60, deadline=None)
-def test_transport_brings_any_payload_across(payload: bytes) -> None:
-    frames = codec.encode_payload(23, 42, payload, Send.IS_REPLY)
+def test_transport_round_trip_of_any_payload(payload: bytes) -> None:
+    frames = codec.encode_payload(23, 42, payload, ReplyMode.IS_REPLY)
     assert all(len(f.data) <= 8 and codec.controller_of(f) == 23 for f in frames)
     assert len(frames) == 1 if len(payload) <= 6 else codec.packet_of(frames[-1]) == Packet.PROCESS_RX_BUFFER
     receiver = CanReassembler(23)
     found = [p for f in frames if (p := receiver.feed(f)) is not None]
-    assert [(p.sender_id, p.send, p.payload) for p in found] == [(42, Send.IS_REPLY, payload)]
+    assert [(p.sender_id, p.send, p.payload) for p in found] == [(42, ReplyMode.IS_REPLY, payload)]
 
 
-def test_a_captured_style_reply_is_pieced_together() -> None:
-    """By hand: a 17-byte selective reply in pieces of seven, then length and CRC (0xB9EB, from the serial vector)."""
+def test_reply_in_captured_form_is_reassembled() -> None:
+    """A 17-byte selective reply in frames of seven bytes, then length and CRC (0xB9EB, from the serial vector)."""
     receiver = CanReassembler(42)
     frames = [CanFrame(0x052A, bytes.fromhex(p)) for p in ("00320020a180ffff", "07cfc70094ffffff", "0eb30701")]
     assert all(receiver.feed(f) is None for f in frames)
@@ -120,9 +120,9 @@ def test_a_captured_style_reply_is_pieced_together() -> None:
 
 
 @pytest.mark.parametrize("lost", [0, 1, 2])
-def test_a_lost_piece_loses_the_packet_and_no_more(lost: int) -> None:
+def test_lost_frame_drops_only_its_packet(lost: int) -> None:
     receiver = CanReassembler(42)
-    frames = codec.encode_payload(42, 23, bytes(range(20)), Send.IS_REPLY)
+    frames = codec.encode_payload(42, 23, bytes(range(20)), ReplyMode.IS_REPLY)
     kept = [f for i, f in enumerate(frames) if i != lost]
     assert [receiver.feed(f) for f in kept] == [None] * len(kept)
     assert receiver.errors == 1
@@ -131,7 +131,7 @@ def test_a_lost_piece_loses_the_packet_and_no_more(lost: int) -> None:
 
 def test_a_wrong_crc_and_short_frames_are_dropped() -> None:
     receiver = CanReassembler(42)
-    frames = codec.encode_payload(42, 23, bytes(range(20)), Send.IS_REPLY)
+    frames = codec.encode_payload(42, 23, bytes(range(20)), ReplyMode.IS_REPLY)
     end = frames[-1]
     broken = CanFrame(end.identifier, end.data[:-1] + bytes((end.data[-1] ^ 1,)))
     assert [receiver.feed(f) for f in (*frames[:-1], broken)] == [None] * len(frames)
@@ -144,5 +144,5 @@ def test_a_wrong_crc_and_short_frames_are_dropped() -> None:
 
 def test_frames_for_others_are_ignored() -> None:
     receiver = CanReassembler(42)
-    assert [receiver.feed(f) for f in codec.encode_payload(43, 23, b"abc", Send.IS_REPLY)] == [None]
+    assert [receiver.feed(f) for f in codec.encode_payload(43, 23, b"abc", ReplyMode.IS_REPLY)] == [None]
     assert codec.decode_status(CanFrame(0x0117, bytes(4))) is None

@@ -1,4 +1,4 @@
-"""The fake firmware itself: it must be as strict and as forgetful as the real one, or the kill tests prove nothing."""
+"""The emulated firmware: the kill tests rely on its time-outs and checks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from drivers.speed import sender_lateness
 from drivers.vesc.payloads import MotorValues, decode_reply
 
 
-def test_motor_times_out_servo_never_and_only_motor_commands_feed() -> None:
+def test_motor_times_out_and_only_motor_commands_reset_its_timer() -> None:
     moves: list[tuple[float, str, float]] = []
     servo: list[tuple[float, float]] = []
     firmware = VescFirmware(
@@ -43,7 +43,7 @@ def test_motor_times_out_servo_never_and_only_motor_commands_feed() -> None:
     firmware.handle(bytes.fromhex("0500004e20"), 110.1)
     firmware.handle(bytes.fromhex("1e"), 111.0)
     firmware.poll(111.9)
-    assert moves[2:] == [(110.0, "brake", -1.5), (110.1, "duty", 0.2)], "works again at once; ALIVE feeds"
+    assert moves[2:] == [(110.0, "brake", -1.5), (110.1, "duty", 0.2)], "works again at once; ALIVE resets the timer"
 
 
 def test_replies_have_the_real_layout(vesc_vectors: list[dict[str, Any]]) -> None:
@@ -65,7 +65,7 @@ def test_replies_have_the_real_layout(vesc_vectors: list[dict[str, Any]]) -> Non
 
 
 @pytest.mark.parametrize("nonsense", [b"", b"\x06\x00", b"\x0c", b"\xff\x00", b"\x32\x00"])
-def test_nonsense_is_ignored(nonsense: bytes) -> None:
+def test_invalid_payloads_are_ignored(nonsense: bytes) -> None:
     firmware = VescFirmware(CommandLog())
     assert firmware.handle(nonsense, 0.0) is None
     assert firmware.log.motor() == []
@@ -80,8 +80,8 @@ def read_some(descriptor: int, count: int) -> bytes:
     return data
 
 
-def test_bytes_on_the_terminal_and_hosts_that_come_and_go(tmp_path: Path, vesc_vectors: list[dict[str, Any]]) -> None:
-    """A host of a few lines, with captured bytes rather than this project's own encoder."""
+def test_bytes_on_the_terminal_and_reconnecting_hosts(tmp_path: Path, vesc_vectors: list[dict[str, Any]]) -> None:
+    """A minimal host that uses captured bytes instead of this project's encoder."""
     log = CommandLog(tmp_path / "log.jsonl")
     request = bytes.fromhex("020100000003")
     with SerialFirmware(VescFirmware(log), link=tmp_path / "vesc") as served:
@@ -101,9 +101,9 @@ def test_bytes_on_the_terminal_and_hosts_that_come_and_go(tmp_path: Path, vesc_v
     assert not (tmp_path / "vesc").is_symlink()
 
 
-def test_faults_lose_break_and_delay() -> None:
+def test_wire_faults_drop_and_corrupt_frames() -> None:
     faults = WireFaults(drop_share=0.3, corrupt_share=0.3, seed=5)
-    passed = [faults.pass_on(b"\x00\x00\x00\x00") for _ in range(2000)]
+    passed = [faults.transmit(b"\x00\x00\x00\x00") for _ in range(2000)]
     assert passed.count(b"") == faults.dropped
     assert 500 < faults.dropped < 700
     broken = [p for p in passed if p not in (b"", b"\x00\x00\x00\x00")]
@@ -113,7 +113,7 @@ def test_faults_lose_break_and_delay() -> None:
 
 @pytest.mark.realtime
 def test_lateness_is_measured_in_both_conditions() -> None:
-    """The bar itself belongs to the benchmark; here only that the figures are those of a sender that ran."""
+    """The benchmark holds the limits; this test checks that the figures come from a sender that ran."""
     figures = sender_lateness(0.7, rates_hz=(100.0,))
     for condition in ("idle", "loaded"):
         p50, p99, top = (figures[f"sender_100_hz_{condition}_late_{k}_ms"] for k in ("p50", "p99", "max"))

@@ -115,7 +115,7 @@ def test_firmware_version_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
 
 
 @pytest.mark.parametrize(("major", "minor", "is_refused"), [(3, 6, True), (2, 18, True), (3, 7, False), (6, 0, False)])
-def test_old_firmware_is_refused_in_a_sentence(major: int, minor: int, is_refused: bool) -> None:
+def test_old_firmware_is_refused_with_the_remedy(major: int, minor: int, is_refused: bool) -> None:
     refusal = payloads.FirmwareVersion(major, minor).refusal()
     assert (refusal is not None) == is_refused
     assert refusal is None or "update it with VESC Tool" in refusal
@@ -131,7 +131,7 @@ def test_resynchronisation_like_the_firmware(vesc_vectors: list[dict[str, Any]])
 
 
 @pytest.mark.parametrize("hidden", ["02ff020100000003", "030100020104408403"])
-def test_inter_byte_timeout_frees_what_a_false_header_hides(hidden: str) -> None:
+def test_inter_byte_timeout_decodes_frames_behind_a_false_header(hidden: str) -> None:
     decoder = VescFrameDecoder(inter_byte_timeout_s=0.03)
     assert decoder.feed(bytes.fromhex(hidden), 1.0) == []
     assert decoder.feed(b"", 1.02) == []
@@ -181,7 +181,7 @@ def test_a_frame_behind_garbage_is_found_at_the_latest_after_silence(garbage: by
 
 @given(st.floats(allow_nan=True, allow_infinity=True))
 @settings(max_examples=200, deadline=None)
-def test_numbers_are_sent_as_they_are_or_refused(value: float) -> None:
+def test_numbers_are_sent_exactly_or_refused(value: float) -> None:
     for encode, scale, low, high in (
         (payloads.set_current, 1e3, -2147483.648, 2147483.647),
         (payloads.set_duty, 1e5, -1.0, 1.0),
