@@ -1,4 +1,4 @@
-"""Motion capture by NatNet: the pose of one rigid body, on the host's clock. Names load on first use.
+"""Motion capture by NatNet: the pose of one rigid body, on the host's clock. Names are imported on first use.
 
 The emulated server is in ``mocap.emulators.natnet_server``, the codec in ``mocap.natnet.codec``.
 """
@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mocap.config import MocapConfig
-    from mocap.natnet.discovery import FoundServer, discover
+    from mocap.natnet.discovery import DiscoveredServer, discover
     from mocap.natnet_client import NatNetClient
     from mocap.rigid_body import RigidBodyPoseSource
     from mocap.time_alignment import ClockAlignment
 
 _MODULES = {
     "ClockAlignment": "time_alignment",
-    "FoundServer": "natnet.discovery",
+    "DiscoveredServer": "natnet.discovery",
     "MocapConfig": "config",
     "NatNetClient": "natnet.client",
     "RigidBodyPoseSource": "rigid_body",
     "discover": "natnet.discovery",
 }
 
-__all__ = ["ClockAlignment", "FoundServer", "MocapConfig", "NatNetClient", "RigidBodyPoseSource", "discover"]
+__all__ = ["ClockAlignment", "DiscoveredServer", "MocapConfig", "NatNetClient", "RigidBodyPoseSource", "discover"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,7 +1,7 @@
-"""From the server's axes and rigid body to ``base_link`` in ``map``: pure functions of numbers.
+"""Transforms from the server's axes and rigid body to ``base_link`` in ``map``. Pure functions of numbers.
 
-The server's body frame turns with its world axes: with Y up, the map (x, y, z) -> (x, -z, y), a turn by +90 degrees
-about x, is applied to positions and to the vector part of quaternions alike, and z is up in both frames afterwards.
+With Y up, the rotation by +90 degrees about x, (x, y, z) -> (x, -z, y), applies to positions and to the vector parts of
+quaternions alike, since the server's body frame has the axes of its world frame. Afterwards z is up in both frames.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from mocap.natnet.models import Quaternion, Vector3
 
 
 def z_up_vector(v: Vector3) -> Vector3:
-    """A vector with Y up, written with Z up."""
+    """Convert a vector from Y up to Z up."""
     return v[0], -v[2], v[1]
 
 
 def y_up_vector(v: Vector3) -> Vector3:
-    """A vector with Z up, written with Y up: the inverse of ``z_up_vector``."""
+    """Convert a vector from Z up to Y up: the inverse of ``z_up_vector``."""
     return v[0], v[2], -v[1]
 
 
 def z_up_quaternion(q: Quaternion) -> Quaternion:
-    """A rotation (x, y, z, w) with Y up, written with Z up."""
+    """Convert a rotation (x, y, z, w) from Y up to Z up."""
     return q[0], -q[2], q[1], q[3]
 
 
 def y_up_quaternion(q: Quaternion) -> Quaternion:
-    """A rotation (x, y, z, w) with Z up, written with Y up."""
+    """Convert a rotation (x, y, z, w) from Z up to Y up."""
     return q[0], q[2], -q[1], q[3]
 
 
 def rotate(q: Quaternion, v: Vector3) -> Vector3:
-    """Turn ``v`` by the unit quaternion ``q`` (x, y, z, w): v + 2 w (u x v) + 2 u x (u x v)."""
+    """Rotate ``v`` by the unit quaternion ``q`` (x, y, z, w): v + 2 w (u x v) + 2 u x (u x v)."""
     x, y, z, w = q
     cx = 2.0 * (y * v[2] - z * v[1])
     cy = 2.0 * (z * v[0] - x * v[2])
@@ -45,20 +45,20 @@ def rotate(q: Quaternion, v: Vector3) -> Vector3:
 
 
 def yaw_quaternion(yaw_rad: float) -> Quaternion:
-    """A turn about z."""
+    """Quaternion (x, y, z, w) of a rotation about z."""
     return 0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
 
 
 def base_link_pose(
     position_m: Vector3, quaternion: Quaternion, yaw_offset_rad: float, pivot_m: Vector3
 ) -> tuple[Vector3, float]:
-    """Pose of ``base_link`` where the rigid body has a known pose (all with Z up).
+    """Pose of ``base_link`` from the pose of the rigid body (all with Z up).
 
     Args:
-        position_m: The rigid body's pivot in ``map``.
-        quaternion: The rigid body's orientation, x, y, z, w, of unit length.
-        yaw_offset_rad: Turn about z from the rigid body to ``base_link``.
-        pivot_m: Where the pivot sits in ``base_link``.
+        position_m: Position of the rigid body's pivot in ``map``.
+        quaternion: Orientation of the rigid body, x, y, z, w, of unit length.
+        yaw_offset_rad: Rotation about z from the rigid body to ``base_link``.
+        pivot_m: Position of the pivot in ``base_link``.
 
     Returns:
         Position of ``base_link`` [m], and the yaw [rad] of its x axis, in (-pi, pi].

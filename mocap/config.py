@@ -1,4 +1,4 @@
-"""What the table ``[hardware.mocap]`` of a car file holds."""
+"""Configuration of motion capture: the table ``[hardware.mocap]`` of the car file."""
 
 from __future__ import annotations
 
@@ -13,34 +13,34 @@ from mocap.natnet.models import NEWEST_BITSTREAM, OLDEST_BITSTREAM, BitstreamVer
 
 @dataclass(frozen=True, slots=True)
 class MocapConfig:
-    """How to reach a NatNet server (Motive) and which of its rigid bodies is the car."""
+    """Address of a NatNet server (Motive), and the rigid body of the car."""
 
     server_address: str = "127.0.0.1"
     """Address of the computer that runs Motive."""
     local_interface: str = ""
-    """Address of this computer's interface towards it; empty for the one the system would use."""
+    """Address of this computer's interface to the server; empty for the interface that the system selects."""
     mode: Literal["unicast", "multicast"] = "unicast"
     """Transmission Type in Motive's Data Streaming pane."""
     multicast_group: str = ""
-    """Group to join in multicast mode; empty for the one the server names, or 239.255.42.99."""
+    """Group to join in multicast mode; empty for the server's group, or 239.255.42.99."""
     command_port: int = 1510
     """The server's command port."""
     data_port: int = 0
-    """Port of multicast frames; 0 for the one the server names, or 1511."""
+    """Port of multicast frames; 0 for the server's port, or 1511."""
     bitstream: str = "4.1"
-    """Newest bitstream version to ask for in unicast mode; an older server is taken as it is."""
+    """Newest bitstream version to request in unicast mode; an older server keeps its version."""
     body: str = ""
-    """Name of the rigid body in Motive. Empty, and no body_id: the only one there is."""
+    """Name of the rigid body in Motive. If empty and without body_id: the only rigid body."""
     body_id: int | None = None
-    """Streaming id of the rigid body, in place of its name."""
+    """Streaming id of the rigid body, instead of its name."""
     up_axis: Literal["y", "z"] = "y"
-    """Up Axis in Motive's Data Streaming pane (its default is Y); frames do not say it."""
+    """Up Axis in Motive's Data Streaming pane (its default is Y); frames do not contain it."""
     yaw_offset_rad: float = 0.0
-    """Turn about the vertical from the rigid body to base_link (x forward)."""
+    """Rotation about the vertical from the rigid body to base_link (x forward)."""
     pivot_in_base_link_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Where the rigid body's pivot sits on the car: forward, left and up of base_link."""
+    """Position of the rigid body's pivot on the car: forward, left and up of base_link."""
     timeout_s: float = 2.0
-    """How long to wait for the server, its list of bodies and its first frame, each."""
+    """Longest wait for the server, for its list of bodies and for its first frame, each."""
 
     def __post_init__(self) -> None:
         if not self.server_address.strip():
@@ -78,7 +78,7 @@ class MocapConfig:
 
 
 def check_multicast_group(group: str, what: str) -> None:
-    """Raise ConfigError where ``group`` is no IPv4 multicast address."""
+    """Raise ConfigError if ``group`` is no IPv4 multicast address."""
     try:
         valid = ipaddress.IPv4Address(group).is_multicast
     except ValueError:

@@ -1,7 +1,7 @@
 """A NatNet client: handshake, keep-alive, clock alignment, and one thread that receives.
 
-Threading: the receiver thread alone reads the sockets and decodes. ``open`` sends requests and waits, under one
-condition, for what the thread notes. Whatever arrives from the network, the thread counts it and goes on.
+Threading: only the receiver thread reads the sockets and decodes. ``open`` sends requests and waits on one condition
+for the thread's results. The thread counts invalid datagrams and continues.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from mocap.natnet.codec import (
     encode_request,
     split_message,
 )
+from mocap.natnet.message_schedule import MessageSchedule
 from mocap.natnet.models import FRAME_MODELS_CHANGED, Description, check_readable
 from mocap.natnet.sockets import (
     DATAGRAM_BYTES,
@@ -43,15 +44,14 @@ from mocap.natnet.sockets import (
     resolve,
     udp_socket,
 )
-from mocap.natnet.upkeep import Upkeep
 from mocap.stream_statistics import StreamStatistics
 from mocap.time_alignment import ClockAlignment
 
 _log = logging.getLogger(__name__)
 
-FIRST_ECHOES = 8
-"""Until there are so many, echoes are sent more often: the quickest is to be worth something."""
-ASK_PERIOD_S = 0.25
+MIN_ECHOES = 8
+"""Number of echoes before the alignment is accurate; until then they are sent more often."""
+RETRY_PERIOD_S = 0.25
 WAKE_PERIOD_S = 0.02
 
 FrameListener = Callable[[Frame, int, float, float], None]
@@ -82,14 +82,14 @@ class NatNetClient:
         self._data: socket.socket | None = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._upkeep = Upkeep(keepalives=config.mode == "unicast")
+        self._schedule = MessageSchedule(keepalives=config.mode == "unicast")
         self._failure: Exception | None = None
 
     def open(self) -> None:
-        """Connect, agree on a bitstream, fetch the model definitions and align the clocks. Idempotent.
+        """Connect, negotiate the bitstream version, request the model definitions and align the clocks. Idempotent.
 
-        Raises NotReadyError where the server does not answer, is set to another mode, or streams a version that
-        cannot be read.
+        Raises NotReadyError if the server does not answer, streams in another mode, or streams a version that cannot
+        be decoded.
         """
         if self._thread is not None and self._thread.is_alive():
             return
@@ -112,7 +112,7 @@ class NatNetClient:
         self._thread.start()
         unicast = config.mode == "unicast"
         wanted = config.bitstream_version
-        if not self._ask(MessageId.CONNECT, self._connect_payload(), lambda: self.server_info is not None):
+        if not self._send_until(MessageId.CONNECT, self._connect_payload(), lambda: self.server_info is not None):
             raise not_ready(
                 f"no NatNet server answered at {config.server_address}:{config.command_port} within "
                 f"{config.timeout_s:g} s: is Motive streaming (Data Streaming pane, Broadcast Frame Data on), is its "
@@ -129,22 +129,22 @@ class NatNetClient:
         if not unicast:
             group = config.multicast_group or info.multicast_group or DEFAULT_GROUP
             self._data = multicast_receiver(group, config.data_port or info.data_port or DEFAULT_DATA_PORT, interface)
-        if not self._ask(MessageId.REQUEST_MODELDEF, b"", lambda: self.models is not None):
+        if not self._send_until(MessageId.REQUEST_MODELDEF, b"", lambda: self.models is not None):
             detail = self._statistics.last_error or "the request had no answer; restart streaming in Motive."
             raise not_ready(f"no model definitions within {config.timeout_s:g} s: {detail}")
         if info.clock_hz:
-            # The thread sends an echo every ECHO_PERIOD_S; a server that answers none leaves times of arrival only.
-            self._wait(lambda: self.alignment.echoes >= FIRST_ECHOES, config.timeout_s)
+            # The thread sends the echoes; without answers, capture times are times of arrival.
+            self._wait(lambda: self.alignment.echoes >= MIN_ECHOES, config.timeout_s)
 
     def _agree_on_bitstream(self, info: ServerInfo, wanted: BitstreamVersion) -> None:
-        """Ask a unicast server from NatNet 4 on for ``wanted``; until it takes effect both versions are tried."""
+        """Request ``wanted`` from a unicast server of NatNet 4 or later; until it takes effect both are decoded."""
         decoder = self._decoder
         assert decoder is not None
         if self._wants_other_bitstream(info):
             self._responses.clear()
             decoder.pending = wanted
             request = encode_request(f"Bitstream,{wanted}")
-            answered = self._ask(MessageId.REQUEST, request, lambda: bool(self._responses))
+            answered = self._send_until(MessageId.REQUEST, request, lambda: bool(self._responses))
             response = self._responses[0] if answered else None
             if response is not None and len(response.data) == 4 and response.as_int() == 0:
                 return
@@ -155,7 +155,7 @@ class NatNetClient:
             raise not_ready(str(error)) from error
 
     def close(self) -> None:
-        """Take leave of the server, stop the thread, close the sockets. Idempotent, safe after a failed open."""
+        """Disconnect, stop the thread, close the sockets. Idempotent, safe after a failed open."""
         self._stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
@@ -179,13 +179,13 @@ class NatNetClient:
     def request(self, command: str, timeout_s: float | None = None) -> Response:
         """Send a command such as ``FrameRate`` and return the answer.
 
-        Raises NotOpenError before ``open`` and NotReadyError where no answer comes. Answers do not say what they
-        answer: one request at a time.
+        Raises NotOpenError before ``open`` and NotReadyError without an answer. Send one request at a time, since
+        answers do not contain their request.
         """
         if self._thread is None:
             raise NotOpenError("The NatNet client is not open; call open() first.")
         self._responses.clear()
-        if not self._ask(MessageId.REQUEST, encode_request(command), lambda: bool(self._responses), timeout_s):
+        if not self._send_until(MessageId.REQUEST, encode_request(command), lambda: bool(self._responses), timeout_s):
             raise not_ready(f"the server did not answer the request '{command}'; is Motive still running?")
         response = self._responses[0]
         if response is None:
@@ -194,26 +194,26 @@ class NatNetClient:
 
     @property
     def version(self) -> BitstreamVersion | None:
-        """Bitstream version of the frames as they come in now; None before the handshake."""
+        """Current bitstream version of the frames; None before the handshake."""
         return None if self._decoder is None else self._decoder.version
 
     @property
     def last_error(self) -> str:
-        """What was wrong with the last datagram that could not be read; empty for none."""
+        """Error of the last datagram that could not be decoded; empty for none."""
         return self._statistics.last_error
 
     @property
     def foreign_address(self) -> str:
-        """Where the last datagram came from that was not the server's; empty for none."""
+        """Source address of the last datagram that was not the server's; empty for none."""
         return self._statistics.foreign_address
 
     @property
     def failure(self) -> Exception | None:
-        """What ended the receiver thread before ``close``, such as an error in a listener; None for nothing."""
+        """Error that ended the receiver thread before ``close``, for example in a listener; None for none."""
         return self._failure
 
     def statistics(self) -> Mapping[str, float]:
-        """Counts of frames by fate, rate, latencies and the state of the clock alignment."""
+        """Counts of received, lost and invalid frames, rate, latencies and clock alignment."""
         with self._changed:
             numbers = self._statistics.as_mapping()
             numbers["round_trip_min_ms"] = self.alignment.round_trip_s * 1e3
@@ -227,25 +227,25 @@ class NatNetClient:
         self._statistics = StreamStatistics()
         self._failure = None
         self._responses.clear()
-        self._upkeep = Upkeep(keepalives=self.config.mode == "unicast")
+        self._schedule = MessageSchedule(keepalives=self.config.mode == "unicast")
 
     def _connect_payload(self) -> bytes:
         wanted = self.config.bitstream_version if self.config.mode == "unicast" else None
         return encode_connect("carlab", bitstream=wanted)
 
-    def _ask(
+    def _send_until(
         self, message_id: int, payload: bytes, answered: Callable[[], bool], timeout_s: float | None = None
     ) -> bool:
-        """Send until there is an answer; False after the time-out."""
+        """Send a message repeatedly until ``ready``; False after the time-out."""
         deadline_s = time.monotonic() + (self.config.timeout_s if timeout_s is None else timeout_s)
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             self._send(message_id, payload)
-            if self._wait(answered, min(ASK_PERIOD_S, left_s)):
+            if self._wait(answered, min(RETRY_PERIOD_S, left_s)):
                 return True
         return answered()
 
     def _wait(self, ready: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait for the receiver thread. Raises NotReadyError where it has ended."""
+        """Wait for the receiver thread. Raises NotReadyError if it has ended."""
         with self._changed:
             self._changed.wait_for(lambda: ready() or self._failure is not None, timeout_s)
             if self._failure is not None:
@@ -257,7 +257,7 @@ class NatNetClient:
             return
         try:
             self._command.sendto(encode_message(message_id, payload), (self._server, self.config.command_port))
-        except OSError as error:  # a cable that is out for a moment; silence is reported by whoever waits for frames
+        except OSError as error:  # the network may be down briefly; missing frames are reported elsewhere
             with self._changed:
                 self._statistics.last_error = f"sending to {self._server} failed: {error}"
 
@@ -267,11 +267,11 @@ class NatNetClient:
             while not self._stop.is_set():
                 self._receive_once()
         except Exception as error:
-            # Nobody waits for this thread: the error is kept for those who ask why frames stay away.
-            _log.exception("The NatNet receiver has ended.")
+            # The error is stored for ``failure`` and ``last_error``.
+            _log.exception("The NatNet receiver has failed.")
             with self._changed:
                 self._failure = error
-                self._statistics.last_error = f"the receiver ended: {error!r}"
+                self._statistics.last_error = f"the receiver failed: {error!r}"
                 self._changed.notify_all()
 
     def _receive_once(self) -> None:
@@ -281,16 +281,16 @@ class NatNetClient:
             try:
                 datagram, source = sock.recvfrom(DATAGRAM_BYTES)
             except OSError as error:
-                # BlockingIOError: another reader was quicker; others: the network is down for a moment.
+                # BlockingIOError: no datagram after all; others: the network is down briefly.
                 if not isinstance(error, BlockingIOError):
                     self._statistics.last_error = f"receiving failed: {error}"
                     self._stop.wait(WAKE_PERIOD_S)
                 continue
             received_s = time.monotonic()
-            self._take(datagram, source, received_s)
-        self._keep_up(time.monotonic())
+            self._handle_datagram(datagram, source, received_s)
+        self._send_due_messages(time.monotonic())
 
-    def _take(self, datagram: bytes, source: tuple[str, int], received_s: float) -> None:
+    def _handle_datagram(self, datagram: bytes, source: tuple[str, int], received_s: float) -> None:
         if source[0] != self._server:
             with self._changed:
                 self._statistics.foreign += 1
@@ -299,25 +299,25 @@ class NatNetClient:
         try:
             message_id, payload = split_message(datagram)
             if message_id == MessageId.FRAMEOFDATA:
-                self._take_frame(payload, received_s)
+                self._handle_frame(payload, received_s)
             else:
-                self._take_message(message_id, payload, received_s)
+                self._handle_message(message_id, payload, received_s)
         except ProtocolError as error:
             with self._changed:
                 self._statistics.add_malformed(str(error))
                 self._changed.notify_all()
 
-    def _take_message(self, message_id: int, payload: bytes, received_s: float) -> None:
+    def _handle_message(self, message_id: int, payload: bytes, received_s: float) -> None:
         models: tuple[Description, ...] | None = None
         with self._changed:
             if message_id == MessageId.SERVERINFO:
-                self._take_server_info(decode_server_info(payload))
+                self._handle_server_info(decode_server_info(payload))
             elif message_id == MessageId.ECHORESPONSE:
                 stamp, ticks = decode_echo_response(payload)
                 self.alignment.add_echo(stamp * 1e-9, ticks, received_s)
             elif message_id == MessageId.MODELDEF and self._decoder is not None:
                 models = self.models = self._decoder.decode_models(payload)
-                self._upkeep.models_wanted = False
+                self._schedule.models_outdated = False
             elif message_id == MessageId.RESPONSE:
                 self._responses.append(Response(payload))
             elif message_id == MessageId.UNRECOGNIZED_REQUEST:
@@ -328,18 +328,18 @@ class NatNetClient:
         if models is not None and self._on_models is not None:
             self._on_models(models)
 
-    def _take_server_info(self, info: ServerInfo) -> None:
-        """Note who answered. After a silence the server may be another one, which is taken as it is now."""
+    def _handle_server_info(self, info: ServerInfo) -> None:
+        """Store the server's information. After a reconnect the server may be a different one."""
         before = self.server_info
-        if before == info and not self._upkeep.reconnecting:
+        if before == info and not self._schedule.reconnecting:
             return
-        self._upkeep.heard_server(time.monotonic())
+        self._schedule.note_server_info(time.monotonic())
         self.server_info = info
         self._decoder = BitstreamSwitch(info.bitstream)
         if before is not None:
             if before != info:
                 _log.warning("The NatNet server has changed: %s", info)
-            self._upkeep.models_wanted = True
+            self._schedule.models_outdated = True
             if self._wants_other_bitstream(info):
                 self._decoder.pending = self.config.bitstream_version
                 self._send(MessageId.REQUEST, encode_request(f"Bitstream,{self.config.bitstream}"))
@@ -353,37 +353,37 @@ class NatNetClient:
             and info.bitstream > self.config.bitstream_version
         )
 
-    def _take_frame(self, payload: bytes, received_s: float) -> None:
+    def _handle_frame(self, payload: bytes, received_s: float) -> None:
         if self._decoder is None:
             return
         frame = self._decoder.decode_frame(payload)
-        self._upkeep.heard_frame(received_s)
+        self._schedule.note_frame(received_s)
         with self._changed:
             sequence = self._statistics.accept(frame.frame_number, received_s)
             if sequence is None:
                 return
             capture_s = self._capture_time(frame, received_s)
             if frame.params & FRAME_MODELS_CHANGED:
-                self._upkeep.models_wanted = True
+                self._schedule.models_outdated = True
         if self._on_frame is not None:
             self._on_frame(frame, sequence, capture_s, received_s)
 
     def _capture_time(self, frame: Frame, received_s: float) -> float:
         exposed_ticks = frame.mid_exposure_ticks or frame.transmit_ticks
         exposure = self.alignment.exposure(exposed_ticks, frame.transmit_ticks, received_s)
-        if exposure.is_odd:
-            self._upkeep.hurry_echo(received_s)
+        if exposure.is_inconsistent:
+            self._schedule.advance_echo(received_s)
         if exposure.is_aligned:
             self._statistics.add_latency(received_s - exposure.capture_s, exposure.on_server_s)
-        elif exposure.is_odd:
+        elif exposure.is_inconsistent:
             self._statistics.mistimed += 1
         return exposure.capture_s
 
-    def _keep_up(self, now_s: float) -> None:
+    def _send_due_messages(self, now_s: float) -> None:
         if self.server_info is None:
             return
-        settled = self.alignment.echoes >= FIRST_ECHOES and not self.alignment.is_uncertain
-        for message_id in self._upkeep.due(now_s, has_clock=self.server_info.clock_hz > 0, settled=settled):
+        settled = self.alignment.echoes >= MIN_ECHOES and not self.alignment.is_uncertain
+        for message_id in self._schedule.due(now_s, has_clock=self.server_info.clock_hz > 0, settled=settled):
             payload = b""
             if message_id == MessageId.CONNECT:
                 payload = self._connect_payload()

@@ -16,7 +16,7 @@ from mocap.config import MocapConfig
 from mocap.natnet.models import Description, Frame, Quaternion, RigidBody, RigidBodyDescription
 from mocap.natnet_client import NatNetClient
 
-SAMPLES_KEPT = 1024
+MAX_SAMPLES = 1024
 NORM_TOLERANCE = 0.01
 TILT_LIMIT_RAD = math.radians(40.0)
 TILTED_SHARE = 0.2
@@ -24,19 +24,19 @@ HEIGHT_LIMIT_M = 0.3
 
 
 class RigidBodyPoseSource:
-    """Poses of one rigid body, received in a thread of its own.
+    """Poses of one rigid body, received in a separate thread.
 
-    A frame in which the body is not tracked, is missing, or has a pose that is no pose gives a sample with
-    ``tracked=False`` and the last good pose; before there was one, such frames give a sample only where they bring
-    numbers. ``t_capture_s`` is the exposure on the host's clock (see ``mocap.time_alignment``); from a server
-    without clock stamps it is the time of arrival.
+    A frame in which the body is untracked, is missing, or has an invalid pose gives a sample with ``tracked=False``
+    and the last valid pose; before the first valid pose it gives the untracked pose, or no sample if there is none.
+    ``t_capture_s`` is the time of exposure on the host's clock (see ``mocap.time_alignment``); for a server without
+    clock stamps it is the time of arrival.
     """
 
-    def __init__(self, config: MocapConfig, samples_kept: int = SAMPLES_KEPT) -> None:
+    def __init__(self, config: MocapConfig, max_samples: int = MAX_SAMPLES) -> None:
         self.config = config
         self._client = NatNetClient(config, on_frame=self._on_frame, on_models=self._on_models)
         self._new_sample = threading.Condition()
-        self._samples: deque[PoseSample] = deque(maxlen=samples_kept)
+        self._samples: deque[PoseSample] = deque(maxlen=max_samples)
         self._body: RigidBodyDescription | None = None
         self._is_open = False
         self._clear_counts()
@@ -47,10 +47,10 @@ class RigidBodyPoseSource:
         self._high_m = [-math.inf] * 3
 
     def open(self) -> None:
-        """Connect, find the body and wait for a first frame with it. Idempotent.
+        """Connect, find the body and wait for its first frame. Idempotent.
 
-        Raises NotReadyError where the server is not there, streams nothing or does not know the body; then the
-        message lists the bodies it does know.
+        Raises NotReadyError if the server is missing, streams no frames or does not have the body; then the message
+        lists the available bodies.
         """
         if self._is_open:
             return
@@ -89,13 +89,13 @@ class RigidBodyPoseSource:
             return self._samples[-1] if self._samples else None
 
     def since(self, sequence: int) -> tuple[PoseSample, ...]:
-        """Samples newer than ``sequence``, oldest first; at most the last ``samples_kept``."""
+        """Samples after ``sequence``, oldest first; at most the last ``max_samples``."""
         with self._new_sample:
             newest_first = list(takewhile(lambda sample: sample.sequence > sequence, reversed(self._samples)))
         return tuple(reversed(newest_first))
 
     def wait_for(self, sequence: int, timeout_s: float) -> PoseSample | None:
-        """Block until there is a sample newer than ``sequence`` and return the newest; None after ``timeout_s``."""
+        """Wait for a sample after ``sequence`` and return the newest; None after ``timeout_s``."""
 
         def newer() -> bool:
             return bool(self._samples) and self._samples[-1].sequence > sequence
@@ -104,7 +104,7 @@ class RigidBodyPoseSource:
             return self._samples[-1] if self._new_sample.wait_for(newer, timeout_s) else None
 
     def statistics(self) -> Mapping[str, float]:
-        """The client's statistics, and how many frames had the body tracked, untracked, missing or unusable."""
+        """The client's statistics, and counts of frames with the body tracked, untracked, missing or unusable."""
         numbers = dict(self._client.statistics())
         with self._new_sample:
             numbers["tracked"] = float(self._tracked)
@@ -114,7 +114,7 @@ class RigidBodyPoseSource:
         return numbers
 
     def problems(self) -> tuple[str, ...]:
-        """What looks wrong though poses arrive, as sentences; empty where all looks well."""
+        """Suspected problems while poses arrive, as sentences with remedies; empty if there are none."""
         found = []
         if self._client.failure is not None:
             found.append(f"motion capture stopped, {self._client.last_error}; close it and open it again.")
@@ -129,17 +129,15 @@ class RigidBodyPoseSource:
                 )
             elif self._tracked and spans_m[2] > HEIGHT_LIMIT_M and min(spans_m[:2]) < 0.1 * spans_m[2]:
                 found.append(
-                    f"the body '{self._body_name}' moves up and down by {spans_m[2]:.2f} m and hardly sideways: "
+                    f"the body '{self._body_name}' moves vertically by {spans_m[2]:.2f} m and hardly horizontally: "
                     f'up_axis = "{other}" may be right in [hardware.mocap].'
                 )
             if self._body is None and self._is_open:
-                found.append("the server no longer knows the body; define it again in Motive under the same name.")
+                found.append("the server no longer has the body; define it again in Motive under the same name.")
             if self._unusable:
-                found.append(
-                    f"{self._unusable} frames had a pose of the body that is no pose (NaN or no unit quaternion)."
-                )
+                found.append(f"{self._unusable} frames had an invalid pose of the body (NaN or no unit quaternion).")
         if self._is_open and not self._client.alignment.is_aligned:
-            found.append("the server answers no clock echo, so times of capture are times of arrival.")
+            found.append("the server answers no clock echo, so capture times are times of arrival; check the firewall.")
         return tuple(found)
 
     def close(self) -> None:
@@ -156,7 +154,7 @@ class RigidBodyPoseSource:
 
     @property
     def client(self) -> NatNetClient:
-        """The connection underneath: server info, models, bitstream version, last error."""
+        """The client: server info, models, bitstream version, last error."""
         return self._client
 
     @property
@@ -209,7 +207,7 @@ class RigidBodyPoseSource:
         return PoseSample(sequence, capture_s, received_s, *held, tracked=False)
 
     def _pose(self, body: RigidBody) -> tuple[tuple[float, float, float], float] | None:
-        """Pose of base_link, or None where the numbers are no pose."""
+        """Pose of base_link; None for invalid numbers."""
         norm = math.sqrt(body.qx**2 + body.qy**2 + body.qz**2 + body.qw**2)
         position = (body.x_m, body.y_m, body.z_m)
         if not abs(norm - 1.0) < NORM_TOLERANCE or not all(map(math.isfinite, position)):
@@ -223,23 +221,23 @@ class RigidBodyPoseSource:
 
 
 def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBodyDescription:
-    """The rigid body that ``config`` names. Raises NotReadyError listing those that are there."""
+    """Select the rigid body of ``config``. Raises NotReadyError with a list of the available bodies."""
     bodies = [model for model in models if isinstance(model, RigidBodyDescription)]
     if config.body_id is not None:
         wanted, chosen = f"with id {config.body_id}", [b for b in bodies if b.id == config.body_id]
     elif config.body:
         wanted, chosen = f"'{config.body}'", [b for b in bodies if b.name == config.body]
     else:
-        wanted, chosen = "to choose by itself", bodies if len(bodies) == 1 else []
+        wanted, chosen = "that is the only one", bodies if len(bodies) == 1 else []
     if len(chosen) == 1:
         return chosen[0]
-    there = ", ".join(f"'{b.name}' (id {b.id})" for b in bodies)
+    available = ", ".join(f"'{b.name}' (id {b.id})" for b in bodies)
     if not bodies:
         remedy = "it streams none: create one in Motive and switch Rigid Bodies on in the Data Streaming pane."
     elif len(chosen) > 1:
-        remedy = f"several have that name: set body_id in [hardware.mocap]; there are {there}."
+        remedy = f"several have that name: set body_id in [hardware.mocap] to one of {available}."
     else:
-        remedy = f"set body in [hardware.mocap] to one of those there are: {there}."
+        remedy = f"set body in [hardware.mocap] to one of {available}."
     raise NotReadyError("No motion capture", [f"the server has no rigid body {wanted}; {remedy}"])
 
 

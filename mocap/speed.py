@@ -1,4 +1,4 @@
-"""How many NatNet frames one core decodes in a second."""
+"""Benchmark of NatNet decoding: frames per second on one core."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mocap.natnet.models import BitstreamVersion, LabelledMarker, MarkerSet, Rig
 
 
 def example_frame(bodies: int, other_markers: int, labelled_markers: int, marker_sets: int = 0) -> Frame:
-    """A frame of a given make-up, with numbers as from a room."""
+    """Create a frame with given numbers of bodies and markers and typical values."""
     return Frame(
         162734,
         tuple(MarkerSet(f"set {i}", ((0.1, 1.5, -0.9), (0.2, 1.5, -0.7))) for i in range(marker_sets)),
@@ -26,10 +26,10 @@ def example_frame(bodies: int, other_markers: int, labelled_markers: int, marker
 
 
 def natnet_decode_speed(seconds: float = 0.5) -> dict[str, float]:
-    """Measure full decoding, from datagram to ``Frame``, for about ``seconds`` each.
+    """Measure decoding from datagram to ``Frame`` for about ``seconds`` per case.
 
     Returns:
-        Frames per second: ``captured_3_0_hz`` and ``captured_4_1_hz`` for the make-up of a frame captured from Motive
+        Frames per second: ``captured_3_0_hz`` and ``captured_4_1_hz`` for the contents of a frame captured from Motive
         (1 body, 5 other markers, 6 labelled markers), ``ten_bodies_4_1_hz`` for 10 bodies with 11 marker sets and 40
         labelled markers.
     """

@@ -7,13 +7,13 @@ from collections import deque
 import numpy as np
 
 REORDER_WINDOW = 100
-"""A frame number this far back is not a late frame but a server that started to count anew."""
+"""A frame number this far back means that the server has restarted its count."""
 RESTART_RUN = 10
-"""So are this many old numbers in a row, each above the one before."""
+"""So does this number of consecutive late frames with increasing numbers."""
 
 
 class StreamStatistics:
-    """Sorts frames by their numbers and keeps what is worth knowing of the stream."""
+    """Classifies frames by their numbers; collects counts and latencies."""
 
     def __init__(self, window: int = 1000) -> None:
         self.frames = 0
@@ -35,15 +35,15 @@ class StreamStatistics:
         self._system_latency_s: deque[float] = deque(maxlen=window)
 
     def accept(self, frame_number: int, received_s: float) -> int | None:
-        """Count a frame; return its sequence number, or None for a repeat or one that a later one has overtaken.
+        """Count a frame; return its sequence number, or None for a repeated or late frame.
 
-        Sequence numbers are the server's frame numbers, shifted after a restart of the server so that they go on
-        growing.
+        Sequence numbers are the server's frame numbers with an offset after a restart of the server, so that they
+        keep increasing.
         """
         if self._newest is None:
             self._newest = frame_number - 1
         step = frame_number - self._newest
-        if step <= -REORDER_WINDOW or (step <= 0 and self._is_recount(frame_number)):
+        if step <= -REORDER_WINDOW or (step <= 0 and self._is_restart(frame_number)):
             self.restarts += 1
             self._base += self._newest + 1 - frame_number
             self._missing.clear()
@@ -61,13 +61,13 @@ class StreamStatistics:
         self._received_s.append(received_s)
         return frame_number + self._base
 
-    def _is_recount(self, frame_number: int) -> bool:
+    def _is_restart(self, frame_number: int) -> bool:
         length, before = self._late_run
         self._late_run = (length + 1 if length and frame_number > before else 1, frame_number)
         return self._late_run[0] >= RESTART_RUN
 
     def _count_late(self, frame_number: int) -> None:
-        """A frame that was missed comes after all, overtaken by a later one; or one comes again."""
+        """Count a frame that is late (out of order) or repeated."""
         if frame_number in self._missing:
             self._missing.remove(frame_number)
             self.lost -= 1
@@ -76,12 +76,12 @@ class StreamStatistics:
             self.repeated += 1
 
     def add_latency(self, latency_s: float, system_latency_s: float) -> None:
-        """Note exposure to arrival, and exposure to transmission as the server stamped it."""
+        """Add the latencies [s] from exposure to arrival, and from exposure to transmission (server stamps)."""
         self._latency_s.append(latency_s)
         self._system_latency_s.append(system_latency_s)
 
     def add_malformed(self, text: str) -> None:
-        """Note a datagram that could not be read."""
+        """Count a datagram that could not be decoded."""
         self.malformed += 1
         self.last_error = text
 
@@ -93,7 +93,7 @@ class StreamStatistics:
         return (len(times) - 1) / (times[-1] - times[0])
 
     def as_mapping(self) -> dict[str, float]:
-        """Everything as numbers; NaN where nothing was measured."""
+        """All counts and percentiles; NaN if not measured."""
         p50, p99 = _percentiles_ms(self._latency_s)
         return {
             "frames": float(self.frames),

@@ -1,9 +1,9 @@
-"""Server clock to host monotonic clock, from echoes of small round-trip time. Pure: all times are arguments.
+"""Alignment of the server's clock to the host's monotonic clock by echoes. Pure: all times are arguments.
 
-An echo sent at t0 and received at t2 on the host's clock was stamped t1 on the server's between them, so the host's
-time of t1 is (t0 + t2) / 2, wrong by at most half the round trip. The quickest echo of each short interval is kept,
-and a line through those of the last minute gives offset and drift (Cristian 1989, "Probabilistic clock
-synchronization"; the line by least squares with a prior on the drift).
+An echo is sent at t0 and received at t2 on the host's clock and stamped t1 on the server's clock. The host's time of t1
+is (t0 + t2) / 2 with an error of at most half the round trip. The echo with the shortest round trip of each interval is
+used; a line through the echoes of the last minute gives offset and drift (Cristian 1989, "Probabilistic clock
+synchronization"; least squares with a prior on the drift).
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ from collections import deque
 from dataclasses import dataclass
 
 INTERVAL_S = 1.0
-"""Of the echoes of one interval only the quickest counts."""
+"""Interval from which only the echo with the shortest round trip is used [s]."""
 MAX_ROUND_TRIP_S = 1.0
-"""Slower echoes are taken for garbage."""
+"""Longest valid round trip [s]."""
 WINDOW = 60
-"""Intervals that are kept."""
+"""Number of intervals in the fit."""
 DRIFT_PRIOR = 100e-6
-"""Standard deviation of the drift [s/s] before anything is known: crystals are within 100 ppm."""
+"""Prior standard deviation of the drift [s/s]: crystals are within 100 ppm."""
 STEP_LIMIT_S = 5e-3
-"""An echo this far beyond its own uncertainty off the line tells of a server clock that was set anew."""
+"""Deviation of an echo from the line, beyond its uncertainty, that indicates a step of the server's clock [s]."""
 TRANSIT_LIMIT_S = 1.0
-"""No frame takes longer on the server, and one that takes longer on the way waited or bears a stamp from before."""
+"""Longest time on the server and longest transit of a frame with consistent stamps [s]."""
 STEP_COUNT = 3
-"""Echoes in a row that must agree on such a step before the past is forgotten."""
+"""Number of consecutive deviating echoes after which the alignment restarts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Echo:
-    """A finished echo: server and host time of the same moment, and the round trip [s]."""
+    """A completed echo: server and host time of the same instant, and the round trip [s]."""
 
     server_s: float
     host_s: float
@@ -38,16 +38,16 @@ class Echo:
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """When a frame was exposed, on the host's clock.
+    """Time of exposure of a frame on the host's clock [s].
 
-    ``is_aligned`` is False where that had to be estimated from the time of arrival; ``is_odd`` is True where the stamps
-    and the time of arrival do not go together, so that a new echo is worth sending at once.
+    ``is_aligned`` is False if the time was estimated from the time of arrival; ``is_inconsistent`` is True if the
+    stamps contradict the time of arrival, so that a new echo should be sent.
     """
 
     capture_s: float
     on_server_s: float
     is_aligned: bool
-    is_odd: bool = False
+    is_inconsistent: bool = False
 
 
 class ClockAlignment:
@@ -59,24 +59,24 @@ class ClockAlignment:
         self.resets = 0
         self._best: deque[Echo] = deque(maxlen=WINDOW)
         self._interval: int | None = None
-        self._strangers = 0
+        self._n_step_echoes = 0
         self._reference: Echo | None = None
         self._offset_s = 0.0
         self._drift = 0.0
 
     @property
     def is_aligned(self) -> bool:
-        """True once there was an echo."""
+        """Whether an echo has been received."""
         return self._reference is not None
 
     @property
     def is_uncertain(self) -> bool:
-        """True while the last echoes suggest that the server clock was set anew."""
-        return self._strangers > 0
+        """Whether the last echoes indicate a step of the server's clock."""
+        return self._n_step_echoes > 0
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster the host's clock runs than the server's [ppm]."""
+        """Rate of the host's clock relative to the server's [ppm]."""
         return self._drift * 1e6
 
     @property
@@ -85,9 +85,9 @@ class ClockAlignment:
         return min((echo.round_trip_s for echo in self._best), default=float("nan"))
 
     def add_echo(self, sent_s: float, server_ticks: int, received_s: float) -> None:
-        """Take one echo: host time sent, server's stamp, host time received.
+        """Add an echo: host time sent [s], server's stamp, host time received [s].
 
-        One with a round trip below zero or beyond MAX_ROUND_TRIP_S says nothing and is ignored.
+        An echo with a round trip below zero or above MAX_ROUND_TRIP_S is ignored.
         """
         round_trip_s = received_s - sent_s
         if not 0.0 <= round_trip_s <= MAX_ROUND_TRIP_S or self.clock_hz <= 0.0:
@@ -96,11 +96,11 @@ class ClockAlignment:
         self.echoes += 1
         if self._reference is not None:
             off_s = abs(echo.host_s - self._to_host(echo.server_s))
-            self._strangers = self._strangers + 1 if off_s > STEP_LIMIT_S + 0.5 * round_trip_s else 0
-            if 0 < self._strangers < STEP_COUNT:
+            self._n_step_echoes = self._n_step_echoes + 1 if off_s > STEP_LIMIT_S + 0.5 * round_trip_s else 0
+            if 0 < self._n_step_echoes < STEP_COUNT:
                 return
-            if self._strangers >= STEP_COUNT:
-                self._forget()
+            if self._n_step_echoes >= STEP_COUNT:
+                self._reset()
         interval = int(received_s / INTERVAL_S)
         if interval != self._interval:
             self._interval = interval
@@ -116,14 +116,14 @@ class ClockAlignment:
         return self._to_host(server_ticks / self.clock_hz) if self._reference is not None else float("nan")
 
     def exposure(self, exposed_ticks: int, transmit_ticks: int, received_s: float) -> Exposure:
-        """Moment of exposure of a frame that arrived at ``received_s`` [s, host monotonic].
+        """Time of exposure of a frame that arrived at ``received_s`` [s, host monotonic].
 
-        Without stamps or a clock it is the time of arrival; without an echo, that less the time on the server. The
-        same where the stamps lie after the arrival, which cannot be: the server's clock was set anew. One too far
-        before it may be true, of a frame that waited, and is kept.
+        Without stamps or a clock it is the time of arrival. Without an echo it is the time of arrival less the time
+        on the server; also if the stamps lie after the arrival (a step of the server's clock). Stamps long before
+        the arrival are used, since the frame may have been delayed.
 
         Args:
-            exposed_ticks: Server stamp of the exposure, 0 for none.
+            exposed_ticks: Server stamp of the exposure; 0 for none.
             transmit_ticks: Server stamp of the transmission, 0 for none.
             received_s: Host time of arrival.
         """
@@ -131,37 +131,37 @@ class ClockAlignment:
             return Exposure(received_s, 0.0, is_aligned=False)
         on_server_s = max(transmit_ticks - exposed_ticks, 0) / self.clock_hz
         if on_server_s > TRANSIT_LIMIT_S:
-            on_server_s = 0.0  # stamps of two clocks: no frame spends so long there
+            on_server_s = 0.0  # implausible: the stamps are of two clocks
         if self._reference is None:
             return Exposure(received_s - on_server_s, on_server_s, is_aligned=False)
         capture_s = self._to_host(exposed_ticks / self.clock_hz)
         transit_s = received_s - capture_s - on_server_s
         if transit_s < -STEP_LIMIT_S:
-            return Exposure(received_s - on_server_s, on_server_s, is_aligned=False, is_odd=True)
-        return Exposure(capture_s, on_server_s, is_aligned=True, is_odd=transit_s > TRANSIT_LIMIT_S)
+            return Exposure(received_s - on_server_s, on_server_s, is_aligned=False, is_inconsistent=True)
+        return Exposure(capture_s, on_server_s, is_aligned=True, is_inconsistent=transit_s > TRANSIT_LIMIT_S)
 
     def _to_host(self, server_s: float) -> float:
         assert self._reference is not None
         since_s = server_s - self._reference.server_s
         return self._reference.host_s + since_s + self._offset_s + self._drift * since_s
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._best.clear()
         self._interval = None
         self._reference = None
-        self._strangers = 0
+        self._n_step_echoes = 0
         self._drift = 0.0
         self.resets += 1
 
     def _fit(self) -> None:
-        """Weighted line through host - server over server time, relative to the newest echo to keep all digits."""
+        """Fit a weighted line to host - server over server time, relative to the newest echo for precision."""
         reference = self._best[-1]
         quickest_s = min(echo.round_trip_s for echo in self._best)
         total = mean_x = mean_y = 0.0
         points = []
         for echo in self._best:
-            # Standard deviation of the stamp's place in the round trip: what exceeds the quickest is queueing, and
-            # may lie on one side alone. The floor keeps a lucky echo from weighing everything.
+            # Standard deviation of the stamp within the round trip: the excess over the shortest round trip is
+            # queueing, possibly on one side only. The floor limits the weight of a single echo.
             sigma_s = 1e-5 + 0.05 * quickest_s + 0.5 * (echo.round_trip_s - quickest_s)
             x = echo.server_s - reference.server_s
             y = (echo.host_s - reference.host_s) - x

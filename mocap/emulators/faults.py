@@ -1,4 +1,4 @@
-"""What can go wrong between cameras and client, for the emulated server to do on purpose."""
+"""Faults between cameras and client that the emulated server can simulate."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from mocap.natnet.models import BitstreamVersion
 
 @dataclass(frozen=True, slots=True)
 class ServerFaults:
-    """Faults of an emulated server; assign a new one to ``NatNetServer.faults`` at any time. Shares are in [0, 1]."""
+    """Faults of an emulated server; may be assigned to ``NatNetServer.faults`` at any time. Shares are in [0, 1]."""
 
     latency_s: float = 0.0
-    """Every frame leaves this much after it was due."""
+    """Delay of every frame."""
     jitter_s: float = 0.0
-    """And by a random delay up to this, which may swap frames."""
+    """Upper limit of an additional random delay, which may reorder frames."""
     loss: float = 0.0
     """Share of frames that are not sent."""
     occlusion: float = 0.0
-    """Share of frames in which no body is tracked; 1 hides the bodies for good."""
+    """Share of frames in which no body is tracked."""
     garbage: float = 0.0
     """Share of frames followed by a datagram of random bytes."""
     truncation: float = 0.0
@@ -27,20 +27,20 @@ class ServerFaults:
     repetition: float = 0.0
     """Share of frames that are sent twice."""
     frozen: bool = False
-    """Frames go on with fresh stamps and repeat the last pose."""
-    silent: bool = False
-    """No frames at all."""
-    deaf: bool = False
-    """No answers to anything."""
+    """Frames repeat the last pose with fresh stamps."""
+    no_frames: bool = False
+    """The server sends no frames."""
+    no_answers: bool = False
+    """The server answers no message."""
     frame_version: BitstreamVersion | None = None
-    """Frames are written in this version whatever was announced."""
+    """Version of the frames, instead of the announced version."""
     clock_offset_s: float = 0.0
     """Added to the server's clock."""
     clock_drift_ppm: float = 0.0
-    """How much too fast the server's clock runs."""
+    """Rate error of the server's clock; positive if it runs fast."""
 
-    def garbled(self, datagram: bytes, rng: random.Random) -> list[bytes]:
-        """What is sent in place of ``datagram``."""
+    def apply(self, datagram: bytes, rng: random.Random) -> list[bytes]:
+        """Datagrams that are sent instead of ``datagram``."""
         sent = [] if rng.random() < self.loss else [datagram]
         if sent and rng.random() < self.repetition:
             sent.append(datagram)

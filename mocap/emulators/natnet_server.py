@@ -1,7 +1,7 @@
-"""A NatNet server that is not Motive: it serves poses from a callback on loopback, for any NatNet client.
+"""An emulated NatNet server: it streams poses from a callback to any NatNet client, by default on loopback.
 
-Behaviour follows the protocol as clients of the vendor's library need it: SERVERINFO of 279 bytes, an answer to
-every echo, no answer to keep-alives, frames from the data port to where CONNECT came from, an end-of-data tag.
+Its behaviour meets the needs of the vendor's client library: SERVERINFO of 279 bytes, an answer to every echo, no
+answer to keep-alives, frames from the data port to the source address of CONNECT, an end-of-data tag.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ _log = logging.getLogger(__name__)
 CLOCK_HZ = 10_000_000
 CLIENT_TIMEOUT_S = 10.0
 MODELS_CHANGED_S = 0.5
-"""For how long frames say that the models changed: one frame alone might be lost."""
+"""Duration of the models-changed flag in frames [s], since a single frame may be lost."""
 PROCESSING_S = 5e-4
-"""From data received to transmission, as stamped, where the exposure was earlier than that."""
+"""Stamped time from data received to transmission [s], if the exposure was earlier."""
 SERVER_NAME = "carlab emulator"
 
 Address = tuple[str, int]
@@ -64,7 +64,7 @@ PoseCallback = Callable[[float], Sequence[RigidBodySample | None]]
 @dataclass(slots=True)
 class _Client:
     version: BitstreamVersion
-    heard_s: float
+    last_message_s: float
     changed: bool = False
 
 
@@ -81,24 +81,24 @@ def _check_servable(version: BitstreamVersion, rate_hz: float, mode: str) -> Non
 class NatNetServer:
     """An emulated server. Constructing does nothing; ``open`` or ``with`` binds the ports and starts to serve.
 
-    By default a thread serves. A process that has a loop of its own opens with ``threaded=False`` and calls ``step``
-    until ``next_deadline_s`` instead.
+    By default a thread serves. A process with its own loop calls ``open(threaded=False)`` and then ``step`` at each
+    ``next_deadline_s``.
 
     Args:
         poses: Called at each frame's deadline t [s, host monotonic] from the serving thread; returns a sample, or
             None for occluded, for each of ``bodies``. Samples may have been captured before t.
-        bodies: What the model definitions list.
+        bodies: Rigid bodies of the model definitions.
         rate_hz: Frames per second.
         mode: Unicast to every client that connects, or multicast to the group.
-        version: Native bitstream version. A unicast client may ask a server from 4.0 on for an older one.
+        version: Native bitstream version. A unicast client may request an older one from a server of 4.0 or later.
         host: Interface to serve on.
-        command_port: 0 for any free one; ``command_port`` holds it once open.
-        data_port: Likewise; in multicast mode also the port that frames go to.
-        multicast_group: Where multicast frames go.
-        up_axis: Axes of what is sent; ``poses`` are with Z up.
-        faults: What goes wrong; none by default.
-        seed: Of the random faults.
-        client_timeout_s: A unicast client that is silent this long is dropped.
+        command_port: 0 for any free port; ``command_port`` holds it once open.
+        data_port: Likewise; in multicast mode also the destination port of frames.
+        multicast_group: Destination of multicast frames.
+        up_axis: Up axis of the streamed data; ``poses`` have Z up.
+        faults: Simulated faults; none by default.
+        seed: Seed of the random faults.
+        client_timeout_s: Time without a message after which a unicast client is dropped [s].
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class NatNetServer:
         self.faults = faults or ServerFaults()
         self.frames = 0
         self.failure: Exception | None = None
-        """What ended the serving thread before ``close``, such as an error in ``poses``."""
+        """Error that ended the serving thread before ``close``, for example from ``poses``."""
         self._poses = poses
         self._scene = EmulatedScene(tuple(bodies), up_axis)
         self._ports = (command_port, data_port)
@@ -149,7 +149,7 @@ class NatNetServer:
         self._start_s = self._next_frame_s = 0.0
 
     def open(self, *, threaded: bool = True) -> None:
-        """Bind both ports and start to serve. Idempotent. Raises NotReadyError for a port that is taken."""
+        """Bind both ports and start serving. Idempotent. Raises NotReadyError if a port is in use."""
         if self._command is not None:
             return
         self.failure = None
@@ -201,22 +201,22 @@ class NatNetServer:
                     select.select([self._command], [], [], wait_s)
                 self.step(time.monotonic())
         except Exception as error:
-            _log.exception("The emulated NatNet server has ended.")
+            _log.exception("The emulated NatNet server has failed.")
             self.failure = error
 
     @property
     def next_deadline_s(self) -> float:
-        """When ``step`` has something to send next [s, host monotonic]."""
+        """Time at which ``step`` is due next [s, host monotonic]."""
         return min(self._next_frame_s, self._waiting[0][0]) if self._waiting else self._next_frame_s
 
     @property
     def clients(self) -> dict[Address, BitstreamVersion]:
-        """Unicast clients that are connected, and the bitstream version each one gets."""
+        """Connected unicast clients with their bitstream versions."""
         with self._lock:
             return {address: client.version for address, client in self._clients.items()}
 
     def set_bodies(self, bodies: Sequence[EmulatedBody]) -> None:
-        """Change what is tracked; a bit tells clients in the frames. ``poses`` must fit at once."""
+        """Change the tracked bodies; a flag in the frames informs clients. ``poses`` must match from then on."""
         with self._lock:
             self._scene = EmulatedScene(tuple(bodies), self._scene.up_axis)
             self._models_changed_until_s = time.monotonic() + MODELS_CHANGED_S
@@ -228,7 +228,7 @@ class NatNetServer:
         return max(1, round(server_s * CLOCK_HZ))
 
     def step(self, now_s: float) -> None:
-        """Answer what has arrived and send what is due at ``now_s`` [s, host monotonic]. Never blocks.
+        """Answer received messages and send the frames due at ``now_s`` [s, host monotonic]. Never blocks.
 
         Raises NotOpenError before ``open``.
         """
@@ -238,7 +238,7 @@ class NatNetServer:
             self._answer_all()
             if now_s >= self._next_frame_s:
                 self._make_frame(self._next_frame_s, now_s)
-                # Absolute deadlines; what was missed is skipped, not sent in a burst.
+                # Absolute deadlines; missed frames are skipped, not sent in a burst.
                 missed = int((now_s - self._next_frame_s) * self.rate_hz)
                 self.frames += 1 + missed
                 self._next_frame_s = self._start_s + self.frames / self.rate_hz
@@ -257,15 +257,15 @@ class NatNetServer:
         stamped = frame._replace(
             timestamp_s=self.frames / self.rate_hz, mid_exposure_ticks=self.ticks(captured_s), params=params
         )
-        for address in [a for a, c in self._clients.items() if now_s - c.heard_s > self.client_timeout_s]:
+        for address in [a for a, c in self._clients.items() if now_s - c.last_message_s > self.client_timeout_s]:
             _log.info("NatNet client %s dropped after %g s of silence.", address, self.client_timeout_s)
             del self._clients[address]
-        if not faults.silent:
+        if not faults.no_frames:
             leaves_s = due_s + faults.latency_s + faults.jitter_s * self._rng.random()
             heapq.heappush(self._waiting, (leaves_s, self.frames, stamped))
 
     def _frozen(self, samples: list[RigidBodySample | None]) -> list[RigidBodySample | None]:
-        """The last poses with the stamps of these samples."""
+        """The last poses with the stamps of ``samples``."""
         return [
             replace(last, t_capture_s=sample.t_capture_s) if sample and last else sample
             for sample, last in zip(samples, self._last_samples or samples, strict=True)
@@ -286,7 +286,7 @@ class NatNetServer:
                 marked = frame._replace(params=frame.params | FRAME_BITSTREAM_CHANGED) if changed else frame
                 payload = encode_frame(marked, self.faults.frame_version or version)
                 written[version, changed] = encode_message(MessageId.FRAMEOFDATA, payload)
-            for datagram in self.faults.garbled(written[version, changed], self._rng):
+            for datagram in self.faults.apply(written[version, changed], self._rng):
                 self._send(self._data, datagram, address)
         for client in self._clients.values():
             client.changed = False
@@ -296,7 +296,7 @@ class NatNetServer:
             return
         try:
             sock.sendto(datagram, address)
-        except OSError as error:  # a full buffer or a client that is gone: UDP loses it, as on a real network
+        except OSError as error:  # full buffer or closed client: the datagram is lost, as on a real network
             _log.debug("Sending to %s failed: %s", address, error)
 
     def _answer_all(self) -> None:
@@ -306,10 +306,10 @@ class NatNetServer:
                 datagram, address = self._command.recvfrom(DATAGRAM_BYTES)
             except BlockingIOError:
                 return
-            except ConnectionError:  # Windows reports a client that is gone here
+            except ConnectionError:  # Windows reports a closed client here
                 continue
             now_s = time.monotonic()
-            if self.faults.deaf:
+            if self.faults.no_answers:
                 continue
             try:
                 message_id, payload = split_message(datagram, lenient=True)
@@ -318,7 +318,7 @@ class NatNetServer:
                 _log.debug("From %s: %s", address, error)
                 continue
             if address in self._clients:
-                self._clients[address].heard_s = now_s
+                self._clients[address].last_message_s = now_s
             if answer is not None:
                 self._send(self._command, encode_message(*answer), address)
 
@@ -328,7 +328,7 @@ class NatNetServer:
         match message_id:
             case MessageId.CONNECT:
                 wanted = decode_connect(payload).bitstream
-                version = self._agreed(wanted) if wanted else version
+                version = self._negotiated_version(wanted) if wanted else version
                 if self.mode == "unicast":
                     changed = known is not None and known.version != version
                     self._clients[address] = _Client(version, now_s, changed or version != self.version)
@@ -372,14 +372,14 @@ class NatNetServer:
             wanted = BitstreamVersion.parse(argument)
         except ProtocolError:
             return 1
-        if client is None or self._agreed(wanted) != wanted:
+        if client is None or self._negotiated_version(wanted) != wanted:
             return 1
         client.changed = client.changed or client.version != wanted
         client.version = wanted
         return 0
 
-    def _agreed(self, wanted: BitstreamVersion) -> BitstreamVersion:
-        """The version that a client gets who asks for ``wanted``: a change needs a server from 4.0 on, and unicast."""
+    def _negotiated_version(self, wanted: BitstreamVersion) -> BitstreamVersion:
+        """Version for a client that requests ``wanted``; a change needs a unicast server of 4.0 or later."""
         possible = self.mode == "unicast" and self.version >= (4, 0) and wanted in SERVED_BITSTREAMS
         return wanted if possible and wanted <= self.version else self.version
 

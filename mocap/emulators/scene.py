@@ -1,4 +1,4 @@
-"""What the emulated server tracks: samples of poses to NatNet frames and model definitions. Pure."""
+"""Bodies of the emulated server: pose samples to NatNet frames and model definitions. Pure."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from mocap.natnet.models import (
     Vector3,
 )
 
-_NOWHERE: Vector3 = (0.0, 0.0, 0.0)
-_UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
+_ORIGIN: Vector3 = (0.0, 0.0, 0.0)
+_IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,25 +34,24 @@ class EmulatedBody:
 
 @dataclass(frozen=True, slots=True)
 class RigidBodySample:
-    """Pose of a rigid body in ``map`` (Z up) at a moment of exposure on the host's monotonic clock.
+    """Pose of a rigid body in ``map`` (Z up) at a time of exposure on the host's monotonic clock.
 
-    ``t_capture_s`` may lie before the moment the sample is handed out: the frame then leaves that much later than
-    its exposure, as from cameras that need time to compute.
+    ``t_capture_s`` may lie before the deadline of the frame; the difference is the processing time of the cameras.
     """
 
     t_capture_s: float
     position_m: Vector3
-    quaternion: Quaternion = _UPRIGHT
+    quaternion: Quaternion = _IDENTITY
 
     @classmethod
     def planar(cls, t_capture_s: float, x_m: float, y_m: float, yaw_rad: float, z_m: float = 0.0) -> RigidBodySample:
-        """A body that stands upright."""
+        """Create a sample of an upright body."""
         return cls(t_capture_s, (x_m, y_m, z_m), yaw_quaternion(yaw_rad))
 
 
 @dataclass(slots=True)
 class EmulatedScene:
-    """Bodies and their last poses. Keeps the last pose of each body: an occluded one is sent stale and untracked."""
+    """Bodies and their last poses; an occluded body is sent with its last pose and untracked."""
 
     bodies: Sequence[EmulatedBody]
     up_axis: Literal["y", "z"] = "y"
@@ -60,7 +59,7 @@ class EmulatedScene:
     _last: dict[int, RigidBodySample] = field(default_factory=dict)
 
     def descriptions(self) -> tuple[Description, ...]:
-        """Rigid bodies, then a marker set for each, then the one called "all", as Motive sends them."""
+        """Rigid bodies, a marker set for each, and the marker set "all", in Motive's order."""
         bodies = []
         sets = []
         everything: list[str] = []
@@ -68,19 +67,19 @@ class EmulatedScene:
             positions = tuple(self._vector(m) for m in body.markers_m)
             names = tuple(f"Marker{i + 1}" for i in range(len(positions)))
             labels = (0,) * len(positions)
-            bodies.append(RigidBodyDescription(body.name, body.id, -1, _NOWHERE, positions, labels, names))
+            bodies.append(RigidBodyDescription(body.name, body.id, -1, _ORIGIN, positions, labels, names))
             sets.append(MarkerSetDescription(body.name, names))
             everything += [f"{body.name}_{i + 1}" for i in range(len(positions))]
         return (*bodies, *sets, MarkerSetDescription("all", tuple(everything)))
 
     def frame(self, number: int, samples: Sequence[RigidBodySample | None]) -> Frame:
-        """A frame without stamps and parameters. None stands for a body that is occluded."""
+        """Create a frame without stamps and parameters; a sample None means an occluded body."""
         rigid_bodies, sets, labelled = [], [], []
         for body, sample in zip(self.bodies, samples, strict=True):
             if sample is not None:
                 self._last[body.id] = sample
             pose = sample or self._last.get(body.id)
-            position, quaternion = (pose.position_m, pose.quaternion) if pose else (_NOWHERE, _UPRIGHT)
+            position, quaternion = (pose.position_m, pose.quaternion) if pose else (_ORIGIN, _IDENTITY)
             tracked = sample is not None
             turned = self._quaternion(quaternion)
             error_m = 2e-4 if tracked else 0.0

@@ -1,4 +1,4 @@
-"""Decoding while the server changes from one bitstream version to another. Pure."""
+"""Decoding during a change of the bitstream version. Pure."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ _SIZED = BitstreamVersion(4, 1)
 
 
 class BitstreamSwitch:
-    """Decodes under ``version``, and under ``pending`` too while a change to it is under way.
+    """Decoder for ``version``, and also for ``pending`` during a change to it.
 
-    Frames in flight still have the old syntax when the server says yes to a change. The change has taken effect once
-    a frame reads cleanly in the new syntax; where old and new are laid out alike, once a frame says so by its
-    bitstream-changed bit.
+    Frames in flight still have the old syntax when the server accepts a change. The change is complete when a frame
+    is valid in the new syntax; if both versions have the same layout, when a frame has the bitstream-changed flag.
     """
 
     def __init__(self, version: BitstreamVersion, pending: BitstreamVersion | None = None) -> None:
@@ -24,9 +23,9 @@ class BitstreamSwitch:
         self.pending = pending
 
     def decode_frame(self, payload: bytes) -> Frame:
-        """Read a frame. Raises ProtocolError; where another version would fit, it says which."""
+        """Decode a frame. Raises ProtocolError, which names a bitstream version that fits the frame, if any."""
         if self.pending is not None:
-            with contextlib.suppress(ProtocolError):  # still the old syntax, or garbage: the old decoder says which
+            with contextlib.suppress(ProtocolError):  # still the old syntax, or garbage: the old decoder decides
                 frame = decode_frame(payload, self.pending)
                 alike = (self.pending < _SIZED) == (self.version < _SIZED)
                 if not alike or frame.params & FRAME_BITSTREAM_CHANGED:
@@ -39,7 +38,7 @@ class BitstreamSwitch:
             raise explain_frame_error(payload, self.version, error) from error
 
     def decode_models(self, payload: bytes) -> tuple[Description, ...]:
-        """Read model definitions, which change together with the frames. Raises ProtocolError."""
+        """Decode model definitions, which change together with the frames. Raises ProtocolError."""
         if self.pending is not None:
             with contextlib.suppress(ProtocolError):  # as above
                 return decode_model_def(payload, self.pending)

@@ -1,7 +1,7 @@
-"""The NatNet codec as one name space: pure functions between datagrams and values, bitstreams 2.6 to 4.1.
+"""The NatNet codec as one namespace: pure functions between datagrams and values, bitstreams 2.6 to 4.1.
 
-Server to client messages come in whole through ``decode_datagram``; the parts are in ``natnet_messages`` (header,
-handshake, requests, echo), ``natnet_descriptions`` (MODELDEF) and ``natnet_frames`` (FRAMEOFDATA).
+``decode_datagram`` decodes any message. The parts are in ``messages`` (header, handshake, requests, echo),
+``descriptions`` (MODELDEF) and ``frames`` (FRAMEOFDATA).
 """
 
 from __future__ import annotations
@@ -33,32 +33,34 @@ from mocap.natnet.models import BitstreamVersion, Description, Frame, MessageId
 
 
 class EchoResponse(NamedTuple):
-    """The client's stamp come back, with the server's clock."""
+    """The returned stamp of the client, with the time of the server's clock."""
 
     stamp: int
     server_ticks: int
 
 
-class Text(NamedTuple):
-    """A message in words (REQUEST or MESSAGESTRING)."""
+class TextMessage(NamedTuple):
+    """A message with a text (REQUEST or MESSAGESTRING)."""
 
     text: str
 
 
-class Plain(NamedTuple):
-    """A message without a payload that means anything."""
+class NoContent(NamedTuple):
+    """A message whose payload has no meaning."""
 
     message_id: int
 
 
-Message = Connect | ServerInfo | Text | Response | tuple[Description, ...] | Frame | EchoResponse | int | Plain
+Message = (
+    Connect | ServerInfo | TextMessage | Response | tuple[Description, ...] | Frame | EchoResponse | int | NoContent
+)
 
 
 def decode_datagram(datagram: bytes, version: BitstreamVersion, *, lenient: bool = False) -> tuple[int, Message]:
-    """Read any datagram of the protocol: its message id and its content.
+    """Decode any datagram of the protocol to its message id and content.
 
     Raises:
-        ProtocolError: Whatever else the bytes are; names the byte and the section.
+        ProtocolError: The bytes do not follow the protocol; names the byte and the section.
     """
     message_id, payload = split_message(datagram, lenient=lenient)
     match message_id:
@@ -71,7 +73,7 @@ def decode_datagram(datagram: bytes, version: BitstreamVersion, *, lenient: bool
         case MessageId.SERVERINFO:
             return message_id, decode_server_info(payload)
         case MessageId.REQUEST | MessageId.MESSAGESTRING:
-            return message_id, Text(decode_text(payload))
+            return message_id, TextMessage(decode_text(payload))
         case MessageId.RESPONSE:
             return message_id, Response(payload)
         case MessageId.ECHOREQUEST:
@@ -79,7 +81,7 @@ def decode_datagram(datagram: bytes, version: BitstreamVersion, *, lenient: bool
         case MessageId.ECHORESPONSE:
             return message_id, EchoResponse(*decode_echo_response(payload))
         case _:
-            return message_id, Plain(message_id)
+            return message_id, NoContent(message_id)
 
 
 __all__ = [
@@ -89,10 +91,10 @@ __all__ = [
     "Frame",
     "Message",
     "MessageId",
-    "Plain",
+    "NoContent",
     "Response",
     "ServerInfo",
-    "Text",
+    "TextMessage",
     "decode_connect",
     "decode_datagram",
     "decode_echo_request",

@@ -1,4 +1,4 @@
-"""MODELDEF payloads: the server's list of what it tracks, bitstreams 2.6 to 4.1 in, 3.0 to 4.1 out. Pure."""
+"""MODELDEF payloads, the server's list of tracked models: decoded for 2.6 to 4.1, encoded for 3.0 to 4.1. Pure."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ _BITSTREAM_4_1 = BitstreamVersion(4, 1)
 
 
 def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Description, ...]:
-    """Read every description.
+    """Decode all descriptions.
 
-    From 4.1 on each one says its size: unknown types are kept as UnknownDescription, and what a later server
-    appends to a known one is skipped. Before 4.1 an unknown type cannot be skipped and is an error.
+    From 4.1 on each description has a size: an unknown type becomes an UnknownDescription, and bytes that a later
+    server appends to a known type are skipped. Before 4.1 an unknown type cannot be skipped and is an error.
 
     Raises:
-        ProtocolError: The version is not supported, or the bytes do not follow it; names the byte and the section.
+        ProtocolError: Unsupported version, or invalid bytes; names the byte and the section.
     """
     check_readable(version)
     reader = Reader(payload, f"NatNet model definitions read as bitstream {version}")
@@ -157,7 +157,7 @@ _READERS: dict[int, Callable[[Reader, BitstreamVersion], Description]] = {
 
 
 def encode_model_def(descriptions: Sequence[Description], version: BitstreamVersion = NEWEST_BITSTREAM) -> bytes:
-    """Write descriptions in the order given.
+    """Encode descriptions in the given order.
 
     Raises:
         ProtocolError: The version is not one of SERVED_BITSTREAMS, or a number does not fit its field.

@@ -1,4 +1,4 @@
-"""Which NatNet servers are on the network."""
+"""Discovery of the NatNet servers on the network."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from mocap.natnet.sockets import DATAGRAM_BYTES, DEFAULT_COMMAND_PORT, udp_socke
 
 
 @dataclass(frozen=True, slots=True)
-class FoundServer:
-    """A server that answered, and from where."""
+class DiscoveredServer:
+    """A server that answered, with its address."""
 
     address: str
     info: ServerInfo
@@ -26,14 +26,14 @@ def discover(
     command_port: int = DEFAULT_COMMAND_PORT,
     local_interface: str = "",
     timeout_s: float = 1.0,
-) -> tuple[FoundServer, ...]:
-    """Ask every server that ``target`` reaches (a broadcast address, or one host) to name itself.
+) -> tuple[DiscoveredServer, ...]:
+    """Request server information from every server at ``target`` (a broadcast address, or one host).
 
     Returns:
-        The servers that answered within ``timeout_s``, by address; empty for none.
+        The servers that answered within ``timeout_s``, sorted by address; may be empty.
 
     Raises:
-        NotReadyError: The question cannot be sent from ``local_interface`` (empty: as the system routes it).
+        NotReadyError: The request cannot be sent from ``local_interface`` (empty: the system's route).
     """
     found: dict[str, ServerInfo] = {}
     sock = udp_socket(local_interface, 0)
@@ -44,7 +44,8 @@ def discover(
             sock.sendto(question, (target, command_port))
         except OSError as error:
             raise NotReadyError(
-                "No motion capture", [f"{target} cannot be asked for NatNet servers ({error}); check the network."]
+                "No motion capture",
+                [f"the request cannot be sent to {target} ({error}); check the network."],
             ) from error
         deadline_s = time.monotonic() + timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
@@ -56,7 +57,7 @@ def discover(
                 if message_id == MessageId.SERVERINFO:
                     found[source[0]] = decode_server_info(payload)
             except (ProtocolError, BlockingIOError, ConnectionError):
-                continue  # somebody else's datagram, or none after all: not a server
+                continue  # another program's datagram, or a spurious wake-up
     finally:
         sock.close()
-    return tuple(FoundServer(address, info) for address, info in sorted(found.items()))
+    return tuple(DiscoveredServer(address, info) for address, info in sorted(found.items()))

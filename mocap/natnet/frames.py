@@ -1,6 +1,6 @@
-"""FRAMEOFDATA payloads: bytes to Frame for bitstreams 2.6 to 4.1, and Frame to bytes for 3.0 to 4.1. Pure.
+"""FRAMEOFDATA payloads: decoded to Frame for bitstreams 2.6 to 4.1, encoded for 3.0 to 4.1. Pure.
 
-Frames of 3.0, 3.1 and 4.0 are laid out alike. 4.1 adds a size in bytes to every section, a section of assets and a
+Frames of 3.0, 3.1 and 4.0 have the same layout. 4.1 adds a size in bytes to every section, a section of assets and a
 precision timestamp. Before 3.0 a rigid body carries its markers (skipped here) and the frame a latency instead of
 clock stamps.
 """
@@ -46,7 +46,7 @@ TRAILER_41 = Struct("<IIdQQQIIhi")
 
 _BITSTREAM_3_0 = BitstreamVersion(3, 0)
 _BITSTREAM_4_1 = BitstreamVersion(4, 1)
-# One version for each distinct layout, to say what an unreadable frame might be.
+# One version for each distinct layout, to identify the version of an unreadable frame.
 _LAYOUTS = tuple(BitstreamVersion(*v) for v in ((4, 1), (3, 0), (2, 11), (2, 9), (2, 7), (2, 6)))
 _LAYOUT_NAMES = {
     (4, 1): "4.1",
@@ -59,14 +59,14 @@ _LAYOUT_NAMES = {
 
 
 def decode_frame(payload: bytes, version: BitstreamVersion) -> Frame:
-    """Read a whole frame and check its layout to the last byte.
+    """Decode a complete frame and check its layout to the last byte.
 
     Args:
         payload: Bytes of the message after its header.
-        version: Bitstream version that was agreed with the server; frames do not say it themselves.
+        version: Bitstream version negotiated with the server; frames do not contain it.
 
     Raises:
-        ProtocolError: The version is not supported, or the bytes do not follow it; names the byte and the section.
+        ProtocolError: Unsupported version, or invalid bytes; names the byte and the section.
     """
     check_readable(version)
     sized = version >= _BITSTREAM_4_1
@@ -115,7 +115,7 @@ def _labelled(reader: Reader, number: int, modern: bool) -> tuple[LabelledMarker
 
 
 def _trailer(reader: Reader, version: BitstreamVersion) -> tuple[Any, ...]:
-    """Time code to flags, in the order of ``Frame``'s last fields; zero where the version has no such field."""
+    """Time code to flags, in the order of ``Frame``'s last fields; zero for fields that the version lacks."""
     mid = received = transmit = precision_s = fraction = 0
     if version >= _BITSTREAM_4_1:
         code, sub, time_s, mid, received, transmit, precision_s, fraction, params, end = reader.take(TRAILER_41)
@@ -129,7 +129,7 @@ def _trailer(reader: Reader, version: BitstreamVersion) -> tuple[Any, ...]:
 
 
 def layouts_that_fit(payload: bytes) -> str:
-    """Bitstream versions in which ``payload`` is a whole frame, as text; empty for none."""
+    """Bitstream versions in which ``payload`` is a valid frame, as text; empty for none."""
     fits = []
     for version in _LAYOUTS:
         try:
@@ -141,7 +141,7 @@ def layouts_that_fit(payload: bytes) -> str:
 
 
 def explain_frame_error(payload: bytes, version: BitstreamVersion, error: ProtocolError) -> ProtocolError:
-    """The same error, or a plainer one where the frame is whole in another bitstream version."""
+    """Return ``error``, or a more specific error if the frame is valid in another bitstream version."""
     fits = layouts_that_fit(payload)
     if not fits:
         return error
@@ -192,7 +192,7 @@ def _analog(reader: Reader, number: int) -> tuple[AnalogSource, ...]:
 
 
 def encode_frame(frame: Frame, version: BitstreamVersion = NEWEST_BITSTREAM) -> bytes:
-    """Write a frame's payload.
+    """Encode a frame's payload.
 
     Raises:
         ProtocolError: The version is not one of SERVED_BITSTREAMS, a number does not fit its field, or there are

@@ -28,17 +28,17 @@ FourVersion = tuple[int, int, int, int]
 
 
 def encode_message(message_id: int, payload: bytes = b"") -> bytes:
-    """One datagram: id, payload length, payload. Raises ProtocolError for a payload that UDP cannot carry."""
+    """Encode a datagram: id, payload length, payload. Raises ProtocolError if the payload exceeds a datagram."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise ProtocolError(f"{len(payload)} bytes do not fit into one datagram of {MAX_PAYLOAD_BYTES}; send less.")
     return UINT16_PAIR.pack(message_id, len(payload)) + payload
 
 
 def split_message(datagram: bytes, *, lenient: bool = False) -> tuple[int, bytes]:
-    """Take the header off.
+    """Split a datagram into message id and payload.
 
-    ``lenient`` is for a server: clients in the wild send a stray NUL after the payload, or claim more bytes than
-    they send; both are taken as they are. Otherwise only one stray trailing NUL is.
+    One extra NUL after the payload is accepted. ``lenient``, for a server, accepts all wrong lengths: some clients
+    announce more bytes than they send.
 
     Raises:
         ProtocolError: No header, or a payload shorter or longer than the header says.
@@ -53,19 +53,19 @@ def split_message(datagram: bytes, *, lenient: bool = False) -> tuple[int, bytes
         return message_id, datagram[HEADER_BYTES : HEADER_BYTES + size]
     if extra < 0:
         raise ProtocolError(
-            f"NatNet message {message_id} announces {size} bytes and brings {size + extra}: it was cut short "
+            f"NatNet message {message_id} announces {size} bytes and has {size + extra}: it was truncated "
             f"at byte {len(datagram)}, in the payload."
         )
     if extra == 1 and datagram[-1] == 0:
         return message_id, datagram[HEADER_BYTES:-1]
     raise ProtocolError(
-        f"NatNet message {message_id} announces {size} bytes and brings {size + extra}: byte {HEADER_BYTES + size}, "
-        "after the payload, belongs to nothing."
+        f"NatNet message {message_id} announces {size} bytes and has {size + extra}: byte {HEADER_BYTES + size}, "
+        "after the payload, is unexpected."
     )
 
 
 class Connect(NamedTuple):
-    """What a client says of itself in CONNECT or DISCOVERY; None for what it leaves out."""
+    """Identification of a client in CONNECT or DISCOVERY; None for missing fields."""
 
     name: str
     app_version: FourVersion | None
@@ -75,7 +75,7 @@ class Connect(NamedTuple):
 
 
 class ServerInfo(NamedTuple):
-    """What a server says of itself. The last four are zero or empty for servers before 3.0."""
+    """Identification of a server. The last four fields are zero or empty for servers before 3.0."""
 
     name: str
     app_version: FourVersion
@@ -92,7 +92,7 @@ class ServerInfo(NamedTuple):
 
 
 def _text(data: bytes) -> str:
-    """Up to the first NUL: Motive leaves garbage after it."""
+    """Text up to the first NUL; Motive sends garbage after it."""
     return data.partition(b"\0")[0].decode("utf-8", "replace")
 
 
@@ -118,7 +118,7 @@ def encode_connect(
 ) -> bytes:
     """Payload of CONNECT (or DISCOVERY): 269 bytes with the options of NatNet 4, 264 without them.
 
-    ``bitstream`` None asks for the server's own version.
+    ``bitstream`` None requests the server's native version.
     """
     sender = _sender(name, app_version, natnet_version)
     if not options:
@@ -128,7 +128,7 @@ def encode_connect(
 
 
 def decode_connect(payload: bytes) -> Connect:
-    """Read CONNECT of any known client: 0, 5 ("Ping"), 264, 269, 271 or 273 bytes. Never raises."""
+    """Decode CONNECT of any known client: 0, 5 ("Ping"), 264, 269, 271 or 273 bytes. Never raises."""
     app_version = natnet_version = bitstream = None
     if len(payload) >= SENDER_BYTES:
         app_version, natnet_version = _four(payload[256:260]), _four(payload[260:264])
@@ -146,7 +146,7 @@ def encode_server_info(info: ServerInfo) -> bytes:
 
 
 def decode_server_info(payload: bytes) -> ServerInfo:
-    """Read SERVERINFO, 279 bytes from 3.0 on and 264 before. Raises ProtocolError for less."""
+    """Decode SERVERINFO, 279 bytes from 3.0 on and 264 before. Raises ProtocolError for fewer bytes."""
     if len(payload) < SENDER_BYTES:
         raise ProtocolError(
             f"NatNet server info ends at byte {len(payload)}, in the name and versions of {SENDER_BYTES} bytes."
@@ -170,12 +170,12 @@ def encode_request(command: str) -> bytes:
 
 
 def decode_text(payload: bytes) -> str:
-    """Text of REQUEST, MESSAGESTRING or a RESPONSE in words, up to the first NUL."""
+    """Text of REQUEST, MESSAGESTRING or RESPONSE, up to the first NUL."""
     return _text(payload)
 
 
 class Response(NamedTuple):
-    """Answer to a REQUEST. Four bytes are a number whose type only the command tells; anything else is text."""
+    """Answer to a REQUEST: four bytes are a number whose type depends on the command; other lengths are text."""
 
     data: bytes
 
@@ -212,7 +212,7 @@ def encode_echo_request(stamp: int) -> bytes:
 
 
 def decode_echo_request(payload: bytes) -> int:
-    """Read the client's stamp. Raises ProtocolError."""
+    """Decode the client's stamp. Raises ProtocolError."""
     return _fixed(_ECHO, payload, "echo request")[0]
 
 
@@ -222,7 +222,7 @@ def encode_echo_response(stamp: int, server_ticks: int) -> bytes:
 
 
 def decode_echo_response(payload: bytes) -> tuple[int, int]:
-    """Read the client's stamp and the server's ticks. Raises ProtocolError."""
+    """Decode the client's stamp and the server's ticks. Raises ProtocolError."""
     stamp, ticks = _fixed(_ECHO_RESPONSE, payload, "echo response")
     return stamp, ticks
 
@@ -234,7 +234,7 @@ def _fixed(layout: Struct, payload: bytes, what: str) -> tuple[int, ...]:
 
 
 def message_name(message_id: int) -> str:
-    """Name of a message for people."""
+    """Name of a message for log lines."""
     try:
         return MessageId(message_id).name
     except ValueError:

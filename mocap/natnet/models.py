@@ -1,4 +1,4 @@
-"""What NatNet messages hold, as named tuples: metres, seconds, quaternions x, y, z, w, in the server's axes.
+"""Contents of NatNet messages as named tuples: metres, seconds, quaternions x, y, z, w, in the server's axes.
 
 Sources of the layouts, here and in the other ``natnet_*`` modules: packets captured from Motive 2.1 (bitstream 3.0)
 and, for the other versions, the depacketizers and headers that the vendor publishes with NatNet SDK 2.5 to 4.1.
@@ -57,11 +57,11 @@ class BitstreamVersion(NamedTuple):
 OLDEST_BITSTREAM = BitstreamVersion(2, 6)
 NEWEST_BITSTREAM = BitstreamVersion(4, 1)
 SERVED_BITSTREAMS = tuple(BitstreamVersion(*v) for v in ((3, 0), (3, 1), (4, 0), (4, 1)))
-"""Versions that can be written as well as read; 2.6 to 2.11 can only be read."""
+"""Versions that can be encoded and decoded; 2.6 to 2.11 can only be decoded."""
 
 
 def check_readable(version: BitstreamVersion) -> None:
-    """Raise ProtocolError where frames of ``version`` cannot be read, with what to do about it."""
+    """Raise ProtocolError with the remedy if frames of ``version`` cannot be decoded."""
     if not OLDEST_BITSTREAM <= version <= NEWEST_BITSTREAM:
         remedy = (
             'set Transmission Type to Unicast in Motive\'s Data Streaming pane and mode = "unicast" in '
@@ -83,7 +83,7 @@ class MarkerSet(NamedTuple):
 
 
 class RigidBody(NamedTuple):
-    """Pose of a rigid body (or of a bone) in a frame. Bit 0 of ``params`` is set while it is tracked."""
+    """Pose of a rigid body (or bone) in a frame. Bit 0 of ``params`` is set while it is tracked."""
 
     id: int
     x_m: float
@@ -98,7 +98,7 @@ class RigidBody(NamedTuple):
 
     @property
     def is_tracked(self) -> bool:
-        """True where the server solved this body in this frame; otherwise the pose is stale or zero."""
+        """Whether the server tracked this body in this frame; otherwise the pose is stale or zero."""
         return bool(self.params & 1)
 
 
@@ -126,7 +126,7 @@ class LabelledMarker(NamedTuple):
 
     @property
     def is_occluded(self) -> bool:
-        """True where no camera saw the marker and its position is the model's."""
+        """Whether no camera saw the marker; then its position is the model's."""
         return bool(self.params & 1)
 
 
@@ -182,10 +182,10 @@ class MarkerSetDescription(NamedTuple):
 
 
 class RigidBodyDescription(NamedTuple):
-    """A rigid body (or bone) as defined in the server. ``marker_names`` exist since 4.0 and are empty before.
+    """Definition of a rigid body (or bone) in the server. ``marker_names`` exist since 4.0 and are empty before.
 
-    ``marker_positions_m`` are as sent. In the packets captured from Motive 2.1 their x is mirrored: with -x they lie
-    where the body's pose and the labelled markers of the frames put them.
+    ``marker_positions_m`` are unchanged. In the packets captured from Motive 2.1 their x is mirrored: with -x they
+    agree with the body's pose and the labelled markers of the frames.
     """
 
     name: str
@@ -260,7 +260,7 @@ class AssetDescription(NamedTuple):
 
 
 class UnknownDescription(NamedTuple):
-    """A description of a type this code does not know, skipped by its size (bitstream 4.1)."""
+    """A description of unknown type, skipped by its size (bitstream 4.1)."""
 
     type_id: int
     data: bytes

@@ -1,4 +1,4 @@
-"""Bounds-checked reading of NatNet payloads: whatever the bytes, either a value or a ProtocolError that says where."""
+"""Bounds-checked reader of NatNet payloads; invalid bytes raise a ProtocolError with their position."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ UINT16_PAIR = Struct("<HH")
 
 
 class Reader:
-    """A position in a payload. ``section`` is what is being read, for messages; all offsets are into the payload."""
+    """Reader with a position in a payload. ``section`` names the current section in error messages."""
 
     __slots__ = ("data", "end", "pos", "section", "sized", "what")
 
@@ -34,7 +34,7 @@ class Reader:
         start = self.pos
         if start + layout.size > self.end:
             raise self.error(
-                f"{layout.size} bytes belong where {self.end - start} are left; it is cut short or garbled,"
+                f"{layout.size} bytes are expected, {self.end - start} are left; the message is truncated or corrupt,"
             )
         self.pos = start + layout.size
         return layout.unpack_from(self.data, start)
@@ -45,7 +45,7 @@ class Reader:
         return value
 
     def count(self, smallest_bytes: int) -> int:
-        """Read a count of things of at least ``smallest_bytes`` each, and refuse one that cannot be true."""
+        """Read a count of entries of at least ``smallest_bytes`` each; raises ProtocolError if they do not fit."""
         number = self.integer()
         if number < 0 or number * smallest_bytes > self.end - self.pos:
             self.pos -= INT32.size
@@ -55,8 +55,8 @@ class Reader:
     def section_count(self, section: str, smallest_bytes: int) -> int:
         """Read the head of a frame's section: a count and, where sections are sized (4.1), the size in bytes.
 
-        A size that leads beyond the payload is refused. Otherwise the content decides where the section ends; the
-        end-of-data tag and the payload's length check the sum.
+        A size beyond the payload raises ProtocolError. Otherwise the size is ignored: the content gives the end of the
+        section, and the end-of-data tag and the payload's length are checked at the end.
         """
         self.section = section
         number = self.count(smallest_bytes)
@@ -70,7 +70,7 @@ class Reader:
         return number
 
     def records(self, layout: Struct, number: int) -> Iterator[tuple[Any, ...]]:
-        """Read ``number`` records in one go."""
+        """Read ``number`` records."""
         start = self.pos
         stop = start + number * layout.size
         if stop > self.end:
@@ -81,10 +81,10 @@ class Reader:
         return layout.iter_unpack(self.data[start:stop])
 
     def text(self) -> str:
-        """Read a NUL-terminated UTF-8 string; bytes that are no UTF-8 become U+FFFD, a name must not cost the pose."""
+        """Read a NUL-terminated UTF-8 string; invalid bytes become U+FFFD, so that the poses can still be decoded."""
         stop = self.data.find(b"\0", self.pos, self.end)
         if stop < 0:
-            raise self.error("a name has no end")
+            raise self.error("a name has no terminating NUL")
         value = self.data[self.pos : stop].decode("utf-8", "replace")
         self.pos = stop + 1
         return value
@@ -94,13 +94,13 @@ class Reader:
         return tuple([self.text() for _ in range(number)])
 
     def finish(self) -> None:
-        """Raise ProtocolError where bytes are left over."""
+        """Raise ProtocolError if unread bytes remain."""
         if self.pos != self.end:
             raise self.error(f"{self.end - self.pos} bytes are left over")
 
 
 def encode_text(text: str) -> bytes:
-    """A NUL-terminated UTF-8 string. Raises ProtocolError for a NUL inside."""
+    """Encode a NUL-terminated UTF-8 string. Raises ProtocolError for a NUL inside."""
     if "\0" in text:
-        raise ProtocolError(f"The name {text!r} holds a NUL, which ends a name on the wire; choose another one.")
+        raise ProtocolError(f"The name {text!r} contains a NUL, which would end it on the wire; choose another name.")
     return text.encode("utf-8") + b"\0"

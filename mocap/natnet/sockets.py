@@ -1,4 +1,4 @@
-"""UDP sockets as NatNet clients and servers need them."""
+"""UDP sockets for NatNet clients and servers."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ DATAGRAM_BYTES = 65536
 
 
 def not_ready(reason: str) -> NotReadyError:
-    """The error for a camera system that is not there."""
+    """Create the error for missing motion capture."""
     return NotReadyError("No motion capture", [reason])
 
 
 def resolve(host: str, setting: str = "server_address") -> str:
-    """IPv4 address of a host; ``setting`` is what the message blames. Raises NotReadyError."""
+    """IPv4 address of a host. Raises NotReadyError, which names ``setting``."""
     try:
         return socket.gethostbyname(host)
-    except (OSError, ValueError) as error:  # ValueError: no name at all, such as one with two dots in a row
+    except (OSError, ValueError) as error:  # ValueError: an invalid name, for example with two consecutive dots
         raise not_ready(
             f"'{host}' is no known IPv4 address or host name ({error}); check {setting} in [hardware.mocap]."
         ) from error
 
 
 def interface_towards(address: str) -> str:
-    """Address of the interface that packets to ``address`` leave by. Raises NotReadyError."""
+    """Address of the interface that routes to ``address``. Raises NotReadyError."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((address, 9))
         except OSError as error:
-            raise not_ready(f"no network leads to {address} ({error}); check cable and address.") from error
+            raise not_ready(f"there is no route to {address} ({error}); check cable and address.") from error
         return str(probe.getsockname()[0])
 
 
 def udp_socket(address: str, port: int, *, shared: bool = False) -> socket.socket:
-    """A bound, non-blocking UDP socket with a large receive buffer. Raises NotReadyError."""
+    """Create a bound, non-blocking UDP socket with a large receive buffer. Raises NotReadyError."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         if shared:
@@ -53,7 +53,7 @@ def udp_socket(address: str, port: int, *, shared: bool = False) -> socket.socke
         sock.close()
         place = f"{address or 'any interface'}:{port}"
         remedy = {
-            errno.EADDRINUSE: "close the program that holds it or set another port.",
+            errno.EADDRINUSE: "close the program that uses it or set another port.",
             errno.EADDRNOTAVAIL: "no interface of this computer has that address: check local_interface.",
         }.get(error.errno or 0, "choose another address or port.")
         raise not_ready(f"UDP {place} cannot be used ({error.strerror}); {remedy}") from error
@@ -61,7 +61,7 @@ def udp_socket(address: str, port: int, *, shared: bool = False) -> socket.socke
 
 
 def multicast_receiver(group: str, port: int, interface: str) -> socket.socket:
-    """A socket that receives what is sent to ``group:port`` and arrives at ``interface``. Raises NotReadyError."""
+    """Create a socket that receives datagrams to ``group:port`` at ``interface``. Raises NotReadyError."""
     # On Linux a socket bound to the group receives nothing else; Windows cannot bind to a group.
     sock = udp_socket("" if sys.platform == "win32" else group, port, shared=True)
     try:

@@ -75,7 +75,7 @@ def main(folder: str, how: str) -> int:
             if how == "unplug":
                 car.world.ask(do="unplug")
             if how == "mocap_silent":
-                car.world.ask(do="mocap", faults={"silent": True})
+                car.world.ask(do="mocap", faults={"no_frames": True})
             if how == "mocap_hidden":
                 car.world.ask(do="mocap", faults={"occlusion": 1.0})
             if how == "mocap_jump":

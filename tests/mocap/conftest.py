@@ -19,14 +19,14 @@ Until = Callable[[Callable[[], bool]], None]
 
 
 def clock_poses(t_s: float) -> list[RigidBodySample | None]:
-    """One body whose x [m] tells the time of exposure [s] modulo 16 s, 3 ms before the frame is due."""
+    """One body whose x [m] is the time of exposure [s] modulo 16 s, 3 ms before the frame is due."""
     t_capture_s = t_s - 0.003
     return [RigidBodySample.planar(t_capture_s, t_capture_s % 16.0, -0.5, 0.75, 0.25)]
 
 
 @pytest.fixture
 def serve() -> Iterator[Serve]:
-    """Opens a server; by default on free ports, with one body that ``clock_poses`` moves."""
+    """Open a server; by default on free ports, with one body moved by ``clock_poses``."""
     with ExitStack() as stack:
 
         def open_server(poses: Any = clock_poses, *, kind: type[NatNetServer] = NatNetServer, **options: Any) -> Any:
@@ -38,7 +38,7 @@ def serve() -> Iterator[Serve]:
 
 @pytest.fixture
 def configure() -> Configure:
-    """The configuration that fits a server."""
+    """Configuration for a server."""
 
     def config(server: NatNetServer, **changes: Any) -> MocapConfig:
         common = {
@@ -54,12 +54,12 @@ def configure() -> Configure:
 
 @pytest.fixture
 def until() -> Until:
-    """Waits for something to become true and fails where it does not for very long."""
+    """Wait for a condition; fail after 30 s."""
 
     def wait(condition: Callable[[], bool]) -> None:
         deadline_s = time.monotonic() + 30.0
         while not condition():
-            assert time.monotonic() < deadline_s, "what the test waits for did not happen"
+            assert time.monotonic() < deadline_s, "the condition was not met in time"
             time.sleep(0.01)
 
     return wait

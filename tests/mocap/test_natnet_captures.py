@@ -1,4 +1,4 @@
-"""Packets captured from Motive 2.1 (github.com/mje-nz/python_natnet, BSD-3-Clause) against what is known of them."""
+"""Packets captured from Motive 2.1 (github.com/mje-nz/python_natnet, BSD-3-Clause) against independent facts."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mocap.natnet.codec import (
 from mocap.natnet.models import MarkerSetDescription, RigidBodyDescription
 
 V3 = BitstreamVersion(3, 0)
-CLOCK_HZ = 3312787  # as the captured server info says
+CLOCK_HZ = 3312787  # from the captured server info
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def frame_of(captures: dict[str, bytes], name: str) -> Frame:
     return frame
 
 
-def test_every_capture_is_read(captures: dict[str, bytes]) -> None:
+def test_every_capture_is_decoded(captures: dict[str, bytes]) -> None:
     ids = {name: decode_datagram(data, V3)[0] for name, data in captures.items()}
     assert ids["discovery"] == 14
     assert ids["connect"] == 0
@@ -64,7 +64,7 @@ def test_every_capture_is_read(captures: dict[str, bytes]) -> None:
 
 def test_server_info(captures: dict[str, bytes]) -> None:
     _, info = decode_datagram(captures["serverinfo"], V3)
-    # The name is followed by stale garbage in the capture: it must not become part of it.
+    # In the capture garbage follows the name; it must not become part of the name.
     assert info == ServerInfo("Motive", (2, 1, 0, 0), (3, 0, 0, 0), CLOCK_HZ, 1511, True, "239.255.42.99")
     assert isinstance(info, ServerInfo)
     written = encode_message(1, encode_server_info(info))
@@ -108,8 +108,8 @@ def test_frame_values(captures: dict[str, bytes]) -> None:
     assert frame.params == 0
 
 
-def test_body_pose_puts_its_markers_where_the_cameras_saw_them(captures: dict[str, bytes]) -> None:
-    """Position, quaternion order and marker positions agree with one another only if all three are read right.
+def test_body_pose_and_definition_agree_with_the_labelled_markers(captures: dict[str, bytes]) -> None:
+    """Position, quaternion order and marker positions agree only if all three are decoded correctly.
 
     This Motive sends the marker positions of its definition with x mirrored: the distances among them are those seen,
     and no rotation brings one onto the other. With -x all five lie within a millimetre.
@@ -143,7 +143,7 @@ def test_occluded_marker(captures: dict[str, bytes]) -> None:
     assert [m.is_occluded for m in frame.labelled_markers] == [True, False, False, False]
 
 
-def test_written_back_byte_for_byte(captures: dict[str, bytes]) -> None:
+def test_encoding_reproduces_the_captured_bytes(captures: dict[str, bytes]) -> None:
     for name in ("mocapframe", "occluded"):
         assert encode_message(7, encode_frame(frame_of(captures, name), V3)) == captures[name]
     _, models = decode_datagram(captures["modeldef"], V3)
@@ -151,12 +151,12 @@ def test_written_back_byte_for_byte(captures: dict[str, bytes]) -> None:
     assert encode_message(5, encode_model_def(models, V3)) == captures["modeldef"]
 
 
-def test_a_captured_frame_fits_no_other_layout(captures: dict[str, bytes]) -> None:
+def test_captured_frame_fits_only_its_layout(captures: dict[str, bytes]) -> None:
     for name in ("mocapframe", "occluded"):
         assert layouts_that_fit(split_message(captures[name])[1]) == "3.0, 3.1 or 4.0"
 
 
-def test_another_decoder_reads_the_same(captures: dict[str, bytes]) -> None:
+def test_independent_decoder_agrees_on_the_captures(captures: dict[str, bytes]) -> None:
     for name in ("mocapframe", "occluded"):
         payload = split_message(captures[name])[1]
         ours, theirs = decode_frame(payload, V3), DataFrame.read_from_buffer(PacketBuffer(payload), Version(3, 0))

@@ -1,4 +1,4 @@
-"""Our client against the emulated server: handshake, versions, staying connected, what it survives."""
+"""The client against the emulated server: handshake, versions, reconnection, faults."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ V30, V40, V41, V42 = (BitstreamVersion(*v) for v in ((3, 0), (4, 0), (4, 1), (4,
 
 
 class Received:
-    """A listener that keeps everything."""
+    """A listener that records all frames."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[Frame, int, float, float]] = []
@@ -57,13 +57,13 @@ class Received:
         return [sequence for _, sequence, _, _ in self.frames]
 
     def errors_s(self, start: int = 0) -> list[float]:
-        """Capture time minus the truth, which x tells modulo 16 s."""
+        """Capture time minus the true time, which x holds modulo 16 s."""
         differences = [capture_s - frame.rigid_bodies[0].x_m for frame, _, capture_s, _ in self.frames[start:]]
         return [(d + 8.0) % 16.0 - 8.0 for d in differences]
 
 
 class Peer:
-    """A bare socket that speaks for itself."""
+    """A minimal client: one socket."""
 
     def __init__(self, server: NatNetServer) -> None:
         self.to = ("127.0.0.1", server.command_port)
@@ -93,7 +93,7 @@ def median(values: list[float]) -> float:
 
 
 def bound_s(numbers: Mapping[str, float]) -> float:
-    """A millisecond; half the quickest round trip where a busy machine makes that longer."""
+    """Tolerance [s]: a millisecond, or half the shortest round trip on a busy machine."""
     return max(1e-3, 0.5e-3 * numbers["round_trip_min_ms"])
 
 
@@ -120,9 +120,9 @@ def test_handshake_models_and_frames(
     assert all(frame.rigid_bodies[0].is_tracked for frame, *_ in received.frames)
 
 
-def test_a_client_asks_a_newer_server_for_an_older_version(serve: Serve, configure: Configure, until: Until) -> None:
+def test_client_requests_an_older_version_from_a_newer_server(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(version="4.1")
-    server.version = V42  # it writes 4.1 and older only: a client that got 4.2 would get nothing
+    server.version = V42  # it encodes 4.1 and older only: a client of 4.2 would get no frames
     received = Received()
     with NatNetClient(configure(server), received) as client:
         until(lambda: len(received.frames) >= 5)
@@ -131,11 +131,11 @@ def test_a_client_asks_a_newer_server_for_an_older_version(serve: Serve, configu
 
 
 class RequestOnlyServer(NatNetServer):
-    """Does not heed a version in CONNECT: a client has to request it, while frames of the native one flow."""
+    """Ignores the version in CONNECT: a client must request it while frames of the native version arrive."""
 
     def _answer(self, message_id: int, payload: bytes, address: Any, now_s: float) -> Any:
         if message_id == MessageId.CONNECT:
-            payload = encode_connect("without a wish", options=False)
+            payload = encode_connect("without a version", options=False)
         return super()._answer(message_id, payload, address, now_s)
 
 
@@ -155,17 +155,17 @@ def test_the_bitstream_changes_in_flight(serve: Serve, configure: Configure, unt
 
 @pytest.fixture
 def quick_to_reconnect(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mocap.natnet.upkeep.RECONNECT_PERIOD_S", 0.5)
+    monkeypatch.setattr("mocap.natnet.message_schedule.RECONNECT_PERIOD_S", 0.5)
 
 
 @pytest.mark.usefixtures("quick_to_reconnect")
-def test_a_restarted_server_is_asked_for_the_version_again(serve: Serve, configure: Configure, until: Until) -> None:
+def test_version_is_requested_again_after_a_server_restart(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(kind=RequestOnlyServer, version="4.1", client_timeout_s=0.6)
     received = Received()
     with NatNetClient(configure(server, bitstream="3.0"), received) as client:
         until(lambda: client.version == V30 and bool(received.frames))
-        server.faults = ServerFaults(deaf=True)
-        until(lambda: not server.clients)  # it has forgotten the client, and answers as before
+        server.faults = ServerFaults(no_answers=True)
+        until(lambda: not server.clients)  # it has dropped the client
         server.faults = ServerFaults()
         until(lambda: set(server.clients.values()) == {V30})
         count = len(received.frames)
@@ -174,7 +174,7 @@ def test_a_restarted_server_is_asked_for_the_version_again(serve: Serve, configu
     assert received.sequences == sorted(set(received.sequences))
 
 
-def test_frames_on_the_way_are_read_in_either_syntax() -> None:
+def test_frames_in_flight_are_decoded_in_both_versions() -> None:
     frame = Frame(5, rigid_bodies=(RigidBody(1, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1),))
     switch = BitstreamSwitch(V41, pending=V30)
     assert switch.decode_frame(encode_frame(frame, V41)) == frame
@@ -188,7 +188,7 @@ def test_frames_on_the_way_are_read_in_either_syntax() -> None:
     assert alike.version == V30
 
 
-def test_the_first_frame_of_a_new_version_says_so(serve: Serve) -> None:
+def test_first_frame_of_a_new_version_has_the_changed_flag(serve: Serve) -> None:
     server = serve(version="4.1")
     with Peer(server) as peer:
         peer.send(MessageId.CONNECT)
@@ -221,10 +221,10 @@ def test_two_clients_with_different_versions(serve: Serve, configure: Configure,
     assert all(poses_old[n] == poses_new[n] for n in both)
 
 
-# -- staying connected ----------------------------------------------------------------------------------------------
+# -- connection upkeep ----------------------------------------------------------------------------------------------
 
 
-def test_who_is_silent_is_dropped_and_who_keeps_alive_is_not(serve: Serve, configure: Configure, until: Until) -> None:
+def test_client_without_keepalives_is_dropped(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(client_timeout_s=1.2)
     with Peer(server) as peer, NatNetClient(configure(server)):
         peer.send(MessageId.CONNECT)
@@ -236,7 +236,7 @@ def test_who_is_silent_is_dropped_and_who_keeps_alive_is_not(serve: Serve, confi
         peer.send(MessageId.DISCONNECT)
         until(lambda: peer.address not in server.clients)
         assert len(server.clients) == 1
-    until(lambda: not server.clients)  # close() takes leave
+    until(lambda: not server.clients)  # close() disconnects
 
 
 def test_changed_models_are_requested_again(serve: Serve, configure: Configure, until: Until) -> None:
@@ -252,17 +252,17 @@ def test_changed_models_are_requested_again(serve: Serve, configure: Configure, 
 def test_lost_requests_for_models_are_sent_again(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve()
     with NatNetClient(configure(server)) as client:
-        server.faults = ServerFaults(deaf=True)
+        server.faults = ServerFaults(no_answers=True)
         server.set_bodies((EmulatedBody("lorry", 12),))
         start = server.frames
-        until(lambda: server.frames > start + 320)  # by now frames have ceased to tell, and two requests were lost
+        until(lambda: server.frames > start + 320)  # the flag has ended, and two requests were lost
         server.faults = ServerFaults()
         until(lambda: client.models is not None and client.models[0][:2] == ("lorry", 12))
 
 
 @pytest.mark.usefixtures("quick_to_reconnect")
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
-def test_a_restarted_server_is_found_again(serve: Serve, configure: Configure, until: Until, mode: str) -> None:
+def test_client_reconnects_to_a_restarted_server(serve: Serve, configure: Configure, until: Until, mode: str) -> None:
     received = Received()
     server = serve(mode=mode, rate_hz=500.0)
     ports = {"command_port": server.command_port, "data_port": server.data_port}
@@ -270,7 +270,7 @@ def test_a_restarted_server_is_found_again(serve: Serve, configure: Configure, u
         until(lambda: len(received.frames) >= 400)
         server.close()
         gap = len(received.frames)
-        serve(mode=mode, version="3.0", rate_hz=60.0, **ports)  # its frame numbers and its clock begin anew
+        serve(mode=mode, version="3.0", rate_hz=60.0, **ports)  # its frame numbers and its clock restart
         until(lambda: len(received.frames) >= gap + 50)
         assert client.version == V30
         numbers = client.statistics()
@@ -282,7 +282,7 @@ def test_a_restarted_server_is_found_again(serve: Serve, configure: Configure, u
     assert all(capture_s <= received_s + 5e-3 for _, _, capture_s, received_s in received.frames)
 
 
-def test_a_clock_that_is_set_anew_is_noticed_and_never_makes_poses_newer(
+def test_clock_step_of_the_server_is_detected_and_poses_never_get_newer(
     serve: Serve, configure: Configure, until: Until
 ) -> None:
     server = serve(faults=ServerFaults(clock_offset_s=10.0))
@@ -300,7 +300,7 @@ def test_a_clock_that_is_set_anew_is_noticed_and_never_makes_poses_newer(
 
 
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
-def test_capture_times_are_the_servers_truth(serve: Serve, configure: Configure, until: Until, mode: str) -> None:
+def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, until: Until, mode: str) -> None:
     server = serve(mode=mode, faults=ServerFaults(clock_offset_s=12345.0, clock_drift_ppm=30.0, jitter_s=0.004))
     received = Received()
     with NatNetClient(configure(server), received) as client:
@@ -313,10 +313,10 @@ def test_capture_times_are_the_servers_truth(serve: Serve, configure: Configure,
     assert numbers["latency_p50_ms"] <= numbers["latency_p99_ms"]
 
 
-# -- what it survives -----------------------------------------------------------------------------------------------
+# -- faults --------------------------------------------------------------------------------------------------------
 
 
-def test_a_bad_network_is_survived_and_counted(serve: Serve, configure: Configure, until: Until) -> None:
+def test_network_faults_are_tolerated_and_counted(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(
         rate_hz=500.0,
         seed=3,
@@ -335,7 +335,7 @@ def test_a_bad_network_is_survived_and_counted(serve: Serve, configure: Configur
         assert frame.rigid_bodies[0].y_m == 0.25
 
 
-def test_datagrams_of_strangers_are_counted_and_ignored(serve: Serve, configure: Configure, until: Until) -> None:
+def test_foreign_datagrams_are_counted_and_ignored(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(rate_hz=30.0)
     received = Received()
     fake = encode_message(MessageId.FRAMEOFDATA, encode_frame(Frame(10**6), V41))
@@ -352,7 +352,7 @@ def test_datagrams_of_strangers_are_counted_and_ignored(serve: Serve, configure:
     assert all(frame.frame_number < 10**6 for frame, *_ in received.frames)
 
 
-def test_an_error_in_a_listener_ends_reception_and_is_kept(serve: Serve, configure: Configure, until: Until) -> None:
+def test_error_in_a_listener_ends_reception_and_is_stored(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve()
     received = Received()
     errors: list[Exception] = []
@@ -374,7 +374,7 @@ def test_an_error_in_a_listener_ends_reception_and_is_kept(serve: Serve, configu
         assert client.failure is None
 
 
-def test_nothing_is_left_behind(serve: Serve, configure: Configure, until: Until) -> None:
+def test_no_open_files_or_threads_remain_after_close(serve: Serve, configure: Configure, until: Until) -> None:
     folder = "/proc/self/fd"
     if not os.path.isdir(folder):
         pytest.skip("open files cannot be counted without /proc")

@@ -1,4 +1,4 @@
-"""What client, server, configuration and discovery say when something is not there or not possible."""
+"""Error messages of client, server, configuration and discovery."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def reason(config: MocapConfig) -> str:
     return caught.value.reasons[0]
 
 
-def test_why_there_is_no_connection(serve: Serve, configure: Configure) -> None:
-    deaf = serve(faults=ServerFaults(deaf=True))
+def test_missing_connection_is_reported_with_the_reason(serve: Serve, configure: Configure) -> None:
+    deaf = serve(faults=ServerFaults(no_answers=True))
     text = reason(configure(deaf, timeout_s=0.3))
     assert f"127.0.0.1:{deaf.command_port}" in text
     assert "Motive" in text
@@ -37,7 +37,7 @@ def test_why_there_is_no_connection(serve: Serve, configure: Configure) -> None:
     assert 'mode = "multicast"' in text
     text = reason(configure(serve(mode="unicast"), mode="multicast"))
     assert 'mode = "unicast"' in text
-    newer = serve(mode="multicast", faults=ServerFaults(silent=True))
+    newer = serve(mode="multicast", faults=ServerFaults(no_frames=True))
     newer.version = V42
     text = reason(configure(newer))
     for word in ("4.2", "2.6 to 4.1", "Transmission Type", "Unicast"):
@@ -63,7 +63,7 @@ def test_a_request_the_server_does_not_know(serve: Serve, configure: Configure) 
     with NatNetClient(configure(server)) as client:
         with pytest.raises(NotReadyError, match="does not know the request 'FrameRat'"):
             client.request("FrameRat")
-        server.faults = ServerFaults(deaf=True)
+        server.faults = ServerFaults(no_answers=True)
         with pytest.raises(NotReadyError, match="did not answer the request 'FrameRate'"):
             client.request("FrameRate", timeout_s=0.2)
 
@@ -74,7 +74,7 @@ def test_a_port_in_use(serve: Serve) -> None:
         serve(command_port=taken)
 
 
-def test_an_error_in_the_poses_ends_the_server_and_is_kept(serve: Serve, until: Until) -> None:
+def test_error_in_the_poses_ends_the_server_and_is_stored(serve: Serve, until: Until) -> None:
     def poses(t_s: float) -> list[None]:
         raise RuntimeError("no physics")
 
@@ -92,7 +92,7 @@ def test_an_error_in_the_poses_ends_the_server_and_is_kept(serve: Serve, until: 
         ({"multicast_group": "10.0.0.1"}, "224.0.0.0"),
     ],
 )
-def test_a_server_that_cannot_be(options: dict[str, Any], words: str) -> None:
+def test_invalid_server_options_are_refused(options: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         NatNetServer(lambda t_s: [None], **options)
 
@@ -115,7 +115,7 @@ def test_a_server_that_cannot_be(options: dict[str, Any], words: str) -> None:
         ({"pivot_in_base_link_m": (0.0, float("nan"), 0.0)}, "pivot_in_base_link_m"),
     ],
 )
-def test_a_configuration_that_cannot_be(options: dict[str, Any], words: str) -> None:
+def test_invalid_configurations_are_refused(options: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         MocapConfig(**options)
 
@@ -123,13 +123,13 @@ def test_a_configuration_that_cannot_be(options: dict[str, Any], words: str) -> 
 # -- discovery ------------------------------------------------------------------------------------------------------
 
 
-def test_servers_name_themselves(serve: Serve) -> None:
+def test_discovery_finds_the_server(serve: Serve) -> None:
     server = serve(mode="multicast", version="4.0")
     (found,) = discover("127.0.0.1", command_port=server.command_port, timeout_s=1.0)
     assert found.address == "127.0.0.1"
     assert (found.info.name, found.info.bitstream, found.info.data_port) == ("carlab emulator", V40, server.data_port)
     assert found.info.is_multicast
-    server.faults = ServerFaults(deaf=True)
+    server.faults = ServerFaults(no_answers=True)
     assert discover("127.0.0.1", command_port=server.command_port, timeout_s=0.1) == ()
     with pytest.raises(NotReadyError, match="network"):
         discover("no-such-host.invalid")

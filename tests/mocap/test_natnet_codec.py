@@ -1,4 +1,4 @@
-"""The codec against another decoder, hand-made bytes, and bytes of any kind."""
+"""The codec against an independent decoder, hand-made bytes and random bytes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def marker(number: int) -> LabelledMarker:
 
 
 def full_frame(version: BitstreamVersion) -> Frame:
-    """Something in every section; all numbers exact in float32."""
+    """A frame with entries in every section; all numbers are exact in float32."""
     return Frame(
         4711,
         (MarkerSet("car", ((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))), MarkerSet("Räder", ())),
@@ -120,11 +120,11 @@ PLATE = ForcePlateDescription(
 
 
 @pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
-def test_another_decoder_reads_our_frames(version: BitstreamVersion) -> None:
+def test_independent_decoder_reads_encoded_frames(version: BitstreamVersion) -> None:
     frame = full_frame(version)
     buffer = PacketBuffer(encode_frame(frame, version))
     theirs = DataFrame.read_from_buffer(buffer, Version(*version))
-    # It leaves the end-of-data tag and, in 4.1, does not know the precision timestamp of 8 bytes: it stops before.
+    # It ignores the end-of-data tag and, in 4.1, the precision timestamp of 8 bytes, so it stops before them.
     assert len(buffer.data) - buffer.pointer == (12 if version >= V41 else 4)
     assert theirs.prefix.frame_number == frame.frame_number
     assert [(s.model_name, s.marker_pos_list) for s in theirs.marker_sets] == [tuple(s) for s in frame.marker_sets]
@@ -160,7 +160,7 @@ def test_another_decoder_reads_our_frames(version: BitstreamVersion) -> None:
 
 
 @pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
-def test_another_decoder_reads_our_descriptions(version: BitstreamVersion) -> None:
+def test_independent_decoder_reads_encoded_descriptions(version: BitstreamVersion) -> None:
     models = full_models(version)
     buffer = PacketBuffer(encode_model_def(models, version))
     theirs = DataDescriptions.read_from_buffer(buffer, Version(*version))
@@ -180,7 +180,7 @@ def test_another_decoder_reads_our_descriptions(version: BitstreamVersion) -> No
 
 
 @pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
-def test_frames_and_descriptions_come_back(version: BitstreamVersion) -> None:
+def test_frames_and_descriptions_round_trip(version: BitstreamVersion) -> None:
     assert decode_frame(encode_frame(full_frame(version), version), version) == full_frame(version)
     models = (*full_models(version), PLATE)
     assert decode_model_def(encode_model_def(models, version), version) == models
@@ -194,8 +194,8 @@ def test_empty_frames_have_the_known_size(version: tuple[int, int], size: int) -
 
 
 @pytest.mark.parametrize(("minor", "size"), [(6, 46), (7, 50), (8, 50), (9, 54), (10, 54), (11, 58)])
-def test_frames_of_2_x_are_read(minor: int, size: int) -> None:
-    """By hand from the layout: no packet of 2.x was captured."""
+def test_frames_of_2_x_are_decoded(minor: int, size: int) -> None:
+    """Bytes made by hand from the layout, since no packet of 2.x was captured."""
     version = BitstreamVersion(2, minor)
     counts = {6: 5, 7: 5, 8: 5, 9: 6, 10: 6, 11: 7}[minor]
     stamp = struct.pack("<f" if minor == 6 else "<d", 2.5)
@@ -211,7 +211,7 @@ def test_frames_of_2_x_are_read(minor: int, size: int) -> None:
 
 
 @pytest.mark.parametrize("version", [(2, 5), (4, 2), (4, 3), (5, 0)])
-def test_other_versions_are_refused_with_the_remedy(version: tuple[int, int]) -> None:
+def test_unsupported_versions_are_refused_with_the_remedy(version: tuple[int, int]) -> None:
     with pytest.raises(ProtocolError) as caught:
         decode_frame(bytes(78), BitstreamVersion(*version))
     text = str(caught.value)
@@ -220,7 +220,7 @@ def test_other_versions_are_refused_with_the_remedy(version: tuple[int, int]) ->
     assert "Motive" in text
 
 
-def test_a_frame_of_another_version_is_named() -> None:
+def test_version_of_an_unexpected_frame_is_named() -> None:
     payload = encode_frame(full_frame(V30), V30)
     with pytest.raises(ProtocolError) as caught:
         decode_frame(payload, V41)
@@ -232,7 +232,7 @@ def test_a_frame_of_another_version_is_named() -> None:
     assert 'bitstream = "3.0"' in text
 
 
-def test_a_frame_of_an_old_version_is_named() -> None:
+def test_version_of_an_unexpected_old_frame_is_named() -> None:
     payload = struct.pack("<i", 7) + bytes(4 * 7) + struct.pack("<fIIdhi", 0.005, 0, 0, 2.5, 0, 0)
     with pytest.raises(ProtocolError) as caught:
         decode_frame(payload, V41)
@@ -241,7 +241,7 @@ def test_a_frame_of_an_old_version_is_named() -> None:
     assert 'bitstream = "2.11"' in text
 
 
-def test_garbage_keeps_its_own_error() -> None:
+def test_error_of_garbage_is_unchanged() -> None:
     with pytest.raises(ProtocolError) as caught:
         decode_frame(bytes(range(90)), V41)
     assert explain_frame_error(bytes(range(90)), V41, caught.value) is caught.value
@@ -282,7 +282,7 @@ def read_or_refuse(datagram: bytes) -> None:
 
 @given(st.binary(max_size=300))
 @settings(max_examples=200, deadline=None)
-def test_any_bytes_are_read_or_refused(data: bytes) -> None:
+def test_random_bytes_are_decoded_or_refused(data: bytes) -> None:
     read_or_refuse(data)
     for message_id in MESSAGE_IDS:
         read_or_refuse(encode_message(message_id, data))
@@ -290,7 +290,7 @@ def test_any_bytes_are_read_or_refused(data: bytes) -> None:
 
 @given(st.sampled_from([5, 7]), st.sampled_from(SERVED_BITSTREAMS), st.data())
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-def test_any_flipped_bits_are_read_or_refused(message_id: int, version: BitstreamVersion, data: st.DataObject) -> None:
+def test_flipped_bits_are_decoded_or_refused(message_id: int, version: BitstreamVersion, data: st.DataObject) -> None:
     if message_id == 7:
         datagram = bytearray(encode_message(7, encode_frame(full_frame(version), version)))
     else:
@@ -329,7 +329,7 @@ def test_servers_before_3_0_send_264_bytes() -> None:
 
 
 @pytest.mark.parametrize("datagram", ["0a000000", "0a00000000", "0a000400"], ids=["exact", "stray NUL", "claims four"])
-def test_a_server_takes_sloppy_keepalives(datagram: str) -> None:
+def test_server_accepts_keepalives_with_a_wrong_length(datagram: str) -> None:
     assert split_message(bytes.fromhex(datagram), lenient=True) == (10, b"")
 
 

@@ -1,11 +1,11 @@
-"""Another client, ``natnet`` 0.3.0 from PyPI, receives what the emulated server sends.
+"""An independent client, ``natnet`` 0.3.0 from PyPI, receives the frames of the emulated server.
 
 Limits of that client, which shape these tests:
 
-* It cannot ask for a version when it connects. Its ``protocol_version`` setter reads frames in flight with the new
-  decoder at once, and raises in its receiving thread when it meets an old one; so each version is the server's own.
-* In 4.1 it does not know the precision timestamp before the frame's parameters and reads those from it, so its
-  ``is_recording`` and ``tracked_models_changed`` mean nothing there; everything before is read.
+* It cannot request a version when it connects. Its ``protocol_version`` setter decodes frames in flight in the new
+  version at once and raises in its receiving thread for an old one; so each version is the server's native version.
+* In 4.1 it reads the frame's parameters from the precision timestamp, which it does not know, so its ``is_recording``
+  and ``tracked_models_changed`` are invalid; all fields before are decoded.
 * It does not check lengths or the end-of-data tag, and measures no latency.
 """
 
@@ -31,7 +31,7 @@ BODIES = (EmulatedBody("car", 7), EmulatedBody("trailer", 9))
 def receive(
     server: NatNetServer, mode: str, version: BitstreamVersion
 ) -> tuple[list[DataFrame], DataDescriptions, float]:
-    """Frames, descriptions and the seconds that the other client took to receive them."""
+    """Frames and descriptions that the independent client received, and the time that it took [s]."""
     frames: list[DataFrame] = []
     models: list[DataDescriptions] = []
     done, described = threading.Event(), threading.Event()
@@ -87,7 +87,7 @@ def check_frame(frame: DataFrame, truth: list[RigidBodySample | None], server: N
 @pytest.mark.realtime
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
 @pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
-def test_another_client_receives_our_frames(
+def test_independent_client_receives_the_frames(
     serve: Callable[..., NatNetServer], mode: str, version: BitstreamVersion
 ) -> None:
     sent: dict[int, list[RigidBodySample | None]] = {}
@@ -117,7 +117,7 @@ def test_another_client_receives_our_frames(
     assert numbers == sorted(set(numbers))
     between = [n for n in list(sent) if numbers[0] <= n <= numbers[-1]]
     assert len(numbers) > 0.95 * len(between)
-    # Connecting takes it 0.1 s or more, and where the machine stalls the server skips frames.
+    # It takes 0.1 s or more to connect, and the server skips frames on a busy machine.
     assert 100.0 < len(numbers) / elapsed_s < 260.0
 
     for frame in frames:

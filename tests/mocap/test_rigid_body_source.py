@@ -1,4 +1,4 @@
-"""One rigid body as a pose source: axes and offsets against scipy, times, sequences, what it says when it cannot."""
+"""One rigid body as a pose source: axes and offsets against scipy, times, sequences, error messages."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Serve = Callable[..., NatNetServer]
 Configure = Callable[..., MocapConfig]
 Until = Callable[[Callable[[], bool]], None]
 
-# Y up to Z up: a quarter turn about x.
+# Y up to Z up: a rotation by 90 degrees about x.
 UP = Rotation.from_euler("x", 90, degrees=True)
 numbers = st.floats(-3.0, 3.0)
 vectors = st.tuples(numbers, numbers, numbers)
@@ -62,7 +62,7 @@ def test_base_link_agrees_with_scipy(position: Any, turn: Rotation, yaw_offset_r
     q = tuple(map(float, turn.as_quat()))
     origin, yaw_rad = axes.base_link_pose(position, q, yaw_offset_rad, pivot)  # type: ignore[arg-type]
     base = turn * Rotation.from_euler("z", yaw_offset_rad)
-    # The pivot, seen from the base_link that was found, is where the body is.
+    # The pivot, transformed from the found base_link, is at the body's position.
     assert np.asarray(origin) + base.apply(pivot) == pytest.approx(position, abs=1e-9)
     forward = base.apply([1.0, 0.0, 0.0])
     assert math.hypot(*forward[:2]) * math.cos(yaw_rad) == pytest.approx(forward[0], abs=1e-9)
@@ -97,7 +97,7 @@ def test_the_pose_of_base_link(serve: Serve, configure: Configure, up_axis: str)
         assert source.problems() == ()
 
 
-def test_the_wrong_up_axis_is_suspected(serve: Serve, configure: Configure, until: Until) -> None:
+def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Until) -> None:
     def tumbled(t_s: float) -> list[RigidBodySample]:
         return [RigidBodySample(t_s, (0.0, 0.0, 0.5), tuple(Rotation.from_euler("x", 60, degrees=True).as_quat()))]
 
@@ -117,8 +117,8 @@ def test_the_wrong_up_axis_is_suspected(serve: Serve, configure: Configure, unti
 
 
 @pytest.mark.parametrize("version", ["3.0", "4.1"])
-def test_capture_times_are_the_truth(serve: Serve, configure: Configure, until: Until, version: str) -> None:
-    """By the x that the server gives a pose, its exposure is known on the host's monotonic clock."""
+def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, until: Until, version: str) -> None:
+    """The x of a pose encodes its true time of exposure on the host's monotonic clock."""
     server = serve(version=version, faults=ServerFaults(clock_offset_s=-321.0, clock_drift_ppm=30.0, latency_s=0.02))
     before_s = time.monotonic()
     with RigidBodyPoseSource(configure(server)) as source:
@@ -132,7 +132,7 @@ def test_capture_times_are_the_truth(serve: Serve, configure: Configure, until: 
 
 
 def test_latest_since_and_wait_for(serve: Serve, configure: Configure, until: Until) -> None:
-    source = RigidBodyPoseSource(configure(serve()), samples_kept=16)
+    source = RigidBodyPoseSource(configure(serve()), max_samples=16)
     assert source.latest() is None
     assert source.since(-1) == ()
     assert source.wait_for(0, 0.0) is None
@@ -149,10 +149,10 @@ def test_latest_since_and_wait_for(serve: Serve, configure: Configure, until: Un
         assert sequences == sorted(set(sequences))
         assert [s.sequence for s in source.since(sequences[-4])][:3] == sequences[-3:]
         assert source.wait_for(10**9, 0.01) is None
-    assert source.latest() is not None  # what was received stays readable
+    assert source.latest() is not None  # received samples stay readable
 
 
-def test_many_may_wait_at_once(serve: Serve, configure: Configure) -> None:
+def test_several_threads_can_wait(serve: Serve, configure: Configure) -> None:
     with RigidBodyPoseSource(configure(serve())) as source:
         found: list[PoseSample | None] = []
         threads = [threading.Thread(target=lambda: found.append(source.wait_for(20, 30.0))) for _ in range(4)]
@@ -177,7 +177,7 @@ def test_tracking_lost_holds_the_last_pose(serve: Serve, configure: Configure, u
         until(lambda: source.latest().tracked)  # type: ignore[union-attr]
 
 
-def test_a_pose_that_is_no_pose_is_not_tracked(serve: Serve, configure: Configure, until: Until) -> None:
+def test_invalid_pose_is_not_tracked(serve: Serve, configure: Configure, until: Until) -> None:
     quaternion = [(0.0, 0.0, 0.0, 1.0)]
     place = [(1.0, 2.0, 0.0)]
     server = serve(lambda t_s: [RigidBodySample(t_s, place[0], quaternion[0])])
@@ -189,7 +189,7 @@ def test_a_pose_that_is_no_pose_is_not_tracked(serve: Serve, configure: Configur
         until(lambda: source.statistics()["unusable"] > count + 3.0)
         assert pose(source.latest()) == pytest.approx((1.0, 2.0, 0.0, 0.0), abs=1e-6)
         assert not source.latest().tracked  # type: ignore[union-attr]
-        assert "no pose" in source.problems()[0]
+        assert "invalid pose" in source.problems()[0]
 
 
 def test_a_body_that_disappears_and_returns(serve: Serve, configure: Configure, until: Until) -> None:
@@ -197,7 +197,7 @@ def test_a_body_that_disappears_and_returns(serve: Serve, configure: Configure, 
     with RigidBodyPoseSource(configure(server, body="car")) as source:
         server.set_bodies((EmulatedBody("lorry", 5),))
         until(lambda: source.statistics()["missing"] > 0.0 and bool(source.problems()))
-        assert "no longer knows the body" in source.problems()[0]
+        assert "no longer has the body" in source.problems()[0]
         assert not source.latest().tracked  # type: ignore[union-attr]
         server.set_bodies((EmulatedBody("car", 8),))
         until(lambda: source.latest().tracked)  # type: ignore[union-attr]
@@ -214,7 +214,7 @@ def test_the_body_is_chosen_by_name_or_id(serve: Serve, configure: Configure) ->
     for choice, x_m in (({"body": "car"}, 1.0), ({"body": "trailer"}, 2.0), ({"body_id": 4}, 2.0)):
         with RigidBodyPoseSource(configure(server, **choice)) as source:
             assert pose(source.latest())[0] == x_m
-    for choice, named in (({"body": "truck"}, "'truck'"), ({"body_id": 77}, "77"), ({}, "by itself")):
+    for choice, named in (({"body": "truck"}, "'truck'"), ({"body_id": 77}, "77"), ({}, "the only one")):
         source = RigidBodyPoseSource(configure(server, **choice))
         with pytest.raises(NotReadyError) as caught:
             source.open()
@@ -223,7 +223,7 @@ def test_the_body_is_chosen_by_name_or_id(serve: Serve, configure: Configure) ->
             assert word in text
 
 
-def test_no_body_and_two_of_a_name() -> None:
+def test_missing_body_and_duplicate_names_are_reported() -> None:
     with pytest.raises(NotReadyError, match="streams none: create one in Motive"):
         select_body((MarkerSetDescription("all", ()),), MocapConfig())
     twins = (RigidBodyDescription("car", 1), RigidBodyDescription("car", 2))
@@ -249,13 +249,13 @@ def no_pose(config: MocapConfig) -> str:
     source = RigidBodyPoseSource(config)
     with pytest.raises(NotReadyError) as caught:
         source.open()
-    source.close()  # safe after an open that stopped half way
+    source.close()  # safe after a failed open
     assert len(caught.value.reasons) == 1
     return caught.value.reasons[0]
 
 
-def test_why_there_is_no_pose(serve: Serve, configure: Configure) -> None:
-    server = serve(faults=ServerFaults(silent=True))
+def test_missing_pose_is_reported_with_the_reason(serve: Serve, configure: Configure) -> None:
+    server = serve(faults=ServerFaults(no_frames=True))
     assert "no frame came within 0.3 s" in no_pose(configure(server, timeout_s=0.3))
     server.faults = ServerFaults(frame_version=BitstreamVersion(3, 0))
     text = no_pose(configure(server, timeout_s=0.5))
@@ -267,7 +267,7 @@ def test_why_there_is_no_pose(serve: Serve, configure: Configure) -> None:
 
 
 def test_frames_from_another_address_are_named(serve: Serve, configure: Configure) -> None:
-    """A computer with two addresses that answers from one and sends frames from the other."""
+    """A computer with two addresses: it answers from one and sends frames from the other."""
     server = serve(rate_hz=100.0)
     assert server._data is not None
     port = server._data.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Clock alignment, stream statistics and the client's timetable, on made-up times."""
+"""Clock alignment, stream statistics and the client's message schedule, on synthetic times."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from mocap.natnet.message_schedule import MessageSchedule
 from mocap.natnet.models import MessageId
-from mocap.natnet.upkeep import Upkeep
 from mocap.stream_statistics import StreamStatistics
 from mocap.time_alignment import ClockAlignment
 
@@ -16,7 +16,7 @@ CLOCK_HZ = 10_000_000.0
 
 
 class ServerClock:
-    """A clock that is offset from the host's and runs too fast by so many ppm."""
+    """A clock with an offset and a rate error (positive: fast) relative to the host's."""
 
     def __init__(self, offset_s: float, ppm: float) -> None:
         self.offset_s, self.ppm = offset_s, ppm
@@ -29,7 +29,7 @@ def echo(alignment: ClockAlignment, clock: ServerClock, sent_s: float, out_s: fl
     alignment.add_echo(sent_s, clock.ticks(sent_s + out_s), sent_s + out_s + back_s)
 
 
-def test_nothing_is_known_before_the_first_echo() -> None:
+def test_alignment_is_unknown_before_the_first_echo() -> None:
     alignment = ClockAlignment(CLOCK_HZ)
     assert not alignment.is_aligned
     assert math.isnan(alignment.to_host_s(5))
@@ -38,7 +38,7 @@ def test_nothing_is_known_before_the_first_echo() -> None:
 
 @pytest.mark.parametrize("offset_s", [-90.0, 0.0, 4.2e5])
 @pytest.mark.parametrize("out_s", [1e-5, 5e-4, 9.9e-4])
-def test_one_echo_is_wrong_by_half_the_round_trip_at_most(offset_s: float, out_s: float) -> None:
+def test_error_of_one_echo_is_at_most_half_the_round_trip(offset_s: float, out_s: float) -> None:
     clock, alignment = ServerClock(offset_s, 0.0), ClockAlignment(CLOCK_HZ)
     echo(alignment, clock, 100.0, out_s, 1e-3 - out_s)
     assert abs(alignment.to_host_s(clock.ticks(100.1)) - 100.1) <= 0.5e-3 + 1e-6
@@ -47,7 +47,7 @@ def test_one_echo_is_wrong_by_half_the_round_trip_at_most(offset_s: float, out_s
 
 @pytest.mark.parametrize("ppm", [-30.0, 0.0, 30.0])
 def test_drift_and_jitter(rng: np.random.Generator, ppm: float) -> None:
-    """100 s of echoes, 4 a second, each way 0.2 ms and an exponential queue of 1 ms in the mean."""
+    """100 s of echoes at 4 Hz; each way takes 0.2 ms plus an exponential queueing delay of 1 ms in the mean."""
     clock, alignment = ServerClock(1234.5, ppm), ClockAlignment(CLOCK_HZ)
     errors_s = []
     for t_s in np.arange(50.0, 150.0, 0.25):
@@ -56,12 +56,12 @@ def test_drift_and_jitter(rng: np.random.Generator, ppm: float) -> None:
         at_s = float(t_s) + 0.2
         errors_s.append(abs(alignment.to_host_s(clock.ticks(at_s)) - at_s))
     assert max(errors_s) < 5e-3
-    assert max(errors_s[60:]) < 5e-4  # a line through many is better than half of one round trip
+    assert max(errors_s[60:]) < 5e-4  # a line through many echoes has a smaller error than one echo
     assert alignment.drift_ppm == pytest.approx(-ppm, abs=8.0)
     assert alignment.resets == 0
 
 
-def test_drift_alone_is_followed() -> None:
+def test_drift_without_jitter_is_tracked() -> None:
     clock, alignment = ServerClock(0.0, 30.0), ClockAlignment(CLOCK_HZ)
     for t_s in np.arange(10.0, 40.0, 0.25):
         echo(alignment, clock, float(t_s), 1e-4, 1e-4)
@@ -69,14 +69,14 @@ def test_drift_alone_is_followed() -> None:
     assert alignment.to_host_s(clock.ticks(50.0)) == pytest.approx(50.0, abs=2e-5)
 
 
-def test_a_clock_set_anew_is_believed_after_three_echoes() -> None:
+def test_clock_step_is_accepted_after_three_echoes() -> None:
     before, after, alignment = ServerClock(1000.0, 0.0), ServerClock(7.0, 0.0), ClockAlignment(CLOCK_HZ)
     for i in range(20):
         echo(alignment, before, 10.0 + 0.25 * i, 1e-4, 1e-4)
     echo(alignment, after, 20.0, 1e-4, 1e-4)
     assert alignment.is_uncertain
     assert alignment.to_host_s(before.ticks(20.0)) == pytest.approx(20.0, abs=1e-4)
-    echo(alignment, before, 20.1, 1e-4, 1e-4)  # it was a stray: the alignment is certain again
+    echo(alignment, before, 20.1, 1e-4, 1e-4)  # a single deviating echo does not change the alignment
     assert not alignment.is_uncertain
     for i in range(3):
         echo(alignment, after, 21.0 + 0.02 * i, 1e-4, 1e-4)
@@ -103,11 +103,11 @@ def test_exposure() -> None:
     echo(alignment, clock, 29.0, 1e-4, 1e-4)
     aligned = alignment.exposure(exposed, sent, 30.005)
     assert (aligned.capture_s, aligned.on_server_s) == (pytest.approx(30.0, abs=1e-6), pytest.approx(0.004))
-    assert (aligned.is_aligned, aligned.is_odd) == (True, False)
-    waited = alignment.exposure(exposed, sent, 33.0)  # an old frame stays old
-    assert (waited.capture_s, waited.is_odd) == (pytest.approx(30.0, abs=1e-6), True)
+    assert (aligned.is_aligned, aligned.is_inconsistent) == (True, False)
+    waited = alignment.exposure(exposed, sent, 33.0)  # a delayed frame keeps its time
+    assert (waited.capture_s, waited.is_inconsistent) == (pytest.approx(30.0, abs=1e-6), True)
     ahead = alignment.exposure(clock.ticks(90.0), clock.ticks(90.004), 30.005)
-    assert (ahead.capture_s, ahead.is_aligned, ahead.is_odd) == (pytest.approx(30.001), False, True)
+    assert (ahead.capture_s, ahead.is_aligned, ahead.is_inconsistent) == (pytest.approx(30.001), False, True)
     unsent = alignment.exposure(exposed, 0, 30.005)
     assert (unsent.capture_s, unsent.on_server_s) == (pytest.approx(30.0, abs=1e-6), 0.0)
     mixed = alignment.exposure(exposed, clock.ticks(3000.0), 30.005)
@@ -123,7 +123,7 @@ def accepted(numbers: list[int]) -> tuple[list[int | None], dict[str, float]]:
     return sequences, statistics.as_mapping()
 
 
-def test_every_fate_of_a_frame_is_counted() -> None:
+def test_lost_late_and_repeated_frames_are_counted() -> None:
     sequences, counts = accepted([10, 11, 13, 12, 13, 11, 16, 17])
     assert sequences == [10, 11, 13, None, None, None, 16, 17]
     assert counts["frames"] == 5.0
@@ -134,8 +134,8 @@ def test_every_fate_of_a_frame_is_counted() -> None:
 
 
 @pytest.mark.parametrize("before", [40, 5000])
-def test_a_server_that_counts_anew(before: int) -> None:
-    """Sequence numbers go on growing, also where so few frames came before that the new ones look late."""
+def test_sequence_numbers_increase_after_a_restarted_count(before: int) -> None:
+    """Sequence numbers keep increasing, also if the new numbers look like those of late frames."""
     sequences, counts = accepted([*range(before), *range(30)])
     given = [s for s in sequences if s is not None]
     assert given == sorted(set(given))
@@ -163,36 +163,36 @@ def test_latency_percentiles() -> None:
     assert numbers["server_latency_p50_ms"] == pytest.approx(0.1)
 
 
-# -- timetable ------------------------------------------------------------------------------------------------------
+# -- schedule -------------------------------------------------------------------------------------------------------
 
 
-def sent_in(upkeep: Upkeep, start_s: float, stop_s: float, **state: bool) -> list[MessageId]:
-    return [m for t in np.arange(start_s, stop_s, 0.01) for m in upkeep.due(float(t), **state)]
+def sent_in(schedule: MessageSchedule, start_s: float, stop_s: float, **state: bool) -> list[MessageId]:
+    return [m for t in np.arange(start_s, stop_s, 0.01) for m in schedule.due(float(t), **state)]
 
 
-def test_timetable() -> None:
-    upkeep = Upkeep(keepalives=True)
-    sent = sent_in(upkeep, 100.0, 103.995, has_clock=True, settled=True)
+def test_message_schedule() -> None:
+    schedule = MessageSchedule(keepalives=True)
+    sent = sent_in(schedule, 100.0, 103.995, has_clock=True, settled=True)
     assert sent.count(MessageId.KEEPALIVE) == 4
     assert 15 <= sent.count(MessageId.ECHOREQUEST) <= 16
     assert MessageId.CONNECT not in sent
-    upkeep.heard_frame(104.0)
-    assert not upkeep.reconnecting
-    sent = sent_in(upkeep, 104.0, 110.5, has_clock=False, settled=True)
+    schedule.note_frame(104.0)
+    assert not schedule.reconnecting
+    sent = sent_in(schedule, 104.0, 110.5, has_clock=False, settled=True)
     assert sent.count(MessageId.CONNECT) == 3
-    assert upkeep.reconnecting
+    assert schedule.reconnecting
     assert MessageId.ECHOREQUEST not in sent
-    upkeep.heard_server(110.5)
-    assert not upkeep.reconnecting
-    unsettled = sent_in(Upkeep(keepalives=False), 100.0, 101.0, has_clock=True, settled=False)
+    schedule.note_server_info(110.5)
+    assert not schedule.reconnecting
+    unsettled = sent_in(MessageSchedule(keepalives=False), 100.0, 101.0, has_clock=True, settled=False)
     assert 30 <= unsettled.count(MessageId.ECHOREQUEST) <= 51
     assert MessageId.KEEPALIVE not in unsettled
 
 
-def test_models_are_asked_for_until_they_come_once_a_second_at_most() -> None:
-    upkeep = Upkeep(keepalives=False)
-    assert sent_in(upkeep, 10.0, 11.0, has_clock=False, settled=True) == []
-    upkeep.models_wanted = True
-    assert sent_in(upkeep, 11.0, 13.995, has_clock=False, settled=True) == [MessageId.REQUEST_MODELDEF] * 3
-    upkeep.models_wanted = False
-    assert sent_in(upkeep, 14.0, 16.0, has_clock=False, settled=True) == []
+def test_models_are_requested_once_a_second_until_they_arrive() -> None:
+    schedule = MessageSchedule(keepalives=False)
+    assert sent_in(schedule, 10.0, 11.0, has_clock=False, settled=True) == []
+    schedule.models_outdated = True
+    assert sent_in(schedule, 11.0, 13.995, has_clock=False, settled=True) == [MessageId.REQUEST_MODELDEF] * 3
+    schedule.models_outdated = False
+    assert sent_in(schedule, 14.0, 16.0, has_clock=False, settled=True) == []

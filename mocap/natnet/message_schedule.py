@@ -1,4 +1,4 @@
-"""What a NatNet client must send to stay served, and when. Pure: times are arguments."""
+"""Schedule of the messages of a connected NatNet client. Pure: times are arguments."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from mocap.natnet.models import MessageId
 KEEPALIVE_PERIOD_S = 1.0
 ECHO_PERIOD_S = 0.25
 FIRST_ECHO_PERIOD_S = 0.02
-"""Between echoes while the clocks are not aligned yet, or no longer."""
+"""Period of echoes until the clocks are aligned, or aligned again [s]."""
 RECONNECT_PERIOD_S = 2.0
-"""After so long without a frame the server may have been restarted and know nothing of this client."""
+"""Time without a frame after which the client reconnects, since the server may have been restarted [s]."""
 MODELS_PERIOD_S = 1.0
 
 
-class Upkeep:
-    """Timetable of keep-alives, echoes, repeated connects and requests for models that changed.
+class MessageSchedule:
+    """Schedule of keep-alives, echoes, reconnects and requests for changed models.
 
-    ``models_wanted`` is set while frames say that models changed and cleared when models come: a request that is
-    lost is sent again, and a change during another one is seen.
+    ``models_outdated`` is set by frames with the models-changed flag and cleared when models arrive, so that a lost
+    request is repeated and a further change is noticed.
     """
 
     def __init__(self, *, keepalives: bool) -> None:
-        self.models_wanted = False
+        self.models_outdated = False
         self.reconnecting = False
         self._keepalives = keepalives
         self._next_keepalive_s = self._next_echo_s = self._next_models_s = -math.inf
         self._next_connect_s = math.inf
 
-    def heard_frame(self, now_s: float) -> None:
-        """The server serves."""
+    def note_frame(self, now_s: float) -> None:
+        """Note a frame at ``now_s``."""
         self._next_connect_s = now_s + RECONNECT_PERIOD_S
 
-    def heard_server(self, now_s: float) -> None:
-        """The server answered a connect."""
+    def note_server_info(self, now_s: float) -> None:
+        """Note an answer to CONNECT at ``now_s``."""
         self.reconnecting = False
         self._next_connect_s = min(self._next_connect_s, now_s + RECONNECT_PERIOD_S)
 
-    def hurry_echo(self, now_s: float) -> None:
-        """The clocks look wrong: echo soon."""
+    def advance_echo(self, now_s: float) -> None:
+        """Send the next echo soon, since the clocks may be misaligned."""
         self._next_echo_s = min(self._next_echo_s, now_s + FIRST_ECHO_PERIOD_S)
 
     def due(self, now_s: float, *, has_clock: bool, settled: bool) -> list[MessageId]:
-        """What to send now; it counts as sent. ``settled`` clocks are asked less often."""
+        """Messages to send now; they count as sent. Echoes are less frequent if the clock is ``settled``."""
         messages = []
         if self._keepalives and now_s >= self._next_keepalive_s:
             self._next_keepalive_s = now_s + KEEPALIVE_PERIOD_S
@@ -55,7 +55,7 @@ class Upkeep:
             self._next_connect_s = now_s + RECONNECT_PERIOD_S
             self.reconnecting = True
             messages.append(MessageId.CONNECT)
-        if self.models_wanted and now_s >= self._next_models_s:
+        if self.models_outdated and now_s >= self._next_models_s:
             self._next_models_s = now_s + MODELS_PERIOD_S
             messages.append(MessageId.REQUEST_MODELDEF)
         return messages
