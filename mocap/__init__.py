@@ -19,7 +19,7 @@ _MODULES = {
     "ClockAlignment": "time_alignment",
     "DiscoveredServer": "natnet.discovery",
     "MocapConfig": "config",
-    "NatNetClient": "natnet.client",
+    "NatNetClient": "natnet_client",
     "RigidBodyPoseSource": "rigid_body",
     "discover": "natnet.discovery",
 }

@@ -1,4 +1,4 @@
-"""The only place that knows concrete cars: a name or a car file becomes a Car."""
+"""Concrete cars: builds a Car from a name or a car file. No other package depends on concrete cars."""
 
 from carlab.cars.car_file import CarFile, RealCar, default_car, is_preset, load_car_file
 from carlab.cars.choice import CarChoice, choose_car

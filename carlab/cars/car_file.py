@@ -1,4 +1,4 @@
-"""The car file (TOML): a simulator's parameters, and under ``[hardware]`` the real car they describe."""
+"""The car file (TOML): parameters of a simulator, and under ``[hardware]`` the configuration of the real car."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ARMING = tuple(f.name for f in fields(HardwareConfig) if f.name.startswith("arm
 
 @dataclass(frozen=True, slots=True)
 class RealCar:
-    """What ``[hardware]`` holds: actuator and calibration, motion capture, and the limits of the safety gate."""
+    """Contents of ``[hardware]``: actuator and calibration, motion capture, and the limits of the safety gate."""
 
     name: str
     hardware: HardwareConfig
@@ -33,7 +33,7 @@ class RealCar:
 
 @dataclass(frozen=True, slots=True)
 class CarFile:
-    """One car file: its text, the simulator in it, and the real car where it has one."""
+    """A car file: its text, its simulator, and its real car (None without ``[hardware]``)."""
 
     name: str
     text: str
@@ -41,9 +41,9 @@ class CarFile:
     real: RealCar | None
 
     def save(self, path: Path | str) -> Path:
-        """Write the file as TOML, replacing one that is there; returns the path.
+        """Write the file as TOML, replacing an existing file; returns the path.
 
-        Raises DataError where it cannot be written.
+        Raises DataError if it cannot be written.
         """
         import tomli_w
 
@@ -54,7 +54,7 @@ class CarFile:
 
 
 def load_car_file(path: Path) -> CarFile:
-    """Read a car file, or one of the cars that come with the package by its bare name (``preset_names``).
+    """Read a car file, or a preset by its bare name (``preset_names``).
 
     Raises ConfigError for a missing file, bad TOML, an unknown key or an impossible value.
     """
@@ -64,16 +64,16 @@ def load_car_file(path: Path) -> CarFile:
         return CarFile(name, text, SimulatorConfig.from_preset(name), None)
     if not path.is_file():
         raise ConfigError(
-            f"There is no car file '{path}'; name a TOML file that is there, or a car that comes with carlab: "
+            f"There is no car file '{path}'; name an existing TOML file or one of the presets: "
             f"{', '.join(preset_names())}."
         )
     try:
         text = path.read_text(encoding="utf-8")
         tables = tomllib.loads(text)
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not a text file; a car file is TOML.") from error
+        raise ConfigError(f"{path} is not a text file; name a car file in TOML.") from error
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}.") from error
+        raise ConfigError(f"{path} is not valid TOML ({error}); correct it.") from error
     check_keys(tables, (*TABLES, "hardware"), str(path))
     hardware = tables.pop("hardware", None)
     simulator = SimulatorConfig.from_tables(tables, str(path))
@@ -82,12 +82,12 @@ def load_car_file(path: Path) -> CarFile:
 
 
 def is_preset(path: Path) -> bool:
-    """Whether this is the bare name of a car that comes with the package, and no file of that name is there."""
+    """Whether this is the bare name of a preset and no file of that name exists."""
     return str(path) in preset_names() and not path.is_file()
 
 
 def default_car() -> CarFile:
-    """The car that sim and emulated drive by default."""
+    """The default car of ``--car sim`` and ``emulated``."""
     return CarFile("rc_car", "", SimulatorConfig.from_preset(), None)
 
 
@@ -110,7 +110,7 @@ def _real_car(tables: Any, path: Path) -> RealCar:
     envelope = from_table(SafetyEnvelope, limits, f"[hardware.limits] of {path}")
     if "corners_m" not in arena:
         raise ConfigError(
-            f"[hardware.arena] of {path} is missing; list the corners the car must stay in, "
+            f"[hardware.arena] of {path} is missing; list the corners of the area in which the car must stay, "
             "for example corners_m = [[-2, -2], [2, -2], [2, 2], [-2, 2]]."
         )
     hardware = HardwareConfig(

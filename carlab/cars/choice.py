@@ -1,4 +1,4 @@
-"""``--car sim``, ``emulated``, ``emulated-can``, a plug-in, the name of a car that comes along, or a car file."""
+"""The cars of ``--car``: sim, emulated, emulated-can, a plug-in, a preset, or a car file."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ PLUGIN_GROUP = "carlab.cars"
 
 @dataclass(slots=True)
 class CarChoice:
-    """A car that is built and not yet open, with what an episode on it needs to know.
+    """A car that is built but not open, with the settings for an episode.
 
-    ``log_to`` tells an emulated car where to write what its firmware saw; others ignore it. ``as_sent`` is what the
-    wire would make of an action, for a dry run.
+    ``log_to`` sets the folder for the firmware log of an emulated car; other cars ignore it. ``as_sent`` maps an
+    action to the action that the car would send (rounded by the calibration), for a dry run.
     """
 
     car: Car
@@ -47,21 +47,21 @@ def choose_car(
     seed: int = 0,
     log_folder: Path | None = None,
 ) -> CarChoice:
-    """Build the car that ``--car`` names; nothing is opened.
+    """Build the car of ``--car`` without opening it.
 
     Args:
         name: sim, emulated, emulated-can, the name of a plug-in (entry point group ``carlab.cars``: a callable that
-            takes a CarFile and a seed and returns a CarChoice), a car that comes with the package (simulated),
+            takes a CarFile and a seed and returns a CarChoice), a preset (simulated),
             the path of a car file, or a car file that was read.
         vehicle: car file whose physics sim, emulated and plug-ins use; the default car without it.
-        reality: car file whose physics a simulated or emulated car has in truth, while ``CarChoice.simulator`` and the
-            recordings keep what the other file says; the same file without it.
-        dry_run: swallow commands.
+        reality: car file with the true physics of a simulated or emulated car, while ``CarChoice.simulator`` and the
+            recordings keep the parameters of the other file; by default the same file.
+        dry_run: discard commands.
         seed: of the sensors' noise.
         log_folder: where an emulated car writes its log.
 
     Raises:
-        ConfigError: there is no such car, or its file is wrong.
+        ConfigError: unknown car, or an error in its file.
     """
     choice = _choose(name, vehicle, reality, seed)
     if log_folder is not None:
@@ -82,11 +82,11 @@ def _choose(
         return BUILT_IN[name](default_car() if vehicle is None else _read(vehicle), seed, truth)
     if isinstance(name, str) and name in plugins:
         if truth is not None:
-            raise ConfigError(f"--reality goes with simulated and emulated cars; '{name}' has physics of its own.")
+            raise ConfigError(f"--reality needs a simulated or emulated car; '{name}' is a plug-in. Remove --reality.")
         choice: CarChoice = plugins[name].load()(default_car() if vehicle is None else _read(vehicle), seed)
         return choice
     if vehicle is not None:
-        raise ConfigError(f"--vehicle goes with --car sim or emulated; '{_name_of(name)}' is a car of its own.")
+        raise ConfigError(f"--vehicle needs --car sim or emulated; '{_name_of(name)}' is a car of its own.")
     if isinstance(name, str):
         path = Path(name)
         if path.suffix != ".toml" and not path.exists() and not is_preset(path):
@@ -98,7 +98,7 @@ def _choose(
     if file.real is None:
         return _simulated(file, seed, truth)
     if truth is not None:
-        raise ConfigError(f"--reality goes with simulated and emulated cars; '{_name_of(name)}' is a real one.")
+        raise ConfigError(f"--reality needs a simulated or emulated car; '{_name_of(name)}' is real. Remove --reality.")
     return _real(file, seed)
 
 

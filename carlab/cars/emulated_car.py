@@ -1,4 +1,4 @@
-"""A hardware car whose wire ends in emulators: the same driver code as a real one, down to the bytes."""
+"""A hardware car with emulators at the other end of the wire: it runs the driver code of a real car."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SETTLE_S = 0.15
 
 
 class EmulatedWorld:
-    """Owns the process with physics, fake firmware and NatNet server. ``open`` starts it and learns its addresses."""
+    """Client of the process with physics, emulated firmware and NatNet server; ``open`` starts the process."""
 
     def __init__(self, config: WorldConfig) -> None:
         self.config = config
@@ -44,10 +44,10 @@ class EmulatedWorld:
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
         self._pending = b""
-        self._asked = 0
+        self._request_id = 0
 
     def open(self) -> None:
-        """Start the process. Raises NotReadyError where it does not come up."""
+        """Start the process. Raises NotReadyError if it does not start."""
         if self._process is not None:
             return
         self._pending = b""
@@ -59,18 +59,18 @@ class EmulatedWorld:
             bufsize=0,
         )
         try:
-            self.addresses = self._ask(dataclasses.asdict(self.config), START_TIMEOUT_S)
+            self.addresses = self._exchange(dataclasses.asdict(self.config), START_TIMEOUT_S)
         except BaseException:
             self.close()
             raise
 
-    def ask(self, **request: Any) -> dict[str, Any]:
-        """Send a request and return its answer. Raises NotOpenError, or NotReadyError where no answer comes."""
-        self._asked += 1
-        return self._ask({**request, "id": self._asked}, ANSWER_TIMEOUT_S)
+    def request(self, **request: Any) -> dict[str, Any]:
+        """Send a request and return its answer. Raises NotOpenError, or NotReadyError without an answer."""
+        self._request_id += 1
+        return self._exchange({**request, "id": self._request_id}, ANSWER_TIMEOUT_S)
 
     def close(self) -> None:
-        """Tell the process to leave, and wait for it. Idempotent."""
+        """End the process and wait for it. Idempotent."""
         process, self._process = self._process, None
         if process is None:
             return
@@ -87,16 +87,16 @@ class EmulatedWorld:
             process.kill()
             process.wait()
 
-    def _ask(self, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+    def _exchange(self, request: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         with self._lock:
             if self._process is None:
-                raise NotOpenError("The emulated world is not open.")
+                raise NotOpenError("The emulated world is not open; open the car first.")
             assert self._process.stdin is not None
             assert self._process.stdout is not None
             try:
                 self._process.stdin.write(json.dumps(request).encode() + b"\n")
                 answer = json.loads(self._read_line(self._process.stdout.fileno(), timeout_s))
-                while answer.pop("id", None) != request.get("id"):  # an earlier one that came too late
+                while answer.pop("id", None) != request.get("id"):  # a late answer to an earlier request
                     answer = json.loads(self._read_line(self._process.stdout.fileno(), timeout_s))
             except NotReadyError:
                 raise
@@ -113,8 +113,8 @@ class EmulatedWorld:
             ready, _, _ = select.select([descriptor], [], [], max(deadline_s - clock.now_s(), 0.0))
             data = os.read(descriptor, 65536) if ready else b""
             if not data:
-                why = "it ended" if ready else f"no answer within {timeout_s:g} s"
-                raise NotReadyError("The emulated car's world does not answer", [f"{why}; the lines above say more."])
+                reason = "it has ended" if ready else f"no answer within {timeout_s:g} s"
+                raise NotReadyError("The emulated car's world does not answer", [f"{reason}; see the lines above."])
             self._pending += data
         line, self._pending = self._pending.split(b"\n", 1)
         return line
@@ -124,11 +124,10 @@ class EmulatedCar(Car):
     """``HardwareCar`` over a pty or CAN bus and NatNet on loopback, with the emulated world at the other end.
 
     Args:
-        file: whose physics and motion capture the world has.
+        file: car file with the physics and motion capture of the world.
         actuator: ``serial`` or ``can``.
-        seed: of the motion capture's noise.
-        reality: physics and motion capture of the world where they differ from the file's; nothing but the bytes on the
-            wire carries them to the driver.
+        seed: seed of the motion capture's noise.
+        reality: physics and motion capture of the world if they differ from the file's; the driver knows the file only.
         world: further options of the world (bitstream, multicast ...).
         actuator_options: further options of the actuator (rates, watchdog ...).
     """
@@ -156,25 +155,25 @@ class EmulatedCar(Car):
         self._car: HardwareCar | None = None
 
     def log_to(self, folder: Path) -> None:
-        """Write what the firmware hears and does to ``firmware.jsonl`` in a folder."""
+        """Write the firmware's log of commands and events to ``firmware.jsonl`` in a folder."""
         self._config = dataclasses.replace(self._config, log=str(folder / "firmware.jsonl"))
 
     @property
     def world(self) -> EmulatedWorld:
-        """The process behind the wire, to ask for its log or to break something. Raises NotOpenError."""
+        """The process with the emulators, for requests of its log or of faults. Raises NotOpenError."""
         if self._world is None:
             raise NotOpenError(f"{self.name} is not open; call open() first, or use it in a with block.")
         return self._world
 
     @property
     def hardware(self) -> HardwareCar:
-        """The car as the driver sees it. Raises NotOpenError."""
+        """The hardware car of the driver. Raises NotOpenError."""
         if self._car is None:
             raise NotOpenError(f"{self.name} is not open; call open() first, or use it in a with block.")
         return self._car
 
     def open(self) -> None:
-        """Start the world, then connect to it as to any hardware."""
+        """Start the world, then connect to it like to real hardware."""
         if self._car is not None:
             return
         if self._actuator == "can" and not self._config.can_channel:
@@ -188,14 +187,14 @@ class EmulatedCar(Car):
             self.close()
             raise
 
-    def _driver(self, there: Mapping[str, Any]) -> HardwareCar:
-        """The car as the driver of a real one would be, at the addresses of the world."""
-        options: dict[str, Any] = {"kind": "vesc_serial", "port": there["port"]}
+    def _driver(self, addresses: Mapping[str, Any]) -> HardwareCar:
+        """Create the hardware car for the addresses of the world."""
+        options: dict[str, Any] = {"kind": "vesc_serial", "port": addresses["port"]}
         if self._actuator == "can":
-            options = {"kind": "vesc_can", "interface": "udp_multicast", "channel": there["can_channel"]}
+            options = {"kind": "vesc_can", "interface": "udp_multicast", "channel": addresses["can_channel"]}
         mocap = MocapConfig(
             mode="multicast" if self._config.mode == "multicast" else "unicast",
-            command_port=there["command_port"],
+            command_port=addresses["command_port"],
             local_interface="127.0.0.1",
             bitstream=self._config.bitstream,
             body=BODY_NAME,
@@ -210,32 +209,32 @@ class EmulatedCar(Car):
         )
 
     def observe(self) -> Observation:
-        """The driver's."""
+        """Observe by the driver."""
         return self.hardware.observe()
 
     def arm(self) -> None:
-        """The driver's."""
+        """Arm the driver."""
         self.hardware.arm()
 
     def command(self, action: Action) -> Action:
-        """The driver's."""
+        """Command by the driver."""
         return self.hardware.command(action)
 
     def stop(self, *, planned: bool) -> None:
-        """The driver's."""
+        """Stop by the driver."""
         if self._car is not None:
             self._car.stop(planned=planned)
 
     def reset_fault(self) -> None:
-        """The driver's."""
+        """Reset a fault of the driver."""
         self.hardware.reset_fault()
 
     def health(self) -> Health:
-        """The driver's."""
+        """Health of the driver."""
         return Health(False, (f"{self.name} is not open.",)) if self._car is None else self._car.health()
 
     def place(self, state: CarState) -> bool:
-        """Put the car at ``state`` in its world and wait until nothing of the old place is in any window."""
+        """Put the car at ``state`` and wait until no pose of the old place is in a velocity window."""
         placed = self.hardware.place(state)
         if placed:
             self.clock.sleep_until(self.clock.now_s() + SETTLE_S)
@@ -243,7 +242,7 @@ class EmulatedCar(Car):
         return placed
 
     def close(self) -> None:
-        """Neutral, disconnect, and let the world end."""
+        """Send neutral, disconnect, and end the world."""
         car, self._car = self._car, None
         try:
             if car is not None:
@@ -254,12 +253,12 @@ class EmulatedCar(Car):
                 self._world = None
 
     def _place(self, state: CarState) -> bool:
-        self.world.ask(do="place", state=list(state.to_array()))
+        self.world.request(do="place", state=list(state.to_array()))
         return True
 
 
 def free_udp_port() -> int:
-    """A UDP port that is free right now."""
+    """A UDP port that is currently free."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

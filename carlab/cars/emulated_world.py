@@ -1,11 +1,11 @@
-"""The world of an emulated car, in a process of its own: physics, fake firmware and a NatNet server around it.
+"""The world of an emulated car in a separate process: physics, emulated firmware and a NatNet server.
 
-    actuator bytes (pty or CAN) ──> fake VESC ──> plant (physics, delays) ──> NatNet server ──> UDP frames
+    actuator bytes (pty or CAN) ──> emulated VESC ──> plant (physics, delays) ──> NatNet server ──> UDP frames
 
-Run as ``python -m carlab.cars.emulated_world``. The first line of standard input is the configuration, each further
-line a request; each gets one line of answer with its "id", all JSON, but for "leave", which ends the process. When
-standard input ends without it (its owner died), or the motor is still powered, the world stays until the firmware's
-own motor time-out has been seen, then leaves. It ignores ^C: its owner decides.
+``python -m carlab.cars.emulated_world`` runs it. The first line of standard input is the configuration, each further
+line a request in JSON; each request gets one line of JSON with its "id" as the answer, except "leave", which ends the
+process. If standard input ends without "leave" (the parent died), or the motor is still powered, the process waits for
+the firmware's motor time-out before it ends. It ignores ^C.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from sim_backends.plant import Plant
 from sim_backends.sensor import MocapSensor
 
 ERPM_PER_MPS = 3000.0
-LINGER_AFTER_TIMEOUT_S = 0.5
+WAIT_AFTER_TIMEOUT_S = 0.5
 BODY_NAME = "car"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class WorldConfig:
-    """What the world is made of. Ports of 0 are chosen and reported; ``can_channel`` is GROUP or GROUP:PORT."""
+    """Configuration of the world. Port 0 means any free port; ``can_channel`` is GROUP or GROUP:PORT."""
 
     simulator: Mapping[str, Any]
     actuator: str = "serial"
@@ -64,7 +64,7 @@ class WorldConfig:
 
 
 class World:
-    """Plant, firmware and NatNet server, wired together. ``with`` starts and stops them."""
+    """Plant, firmware and NatNet server, connected to each other. ``with`` starts and stops them."""
 
     def __init__(self, config: WorldConfig) -> None:
         simulator = SimulatorConfig.from_tables(config.simulator, "the emulated car")
@@ -119,7 +119,7 @@ class World:
 
     @property
     def addresses(self) -> dict[str, Any]:
-        """Where a host finds everything."""
+        """Ports and channel for a host."""
         serial = isinstance(self.firmware, SerialFirmware)
         return {
             "port": self.firmware.port if isinstance(self.firmware, SerialFirmware) else "",
@@ -130,7 +130,7 @@ class World:
         }
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Do what a request asks for; the answer is ready for JSON."""
+        """Execute a request; returns the answer as JSON values."""
         match request.get("do"):
             case "place":
                 with self._lock:
@@ -155,17 +155,17 @@ class World:
             case "mocap":
                 self.server.faults = ServerFaults(**request["faults"])
             case other:
-                return {"error": f"The emulated world cannot do '{other}'."}
+                return {"error": f"The emulated world has no request '{other}'; use state, for example."}
         return {"t_s": self.clock.now_s()}
 
     @property
     def is_driven(self) -> bool:
-        """Whether the motor is powered: its firmware has heard neither neutral nor, for long enough, nothing."""
+        """Whether the motor is powered: neither neutral nor a time-out has released it."""
         return self._command.throttle != 0.0
 
-    def linger(self) -> None:
-        """Stay until the firmware has timed out, as the hardware would be seen to do."""
-        deadline_s = self.clock.now_s() + self.config.motor_timeout_s + LINGER_AFTER_TIMEOUT_S
+    def wait_for_motor_timeout(self) -> None:
+        """Wait until the firmware's time-out has released the motor, like real hardware."""
+        deadline_s = self.clock.now_s() + self.config.motor_timeout_s + WAIT_AFTER_TIMEOUT_S
         while self.clock.now_s() < deadline_s:
             self.clock.sleep_until(self.clock.now_s() + 0.05)
 
@@ -208,10 +208,10 @@ def main() -> int:
         world = World(config)
         world.__enter__()
     except (CarlabError, OSError) as error:
-        _say({"error": str(error)})
+        _write_answer({"error": str(error)})
         return 1
     try:
-        _say(world.addresses)
+        _write_answer(world.addresses)
         pending = b""
         while True:
             select.select([0], [], [])
@@ -222,22 +222,22 @@ def main() -> int:
             requests = [json.loads(line) for line in lines]
             if any(request.get("do") == "leave" for request in requests):
                 if world.is_driven:
-                    world.linger()
+                    world.wait_for_motor_timeout()
                 return 0
             for request in requests:
-                _say({**world.answer(request), "id": request.get("id")})
-        world.linger()
+                _write_answer({**world.answer(request), "id": request.get("id")})
+        world.wait_for_motor_timeout()
     finally:
         world.__exit__()
     return 0
 
 
-def _say(answer: Mapping[str, Any]) -> None:
+def _write_answer(answer: Mapping[str, Any]) -> None:
     try:
         sys.stdout.write(json.dumps(answer) + "\n")
         sys.stdout.flush()
     except BrokenPipeError:
-        # The owner is gone; standard input will say so too.
+        # The parent has ended; standard input ends too.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 

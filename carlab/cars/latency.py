@@ -1,4 +1,4 @@
-"""Where the time goes between a decision and the wheels, and between the cameras and a decision, part by part."""
+"""Measurement of the latency from decision to wheels and from cameras to decision, by part."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ ARRIVAL_TO_LOOP = "arrival to loop"
 
 @dataclass(frozen=True, slots=True)
 class LatencyParts:
-    """Samples [s] of each part that could be measured, by its name, each (n,)."""
+    """Samples [s] of each measured part by its name, each (n,)."""
 
     parts: Mapping[str, FloatArray]
 
     def mean_s(self, *names: str) -> float:
-        """Sum of the means of some parts [s]; parts that were not measured count as zero."""
+        """Sum of the means of parts [s]; parts without samples count as zero."""
         return float(sum(self.parts[name].mean() for name in names if name in self.parts))
 
     @property
     def command_s(self) -> float:
-        """Mean time from handing over a command to its effect at the firmware [s]."""
+        """Mean time from the command call to the decoded command in the firmware [s]."""
         return self.mean_s(COMMAND_TO_WIRE, WIRE_TO_FIRMWARE)
 
     @property
@@ -39,7 +39,7 @@ class LatencyParts:
         return self.mean_s(EXPOSURE_TO_ARRIVAL)
 
     def rows(self) -> list[tuple[str, float, float, float, int]]:
-        """For each part: name, median, 99th percentile and largest [ms], and count."""
+        """For each part: name, median, 99th percentile and maximum [ms], and count."""
         table = []
         for name, samples in self.parts.items():
             p50, p99, top = np.percentile(samples, [50, 99, 100]) * 1e3
@@ -48,7 +48,7 @@ class LatencyParts:
 
 
 def measure_pose_latency(car: Car, *, seconds: float = 2.0, period_s: float = 1.0 / 30.0) -> LatencyParts:
-    """Watch poses arrive at an open car, moving nothing."""
+    """Measure the latency of poses on an open car; the car does not move."""
     arrival: list[float] = []
     waiting: list[float] = []
     pacer = Pacer(car.clock, period_s)
@@ -64,10 +64,10 @@ def measure_pose_latency(car: Car, *, seconds: float = 2.0, period_s: float = 1.
 
 
 def measure_latency(car: EmulatedCar, *, ticks: int = 90, period_s: float = 1.0 / 30.0) -> LatencyParts:
-    """Measure every part on an open emulated car, by steering at standstill with a different value each tick.
+    """Measure every part on an open emulated car by steering at rest with a different value each tick.
 
-    The sender says when a command was written, the fake firmware when it was decoded; the servo's position tells
-    which command was which.
+    The sender reports when a command was written, the emulated firmware when it was decoded; the servo position
+    identifies the command.
     """
     hardware = car.hardware
     calibration = hardware.actuator.calibration
@@ -88,7 +88,7 @@ def measure_latency(car: EmulatedCar, *, ticks: int = 90, period_s: float = 1.0 
             written[key] = status.t_written_s
     car.stop(planned=True)
     decoded: dict[int, float] = {}
-    for t_s, name, value in car.world.ask(do="log", since_s=start_s)["entries"]:
+    for t_s, name, value in car.world.request(do="log", since_s=start_s)["entries"]:
         if name == "servo":
             decoded.setdefault(round(value * 1000), t_s)
     keys = [key for key in issued if key in written and key in decoded]

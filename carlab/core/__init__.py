@@ -1,1 +1,1 @@
-"""The contract that everything else stands on: NumPy and the standard library only."""
+"""Interfaces and quantities for all packages; depends on NumPy and the standard library only."""

@@ -17,7 +17,7 @@ def wrap(angle_rad: Any) -> Any:
 
 
 def difference(a_rad: Any, b_rad: Any) -> Any:
-    """Smallest signed turn from ``b_rad`` to ``a_rad``."""
+    """Smallest signed angle from ``b_rad`` to ``a_rad``."""
     return wrap(a_rad - b_rad)
 
 
@@ -26,13 +26,13 @@ def circular_mean(angles_rad: FloatArray) -> float:
     return float(np.arctan2(np.mean(np.sin(angles_rad)), np.mean(np.cos(angles_rad))))
 
 
-def on_one_branch(measured_rad: FloatArray, starts: ArrayLike, predicted_rad: FloatArray) -> tuple[FloatArray, ...]:
-    """A measured angle (n,) without jumps, and predictions of it (B, N) on the branch where each begins.
+def align_unwrapped(measured_rad: FloatArray, starts: ArrayLike, predicted_rad: FloatArray) -> tuple[FloatArray, ...]:
+    """Unwrap a measured angle (n,), and shift predictions (B, N) by multiples of 2 pi to match it at their starts.
 
     Args:
-        measured_rad: over the ticks (n,).
+        measured_rad: angle at the ticks (n,).
         starts: tick of the first angle of each prediction (B,).
-        predicted_rad: without jumps (B, N).
+        predicted_rad: unwrapped predictions (B, N).
     """
     whole = np.unwrap(measured_rad)
     turns = np.round((whole[np.asarray(starts, dtype=int)] - predicted_rad[:, 0]) / (2.0 * np.pi))

@@ -1,4 +1,4 @@
-"""The contract of every car, real or not."""
+"""The interface of every car: real, emulated or simulated."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from carlab.core.quantities import Action, ActionLimits, CarState, Health, Obser
 
 
 class Car(ABC):
-    """A car that can be driven.
+    """Interface of a car.
 
-    Constructing does nothing. ``open`` connects and moves nothing; the car stays disarmed and takes only neutral.
-    ``arm`` lets commands through. ``stop`` and ``close`` leave the car in neutral, whatever happened before. A
-    failure latches: the car takes no command until ``reset_fault`` and a new ``arm``.
+    Constructing does nothing. ``open`` connects without motion; the car stays disarmed and accepts only neutral.
+    ``arm`` enables commands. ``stop`` and ``close`` leave the car in neutral in every state. A failure latches: the
+    car accepts no command until ``reset_fault`` and a new ``arm``.
     """
 
     name: str
@@ -25,7 +25,7 @@ class Car(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Connect to everything; idempotent. Raises NotReadyError with every reason at once."""
+        """Connect actuator and motion capture; idempotent. Raises NotReadyError with all reasons."""
 
     @abstractmethod
     def observe(self) -> Observation:
@@ -33,22 +33,22 @@ class Car(ABC):
 
     @abstractmethod
     def arm(self) -> None:
-        """Let commands through. Raises NotReadyError with every reason; ActuatorFaultError while a fault is latched."""
+        """Enable commands. Raises NotReadyError with all reasons; ActuatorFaultError while a fault is latched."""
 
     @abstractmethod
     def command(self, action: Action) -> Action:
-        """Hand over a command, held until the next one or until the watchdog's deadline; returns what is sent.
+        """Post a command, held until the next one or the watchdog's deadline; returns the command that is sent.
 
         Raises ActionOutOfRangeError (nothing is sent), NotArmedError, ActuatorFaultError, NotOpenError.
         """
 
     @abstractmethod
     def stop(self, *, planned: bool) -> None:
-        """Neutral, and disarm. ``planned=False`` latches as a fault. Never raises for a car that is closed."""
+        """Send neutral and disarm. ``planned=False`` latches a fault. Never raises for a closed car."""
 
     @abstractmethod
     def reset_fault(self) -> None:
-        """Clear a latched fault; the car stays disarmed. Raises ActuatorFaultError where the cause persists."""
+        """Clear a latched fault; the car stays disarmed. Raises ActuatorFaultError if the cause persists."""
 
     @abstractmethod
     def health(self) -> Health:
@@ -56,14 +56,14 @@ class Car(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Neutral, then disconnect. Idempotent and safe after any failure."""
+        """Send neutral, then disconnect. Idempotent and safe after any failure."""
 
     def place(self, state: CarState) -> bool:
-        """Put the car at ``state`` where that can be done without driving; False where a person has to do it."""
+        """Put the car at ``state`` without driving; returns False if a person has to do it."""
         return False
 
     def check(self, action: Action) -> None:
-        """Raise ActionOutOfRangeError if ``action`` is not a number or beyond the limits; never moves the car."""
+        """Raise ActionOutOfRangeError if ``action`` is not a number or beyond the limits; sends nothing."""
         if not action.is_finite:
             raise ActionOutOfRangeError(f"{action} is not a number; the policy that made it has diverged.")
         for channel, limit in (("steering", self.limits.max_steering), ("throttle", self.limits.max_throttle)):

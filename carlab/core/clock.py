@@ -1,4 +1,4 @@
-"""Clocks and pacing. The only module, beside the receiver threads and processes at the wire, that asks for the time."""
+"""Clocks and pacing. Apart from threads and processes at the wire, only this module reads the time."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 @runtime_checkable
 class Clock(Protocol):
-    """A monotonic clock that can be slept on."""
+    """A monotonic clock with a sleep function."""
 
     def now_s(self) -> float:
-        """Seconds on this clock; only differences mean anything."""
+        """Time on this clock [s]; only differences are meaningful."""
 
     def sleep_until(self, t_s: float) -> None:
-        """Return when ``now_s()`` has reached ``t_s``; at once if it has."""
+        """Sleep until ``now_s()`` reaches ``t_s``; returns at once if it has."""
 
 
 class MonotonicClock:
@@ -28,13 +28,13 @@ class MonotonicClock:
         return time.monotonic()
 
     def sleep_until(self, t_s: float) -> None:
-        """Sleep to an absolute deadline, so that errors do not add up."""
+        """Sleep until an absolute deadline, so that errors do not accumulate."""
         while (left_s := t_s - time.monotonic()) > 0:
             time.sleep(left_s)
 
 
 class SimulatedClock:
-    """A clock that moves only when it is slept on: simulated episodes run as fast as they compute."""
+    """A clock that advances only by ``sleep_until``: simulated episodes run faster than real time."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self._now_s = start_s
@@ -44,7 +44,7 @@ class SimulatedClock:
         return self._now_s
 
     def sleep_until(self, t_s: float) -> None:
-        """Jump to ``t_s``; never back."""
+        """Advance to ``t_s``; never goes back."""
         self._now_s = max(self._now_s, t_s)
 
 
@@ -60,7 +60,7 @@ def monotonic_ns() -> int:
 
 @dataclass(frozen=True, slots=True)
 class TickTiming:
-    """When a tick was due and how late it woke, on the pacer's clock."""
+    """Deadline and lateness of a tick on the pacer's clock, and the number of skipped deadlines."""
 
     deadline_s: float
     late_s: float
@@ -69,7 +69,7 @@ class TickTiming:
 
 @dataclass(slots=True)
 class Pacer:
-    """Absolute deadlines one period apart; missed ones are skipped and counted, never made up in a burst."""
+    """Absolute deadlines one period apart; missed deadlines are skipped and counted."""
 
     clock: Clock
     period_s: float
@@ -83,7 +83,7 @@ class Pacer:
         return self._next_s
 
     def wait(self) -> TickTiming:
-        """Sleep to the next deadline that is still ahead and say how late the wake-up was."""
+        """Sleep until the next future deadline; returns the lateness of the wake-up."""
         if self._next_s is None:
             self.start()
         assert self._next_s is not None

@@ -1,4 +1,4 @@
-"""What an episode emits while it runs. Recorders and displays listen; the loop knows none of them.
+"""Documents that an episode emits. Recorders and displays receive them; the control loop does not depend on these.
 
 Order: one EpisodeStarted; then Tick, Transition, SafetyEvent and HealthReading as they happen; one EpisodeEnded.
 All ``t_s`` are on the car's clock.
@@ -36,10 +36,10 @@ class EpisodeStarted:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """One control tick: what was seen, asked for and sent.
+    """One control tick: observation, requested action and sent action.
 
-    ``features`` is the encoded observation the policy saw; ``late_s`` is how late the tick woke; ``policy_s`` is how
-    long the policy thought; ``safety_state`` is the gate's state after the command.
+    ``features`` is the encoded observation of the policy; ``late_s`` is the lateness of the tick; ``policy_s`` is the
+    computing time of the policy; ``safety_state`` is the gate's state after the command.
     """
 
     step: int
@@ -55,7 +55,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One row of experience: the action sent at tick ``step`` and what came of it one period later."""
+    """One row of experience: the action sent at tick ``step`` and the observation one period later."""
 
     step: int
     t_s: float
@@ -69,7 +69,7 @@ class Transition:
 
 @dataclass(frozen=True, slots=True)
 class SafetyEvent:
-    """The safety gate changed a command or its own state. ``kind`` is a short id such as ``clip`` or ``geofence``."""
+    """A change of a command or of its state by the safety gate. ``kind`` is a short id such as ``geofence``."""
 
     t_s: float
     kind: str
@@ -78,7 +78,7 @@ class SafetyEvent:
 
 @dataclass(frozen=True, slots=True)
 class HealthReading:
-    """The car's condition, once a second or so."""
+    """The car's condition, about once a second."""
 
     t_s: float
     health: Health
@@ -86,7 +86,7 @@ class HealthReading:
 
 @dataclass(frozen=True, slots=True)
 class EpisodeEnded:
-    """The last document. ``last`` is the observation after the last command, where there is one."""
+    """The last document. ``last`` is the observation after the last command, or None."""
 
     t_s: float
     reason: EndReason

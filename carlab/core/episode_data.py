@@ -1,4 +1,4 @@
-"""One finished episode as arrays: what replay, learning and diagnosis read, whatever it was recorded by."""
+"""One episode as arrays, for replay, learning and diagnosis, independent of the file format."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from carlab.core.quantities import FloatArray
 class EpisodeData:
     """An episode of T commands. Row k of ``sent`` was sent at ``times_s[k]`` and held until ``times_s[k + 1]``.
 
-    times_s     (T + 1,)     [s] when each state was observed, on the recording's own clock
+    times_s     (T + 1,)     [s] time of each observation on the recording's clock
     states      (T + 1, 6)   x, y [m], yaw [rad] of base_link in map; vx, vy [m/s], yaw rate [rad/s] in the body frame
-    requested   (T, 2)       steering, throttle as the policy asked for them
-    sent        (T, 2)       steering, throttle as they left the safety gate
-    rewards     (T,)         reward of each transition; NaN where the recording has none
+    requested   (T, 2)       steering, throttle requested by the policy
+    sent        (T, 2)       steering, throttle sent by the safety gate
+    rewards     (T,)         reward of each transition; NaN if the recording has none
     poses       (P, 4)       raw motion capture: capture time [s], x, y [m], yaw [rad]; P may be 0
     metadata                 texts: car, reality, policy, task, seed, end_reason, end_detail, units ...
     extra                    further columns of a foreign file by name, each (T + 1,)
@@ -45,7 +45,7 @@ class EpisodeData:
         }
         for name, (found, wanted) in shapes.items():
             if found != wanted:
-                raise DataError(f"{name} has shape {found} where {wanted} belongs to {ticks} commands.")
+                raise DataError(f"{name} has shape {found}; {ticks} commands need {wanted}.")
 
     @property
     def ticks(self) -> int:

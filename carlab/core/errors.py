@@ -1,19 +1,19 @@
-"""Every error that carlab raises on purpose.
+"""All errors that carlab raises deliberately.
 
     CarlabError
-    ├── ConfigError (ValueError)         a file or option is wrong: names the key and the nearest known one
-    ├── DataError (ValueError)           a recording or packet is wrong: names the row, the column or the byte
-    │   ├── DivergedError                numbers of what is learned grew beyond all bounds
-    │   └── ProtocolError                bytes that do not follow their protocol
-    ├── NotReadyError (ConnectionError)  a car, port or camera system is not there; lists every reason at once
+    ├── ConfigError (ValueError)         an error in a file or option: names the key and the nearest known key
+    ├── DataError (ValueError)           an error in a recording or packet: names the row, the column or the byte
+    │   ├── DivergedError                learned parameters diverged to NaN or infinity
+    │   └── ProtocolError                bytes that violate their protocol
+    ├── NotReadyError (ConnectionError)  a car, port or camera system is missing; lists all reasons
     ├── NotOpenError (RuntimeError)      used before open() or after close()
     ├── NotArmedError (RuntimeError)     a moving command before arm()
     ├── ActionOutOfRangeError (ValueError)  a command beyond the car's limits, or not a number
-    ├── PoseLostError (TimeoutError)     no pose, or one that is too old
+    ├── PoseLostError (TimeoutError)     no pose, or too old a pose
     ├── ActuatorFaultError (OSError)     the link, the firmware or the sender process failed; latched
-    └── SafetyStop                       the safety gate ended the episode (beside the gate, in carlab.core.safety)
+    └── SafetyStop                       the safety gate ended the episode (in carlab.core.safety)
 
-Each message is one sentence with the next step. The command line prints it alone and exits with ``exit_code``.
+Each message is one sentence with the remedy. The command line prints the message and exits with ``exit_code``.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from collections.abc import Sequence
 
 
 class CarlabError(Exception):
-    """Base of all errors raised on purpose. ``exit_code`` is what the command line returns."""
+    """Base of all deliberate errors. ``exit_code`` is the exit code of the command line."""
 
     exit_code = 1
 
 
 class ConfigError(CarlabError, ValueError):
-    """A configuration file or an option is wrong."""
+    """An error in a configuration file or an option."""
 
     exit_code = 2
 
 
 class DataError(CarlabError, ValueError):
-    """A recording or a packet cannot be used as it is."""
+    """An error in a recording or a packet."""
 
 
 class DivergedError(DataError):
-    """What was being learned is no number any more; with smaller steps or other draws it may go well."""
+    """Training diverged to NaN or infinity; smaller steps or another seed may help."""
 
 
 class ProtocolError(DataError):
-    """Bytes that do not follow their protocol."""
+    """Bytes that violate their protocol."""
 
 
 class NotReadyError(CarlabError, ConnectionError):
-    """Something that must be there is not. Holds every reason found, not only the first."""
+    """A required device or service is missing; ``reasons`` holds all reasons found."""
 
     exit_code = 3
 

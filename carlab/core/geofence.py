@@ -1,4 +1,4 @@
-"""Will the car stop inside the arena? Pure geometry; polygons are corners (n, 2) [m] in ``map``, in either sense."""
+"""Geofence: whether the car can stop inside the arena. Polygons are corners (n, 2) [m] in ``map``, in either sense."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Polygon = Sequence[tuple[float, float]]
 
 
 def as_polygon(corners_m: Polygon, where: str) -> tuple[tuple[float, float], ...]:
-    """Check corners given by a user: at least three, finite, and enclosing an area. Raises ConfigError."""
+    """Check a user's corners: at least three, finite, with a positive area. Raises ConfigError."""
     try:
         points = np.asarray(corners_m, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -30,7 +30,7 @@ def as_polygon(corners_m: Polygon, where: str) -> tuple[tuple[float, float], ...
 
 
 def contains(corners_m: Polygon, x_m: float, y_m: float) -> bool:
-    """True where the point lies inside the polygon (even-odd rule)."""
+    """Whether the point lies inside the polygon (even-odd rule)."""
     inside = False
     previous_x, previous_y = corners_m[-1]
     for corner_x, corner_y in corners_m:
@@ -43,7 +43,7 @@ def contains(corners_m: Polygon, x_m: float, y_m: float) -> bool:
 
 
 def free_distance_m(corners_m: Polygon, x_m: float, y_m: float, heading_rad: float) -> float:
-    """Distance [m] from a point along a heading to the polygon's nearest edge; inf where the ray meets none."""
+    """Distance [m] from a point along a heading to the polygon's nearest edge; inf if the ray meets none."""
     direction_x, direction_y = math.cos(heading_rad), math.sin(heading_rad)
     nearest = math.inf
     previous_x, previous_y = corners_m[-1]
@@ -61,34 +61,34 @@ def free_distance_m(corners_m: Polygon, x_m: float, y_m: float, heading_rad: flo
 
 
 def stopping_distance_m(speed_mps: Any, reaction_s: float, deceleration_mps2: float) -> Any:
-    """Distance to standstill: travel during the reaction time plus v^2 / (2 a); of a speed or an array of them."""
+    """Stopping distance [m]: travel during the reaction time plus v^2 / (2 a), for a speed or an array of speeds."""
     return speed_mps * reaction_s + speed_mps**2 / (2.0 * deceleration_mps2)
 
 
 def can_stop_inside(corners_m: Polygon, state: CarState, reaction_s: float, deceleration_mps2: float) -> bool:
-    """True where the car is inside and its stopping point, straight along its motion over ground, is inside too."""
+    """Whether the car and its stopping point, straight along its course over ground, are inside."""
     if not contains(corners_m, state.x_m, state.y_m):
         return False
     speed = state.speed_mps
     course_rad = state.yaw_rad + math.atan2(state.vy_mps, state.vx_mps)
     needed = stopping_distance_m(speed, reaction_s, deceleration_mps2)
-    # From inside, every way meets an edge somewhere: infinity means a course that is none, or an edge just touched.
+    # From inside, every ray meets an edge: infinity means a NaN course or a point on an edge.
     return bool(needed < free_distance_m(corners_m, state.x_m, state.y_m, course_rad) < math.inf)
 
 
-def each_can_stop_inside(
+def can_stop_inside_batch(
     corners_m: Polygon, places_m: FloatArray, course_rad: FloatArray, needed_m: FloatArray
 ) -> NDArray[np.bool_]:
-    """``can_stop_inside`` of many cars at once.
+    """``can_stop_inside`` for a batch of cars.
 
     Args:
         corners_m: the polygon.
-        places_m: where the cars are (n, 2).
-        course_rad: which way they move over ground (n,).
-        needed_m: their stopping distances (n,).
+        places_m: positions of the cars (n, 2).
+        course_rad: directions of motion over ground (n,).
+        needed_m: stopping distances (n,).
 
     Returns:
-        True where a car can (n,).
+        Whether each car can stop inside (n,).
     """
     corners = corners_array(corners_m)
     before = np.roll(corners, 1, axis=0)

@@ -1,4 +1,4 @@
-"""Scripted excitations as plain command sequences of time: what to drive so that a car shows what it is."""
+"""Scripted excitation manoeuvres for system identification: commands as functions of time."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class Manoeuvre:
     at: Callable[[float], Action]
 
     def command(self, elapsed_s: float) -> Action | None:
-        """The action at a time; None when it is over. Neutral before the start."""
+        """The action at a time [s]; None after the end, neutral before the start."""
         if elapsed_s >= self.duration_s:
             return None
         return self.at(elapsed_s) if elapsed_s >= 0.0 else NEUTRAL
 
 
 def steering_steps(throttle: float = 0.3, small: float = 0.3, large: float = 0.8, hold_s: float = 0.8) -> Manoeuvre:
-    """Steps of two sizes to both sides at constant throttle: tells a delay from a lag and a lag from a rate limit."""
+    """Steps of two sizes to both sides at constant throttle: separates delay, lag and rate limit."""
     levels = (0.0, small, 0.0, -small, 0.0, large, 0.0, -large, 0.0)
 
     def at(elapsed_s: float) -> Action:
@@ -37,7 +37,7 @@ def steering_steps(throttle: float = 0.3, small: float = 0.3, large: float = 0.8
 def throttle_steps(
     levels: tuple[float, ...] = (0.2, 0.5, 0.0, -0.3, 0.0), hold_s: float = 0.8, steering: float = 0.5
 ) -> Manoeuvre:
-    """Steps of throttle on a circle, so that the car stays near."""
+    """Steps of throttle on a circle, so that the car stays in a small area."""
 
     def at(elapsed_s: float) -> Action:
         return Action(steering, levels[min(int(elapsed_s / hold_s), len(levels) - 1)])
@@ -72,7 +72,7 @@ def throttle_ramp(top: float = 0.6, duration_s: float = 6.0, steering: float = 0
 
 
 def coast_down(throttle: float = 0.5, push_s: float = 1.0, coast_s: float = 3.0, steering: float = 0.5) -> Manoeuvre:
-    """Accelerate, then let it roll: what slows the car without the motor."""
+    """Accelerate, then coast: shows the resistances without the motor."""
     return Manoeuvre("coast_down", push_s + coast_s, lambda t: Action(steering, throttle if t < push_s else 0.0))
 
 

@@ -1,4 +1,4 @@
-"""The one encoder of what a policy and a model see. Environment, policies, data sets and learned worlds all call it.
+"""The encoder of the inputs of policies and models; environments, policies, data sets and learned worlds use it.
 
 Features, shape (..., 7 + 2 H): ``[x, y, sin yaw, cos yaw, vx, vy, yaw_rate, a(t-H) ... a(t-1)]`` with poses in ``map``,
 velocities in the body frame, SI units, and the last H actions sent, oldest first (H = 3 in Rothfuss et al.,
@@ -47,7 +47,7 @@ def decode_history(features: Any) -> Any:
 
 
 def push_action(history: Any, action: Any) -> Any:
-    """History (..., H, 2) after ``action`` (..., 2) was sent: the oldest drops out. NumPy or torch."""
+    """Append ``action`` (..., 2) to a history (..., H, 2) and drop the oldest action. NumPy or torch."""
     if history.shape[-2] == 0:
         return history
     xp = array_namespace(history)
@@ -61,7 +61,7 @@ class ActionHistory:
         self._rows: FloatArray = np.zeros((length, ACTION_SIZE))
 
     def reset(self, actions: Iterable[Action] = ()) -> None:
-        """Forget everything, then push ``actions``."""
+        """Reset to neutral, then push ``actions``."""
         self._rows = np.zeros_like(self._rows)
         for action in actions:
             self.push(action)

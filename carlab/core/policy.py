@@ -1,4 +1,4 @@
-"""What drives: a policy sees a tick and answers with an action."""
+"""The interface of policies: from the input of a tick to an action."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from carlab.core.quantities import Action, FloatArray, Observation
 
 @dataclass(frozen=True, slots=True)
 class PolicyInput:
-    """What a policy may look at: encoded features (7 + 2 H,), the observation, ticks and seconds since the start."""
+    """Input of a policy: encoded features (7 + 2 H,), the observation, ticks and seconds since the start."""
 
     features: FloatArray
     observation: Observation
@@ -20,7 +20,7 @@ class PolicyInput:
 
 @runtime_checkable
 class Policy(Protocol):
-    """Decides one action a tick. ``act`` returns None when it has nothing more to do."""
+    """A policy: one action per tick. ``act`` returns None at the end of a script."""
 
     name: str
 

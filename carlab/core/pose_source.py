@@ -1,4 +1,4 @@
-"""What a car needs of a motion-capture system."""
+"""The interface of motion-capture systems."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from carlab.core.quantities import PoseSample
 
 @runtime_checkable
 class PoseSource(Protocol):
-    """Delivers poses of one rigid body in ``map``. Constructing does nothing; ``open`` connects."""
+    """Source of poses of one rigid body in ``map``. Constructing does nothing; ``open`` connects."""
 
     def open(self) -> None:
-        """Connect and start to receive. Idempotent. Raises NotReadyError with every reason."""
+        """Connect and start receiving. Idempotent. Raises NotReadyError with all reasons."""
 
     def latest(self) -> PoseSample | None:
         """The newest sample, tracked or not; None before the first. Never blocks."""
 
     def since(self, sequence: int) -> tuple[PoseSample, ...]:
-        """Samples received after the one with this sequence number, oldest first (a bounded number is kept)."""
+        """Samples received after this sequence number, oldest first; only a bounded number is stored."""
 
     def wait_for(self, sequence: int, timeout_s: float) -> PoseSample | None:
-        """Block until a sample newer than ``sequence`` is there; None after ``timeout_s``."""
+        """Wait for a sample after ``sequence``; None after ``timeout_s``."""
 
     def statistics(self) -> Mapping[str, float]:
         """Rates, losses and latencies; the names end in their units."""

@@ -1,4 +1,4 @@
-"""Quantities that cross a boundary: frozen, SI units, the unit in every name.
+"""Quantities at the interfaces between packages: immutable, in SI units, with the unit in every name.
 
 Frames (REP-103, REP-105): world frame ``map`` and body frame ``base_link``; x forward, y left, yaw counter-clockwise.
 Commands are dimensionless in [-1, 1]; steering is positive to the left, throttle is positive forward.
@@ -99,13 +99,13 @@ class PoseSample:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The newest state of a car, with when it was true and when it was known.
+    """The newest state of a car, with its times of capture and arrival.
 
-    State, times and sequence are those of the newest *tracked* pose; ``tracked`` says whether the very newest frame
-    saw the body, so that an unseen body shows as a state that grows old. ``velocity_delay_s`` is the known delay of
-    the velocity filter; ``poses`` are the raw samples that arrived since the previous observation, oldest first.
-    ``velocity_valid`` is False where too few poses have come for velocities, which are zero then.
-    ``motor_is_turning`` is measured by the motor controller; None where nothing measures it.
+    State, times and sequence are those of the newest *tracked* pose; ``tracked`` is False if the newest frame did not
+    track the body, so the state of a lost body becomes stale. ``velocity_delay_s`` is the known delay of the velocity
+    filter; ``poses`` are the raw samples since the previous observation, oldest first. ``velocity_valid`` is False
+    if there are too few poses to estimate velocities, which are zero then. ``motor_is_turning`` is measured by the
+    motor controller; None if it is not measured.
     """
 
     state: CarState
@@ -137,7 +137,7 @@ class ActionLimits:
 
 
 class Reality(enum.Enum):
-    """What a car is made of. Printed in capitals at the start of each run and written into each recording."""
+    """Whether a car is simulated, emulated or real. Printed at the start of each run and written to each recording."""
 
     SIMULATED = "simulated"
     EMULATED = "emulated"

@@ -1,9 +1,9 @@
-"""The one gate that every command passes: pure limits, and SafeCar which applies them to a car.
+"""The safety gate for all commands: limits as pure functions, and SafeCar, which applies them to a car.
 
-Numbers to start from are those of common drivers: a stale pose gives neutral after 100 ms and ends the episode after
-500 ms, as does one further from the last than the car can drive (another body taken for the car); commands are
-clipped and slew-limited (towards zero is always allowed at once); a geofence asks whether the car could still stop
-inside. What is recorded as sent is what came out of this gate. No comparison here lets a NaN pass.
+The default limits are those of common drivers. A stale pose gives neutral after 100 ms and ends the episode after
+500 ms; so does a pose further from the last one than the car can drive (another body taken for the car). Commands are
+clipped and slew-limited, except towards zero. The geofence checks whether the car can still stop inside. Recordings
+contain the commands that this gate has sent. Every comparison rejects NaN.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from carlab.core.outcome import EndReason
 from carlab.core.quantities import NEUTRAL, Action, CarState, Observation
 
 FROZEN_POSITION_M, FROZEN_YAW_RAD = 2e-5, 1e-4
-"""A smaller change of the pose is none: below the noise of motion capture, above the resolution of 32-bit numbers. A
-car that is blocked with turning wheels still moves by the noise, so it does not count as frozen."""
+"""Smallest change of a live pose: below the noise of motion capture, above the resolution of 32-bit numbers. The pose
+of a car that is blocked with turning wheels still changes by the noise, so it does not count as frozen."""
 CLOCK_TOLERANCE_S = 0.01
-"""A pose that claims to arrive further ahead than this was stamped by another clock."""
+"""Largest time of arrival ahead of the car's clock [s]; a later one belongs to another clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class SafetyEnvelope:
-    """Limits of one car in one place. Rates are per second of normalised command; the arena is corners [m] or empty.
+    """Limits of a car in an arena. Rates are per second of normalised command; the arena is corners [m] or empty.
 
-    Between two observations the pose may move by ``max_speed_mps`` and turn by ``max_yaw_rate_radps`` for the time
-    between them, and by the jump margins on top. A pose that stays the same for ``frozen_pose_s`` while the motor turns
-    on command ends the episode.
+    Between two observations the pose may move by ``max_speed_mps`` and turn by ``max_yaw_rate_radps`` times the time
+    between them, plus the jump margins. A pose that is unchanged for ``frozen_pose_s`` while the motor turns on command
+    ends the episode.
     """
 
     max_steering: float = 1.0
@@ -58,7 +58,7 @@ class SafetyEnvelope:
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be above zero, not {getattr(self, name)}.")
         if not self.reaction_s >= 0:
-            raise ConfigError(f"reaction_s must not be below zero, and is {self.reaction_s}.")
+            raise ConfigError(f"reaction_s must not be below zero, but is {self.reaction_s}.")
         if not (0 < self.max_steering <= 1 and 0 < self.max_throttle <= 1):
             raise ConfigError("max_steering and max_throttle must lie in (0, 1].")
         if self.lost_pose_s < self.stale_pose_s:
@@ -71,7 +71,7 @@ def clip(value: float, limit: float) -> float:
 
 
 def slew(target: float, previous: float, max_step: float) -> float:
-    """Move from ``previous`` towards ``target`` by at most ``max_step``; the way to zero is never held back."""
+    """Move from ``previous`` towards ``target`` by at most ``max_step``; motion towards zero is not limited."""
     if target * previous < 0.0:
         previous = 0.0
     if abs(target) <= abs(previous):
@@ -80,7 +80,7 @@ def slew(target: float, previous: float, max_step: float) -> float:
 
 
 def limit(requested: Action, previous: Action, dt_s: float, envelope: SafetyEnvelope) -> Action:
-    """Clip and slew-limit a command. ``previous`` is what was sent ``dt_s`` ago."""
+    """Clip and slew-limit a command. ``previous`` is the command sent ``dt_s`` ago."""
     dt_s = max(dt_s, 0.0)
     steering = clip(requested.steering, envelope.max_steering)
     throttle = clip(requested.throttle, envelope.max_throttle)
@@ -90,12 +90,12 @@ def limit(requested: Action, previous: Action, dt_s: float, envelope: SafetyEnve
     )
 
 
-def jump(observation: Observation, previous: Observation, envelope: SafetyEnvelope) -> str | None:
-    """What the pose has done since ``previous`` that no car can do, in words; None where it can have driven there."""
+def pose_jump(observation: Observation, previous: Observation, envelope: SafetyEnvelope) -> str | None:
+    """Describe a pose change since ``previous`` that exceeds the car's speed or yaw rate; None if it is possible."""
     then, now = previous.state, observation.state
     dt_s = max(
         observation.t_capture_s - previous.t_capture_s, observation.t_receive_s - previous.t_receive_s, 0.0
-    )  # Either alone is too short: of capture where the camera's clock was set back, of receipt in a burst.
+    )  # Capture times alone fail after a step of the camera's clock, arrival times alone in a burst.
     moved_m = math.hypot(now.x_m - then.x_m, now.y_m - then.y_m)
     turned_rad = abs(float(wrap(now.yaw_rad - then.yaw_rad)))
     if (
@@ -109,24 +109,27 @@ def jump(observation: Observation, previous: Observation, envelope: SafetyEnvelo
 def violation(
     observation: Observation, previous: Observation | None, now_s: float, envelope: SafetyEnvelope
 ) -> tuple[EndReason, str] | None:
-    """The reason to end the episode now, with its figures; None while all is well.
+    """Reason to end the episode now, with its figures; None if there is none.
 
-    ``previous`` is the observation of the tick before, None at the first.
+    ``previous`` is the observation of the previous tick, None at the first.
     """
     state = observation.state
     age_s, taken_s = now_s - observation.t_receive_s, now_s - observation.t_capture_s
     if not (age_s <= envelope.lost_pose_s and taken_s <= envelope.lost_pose_s):
         reason = EndReason.POSE_STALE if observation.tracked else EndReason.TRACKING_LOST
-        came = f"came {age_s * 1e3:.0f} ms ago and was taken {taken_s * 1e3:.0f} ms ago"
-        return reason, f"The newest usable pose {came}."
+        ages = f"arrived {age_s * 1e3:.0f} ms ago and was captured {taken_s * 1e3:.0f} ms ago"
+        return reason, f"The newest usable pose {ages}."
     if age_s < -CLOCK_TOLERANCE_S:
-        return EndReason.POSE_STALE, f"The newest pose is {-age_s:.2f} s ahead of the car's clock; it has another one."
+        return EndReason.POSE_STALE, f"The newest pose is {-age_s:.2f} s ahead of the car's clock."
     if not all(map(math.isfinite, astuple(state))):
         return EndReason.TRACKING_LOST, f"The estimated state is not a number: {state}."
-    if previous is not None and (leap := jump(observation, previous, envelope)) is not None:
-        return EndReason.POSE_JUMP, leap
+    if previous is not None and (jump := pose_jump(observation, previous, envelope)) is not None:
+        return EndReason.POSE_JUMP, jump
     if state.speed_mps > envelope.max_speed_mps:
-        return EndReason.OVERSPEED, f"{state.speed_mps:.2f} m/s where {envelope.max_speed_mps:.2f} m/s is the limit."
+        return (
+            EndReason.OVERSPEED,
+            f"The speed is {state.speed_mps:.2f} m/s, limit {envelope.max_speed_mps:.2f} m/s.",
+        )
     if envelope.arena_m and not can_stop_inside(
         envelope.arena_m, state, envelope.reaction_s, envelope.deceleration_mps2
     ):
@@ -134,8 +137,8 @@ def violation(
     return None
 
 
-class FrozenPoseWatch:
-    """Notices a pose that does not change although the motor turns on command.
+class FrozenPoseDetector:
+    """Detects a pose that does not change although the motor turns on command.
 
     Fresh stamps do not prove a fresh pose: paused motion-capture software may repeat the last one.
     """
@@ -146,16 +149,16 @@ class FrozenPoseWatch:
         self._since_s = 0.0
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Reset the detector."""
         self._pose = None
 
     def problem(self, observation: Observation, sent: Action, now_s: float) -> str | None:
-        """Return what is wrong, None while all is well.
+        """Describe a frozen pose; None if the pose is not frozen.
 
         Args:
             observation: the newest observation.
             sent: the last command that was sent.
-            now_s: the time of the car's clock [s].
+            now_s: time on the car's clock [s].
         """
         state = observation.state
         must_move = observation.motor_is_turning is True and sent.throttle != 0.0
@@ -163,7 +166,7 @@ class FrozenPoseWatch:
             self._pose, self._since_s = state, now_s
             return None
         frozen_s = now_s - self._since_s
-        return None if frozen_s <= self.frozen_pose_s else f"It was the same for {frozen_s:.2f} s."
+        return None if frozen_s <= self.frozen_pose_s else f"It was unchanged for {frozen_s:.2f} s."
 
 
 def _has_moved(now: CarState, then: CarState) -> bool:
@@ -182,7 +185,7 @@ class SafetyState(enum.Enum):
 
 
 class SafetyStop(CarlabError):
-    """The gate has put the car in neutral and ended the episode. ``reason`` says why, ``detail`` with what figures."""
+    """The gate has sent neutral and ended the episode, for ``reason`` with the figures in ``detail``."""
 
     exit_code = 4
 
@@ -193,9 +196,9 @@ class SafetyStop(CarlabError):
 
 
 class SafeCar:
-    """Applies an envelope to a car, and the car's own limits where they are narrower. Every episode commands by it.
+    """Applies the narrower limits of an envelope and a car to every command of an episode.
 
-    Emits a SafetyEvent whenever the kind of intervention changes, not on every tick that it lasts.
+    Emits a SafetyEvent when the kind of intervention changes, not on every tick.
     """
 
     def __init__(self, car: Car, envelope: SafetyEnvelope, on_event: Callable[[SafetyEvent], None]) -> None:
@@ -210,23 +213,23 @@ class SafeCar:
         self._sent = NEUTRAL
         self._sent_s: float | None = None
         self._seen: Observation | None = None
-        self._frozen = FrozenPoseWatch(envelope.frozen_pose_s)
+        self._frozen = FrozenPoseDetector(envelope.frozen_pose_s)
         self._active: frozenset[str] = frozenset()
 
     def arm(self) -> None:
-        """Arm the car. Raises what Car.arm raises."""
+        """Arm the car. Raises the errors of Car.arm."""
         self.car.arm()
         self.state = SafetyState.ARMED
         self._sent, self._sent_s, self._seen = NEUTRAL, None, None
         self._frozen.reset()
 
     def command(self, requested: Action, observation: Observation, period_s: float) -> Action:
-        """Pass a command through the gate and return what was sent; raise SafetyStop where the episode must end."""
+        """Limit and send a command; returns the command sent. Raises SafetyStop if the episode must end."""
         now_s = self.car.clock.now_s()
         if self.state not in (SafetyState.ARMED, SafetyState.PAUSED):
             raise NotArmedError("The safety gate is not armed; call arm() first.")
         if not requested.is_finite:
-            self._end(EndReason.BAD_COMMAND, f"It asked for {requested}.", now_s)
+            self._end(EndReason.BAD_COMMAND, f"The requested command is {requested}.", now_s)
         found = violation(observation, self._seen, now_s, self.envelope)
         if found is not None:
             self._end(*found, now_s)
@@ -236,9 +239,9 @@ class SafeCar:
         age_s = now_s - observation.t_receive_s
         kinds: dict[str, str] = {}
         if age_s > self.envelope.stale_pose_s:
-            kinds["stale_pose"] = f"The pose is {age_s * 1e3:.0f} ms old: neutral until it is fresh."
+            kinds["stale_pose"] = f"The pose is {age_s * 1e3:.0f} ms old: neutral until a fresh pose arrives."
         elif not observation.velocity_valid:
-            kinds["unknown_speed"] = "Too few poses have come to know the speed: neutral until there are."
+            kinds["unknown_speed"] = "Too few poses to estimate the speed: neutral until more arrive."
         if kinds:
             target = NEUTRAL
             self.state = SafetyState.PAUSED
@@ -246,7 +249,7 @@ class SafeCar:
             dt_s = period_s if self._sent_s is None else min(now_s - self._sent_s, 2.0 * period_s)
             target = limit(requested, self._sent, dt_s, self.envelope)
             if target != requested:
-                kinds["limited"] = f"Asked for {requested}, limited to {target}."
+                kinds["limited"] = f"Requested {requested}, limited to {target}."
             self.state = SafetyState.ARMED
         for kind in kinds.keys() - self._active:
             self._on_event(SafetyEvent(now_s, kind, kinds[kind]))
@@ -261,7 +264,7 @@ class SafeCar:
         return sent
 
     def stop(self, *, planned: bool) -> None:
-        """Neutral and disarm; ``planned=False`` latches."""
+        """Send neutral and disarm; ``planned=False`` latches a fault."""
         self.state = SafetyState.DISARMED if planned else SafetyState.FAULT
         self.car.stop(planned=planned)
 

@@ -1,8 +1,8 @@
-"""Poses of motion capture in, car states out: velocities with a known delay, never a difference of wrapped angles.
+"""Estimator of car states from motion-capture poses: velocities with a known delay, from unwrapped angles.
 
-The velocity is the slope of a least-squares line through the poses of the last few hundredths of a second. For stamps
-one ``dt`` apart its standard deviation is ``sigma sqrt(12 / (n (n^2 - 1))) / dt`` (the Savitzky-Golay filter of order
-one), and it is the velocity at the window's mean time, which is what ``velocity_delay_s`` says.
+The velocity is the slope of a least-squares line through the poses of a short window. For stamps one ``dt`` apart its
+standard deviation is ``sigma sqrt(12 / (n (n^2 - 1))) / dt`` (Savitzky-Golay filter of order one). It is the velocity
+at the window's mean time; ``velocity_delay_s`` is the age of that time.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from carlab.core.angles import wrap
 from carlab.core.quantities import CarState, FloatArray, PoseSample
 
 MIN_SAMPLES = 3
-RESTART_AFTER = 10
+RESTART_AFTER_SAMPLES = 10
 
 
 @dataclass(frozen=True, slots=True)
 class VelocityFit:
-    """Body velocities at ``t_s``, the mean time of the poses they were fitted to."""
+    """Body velocities at ``t_s``, the mean time of the fitted poses."""
 
     t_s: float
     vx_mps: float
@@ -47,17 +47,17 @@ def fit_velocity(poses: FloatArray) -> VelocityFit:
 
 
 class StateEstimator:
-    """Estimates the state of a car from its pose samples, one ``update`` a sample.
+    """Estimates the state of a car from its pose samples, with one ``update`` per sample.
 
     Args:
-        window_s: Poses of this long are fitted [s]. Where it holds fewer than three samples (slow or lossy motion
-            capture) the three newest are taken, if they lie within ``max_span_s``.
-        max_span_s: Longest time that a fit may span [s]; four windows unless given.
+        window_s: Length of the window of the fit [s]. If it holds fewer than three samples (slow or lossy motion
+            capture), the three newest samples are used if they lie within ``max_span_s``.
+        max_span_s: Longest time span of a fit [s]; by default four windows.
 
     Attributes:
         velocity_valid: False while there are too few samples; the velocities of ``estimate`` are zero then.
-        dropped: Count of samples left out because they repeat a frame, go back in time or are not finite.
-        untracked: Count of samples left out because the body was not tracked.
+        dropped: Count of ignored samples: repeated, backward in time or not finite.
+        untracked: Count of ignored samples in which the body was not tracked.
     """
 
     def __init__(self, window_s: float = 0.05, max_span_s: float | None = None) -> None:
@@ -70,7 +70,7 @@ class StateEstimator:
         self._backward_run = 0
 
     def reset(self) -> None:
-        """Forget every sample (after the car was moved by hand); the counts stay."""
+        """Discard all samples (after the car was moved by hand); the counts stay."""
         self._poses.clear()
         self._newest = None
         self._backward_run = 0
@@ -82,14 +82,14 @@ class StateEstimator:
 
     @property
     def newest(self) -> PoseSample | None:
-        """The newest sample that was taken in; None before the first."""
+        """The newest accepted sample; None before the first."""
         return self._newest
 
     def update(self, sample: PoseSample) -> None:
-        """Take in one sample. Untracked, repeated, backward and non-finite ones are counted and left out.
+        """Add one sample. Untracked, repeated, backward and non-finite samples are counted and ignored.
 
-        When the clock of the source has been set back for good (ten samples in a row are older than the newest), the
-        window starts anew.
+        After a backward step of the source's clock (ten consecutive samples are older than the newest) the window
+        restarts.
         """
         if not sample.tracked:
             self.untracked += 1
@@ -102,7 +102,7 @@ class StateEstimator:
             self.dropped += 1
             repeated = sample.t_capture_s == self._newest.t_capture_s
             self._backward_run = 0 if repeated else self._backward_run + 1
-            if self._backward_run < RESTART_AFTER:
+            if self._backward_run < RESTART_AFTER_SAMPLES:
                 return
             self.reset()
         self._backward_run = 0
@@ -115,7 +115,7 @@ class StateEstimator:
         self._forget_old()
 
     def estimate(self) -> tuple[CarState, float] | None:
-        """State with the newest pose, and how much older than that pose its velocities are [s].
+        """State with the newest pose, and the delay of its velocities relative to that pose [s].
 
         None before the first tracked sample. With too few samples for a fit (``velocity_valid`` is False) the
         velocities and the delay are zero. The yaw is wrapped to [-pi, pi).
@@ -132,7 +132,7 @@ class StateEstimator:
 
     def _forget_old(self) -> None:
         newest_s = self._poses[-1][0]
-        # Half a microsecond of slack: a sample exactly one window old stays, whatever the rounding of its stamp.
+        # Half a microsecond of tolerance keeps a sample that is exactly one window old despite rounding.
         while newest_s - self._poses[0][0] > self.window_s + 5e-7 and (
             len(self._poses) > MIN_SAMPLES or newest_s - self._poses[0][0] > self.max_span_s
         ):

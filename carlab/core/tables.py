@@ -1,4 +1,4 @@
-"""Strict reading of configuration tables into dataclasses: unknown keys are errors that name the nearest known one."""
+"""Strict reading of configuration tables into dataclasses; an unknown key is an error that names the nearest key."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
 
 
 def number(value: Any, where: str) -> float:
-    """Return ``value`` as a float; raises ConfigError for what is no number and for one that no float can hold."""
+    """Return ``value`` as a float. Raises ConfigError if it is no number or too large for a float."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ConfigError(f"{where} must be a number, not {value!r}.")
     try:

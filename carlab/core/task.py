@@ -1,6 +1,6 @@
-"""Tasks: goal, reward, end and start, shared by the real, the simulated and the learned world.
+"""Tasks: start, goal, reward and termination, shared by real, simulated and learned worlds.
 
-Rewards and ends are pure functions of features (see ``carlab.core.observation``) in the array library of their
+Rewards and terminations are pure functions of features (see ``carlab.core.observation``) in the array library of their
 inputs, NumPy or torch, batched over leading axes and differentiable where their inputs are.
 """
 
@@ -25,11 +25,11 @@ PAPER_ARENA_M: Corners = rectangle(-1.4, 2.8, -2.6, 1.5)
 
 @runtime_checkable
 class Task(Protocol):
-    """What an episode is about."""
+    """Interface of a task."""
 
     @property
     def name(self) -> str:
-        """Short name, as the command line and recordings have it."""
+        """Short name in the command line and in recordings."""
 
     @property
     def history_length(self) -> int:
@@ -37,31 +37,31 @@ class Task(Protocol):
 
     @property
     def max_ticks(self) -> int:
-        """Ticks of an episode."""
+        """Number of ticks of an episode."""
 
     @property
     def arena_m(self) -> Corners:
-        """Corners of the area [m] the task takes place in."""
+        """Corners of the task's area [m]."""
 
     @property
     def goal(self) -> tuple[float, float, float] | None:
-        """Goal pose (x [m], y [m], yaw [rad]) where there is one."""
+        """Goal pose (x [m], y [m], yaw [rad]); None without a goal."""
 
     @property
     def path_m(self) -> Corners:
-        """Reference path, empty where there is none."""
+        """Reference path [m]; empty without a path."""
 
     def sample_start(self, rng: np.random.Generator) -> CarState:
-        """Draw a start state."""
+        """Draw an initial state."""
 
     def reward(self, features: Any, action: Any, next_features: Any) -> Any:
         """Reward (...,) of transitions; features (..., F), action (..., 2)."""
 
     def terminated(self, next_features: Any) -> Any:
-        """Whether the task itself ends here, booleans (...,)."""
+        """Whether the task terminates, booleans (...,)."""
 
     def summary(self, final: CarState) -> dict[str, float]:
-        """Figures of how an episode ended, by name with unit."""
+        """Figures of the final state, by name with unit."""
 
 
 def long_tail_tolerance(distance: Any, bound: float, margin: float, value_at_margin: float = 0.1) -> Any:
@@ -141,7 +141,7 @@ class ParkingTask:
         )
 
     def terminated(self, next_features: Any) -> Any:
-        """Ends on parking only where ``stop_when_parked`` is set; the paper drives all its ticks."""
+        """Terminate when parked, only if ``stop_when_parked``; the paper drives all ticks."""
         parked = self.parked(next_features)
         return parked if self.stop_when_parked else parked & False
 
@@ -196,7 +196,7 @@ class PathTask:
         return None
 
     def sample_start(self, rng: np.random.Generator) -> CarState:
-        """On the path's first point, along it, within 5 cm and 0.1 rad, at rest."""
+        """Draw an initial state at rest at the path's first point, along it, within 5 cm and 0.1 rad."""
         (x0, y0), (x1, y1) = self.path_m[:2]
         dx, dy, turn = rng.uniform(-1.0, 1.0, 3) * (0.05, 0.05, 0.1)
         return CarState(x0 + float(dx), y0 + float(dy), math.atan2(y1 - y0, x1 - x0) + float(turn))
@@ -204,7 +204,7 @@ class PathTask:
     def project(self, features: Any, near: Any | None = None) -> tuple[Any, Any]:
         """Arc length [m] and distance [m] of the nearest point of the path, each (...,).
 
-        ``near`` (...,) restricts the search to within ``width_m`` of arc length, so that a crossing is no short cut.
+        ``near`` (...,) restricts the search to within ``width_m`` of arc length, so that crossings are unambiguous.
         """
         xp = array_namespace(features)
         corners = np.asarray(self.path_m)
@@ -251,7 +251,7 @@ class PathTask:
         )
 
     def terminated(self, next_features: Any) -> Any:
-        """Further from the path than its width."""
+        """Whether the car is further from the path than ``width_m``."""
         return self.project(next_features)[1] > self.width_m
 
     def summary(self, final: CarState) -> dict[str, float]:
@@ -262,7 +262,7 @@ class PathTask:
 
 @dataclass(frozen=True, slots=True)
 class RecordedTask:
-    """Nothing but a start: for replaying recorded actions. Every reward is zero."""
+    """A task with an initial state only, for replaying recorded actions. Every reward is zero."""
 
     start: CarState
     max_ticks: int
@@ -281,7 +281,7 @@ class RecordedTask:
         return ()
 
     def sample_start(self, rng: np.random.Generator) -> CarState:
-        """Always the recorded start."""
+        """The recorded initial state."""
         return self.start
 
     def reward(self, features: Any, action: Any, next_features: Any) -> Any:

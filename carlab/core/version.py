@@ -1,3 +1,3 @@
-"""The version of carlab, which recordings and runs name."""
+"""The version of carlab, written to recordings and runs."""
 
 VERSION = "0.1.0"

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from carlab.core.errors import ConfigError, DataError
-from carlab.core.geofence import each_can_stop_inside, stopping_distance_m
+from carlab.core.geofence import can_stop_inside_batch, stopping_distance_m
 from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import Task
@@ -191,7 +191,7 @@ class ModelEnv(VecEnv):
         needed = stopping_distance_m(speed, self._envelope.reaction_s, self._envelope.deceleration_mps2)
         found: NDArray[np.bool_] = ~(speed <= self._envelope.max_speed_mps)
         if self._arena_m:
-            found |= ~each_can_stop_inside(self._arena_m, state[:, :2], course, needed)
+            found |= ~can_stop_inside_batch(self._arena_m, state[:, :2], course, needed)
         return found
 
     def _start(self, cars: NDArray[np.int64]) -> NDArray[np.float32]:

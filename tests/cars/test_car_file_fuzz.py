@@ -1,4 +1,4 @@
-"""Mutations of valid car files: whatever is in them, only ConfigError leaves the loader, with one sentence."""
+"""Mutations of valid car files: the loader raises only ConfigError, with one sentence."""
 
 import os
 import random
@@ -30,7 +30,7 @@ def seeds() -> list[str]:
 
 
 def mutated(text: str, rng: random.Random) -> str:
-    """One to three changes: a value, a key, a table header, a line, or a character."""
+    """Change one to three values, keys, table headers, lines or characters."""
     for _ in range(rng.randint(1, 3)):
         lines = text.split("\n")
         k = rng.randrange(len(lines))
@@ -53,7 +53,7 @@ def mutated(text: str, rng: random.Random) -> str:
     return text
 
 
-def test_only_config_errors_leave_the_loader(tmp_path: Path) -> None:
+def test_loader_raises_only_config_errors(tmp_path: Path) -> None:
     rng, files = random.Random(0), seeds()
     path = tmp_path / "car.toml"
     refused = 0
@@ -73,7 +73,7 @@ def test_only_config_errors_leave_the_loader(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "corners", ["[[0, 0], [1], [1, 1]]", '[["a", 0], [1, 0], [1, 1]]', "[[0, 0], [1, 0], {a = 1}]", "3", "[]"]
 )
-def test_corners_that_are_no_polygon_are_refused_in_one_sentence(corners: str, tmp_path: Path) -> None:
+def test_invalid_corners_are_refused_with_one_sentence(corners: str, tmp_path: Path) -> None:
     text = re.sub(r"corners_m = .*", f"corners_m = {corners}", seeds()[0])
     path = tmp_path / "car.toml"
     path.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The same policy on the same physics, in process and over the wire, ends in the same place."""
+"""The same policy on the same physics ends at the same state, in process and over the wire."""
 
 import math
 from collections.abc import Iterator
@@ -53,7 +53,7 @@ def drive(car: Car, policy: Policy, seed: int) -> EpisodeData:
 
 @pytest.mark.realtime
 @pytest.mark.timeout(240)
-def test_same_policy_same_end(emulated: EmulatedCar, latency: LatencyParts) -> None:
+def test_same_policy_ends_at_the_same_state(emulated: EmulatedCar, latency: LatencyParts) -> None:
     policy = ReverseParkingPolicy.for_car(default_car().simulator)
     extra_pose_s = latency.pose_s - default_car().simulator.mocap.latency_s
     apart_m, apart_rad = [], []
@@ -77,17 +77,17 @@ def test_same_policy_same_end(emulated: EmulatedCar, latency: LatencyParts) -> N
 
 
 @pytest.mark.realtime
-def test_latency_by_part_adds_up(latency: LatencyParts) -> None:
+def test_latency_parts_match_the_known_delays(latency: LatencyParts) -> None:
     assert set(latency.parts) == {COMMAND_TO_WIRE, WIRE_TO_FIRMWARE, EXPOSURE_TO_ARRIVAL, ARRIVAL_TO_LOOP}
     for name, samples in latency.parts.items():
         assert (samples > 0).all(), (name, samples)
-    # A servo frame of 8 bytes and one of 10 at 115200 baud take 1.56 ms on the wire; the servo's comes at its end.
+    # Frames of 8 and 10 bytes at 115200 baud take 1.56 ms on the wire; the servo frame is the last.
     assert np.median(latency.parts[WIRE_TO_FIRMWARE]) > 0.6e-3
-    # The world delivers each exposure as late as the car file says, and never earlier.
+    # The world delivers each exposure after the latency of the car file, never earlier.
     assert np.median(latency.parts[EXPOSURE_TO_ARRIVAL]) > default_car().simulator.mocap.latency_s - 1e-3
 
 
-def test_a_seed_fixes_the_simulated_episode_to_the_last_bit() -> None:
+def test_equal_seeds_give_identical_simulated_episodes() -> None:
     policy = ReverseParkingPolicy.for_car(default_car().simulator)
     runs = []
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""The process behind an emulated car: its answers belong to their questions, and it never stays behind."""
+"""The process of an emulated car: answers match their requests, and the process always ends."""
 
 import contextlib
 import os
@@ -36,36 +36,34 @@ def world() -> Iterator[EmulatedWorld]:
     opened.close()
 
 
-def test_an_answer_that_comes_too_late_is_not_taken_for_the_next(
-    world: EmulatedWorld, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_late_answer_is_not_used_for_the_next_request(world: EmulatedWorld, monkeypatch: pytest.MonkeyPatch) -> None:
     pid = world.addresses["pid"]
     os.kill(pid, signal.SIGSTOP)
     try:
         monkeypatch.setattr(emulated_car_module, "ANSWER_TIMEOUT_S", 0.2)
         with pytest.raises(NotReadyError, match="no answer within") as caught:
-            world.ask(do="log")
+            world.request(do="log")
         assert len(caught.value.reasons) == 1
     finally:
         os.kill(pid, signal.SIGCONT)
         monkeypatch.undo()
-    assert "state" in world.ask(do="state")
-    with pytest.raises(NotReadyError, match="cannot do 'somersault'"):
-        world.ask(do="somersault")
-    assert "entries" in world.ask(do="log")
+    assert "state" in world.request(do="state")
+    with pytest.raises(NotReadyError, match="no request 'somersault'"):
+        world.request(do="somersault")
+    assert "entries" in world.request(do="log")
 
 
-def test_a_world_that_was_killed_is_a_sentence_and_closes(world: EmulatedWorld) -> None:
+def test_killed_world_is_reported_and_closes(world: EmulatedWorld) -> None:
     os.kill(world.addresses["pid"], signal.SIGKILL)
     for _ in range(2):
         with pytest.raises(NotReadyError, match="world"):
-            world.ask(do="state")
+            world.request(do="state")
     world.close()
     with pytest.raises(NotOpenError):
-        world.ask(do="state")
+        world.request(do="state")
 
 
-def test_a_car_whose_world_dies_closes_and_opens_again() -> None:
+def test_car_closes_and_reopens_after_its_world_was_killed() -> None:
     car = EmulatedCar(default_car())
     try:
         car.open()
@@ -83,7 +81,7 @@ def test_a_car_whose_world_dies_closes_and_opens_again() -> None:
         car.close()
 
 
-def test_opening_that_fails_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_opening_leaves_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
     pids: list[int] = []
 
     def broken(self: EmulatedCar, there: dict[str, int]) -> None:
@@ -112,8 +110,8 @@ with car:
 
 @pytest.mark.realtime
 @pytest.mark.parametrize("after_s", [0.05, 0.3, 0.6, 1.0, None])
-def test_killed_at_any_moment_of_opening_or_placing_it_leaves_no_process(after_s: float | None) -> None:
-    """Processes of a session of their own are found by the marker in their environment."""
+def test_kill_during_opening_or_placing_leaves_no_process(after_s: float | None) -> None:
+    """Processes in separate sessions are found by the marker in their environment."""
     marker = f"CARLAB_TEST_MARKER_{os.getpid()}_{after_s}"
     process = subprocess.Popen(
         [sys.executable, "-c", OPENER], stdout=subprocess.PIPE, text=True, env={**os.environ, marker: "1"}
@@ -133,12 +131,12 @@ def test_killed_at_any_moment_of_opening_or_placing_it_leaves_no_process(after_s
             process.stdout.close()
     end_s = time.monotonic() + TIMEOUT_S
     while left := marked(marker):
-        assert time.monotonic() < end_s, f"left behind: {left}"
+        assert time.monotonic() < end_s, f"processes still running: {left}"
         time.sleep(0.05)
 
 
 def marked(marker: str) -> list[int]:
-    """Processes with a variable in their environment."""
+    """Ids of processes with the marker in their environment."""
     found = []
     for environment in Path("/proc").glob("[0-9]*/environ"):
         with contextlib.suppress(OSError):
@@ -154,7 +152,7 @@ def assert_gone(pid: int) -> None:
 
 @pytest.mark.realtime
 def test_a_frozen_pose_with_fresh_stamps_ends_the_episode() -> None:
-    """The cameras repeat one pose while the wheels turn: the gate stops the car within about half a second."""
+    """Motion capture repeats one pose while the wheels turn: the gate stops the car within about half a second."""
     events: list[SafetyEvent] = []
     with EmulatedCar(default_car()) as car:
         car.place(CarState())
@@ -167,7 +165,7 @@ def test_a_frozen_pose_with_fresh_stamps_ends_the_episode() -> None:
                 time.sleep(1.0 / 30.0)
 
         drive(30)
-        car.world.ask(do="mocap", faults={"frozen": True})
+        car.world.request(do="mocap", faults={"frozen": True})
         frozen_s = time.monotonic()
         with pytest.raises(SafetyStop) as stop:
             drive(90)

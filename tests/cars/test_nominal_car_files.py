@@ -1,4 +1,4 @@
-"""The nominal files of the two public cars load under their name, and their facts are those that were published."""
+"""The presets of the two public cars: loading by name, and the published numbers."""
 
 import tomllib
 from importlib import resources
@@ -17,7 +17,7 @@ FACTS = ("vehicle.mass", "vehicle.front_axle", "vehicle.rear_axle", "timing.cont
 
 
 @pytest.mark.parametrize("name", CARS)
-def test_a_car_that_comes_along_is_loaded_by_its_name_and_from_its_file(name):
+def test_preset_is_loaded_by_name_and_by_path(name):
     by_name = load_car_file(Path(name))
     with resources.as_file(resources.files("sim_backends") / "presets" / f"{name}.toml") as path:
         by_path = load_car_file(path)
@@ -27,7 +27,7 @@ def test_a_car_that_comes_along_is_loaded_by_its_name_and_from_its_file(name):
 
 
 @pytest.mark.parametrize("name", CARS)
-def test_what_was_measured_is_held_and_what_was_guessed_has_a_range(name):
+def test_measured_parameters_are_fixed_and_unknown_ones_have_a_range(name):
     config = SimulatorConfig.from_preset(name)
     for fact in FACTS:
         assert fact not in config.priors
@@ -37,7 +37,7 @@ def test_what_was_measured_is_held_and_what_was_guessed_has_a_range(name):
         assert high > 1.5 * low
 
 
-def test_the_published_facts():
+def test_preset_numbers_equal_the_published_facts():
     eth = SimulatorConfig.from_preset("eth_rc_car").parameters
     assert (eth.mass_kg, eth.front_axle_m, eth.rear_axle_m) == (1.65, 0.13, 0.17)
     dart = SimulatorConfig.from_preset("dart_jetracer").parameters
@@ -46,7 +46,7 @@ def test_the_published_facts():
     assert dart.mass_kg * dart.rear_axle_m / dart.wheelbase_m == pytest.approx(0.847, abs=0.001)
 
 
-def test_the_linear_car_differs_from_the_other_in_nothing_but_its_tyre_model():
+def test_linear_preset_differs_only_in_its_tyre_model():
     plain, linear = (SimulatorConfig.from_preset(n) for n in ("dart_jetracer", "dart_jetracer_linear"))
     assert (plain.kind, linear.kind) == ("dynamic", "linear_tyre")
     assert plain.values() == linear.values()
@@ -54,7 +54,7 @@ def test_the_linear_car_differs_from_the_other_in_nothing_but_its_tyre_model():
 
 
 @pytest.mark.parametrize("name", CARS)
-def test_it_can_be_driven_as_a_simulated_car(name):
+def test_preset_can_be_driven_as_a_simulated_car(name):
     choice = choose_car(name)
     assert choice.car.reality is Reality.SIMULATED
     with choice.car as car:
@@ -68,7 +68,7 @@ def test_it_can_be_driven_as_a_simulated_car(name):
     assert state.yaw_rate_radps > 0.2
 
 
-def test_an_unknown_name_is_answered_with_those_there_are(capfd):
+def test_unknown_name_is_refused_with_the_available_names(capfd):
     with pytest.raises(ConfigError, match="dart_jetracer, dart_jetracer_linear, eth_rc_car, rc_car"):
         load_car_file(Path("dart_jetracr"))
     with pytest.raises(ConfigError, match=r"dart_jetracer, dart_jetracer_linear, eth_rc_car, rc_car, or a FILE\.toml"):
@@ -77,7 +77,7 @@ def test_an_unknown_name_is_answered_with_those_there_are(capfd):
     assert "eth_rc_car" in " ".join(capfd.readouterr().err.split())
 
 
-def test_a_file_of_that_name_goes_before_the_car_that_comes_along(tmp_path, monkeypatch):
+def test_file_has_priority_over_a_preset_of_the_same_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("eth_rc_car").write_text("[vehicle]\nmass = 9.0\n")
     assert load_car_file(Path("eth_rc_car")).simulator.parameters.mass_kg == 9.0

@@ -1,6 +1,6 @@
-"""One suite for every car: simulated, emulated over serial, emulated over CAN, dry run, and with --hil a real one.
+"""One suite for every car: simulated, emulated over serial, emulated over CAN, dry run, and with --hil a real car.
 
-The emulated cars are the whole hardware path: sender process, bytes on a pty or CAN bus, NatNet over UDP.
+The emulated cars use the complete hardware path: sender process, bytes on a pty or CAN bus, NatNet over UDP.
 """
 
 import math
@@ -47,7 +47,7 @@ def car(closed_car: Car) -> Iterator[Car]:
 
 
 def arm(car: Car) -> None:
-    """Arm within five seconds: a machine that is busy elsewhere gets its poses late, and a car says so and waits."""
+    """Arm within five seconds; on a busy machine poses may be late, and the car refuses to arm."""
     end_s = car.clock.now_s() + 5.0
     while True:
         try:
@@ -70,7 +70,7 @@ def hold(car: Car, action: Action, seconds: float) -> None:
         wait(car, 0.03)
 
 
-def test_constructing_does_nothing_and_a_closed_car_refuses(closed_car: Car) -> None:
+def test_constructing_does_nothing_and_a_closed_car_raises(closed_car: Car) -> None:
     for use in (closed_car.observe, closed_car.arm, lambda: closed_car.command(NEUTRAL)):
         with pytest.raises(NotOpenError):
             use()
@@ -104,7 +104,7 @@ def test_observations_are_fresh_and_advance(car: Car) -> None:
     assert second.velocity_delay_s > 0.0
 
 
-def test_nothing_but_neutral_before_arming(car: Car) -> None:
+def test_only_neutral_is_accepted_before_arming(car: Car) -> None:
     assert car.command(NEUTRAL).is_neutral
     with pytest.raises(NotArmedError):
         car.command(Action(0.2, 0.2))
@@ -131,9 +131,9 @@ def test_command_returns_what_is_sent(car: Car) -> None:
         assert sent.throttle == pytest.approx(action.throttle, abs=0.002)
 
 
-def test_it_drives_where_it_is_told(car: Car) -> None:
+def test_commands_drive_the_car_forward_and_left(car: Car) -> None:
     if car.reality in (Reality.DRY_RUN, Reality.REAL):
-        pytest.skip("this car moves nothing, or has no room to")
+        pytest.skip("this car does not move, or has no space")
     assert car.place(CarState(0.0, 0.0, 0.5))
     start = car.observe().state
     assert math.hypot(start.x_m, start.y_m) < 0.01
@@ -148,14 +148,14 @@ def test_it_drives_where_it_is_told(car: Car) -> None:
     assert moved.x_m * math.cos(0.5) + moved.y_m * math.sin(0.5) > 0.1
 
 
-def test_the_watchdog_gives_neutral_when_commands_stop(car: Car) -> None:
+def test_watchdog_sends_neutral_when_commands_stop(car: Car) -> None:
     if car.reality in (Reality.DRY_RUN, Reality.REAL):
-        pytest.skip("this car moves nothing, or has no room to")
+        pytest.skip("this car does not move, or has no space")
     car.place(CarState())
     arm(car)
     hold(car, Action(0.0, 0.5), 0.6)
     fast = car.observe().state.vx_mps
-    # Silence: the deadline is 0.15 s, the command delay 0.08 s; after that the motor no longer pushes.
+    # Without commands: after the deadline of 0.15 s and the command delay of 0.08 s the motor force is zero.
     wait(car, 0.4)
     later = car.observe().state.vx_mps
     wait(car, 0.3)
@@ -182,7 +182,7 @@ def test_a_planned_stop_disarms_and_an_unplanned_one_latches(car: Car) -> None:
     assert car.command(Action(0.1, 0.0)).steering > 0
 
 
-def test_it_can_be_opened_again(closed_car: Car) -> None:
+def test_car_can_be_opened_again(closed_car: Car) -> None:
     for _ in range(2):
         with closed_car:
             closed_car.observe()
@@ -190,7 +190,7 @@ def test_it_can_be_opened_again(closed_car: Car) -> None:
             closed_car.command(Action(0.1, 0.0))
 
 
-def test_the_data_says_what_the_car_is_made_of(closed_car: Car, request: pytest.FixtureRequest) -> None:
+def test_reality_of_each_car_is_declared(closed_car: Car, request: pytest.FixtureRequest) -> None:
     kind = request.node.callspec.params["closed_car"]
     expected = {"sim": Reality.SIMULATED, "dry-run": Reality.DRY_RUN, "real": Reality.REAL}
     assert closed_car.reality is expected.get(kind, Reality.EMULATED)

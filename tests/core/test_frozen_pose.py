@@ -36,7 +36,7 @@ def test_a_pose_that_is_frozen_while_the_motor_turns_ends_the_episode() -> None:
 
 
 @pytest.mark.parametrize("turning", [False, None])
-def test_a_car_that_stands_is_not_frozen(turning: bool | None) -> None:
+def test_car_at_rest_is_not_frozen(turning: bool | None) -> None:
     safe, car, _ = gate()
     assert drive_with_pose(safe, car, [CarState(x_m=1.0)] * 60, turning) == 60
 
@@ -47,7 +47,7 @@ def test_a_blocked_car_whose_pose_moves_by_the_noise_is_not_frozen() -> None:
     assert drive_with_pose(safe, car, [CarState(x_m=1.0 + float(n)) for n in noise]) == 60
 
 
-def test_a_car_that_only_turns_is_not_frozen() -> None:
+def test_car_with_changing_yaw_only_is_not_frozen() -> None:
     safe, car, _ = gate()
     assert drive_with_pose(safe, car, [CarState(yaw_rad=0.01 * k) for k in range(60)]) == 60
 

@@ -10,8 +10,8 @@ from carlab.core.errors import ConfigError
 from carlab.core.geofence import (
     as_polygon,
     can_stop_inside,
+    can_stop_inside_batch,
     contains,
-    each_can_stop_inside,
     free_distance_m,
     rectangle,
     stopping_distance_m,
@@ -36,8 +36,8 @@ def test_free_distance_inside_a_concave_polygon(heading_rad: float, distance_m: 
     assert free_distance_m(CONCAVE, 2.0, 0.5, heading_rad) == pytest.approx(distance_m)
 
 
-def test_the_nearest_of_several_edges_on_the_way_counts_in_either_sense() -> None:
-    # From the left arm of the W towards the right one the ray leaves through the notch and enters again.
+def test_free_distance_ends_at_the_nearest_edge_in_either_sense() -> None:
+    # From the left arm of the W towards the right arm the ray leaves through the notch and enters again.
     for corners in (CONCAVE, CONCAVE[::-1]):
         assert free_distance_m(corners, 0.5, 2.0, 0.0) == pytest.approx(0.5)
         assert free_distance_m(corners, 3.5, 2.0, math.pi) == pytest.approx(0.5)
@@ -61,12 +61,12 @@ def test_the_nearest_of_several_edges_on_the_way_counts_in_either_sense() -> Non
         (CarState(0.0, 0.0, 0.0, math.nan), False),
     ],
 )
-def test_a_car_can_stop_inside_where_its_way_over_ground_is_long_enough(state: CarState, can: bool) -> None:
+def test_car_can_stop_inside_if_the_free_distance_suffices(state: CarState, can: bool) -> None:
     assert can_stop_inside(rectangle(-1.0, 1.0, -1.0, 1.0), state, 0.1, 2.0) is can
 
 
-def test_of_many_cars_each_can_stop_where_its_way_stays_inside(rng: np.random.Generator) -> None:
-    """Against matplotlib at 400 points of each way; those that end within a hundredth of an edge are not asked."""
+def test_batch_of_cars_can_stop_if_their_paths_stay_inside(rng: np.random.Generator) -> None:
+    """Against matplotlib at 400 points of each stopping path, except paths that end within a hundredth of an edge."""
     places, course = rng.uniform(-0.3, 4.3, (1500, 2)), rng.uniform(-4.0, 4.0, 1500)
     needed = rng.uniform(0.0, 2.0, 1500)
 
@@ -77,7 +77,7 @@ def test_of_many_cars_each_can_stop_where_its_way_stays_inside(rng: np.random.Ge
         return inside.all(axis=1)
 
     for corners in (CONCAVE, CONCAVE[::-1], rectangle(-0.2, 3.0, 0.5, 4.0)):
-        found = each_can_stop_inside(corners, places, course, needed)
+        found = can_stop_inside_batch(corners, places, course, needed)
         longer, shorter = stays(corners, 1.02), stays(corners, 0.98)
         clear = longer == shorter
         assert clear.sum() > 1400
@@ -85,13 +85,13 @@ def test_of_many_cars_each_can_stop_where_its_way_stays_inside(rng: np.random.Ge
         assert 200 < found.sum() < 1300
 
 
-def test_of_many_cars_it_is_what_is_said_of_each(rng: np.random.Generator) -> None:
+def test_batch_agrees_with_single_cars(rng: np.random.Generator) -> None:
     places, course = rng.uniform(-0.3, 4.3, (300, 2)), rng.uniform(-4.0, 4.0, 300)
     speed = rng.uniform(-3.0, 3.0, 300)
     places[0, 0], course[1] = math.nan, math.nan
     needed = stopping_distance_m(np.abs(speed), 0.1, 2.0)
-    # Driven backwards, the way over ground is the other one.
-    found = each_can_stop_inside(CONCAVE, places, course + np.where(speed < 0.0, math.pi, 0.0), needed)
+    # In reverse the course over ground is opposite to the heading.
+    found = can_stop_inside_batch(CONCAVE, places, course + np.where(speed < 0.0, math.pi, 0.0), needed)
     states = [CarState(x, y, yaw, v) for (x, y), yaw, v in zip(places, course, speed, strict=True)]
     assert found.tolist() == [can_stop_inside(CONCAVE, s, 0.1, 2.0) for s in states]
 

@@ -1,4 +1,4 @@
-"""The safety gate: dense around its bounds, and driven through a car that only logs its commands."""
+"""The safety gate: tests near its limits, with a car that only logs its commands."""
 
 import math
 from dataclasses import fields, replace
@@ -27,7 +27,7 @@ def test_nothing_passes_before_arming() -> None:
 
 
 @given(st.lists(st.tuples(ANY_FLOAT, ANY_FLOAT), max_size=20))
-def test_no_command_sequence_gets_past_the_bounds(commands: list[tuple[float, float]]) -> None:
+def test_every_command_sequence_stays_within_the_limits(commands: list[tuple[float, float]]) -> None:
     envelope = SafetyEnvelope(max_steering=0.8, max_throttle=0.3, steering_rate_per_s=3.0, throttle_rate_per_s=2.0)
     car = LoggingCar()
     safe = SafeCar(car, envelope, lambda event: None)
@@ -60,7 +60,7 @@ def test_no_command_sequence_gets_past_the_bounds(commands: list[tuple[float, fl
 
 
 @pytest.mark.parametrize(("age_s", "paused"), [(0.0, False), (0.099, False), (0.101, True), (0.499, True)])
-def test_a_stale_pose_gives_neutral_and_comes_back(age_s: float, paused: bool) -> None:
+def test_stale_pose_gives_neutral_until_a_fresh_pose(age_s: float, paused: bool) -> None:
     safe, car, events = gate()
     safe.arm()
     sent = safe.command(Action(0.5, 0.5), seen(car.clock.now_s() - age_s), PERIOD_S)
@@ -112,7 +112,7 @@ def test_overspeed_and_geofence() -> None:
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 2))
-def test_slew_reaches_its_target_and_never_holds_back_a_release(target: float, previous: float, step: float) -> None:
+def test_slew_reaches_its_target_and_never_limits_motion_to_zero(target: float, previous: float, step: float) -> None:
     value = slew(target, previous, step)
     assert min(target, previous, 0.0) <= value <= max(target, previous, 0.0)
     if abs(target) <= abs(previous) and target * previous >= 0:
@@ -162,15 +162,15 @@ def test_a_state_that_is_not_a_number_ends_the_episode(
 @pytest.mark.parametrize(
     ("t_capture_s", "t_receive_s", "why"),
     [
-        (10.0, math.nan, "came nan ms ago"),
-        (math.nan, 10.0, "taken nan ms ago"),
-        (10.0, 3610.0, "has another"),
-        (9.499, 10.0, "taken 501 ms ago"),
+        (10.0, math.nan, "arrived nan ms ago"),
+        (math.nan, 10.0, "captured nan ms ago"),
+        (10.0, 3610.0, "ahead of the car's clock"),
+        (9.499, 10.0, "captured 501 ms ago"),
         (9.501, 9.95, None),
         (10.005, 10.005, None),
     ],
 )
-def test_a_pose_of_another_time_ends_the_episode(t_capture_s: float, t_receive_s: float, why: str | None) -> None:
+def test_pose_with_implausible_times_ends_the_episode(t_capture_s: float, t_receive_s: float, why: str | None) -> None:
     safe, car, _ = gate()
     safe.arm()
     observation = Observation(CarState(), t_capture_s, t_receive_s, 1)
@@ -200,9 +200,7 @@ def test_a_pose_of_another_time_ends_the_episode(t_capture_s: float, t_receive_s
         (CarState(x_m=0.21), -100.0, 0.05, True),
     ],
 )
-def test_a_pose_that_jumps_further_than_a_car_drives_ends_the_episode(
-    state: CarState, dt_capture_s: float, dt_receive_s: float, leaps: bool
-) -> None:
+def test_pose_jump_ends_the_episode(state: CarState, dt_capture_s: float, dt_receive_s: float, leaps: bool) -> None:
     if state.yaw_rad == 0.0:
         state = replace(state, yaw_rad=3.0)
     safe, car, events = gate(max_speed_mps=2.0, lost_pose_s=200.0)
@@ -224,7 +222,7 @@ def test_a_pose_that_jumps_further_than_a_car_drives_ends_the_episode(
     safe.command(Action(0.1, 0.1), later, PERIOD_S)
 
 
-def test_another_body_after_a_gap_is_a_jump_though_it_stands_still() -> None:
+def test_another_body_at_rest_after_a_gap_is_a_jump() -> None:
     safe, car, _ = gate(max_speed_mps=2.0)
     safe.arm()
     safe.command(Action(0.1, 0.1), seen(10.0), PERIOD_S)
@@ -245,7 +243,7 @@ def test_an_unknown_speed_gives_neutral_until_it_is_known() -> None:
     assert safe.state is SafetyState.ARMED
 
 
-def test_events_tell_the_begin_of_an_intervention_and_not_each_tick_of_it() -> None:
+def test_events_are_emitted_at_the_start_of_an_intervention_only() -> None:
     safe, car, events = gate(max_throttle=0.2)
     safe.arm()
     for throttle in (0.1, 0.5, 0.6, 0.1, 0.5):
@@ -255,7 +253,7 @@ def test_events_tell_the_begin_of_an_intervention_and_not_each_tick_of_it() -> N
     assert [a.throttle for a in car.log] == [0.1, 0.2, 0.2, 0.1, 0.2]
 
 
-def test_the_narrower_of_envelope_and_car_limits() -> None:
+def test_narrower_limit_of_envelope_and_car_applies() -> None:
     for steering, throttle in ((0.3, 0.9), (0.9, 0.3)):
         car = LoggingCar()
         car.limits = ActionLimits(max_steering=0.5, max_throttle=0.5)
@@ -269,7 +267,7 @@ def test_the_narrower_of_envelope_and_car_limits() -> None:
 
 
 @pytest.mark.parametrize("bad", [Action(math.nan, 0.0), Action(0.0, math.inf), Action(-math.inf, math.nan)])
-def test_what_is_not_a_number_does_not_even_reach_the_car(bad: Action) -> None:
+def test_nan_command_never_reaches_the_car(bad: Action) -> None:
     safe, car, _ = gate()
     car.check = lambda action: None  # type: ignore[method-assign]
     safe.arm()
@@ -279,14 +277,14 @@ def test_what_is_not_a_number_does_not_even_reach_the_car(bad: Action) -> None:
     assert (car.log, car.stops) == ([], [False])
 
 
-def test_what_is_said_to_be_sent_is_what_the_car_says() -> None:
+def test_returned_command_is_that_of_the_car() -> None:
     safe, car, _ = gate()
     car.command = lambda action: Action(0.123, round(action.throttle, 1))  # type: ignore[method-assign]
     safe.arm()
     assert safe.command(Action(0.12345, 0.26), seen(10.0), PERIOD_S) == Action(0.123, 0.3)
 
 
-def test_a_long_gap_does_not_save_up_slew() -> None:
+def test_slew_does_not_accumulate_over_a_gap() -> None:
     safe, car, _ = gate(throttle_rate_per_s=1.0, lost_pose_s=9.0)
     safe.arm()
     assert safe.command(Action(0.0, 1.0), seen(10.0), PERIOD_S).throttle == pytest.approx(PERIOD_S)
@@ -321,7 +319,7 @@ def test_slew_begins_at_neutral_after_arming_and_after_a_pause() -> None:
         (ActionOutOfRangeError("beyond the car's limit"), EndReason.BAD_COMMAND),
     ],
 )
-def test_a_car_that_refuses_ends_the_episode(error: Exception, reason: EndReason) -> None:
+def test_error_of_the_car_ends_the_episode(error: Exception, reason: EndReason) -> None:
     safe, car, _ = gate()
     safe.arm()
 
@@ -338,14 +336,14 @@ def test_a_car_that_refuses_ends_the_episode(error: Exception, reason: EndReason
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-2, 0))
-def test_time_that_does_not_pass_moves_no_command_away_from_zero(target: float, previous: float, dt_s: float) -> None:
+def test_zero_time_step_moves_no_command_away_from_zero(target: float, previous: float, dt_s: float) -> None:
     value = limit(Action(0.0, target), Action(0.0, previous), dt_s, SafetyEnvelope()).throttle
     assert abs(value) <= abs(previous)
     assert value * previous >= 0.0
 
 
 @pytest.mark.parametrize("planned", [True, False])
-def test_after_a_stop_nothing_passes(planned: bool) -> None:
+def test_no_command_passes_after_a_stop(planned: bool) -> None:
     safe, car, _ = gate()
     safe.arm()
     safe.stop(planned=planned)

@@ -85,7 +85,7 @@ def test_noise_follows_the_savitzky_golay_formula():
     assert abs(np.mean(vx)) < 4 * expected / math.sqrt(len(vx))
 
 
-def test_too_few_samples_give_zero_velocity_and_say_so():
+def test_too_few_samples_give_invalid_zero_velocity():
     estimator = StateEstimator()
     assert estimator.estimate() is None
     for i in range(2):
@@ -112,7 +112,7 @@ def test_repeated_backward_untracked_and_not_finite_samples_change_nothing():
     assert (dirty.dropped, dirty.untracked, clean.dropped) == (90, 30, 0)
 
 
-def test_a_clock_set_back_for_good_starts_a_new_window():
+def test_backward_clock_step_starts_a_new_window():
     estimator = StateEstimator()
     for i in range(20):
         estimator.update(sample(i, 1000 + i / 120, 0.0, 0, 0))
@@ -123,7 +123,7 @@ def test_a_clock_set_back_for_good_starts_a_new_window():
     assert state.x_m == pytest.approx(2.0 * 19 / 120)
 
 
-def test_slow_motion_capture_uses_three_samples_and_an_old_one_does_not_count():
+def test_slow_motion_capture_uses_three_recent_samples():
     estimator = StateEstimator(window_s=0.05)
     for i in range(5):
         estimator.update(sample(i, i / 30, 1.5 * i / 30, 0, 0))
@@ -133,7 +133,7 @@ def test_slow_motion_capture_uses_three_samples_and_an_old_one_does_not_count():
     assert not estimator.velocity_valid
 
 
-def test_reset_forgets_the_place_but_not_the_counts():
+def test_reset_discards_samples_and_keeps_counts():
     estimator = StateEstimator()
     for i in range(10):
         estimator.update(sample(i, i / 120, 1.0, 0, 0))

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import circmean
 
-from carlab.core.angles import circular_mean, difference, on_one_branch, wrap
+from carlab.core.angles import align_unwrapped, circular_mean, difference, wrap
 from carlab.core.clock import MonotonicClock, Pacer, SimulatedClock
 from carlab.core.errors import ConfigError
 from carlab.core.tables import from_table
@@ -31,7 +31,7 @@ class Outer:
     maybe: float | None = None
 
 
-def test_a_good_table_becomes_the_dataclass() -> None:
+def test_valid_table_becomes_the_dataclass() -> None:
     table = {"port": "/dev/x", "kind": "b", "corners": [[0, 1], [2, 3.5]], "inner": {"gain": 3}, "maybe": 2}
     assert from_table(Outer, table, "[t]") == Outer("/dev/x", "b", 1, ((0.0, 1.0), (2.0, 3.5)), Inner(3.0), 2.0)
 
@@ -52,7 +52,7 @@ def test_a_good_table_becomes_the_dataclass() -> None:
         ({"port": "x", "inner": 3}, ["'inner'", "table"]),
     ],
 )
-def test_a_bad_table_is_one_sentence_that_names_the_key(table: dict[str, object], words: list[str]) -> None:
+def test_bad_table_is_reported_with_its_key(table: dict[str, object], words: list[str]) -> None:
     with pytest.raises(ConfigError) as caught:
         from_table(Outer, table, "[t] of car.toml")
     message = str(caught.value)
@@ -92,7 +92,7 @@ def test_wrap_keeps_the_direction(angle: float) -> None:
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
 
 
-def test_difference_goes_the_short_way() -> None:
+def test_difference_is_the_smallest_angle() -> None:
     assert difference(-3.1, 3.1) == pytest.approx(2 * math.pi - 6.2)
 
 
@@ -101,10 +101,10 @@ def test_circular_mean_agrees_with_scipy(rng: np.random.Generator) -> None:
     assert circular_mean(angles) == pytest.approx(circmean(angles, high=math.pi, low=-math.pi), abs=1e-9)
 
 
-def test_predictions_of_an_angle_are_laid_on_the_branch_of_what_was_measured():
+def test_predictions_are_unwrapped_onto_the_measured_angle():
     true = np.linspace(2.5, 10.0, 76)
     starts = [0, 30, 60]
     predicted = np.stack([wrap(true[k]) + (true[k : k + 10] - true[k]) for k in starts])
-    whole, shifted = on_one_branch(wrap(true), starts, predicted)
+    whole, shifted = align_unwrapped(wrap(true), starts, predicted)
     assert whole == pytest.approx(true)
     assert shifted == pytest.approx(np.stack([true[k : k + 10] for k in starts]))

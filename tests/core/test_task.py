@@ -1,4 +1,4 @@
-"""Rewards and encoder: closed forms, NumPy and torch alike, and the row that is learned from."""
+"""Rewards and encoder: closed forms, and agreement of NumPy and torch."""
 
 import math
 
@@ -22,7 +22,7 @@ def test_encode_and_decode_are_inverse(rng: np.random.Generator) -> None:
     assert features.shape == (50, feature_size(3)) == (50, 13)
     np.testing.assert_allclose(decode_state(features), states, atol=1e-12)
     np.testing.assert_array_equal(decode_history(features), history)
-    # The layout is written down, not merely invertible: oldest action first, steering before throttle.
+    # The layout itself: oldest action first, steering before throttle.
     np.testing.assert_allclose(features[0, 2:4], [math.sin(states[0, 2]), math.cos(states[0, 2])])
     np.testing.assert_array_equal(features[0, 7:], history[0].reshape(-1))
 
@@ -45,7 +45,7 @@ def test_parking_reward_is_the_paper_s_closed_form() -> None:
     actions = np.tile([1.0, -1.0], (4, 1))
     reward = task.reward(features_of(states), actions, features_of(states))
     np.testing.assert_allclose(reward, np.array([1.0, 1.0, 0.1, 0.1]) - 0.01, atol=1e-6)
-    # Beyond pi the yaw error is the short way round.
+    # The yaw error is wrapped to [-pi, pi).
     turned = np.zeros((1, 6))
     turned[0, 2] = 2 * math.pi - 0.05
     assert task.reward(features_of(turned), np.zeros((1, 2)), features_of(turned))[0] == pytest.approx(1.0)
@@ -86,7 +86,7 @@ def test_parking_start_matches_its_description(rng: np.random.Generator) -> None
         (CarState(0.0, 0.0, 0.0, 0.22, 0.22), False),
     ],
 )
-def test_parked_means_place_heading_and_speed(final: CarState, parked: bool) -> None:
+def test_parked_requires_position_heading_and_speed(final: CarState, parked: bool) -> None:
     task = ParkingTask()
     assert bool(task.summary(final)["parked"]) is parked
     assert bool(task.parked(features_of(final.to_array()[None]))[0]) is parked
@@ -107,7 +107,7 @@ def test_progress_along_a_circle_is_its_arc_length() -> None:
     assert back == pytest.approx(-3.5, rel=1e-3)
 
 
-def test_a_crossing_is_no_short_cut() -> None:
+def test_crossing_of_the_path_gives_no_extra_progress() -> None:
     task = PathTask()
     path = np.array(figure_eight_path(1.2))
     # Just before and after the crossing at half a lap: progress is one step, not half a lap.

@@ -199,7 +199,7 @@ def test_suspended_main_process_ends_in_neutral_and_is_refused_after_resuming(fi
         t_resumed_s = time.monotonic()
         drive.process.send_signal(signal.SIGCONT)
         said = drive.end()
-        assert "error ActuatorFaultError no command came" in said
+        assert "error ActuatorFaultError no command arrived" in said
         assert said.count("refused ActuatorFaultError") == 2
         assert "took it" not in said
         assert all(e.value == 0.0 for e in firmware.log.motor(t_resumed_s))
@@ -211,7 +211,7 @@ def test_a_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: Serial
         assert drive.lines.readline().strip() == "hanging"
         t_s = time.monotonic()
         said = drive.end()
-        assert "error ActuatorFaultError no command came" in said
+        assert "error ActuatorFaultError no command arrived" in said
         assert said.count("refused ActuatorFaultError") == 2
         later = [e for e in firmware.log.motor() if e.t_s > t_s + 1.0]
         assert len(later) >= 20

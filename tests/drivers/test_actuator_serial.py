@@ -133,7 +133,7 @@ def test_watchdog_then_latch_then_reset_and_arm(serial_firmware: SerialFirmware)
         after = [e for e in motor if e.t_s > moving[-1]]
         assert len(after) >= 3
         assert all(e.value == 0.0 for e in after)
-        with pytest.raises(ActuatorFaultError, match=r"no command came for 0\.5 s"):
+        with pytest.raises(ActuatorFaultError, match=r"no command arrived for 0\.5 s"):
             actuator.command(MOVING)
         with pytest.raises(ActuatorFaultError):
             actuator.command(NEUTRAL)

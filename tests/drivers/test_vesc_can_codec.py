@@ -138,7 +138,7 @@ def test_a_wrong_crc_and_short_frames_are_dropped() -> None:
     assert receiver.feed(CanFrame(0x072A, b"\x17")) is None
     assert receiver.feed(CanFrame(0x082A, b"\x17\x01")) is None
     assert receiver.errors == 3
-    with pytest.raises(ProtocolError, match="bytes where"):
+    with pytest.raises(ProtocolError, match="bytes, not"):
         codec.decode_status(CanFrame(0x0917, b"\x00\x01"))
 
 

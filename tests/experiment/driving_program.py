@@ -73,13 +73,13 @@ def main(folder: str, how: str) -> int:
         print(f"tick {tick.step}", flush=True)
         if tick.step == MISBEHAVE_AT_TICK:
             if how == "unplug":
-                car.world.ask(do="unplug")
+                car.world.request(do="unplug")
             if how == "mocap_silent":
-                car.world.ask(do="mocap", faults={"no_frames": True})
+                car.world.request(do="mocap", faults={"no_frames": True})
             if how == "mocap_hidden":
-                car.world.ask(do="mocap", faults={"occlusion": 1.0})
+                car.world.request(do="mocap", faults={"occlusion": 1.0})
             if how == "mocap_jump":
-                car.world.ask(do="place", state=[1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+                car.world.request(do="place", state=[1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
             if how == "world_dies":
                 os.kill(car.world.addresses["pid"], signal.SIGKILL)
             if how == "mocap_error":

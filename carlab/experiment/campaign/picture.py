@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from carlab.core.angles import on_one_branch
+from carlab.core.angles import align_unwrapped
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import STATE_NAMES
 from carlab.core.task import ParkingTask
@@ -93,7 +93,7 @@ def _state(axis: Any, which: int, episode: EpisodeData, predictions: WindowPredi
     """Plot one measured state and its predictions with twice their standard deviation."""
     measured, mean = episode.states[:, which], predictions.mean[..., which]
     if STATE_NAMES[which] == "yaw" and len(mean):
-        measured, mean = on_one_branch(measured, predictions.ticks[:, 0], mean)
+        measured, mean = align_unwrapped(measured, predictions.ticks[:, 0], mean)
     times_s = episode.times_s - episode.times_s[0]
     axis.plot(times_s, measured, color="black", linewidth=1.2)
     for ticks, window_mean, window_std in zip(predictions.ticks, mean, predictions.std[..., which], strict=True):

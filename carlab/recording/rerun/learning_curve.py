@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from carlab.core.angles import on_one_branch
+from carlab.core.angles import align_unwrapped
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.recording.atomic_files import rerun_file
 
@@ -50,7 +50,7 @@ def write_learning_curve(
             for k, name in enumerate(STATE_NAMES):
                 measured, predicted = states[:, k], mean[..., k]
                 if name == "yaw" and len(ticks):
-                    measured, predicted = on_one_branch(measured, ticks[:, 0], predicted)
+                    measured, predicted = align_unwrapped(measured, ticks[:, 0], predicted)
                 _series(stream, f"states/{name}/measured", before + np.arange(len(states)), measured[:, None])
                 if len(ticks):
                     center, half_width = predicted[:, 1:].ravel(), 2.0 * std[:, 1:, k].ravel()
