@@ -1,4 +1,4 @@
-"""Recordings of episodes: written while they run, read back afterwards, drawn and exported."""
+"""Recordings of episodes: writing during the episode, reading, plotting, import and export."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used: rerun, pyarrow and matplotlib are heavy."""
+    """Import a public name on first use, since rerun, pyarrow and matplotlib load slowly."""
     if name in _MODULES:
         return getattr(importlib.import_module(f"carlab.recording.{_MODULES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

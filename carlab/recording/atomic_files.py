@@ -1,4 +1,4 @@
-"""Files that replace the one that is there only once they are whole."""
+"""Atomic writing: a file replaces an existing file only after it is complete."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ APPLICATION = "carlab"
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text as UTF-8, or leave the file that is there.
+    """Write text as UTF-8; after an error an existing file is unchanged.
 
     Raises:
         DataError: it cannot be written.
@@ -41,17 +41,17 @@ def write_text(path: Path, text: str) -> None:
 def rerun_file(
     path: Path, recording_id: str | None = None, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A stream into an .rrd file that is there when the block ends well; after an error the old one stays.
+    """Recording stream into an .rrd file, created when the block ends; after an error the old file is unchanged.
 
     Raises:
         DataError: it cannot be written.
     """
     import rerun as rr
 
-    from carlab.recording.drained_file import DrainedFile
+    from carlab.recording.pipe_file import PipeFile
 
     partial = partial_path(path)
-    file = DrainedFile(partial)
+    file = PipeFile(partial)
     stream: rr.RecordingStream | None = None
     try:
         partial.unlink(missing_ok=True)

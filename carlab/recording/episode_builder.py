@@ -1,4 +1,4 @@
-"""Documents to arrays and back: pure, and the one place that says which state belongs to which command."""
+"""Conversion between documents and arrays; defines which state belongs to which command. Pure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LATE = "late_s"
 POLICY_TIME = "policy_s"
 TRACKED = "tracked"
 Row = tuple[float, int, Observation]
-"""Time [s] of an observation, the step that it begins, and the observation."""
+"""Time [s] of an observation, the step that starts with it, and the observation."""
 OWN_COLUMNS = (POSE_AGE, VELOCITY_DELAY, LATE, POLICY_TIME, TRACKED)
 
 
@@ -29,17 +29,16 @@ def episode_from_documents(
     extra: Mapping[int, Mapping[str, float]] | None = None,
     run_metadata: Mapping[str, str] | None = None,
 ) -> EpisodeData:
-    """Arrays of one episode, finished or not.
+    """Convert the documents of one episode, complete or not, to arrays.
 
-    ``times_s`` are the times of the ticks on the car's clock, the last one that of the last transition. Where there
-    is no observation after the last command (the program was killed, or the car failed in the middle of a tick) that
-    command is left out, because nobody saw what came of it.
-    ``extra`` gets the columns ``pose_age_s``, ``velocity_delay_s``, ``late_s`` and ``policy_s`` (NaN in the last row,
-    where there was no tick; a column without any number is left out), ``tracked`` (0 or 1) if it was ever lost, and
-    the further columns given by step in the argument ``extra``.
+    ``times_s`` are the times of the ticks on the car's clock; the last one is that of the last transition. The last
+    command is omitted if no observation follows it (the program was killed, or the car failed during the tick).
+    ``extra`` has the columns ``pose_age_s``, ``velocity_delay_s``, ``late_s`` and ``policy_s`` (NaN in the last row,
+    which has no tick; columns of NaN are omitted), ``tracked`` (0 or 1) if tracking was ever lost, and the further
+    columns of the argument ``extra`` (by step).
 
     Raises:
-        DataError: There is no tick with an observation after it.
+        DataError: No tick is followed by an observation.
     """
     started = next((d for d in documents if isinstance(d, EpisodeStarted)), None)
     ended = next((d for d in documents if isinstance(d, EpisodeEnded)), None)
@@ -74,7 +73,7 @@ def _reward(transition: Transition | None) -> float:
 def _observed(
     documents: Sequence[Document], transitions: Mapping[int, Transition], ended: EpisodeEnded | None
 ) -> tuple[list[Tick], list[Row]]:
-    """Ticks with an observation after their command, and the rows of all observations: one more than ticks."""
+    """Ticks whose command is followed by an observation, and the rows of all observations (one more than ticks)."""
     ticks = [d for d in documents if isinstance(d, Tick)]
     rows = [(tick.t_s, tick.step, tick.observation) for tick in ticks]
     if ended is None or ended.last is None or not ticks or ended.steps <= ticks[-1].step:
@@ -84,7 +83,7 @@ def _observed(
 
 
 def _tracked_poses(seen: Sequence[Observation]) -> FloatArray:
-    """Raw poses (P, 4) of all observations, without those of lost tracking."""
+    """Tracked raw poses (P, 4) of all observations."""
     poses = [pose for observation in seen for pose in observation.poses if pose.tracked]
     columns = [(pose.t_capture_s, pose.x_m, pose.y_m, pose.yaw_rad) for pose in poses]
     return np.array(columns, dtype=np.float64).reshape(-1, 4)
@@ -93,7 +92,7 @@ def _tracked_poses(seen: Sequence[Observation]) -> FloatArray:
 def _extra_columns(
     ticks: Sequence[Tick], rows: Sequence[Row], extra: Mapping[int, Mapping[str, float]]
 ) -> dict[str, FloatArray]:
-    """Further columns (T + 1,) of the rows; those without any number are left out."""
+    """Further columns (T + 1,) of the rows; columns of NaN are omitted."""
     seen = [observation for _, _, observation in rows]
     names = dict.fromkeys(name for values in extra.values() for name in values)
     columns = {
@@ -140,7 +139,7 @@ def _ended_texts(ended: EpisodeEnded | None) -> dict[str, str]:
 
 
 def goal_of(metadata: Mapping[str, str]) -> tuple[float, float, float] | None:
-    """The goal (x [m], y [m], yaw [rad]) in an episode's metadata; None where there is none."""
+    """The goal (x [m], y [m], yaw [rad]) in an episode's metadata; None without a goal."""
     goal = json.loads(metadata.get("goal", "null"))
     return None if goal is None else (float(goal[0]), float(goal[1]), float(goal[2]))
 
@@ -151,9 +150,9 @@ def polygon_of(metadata: Mapping[str, str], key: str) -> FloatArray:
 
 
 def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
-    """The documents that an episode of arrays would have emitted, so that every sink can write it.
+    """Convert an episode of arrays to documents, so that every sink can write it.
 
-    What the arrays do not hold (times of capture, lateness) is NaN. ``features`` are empty.
+    Values that the arrays lack (times of capture, lateness) are NaN. ``features`` are empty.
     """
     texts = episode.metadata
     yield started_from_arrays(episode)
@@ -182,7 +181,7 @@ def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
 
 
 def started_from_arrays(episode: EpisodeData) -> EpisodeStarted:
-    """The EpisodeStarted of an episode of arrays; a recording that does not say counts as one of a real car."""
+    """The EpisodeStarted of an episode of arrays; without metadata the car counts as real."""
     texts = episode.metadata
     known = _started_texts(EpisodeStarted(0, 0.0, 0, "", Reality.REAL, "", "", 0, 0.0, 0))
     known |= _ended_texts(EpisodeEnded(0.0, EndReason.COMPLETED, "", 0, 0.0))
@@ -210,7 +209,7 @@ def _observations(episode: EpisodeData) -> Iterator[Observation]:
     unknown = np.full(episode.ticks + 1, np.nan)
     age_s, delay_s = (episode.extra.get(name, unknown) for name in (POSE_AGE, VELOCITY_DELAY))
     tracked = episode.extra.get(TRACKED, np.ones(episode.ticks + 1))
-    # Each raw pose belongs to the first observation that is not older; those of equal time keep their order.
+    # Each raw pose belongs to the first observation that is not older; poses of equal time keep their order.
     owner = np.minimum(np.searchsorted(episode.times_s, episode.poses[:, 0], side="left"), episode.ticks)
     by_owner = np.argsort(owner, kind="stable")
     first = np.searchsorted(owner[by_owner], np.arange(episode.ticks + 2))

@@ -1,6 +1,6 @@
-"""A summary picture of one or several episodes (matplotlib, no window), for reports and for ``carlab view``.
+"""Summary picture of one or several episodes (matplotlib without a window), for reports and ``carlab view``.
 
-Colours are from Okabe and Ito's palette and the viridis map, which people with any colour vision tell apart.
+Colours are from Okabe and Ito's palette and the viridis map, which suit colour-blind readers.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from carlab.recording.sink import describe_os_error
 
 CAR_LENGTH_M = 0.42
 CAR_WIDTH_M = 0.19
-_OUTLINES = 9
+_OUTLINE_COUNT = 9
 _PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8c6d1f")
 _INK, _FAINT = "#333333", "#b8b8b8"
-_MOST_LABELS = 8
+_MAX_LABELS = 8
 
 
 def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str = "") -> None:
@@ -33,9 +33,9 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
     and the outlines of their start and end. Arena, goal and path come from the metadata of the first that has them.
 
     Args:
-        episodes: What to draw; at least one.
-        path: The picture; its ending (.png, .svg, .pdf) chooses the format. Overwritten.
-        title: Printed on top; car, reality and policy of the first episode unless given.
+        episodes: Episodes to draw; at least one.
+        path: The picture; its suffix (.png, .svg, .pdf) selects the format. Overwritten.
+        title: Title of the picture; by default car, reality and policy of the first episode.
 
     Raises:
         DataError: There is no episode, or the picture cannot be written.
@@ -44,7 +44,7 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
     from matplotlib.figure import Figure
 
     if not episodes:
-        raise DataError("There is no episode to draw; record one first, with carlab drive.")
+        raise DataError("There is no episode to draw; record one with carlab drive.")
     figure = Figure(figsize=(13.0, 7.6), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(4, 2, width_ratios=[1.15, 1.0])
@@ -68,7 +68,7 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
     except OSError as error:
         raise DataError(describe_os_error(error, path)) from error
     except ValueError as error:
-        raise DataError(f"{path} has an ending that is no picture format ({error}); use .png, .svg or .pdf.") from error
+        raise DataError(f"The suffix of {path} is no picture format ({error}); use .png, .svg or .pdf.") from error
 
 
 def _title(episode: EpisodeData) -> str:
@@ -79,12 +79,12 @@ def _title(episode: EpisodeData) -> str:
 
 
 def _end_of(episode: EpisodeData) -> str:
-    """How an episode ended, in two words: ``goal reached``."""
+    """Reason for the end of an episode, for example ``goal reached``."""
     return episode.metadata.get("end_reason", "").replace("_", " ").lower()
 
 
 def outline(x_m: float, y_m: float, yaw_rad: float) -> FloatArray:
-    """Corners of the drawn car with a nose, shape (6, 2) [m], closed."""
+    """Closed outline of the car with a pointed front, shape (6, 2) [m]."""
     half_m, side_m = 0.5 * CAR_LENGTH_M, 0.5 * CAR_WIDTH_M
     nose_m = 0.7 * half_m
     corners = np.array(
@@ -138,7 +138,7 @@ def _draw_by_time(figure: Any, plan: Any, episode: EpisodeData) -> None:
 
 
 def _even_rows(t_s: FloatArray) -> list[int]:
-    wanted = np.linspace(0.0, float(t_s[-1]), _OUTLINES)
+    wanted = np.linspace(0.0, float(t_s[-1]), _OUTLINE_COUNT)
     return sorted({int(k) for k in np.minimum(np.searchsorted(t_s, wanted), len(t_s) - 1)})
 
 
@@ -146,7 +146,7 @@ def _draw_many(plan: Any, episodes: Sequence[EpisodeData]) -> None:
     for k, episode in enumerate(episodes):
         color = _color(k)
         number = episode.metadata.get("episode", str(k + 1))
-        label = " ".join(filter(None, (number, _end_of(episode)))) if k < _MOST_LABELS else None
+        label = " ".join(filter(None, (number, _end_of(episode)))) if k < _MAX_LABELS else None
         plan.plot(*episode.states[:, :2].T, color=color, linewidth=1.9, alpha=0.9, label=label, zorder=4)
         shape = outline(*episode.states[-1, :3])
         plan.fill(*shape.T, facecolor=color, alpha=0.35, zorder=3)
@@ -197,7 +197,7 @@ def _draw_velocities(speeds: Any, turns: Any, episodes: Sequence[EpisodeData]) -
 
 
 def _draw_below(axis: Any, episodes: Sequence[EpisodeData]) -> None:
-    """Latencies of one episode, rewards of several; the speed over ground where neither was recorded."""
+    """Draw latencies of one episode or rewards of several; the speed over ground if neither was recorded."""
     first = episodes[0]
     columns = ((POSE_AGE, "age of the pose"), (LATE, "lateness of the tick"), (POLICY_TIME, "time of the policy"))
     known = [(first.extra[name], label) for name, label in columns if name in first.extra]

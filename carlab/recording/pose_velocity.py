@@ -1,4 +1,4 @@
-"""Velocities from poses with irregular stamps: a centred local quadratic, without delay, never across a break."""
+"""Velocities from poses with irregular stamps by a centred local quadratic fit, separately between breaks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ BoolArray = NDArray[np.bool_]
 IndexArray = NDArray[np.intp]
 
 HALF_WINDOW_S = 0.05
-"""Half the smoother's span: at 100 Hz eleven samples, at 30 Hz the least number, five."""
+"""Half the span of the fit [s]: eleven samples at 100 Hz, the minimum of five at 30 Hz."""
 MIN_HALF_ROWS = 2
 
-# A break is a step that no wheeled model car makes: beyond what 100 m/s^2 (a hard collision reaches half of it) and
-# 500 rad/s^2 add to the motion of the rows around it, plus 5 cm and 0.3 rad for stamps that jitter.
+# A break is a step beyond the motion of the neighbouring rows plus accelerations of 100 m/s^2 (twice those of a hard
+# collision) and 500 rad/s^2, plus 5 cm and 0.3 rad for jitter of the stamps.
 _JUMP_M, _JUMP_ACCELERATION = 0.05, 100.0
 _JUMP_RAD, _JUMP_ANGULAR = 0.3, 500.0
 
@@ -36,7 +36,7 @@ class PoseMotion:
     half_rows: int
 
     def method(self) -> str:
-        """Words for the metadata."""
+        """Description of the method for the metadata."""
         return (
             f"local quadratic through {2 * self.half_rows + 1} unwrapped poses about each row, centred: no delay "
             "(one-sided at the ends and at breaks)"
@@ -44,7 +44,7 @@ class PoseMotion:
 
 
 def pose_jumps(t_s: FloatArray, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> IndexArray:
-    """Row indices k, shape (J,), where the pose steps between rows k - 1 and k farther than a car can."""
+    """Row indices k, shape (J,), at which the step from row k - 1 to k exceeds the motion of a car."""
     dt = np.diff(t_s)
     safe = np.where(dt > 0, dt, np.nan)
     steps = np.stack([np.diff(x_m), np.diff(y_m), _unwrap_steps(yaw_rad)])
@@ -58,7 +58,7 @@ def pose_jumps(t_s: FloatArray, x_m: FloatArray, y_m: FloatArray, yaw_rad: Float
 def pose_motion(
     t_s: FloatArray, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray, segment: FloatArray
 ) -> PoseMotion:
-    """Differentiate a pose. All arguments (N,); ``segment`` numbers the stretches that are not to be mixed."""
+    """Differentiate a pose. All arguments (N,); rows of different ``segment`` numbers are fitted separately."""
     dt = np.diff(t_s)
     period = float(np.median(dt[dt > 0])) if np.any(dt > 0) else 1.0
     half = max(MIN_HALF_ROWS, round(HALF_WINDOW_S / period))
@@ -98,7 +98,7 @@ def _unwrap_steps(yaw_rad: FloatArray) -> FloatArray:
 
 
 def _median_of_neighbours(rates: FloatArray) -> FloatArray:
-    """Median of each row's four neighbours on either side, itself left out. ``rates`` (C, n)."""
+    """Median of each row's four neighbours on either side, without the row. ``rates`` (C, n)."""
     reach = 4
     if rates.shape[1] < 2 * reach + 1:
         return np.repeat(np.nan_to_num(np.nanmedian(rates, axis=1, keepdims=True)), rates.shape[1], axis=1)

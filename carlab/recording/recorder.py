@@ -1,4 +1,4 @@
-"""Takes the documents of an episode from the control loop and writes them in a thread of its own."""
+"""Recorder: writes the documents of the control loop in a separate thread."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from carlab.recording.sink import Item, LogLine, Sink, describe_os_error
 
 logger = logging.getLogger(__name__)
 
-_NEVER_DROPPED = (EpisodeStarted, EpisodeEnded, SafetyEvent)
+_UNDROPPABLE = (EpisodeStarted, EpisodeEnded, SafetyEvent)
 _CLOSE = object()
 
 
 class Recorder:
-    """Fans the documents of one episode out to sinks without ever blocking who emits them.
+    """Distributes the documents of one episode to sinks without blocking the emitting thread.
 
-    A full queue drops ticks, transitions, health readings and log lines (``dropped`` counts them; the EpisodeEnded
-    carries the count as ``recorder_dropped``), never the start, the end or a safety event. A sink that raises is
-    closed and left out, ``failed`` says why, and the others go on. ``emit`` and ``close`` may be called from any
-    thread, also while the one that opened the recorder hangs.
+    If the queue is full, ticks, transitions, health readings and log lines are dropped (``dropped`` counts them, also
+    ``recorder_dropped`` in the EpisodeEnded), but never the start, the end or a safety event. A sink that raises is
+    closed and not used any more; ``failed`` has the reason, and the other sinks continue. ``emit`` and ``close`` may
+    be called from any thread, also while the thread that opened the recorder hangs.
 
     Args:
-        sinks: Where to write; this recorder opens and closes them.
-        capacity: Documents that may wait before the droppable ones are dropped.
-        flush_interval_s: At most this much is lost when the process is killed [s].
+        sinks: Writers of the documents; this recorder opens and closes them.
+        capacity: Length of the queue from which documents are dropped.
+        flush_interval_s: Longest time whose documents are lost if the process is killed [s].
     """
 
     def __init__(self, sinks: Sequence[Sink], *, capacity: int = 100_000, flush_interval_s: float = 0.25) -> None:
@@ -49,16 +49,16 @@ class Recorder:
 
     @property
     def failed(self) -> str | None:
-        """Why the first sink that failed did, in one sentence; None while all is well."""
+        """Error of the first failed sink, in one sentence; None without a failure."""
         return self._failed
 
     @property
     def dropped(self) -> int:
-        """How many documents were dropped because the sinks were too slow."""
+        """Number of documents dropped because the sinks were too slow."""
         return self._dropped
 
     def open(self) -> None:
-        """Open every sink and start the writer. Raises DataError where a file cannot be made; then none stays open."""
+        """Open every sink and start the writer. Raises DataError if a file cannot be created; then all are closed."""
         with self._lock:
             if self._thread is not None:
                 return
@@ -73,12 +73,12 @@ class Recorder:
             self._thread.start()
 
     def emit(self, document: Document | LogLine) -> None:
-        """Hand over one document; returns at once. Raises NotOpenError before ``open``; ignored after ``close``."""
+        """Queue one document; returns at once. Raises NotOpenError before ``open``; ignored after ``close``."""
         if self._thread is None:
             raise NotOpenError("The recorder was used before it was opened; use it in a with statement.")
         if self._closing:
             return
-        if not isinstance(document, _NEVER_DROPPED) and self._queue.qsize() >= self._capacity:
+        if not isinstance(document, _UNDROPPABLE) and self._queue.qsize() >= self._capacity:
             self._dropped += 1
             return
         self._queue.put(document)
@@ -88,11 +88,11 @@ class Recorder:
         return _RecorderHandler(self, level)
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Write what is waiting, finish the files and join the writer. Idempotent, from any thread.
+        """Write the queued documents, complete the files and join the writer. Idempotent, from any thread.
 
-        Waits as long as the writer gets on, and gives up when it has not for ``timeout_s`` (a disk that hangs). An
-        episode that never got its EpisodeEnded is finished as CRASHED. Does not raise for a file that could not be
-        finished: ``failed`` says so.
+        Waits while the writer makes progress, and gives up after ``timeout_s`` without progress (a disk that hangs).
+        An episode without an EpisodeEnded is completed as CRASHED. Does not raise if a file cannot be completed;
+        ``failed`` has the reason.
         """
         with self._lock:
             if self._thread is None:
@@ -106,9 +106,9 @@ class Recorder:
             if progress != self._progress:
                 progress, give_up_s = self._progress, monotonic_ns() * 1e-9 + timeout_s
             elif monotonic_ns() * 1e-9 >= give_up_s:
-                self._remember(
-                    f"The recording was not finished because its writer stood still for {timeout_s:g} s; its .partial "
-                    "file holds what was written, check the disk."
+                self._store_failure(
+                    f"The recording is incomplete: its writer made no progress for {timeout_s:g} s. Its .partial "
+                    "file has the documents written so far; check the disk."
                 )
                 return
             self._thread.join(min(0.05, timeout_s))
@@ -144,7 +144,7 @@ class Recorder:
             try:
                 sink.close()
             except Exception as error:
-                self._fail(sink, error)
+                self._close_failed_sink(sink, error)
             self._progress += 1
 
     def _write(self, sinks: list[Sink], item: Item) -> None:
@@ -155,7 +155,7 @@ class Recorder:
                 sink.write(item)
             except Exception as error:
                 sinks.remove(sink)
-                self._fail(sink, error)
+                self._close_failed_sink(sink, error)
 
     def _flush(self, sinks: list[Sink]) -> None:
         for sink in tuple(sinks):
@@ -165,18 +165,18 @@ class Recorder:
                 sink.flush()
             except Exception as error:
                 sinks.remove(sink)
-                self._fail(sink, error)
+                self._close_failed_sink(sink, error)
 
-    def _fail(self, sink: Sink, error: Exception) -> None:
-        """Close a sink that raised, as well as that can be done, and remember why.
+    def _close_failed_sink(self, sink: Sink, error: Exception) -> None:
+        """Close a sink that raised an error, and store the error.
 
-        After an error of the disk the file stays ``.partial``: bytes may be missing in the middle. After any other
-        error it is finished, and marked as what it is.
+        After a disk error the file stays ``.partial``, since bytes may be missing inside. After other errors it is
+        completed as RECORDER_ERROR.
         """
         name = getattr(sink, "path", type(sink).__name__)
         sentence = describe_os_error(error, name) if isinstance(error, OSError) else f"{name}: {error}"
-        self._remember(sentence)
-        if isinstance(error, OSError):  # Whoever drives tells it once, from ``failed``.
+        self._store_failure(sentence)
+        if isinstance(error, OSError):  # The episode reports ``failed`` once.
             logger.info("Recording failed: %s", sentence)
         else:
             logger.error("Recording failed: %s", sentence, exc_info=error)
@@ -184,17 +184,17 @@ class Recorder:
             if not isinstance(error, OSError):
                 sink.close(EndReason.RECORDER_ERROR, sentence)
         except Exception as second:
-            logger.warning("%s could not be finished either: %s", name, second)
+            logger.warning("%s could not be completed either: %s", name, second)
         finally:
             sink.abandon()
 
-    def _remember(self, sentence: str) -> None:
+    def _store_failure(self, sentence: str) -> None:
         if self._failed is None:
             self._failed = sentence
 
 
 class _RecorderHandler(logging.Handler):
-    """Sends log records to a recorder, except its own (they would come back for ever)."""
+    """Sends log records to a recorder, except its own records (to avoid an endless loop)."""
 
     def __init__(self, recorder: Recorder, level: int) -> None:
         super().__init__(level)

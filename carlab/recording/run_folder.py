@@ -1,13 +1,13 @@
-"""The folder of one run: what is in it, where, and in which surroundings it was made.
+"""The folder of one run: its files and the environment of the run.
 
 runs/2026-11-21_134500_<name>/
     config.toml          the resolved configuration
     environment.json     program, git, packages, host, start
-    episodes/0001.mcap   one recording an episode, with 0001.rrd beside it
-    episodes/stopped/    those of a learning run that a person ended; they are driven again
-    models/  policy/     what was learned
-    log.jsonl            the program's log, one JSON object a line
-    result.json          how the run ended
+    episodes/0001.mcap   one recording per episode, also as 0001.rrd
+    episodes/stopped/    episodes of a learning run that a person ended; they are driven again
+    models/  policy/     learned models and policies
+    log.jsonl            the program's log, one JSON object per line
+    result.json          the result of the run
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _EPISODE_FILE = re.compile(r"(\d+)\.(?:mcap|rrd)(?:\.partial)?")
 
 @dataclass(frozen=True, slots=True)
 class RunDirectory:
-    """A run's folder. Make one with ``create`` or take one up again with ``open_existing``."""
+    """A run's folder. Create one with ``create`` or resume one with ``open_existing``."""
 
     path: Path
 
@@ -50,26 +50,26 @@ class RunDirectory:
     def create(
         cls, root: Path | str, name: str, *, config_toml: str = "", metadata: Mapping[str, str] | None = None
     ) -> Self:
-        """Make ``root/<date>_<time>_<name>`` with its folders, configuration and environment.
+        """Create ``root/<date>_<time>_<name>`` with its folders, configuration and environment.
 
         Args:
-            root: Where runs are kept, usually ``runs``.
-            name: What the run is called; characters that do not belong into a file name become ``-``.
+            root: Folder of all runs, usually ``runs``.
+            name: Name of the run; characters that are invalid in file names become ``-``.
             config_toml: The resolved configuration.
             metadata: Further facts for environment.json.
 
         Raises:
-            DataError: The folder cannot be written, in one sentence.
+            DataError: The folder cannot be written.
         """
         stamp = datetime.fromtimestamp(wall_clock_ns() * 1e-9).strftime("%Y-%m-%d_%H%M%S")
         slug = re.sub(r"[^\w.-]+", "-", name, flags=re.ASCII).strip("-.") or "run"
         base = Path(root) / f"{stamp}_{slug}"
         if base.parent.exists() and not base.parent.is_dir():
-            raise DataError(f"{base.parent} is a file, not a folder for runs; choose another one.")
+            raise DataError(f"{base.parent} is a file, not a folder for runs; choose another folder.")
         try:
             base.parent.mkdir(parents=True, exist_ok=True)
             path, number = base, 1
-            while not _made(path):
+            while not _create_folder(path):
                 number += 1
                 path = base.with_name(f"{base.name}-{number}")
             run = cls(path)
@@ -83,10 +83,12 @@ class RunDirectory:
 
     @classmethod
     def open_existing(cls, path: Path | str) -> Self:
-        """Take up a run again. Raises DataError where ``path`` is no run's folder."""
+        """Resume a run. Raises DataError if ``path`` is no run's folder."""
         path = Path(path)
         if not (path / "environment.json").is_file():
-            raise DataError(f"{path} is not a run's folder (no environment.json in it); name one such as runs/2026-...")
+            raise DataError(
+                f"{path} is not a run's folder (it has no environment.json); name one such as runs/2026-..."
+            )
         run = cls(path)
         try:
             for folder in (run.episodes, run.models, run.policy):
@@ -102,7 +104,7 @@ class RunDirectory:
 
     @property
     def stopped(self) -> Path:
-        """Folder of recordings that are no episodes of the run, because a person ended them; it may be absent."""
+        """Folder of the recordings of episodes that a person ended; it may be missing."""
         return self.episodes / "stopped"
 
     @property
@@ -121,17 +123,17 @@ class RunDirectory:
         return (self.path / "config.toml").read_text(encoding="utf-8")
 
     def next_episode(self) -> int:
-        """The number after the highest that any file has, finished or not; numbers start at 1."""
+        """One more than the highest number of a complete or partial recording; numbers start at 1."""
         folders = (folder for folder in (self.episodes, self.stopped) if folder.is_dir())
         names = (_EPISODE_FILE.fullmatch(entry.name) for folder in folders for entry in folder.iterdir())
         return 1 + max((int(match[1]) for match in names if match), default=0)
 
     def episode_path(self, number: int, suffix: str = ".mcap") -> Path:
-        """Where a file of an episode lies: ``episodes/0001.mcap``."""
+        """Path of a file of an episode: ``episodes/0001.mcap``."""
         return self.episodes / f"{number:04d}{suffix}"
 
-    def set_aside(self, recording: Path) -> None:
-        """Move an episode's files into ``stopped``. Raises DataError where that fails."""
+    def move_to_stopped(self, recording: Path) -> None:
+        """Move an episode's files into ``stopped``. Raises DataError if that fails."""
         try:
             self.stopped.mkdir(exist_ok=True)
             for file in (recording.with_suffix(".rrd"), recording):
@@ -141,7 +143,7 @@ class RunDirectory:
             raise DataError(describe_os_error(error, self.stopped)) from error
 
     def recordings(self, *, partial: bool = False) -> list[Path]:
-        """The finished MCAP recordings in order; with ``partial`` the unfinished ones too."""
+        """The complete MCAP recordings in order; with ``partial`` also the incomplete ones."""
         ends = (".mcap", ".mcap.partial") if partial else (".mcap",)
         return sorted(entry for entry in self.episodes.iterdir() if entry.name.endswith(ends))
 
@@ -156,11 +158,11 @@ class RunDirectory:
         return handler
 
     def write_result(self, result: Mapping[str, Any]) -> None:
-        """Write result.json: how the run ended. Raises DataError where that fails."""
+        """Write result.json. Raises DataError if that fails."""
         self.write_json(RESULT_FILE, result)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a JSON file whole or not at all. Raises DataError where that fails."""
+        """Write a JSON file atomically. Raises DataError if that fails."""
         path = self.path / name
         unfinished = path.with_name(f"{name}.partial")
         try:
@@ -171,7 +173,7 @@ class RunDirectory:
             raise DataError(describe_os_error(error, path)) from error
 
 
-def _made(path: Path) -> bool:
+def _create_folder(path: Path) -> bool:
     try:
         path.mkdir()
     except FileExistsError:
@@ -180,24 +182,24 @@ def _made(path: Path) -> bool:
 
 
 class _LogFile(logging.FileHandler):
-    """A log file that loses lines, silently, while its disk is full: the recording says so."""
+    """A log file that drops lines without an error while its disk is full; the recording reports the full disk."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Leave out a line that cannot be written; print the traceback of any other error."""
+        """Drop a line that cannot be written; print the traceback of other errors."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handleError(record)
 
     def close(self) -> None:
-        """Close the file, without what cannot be written any more."""
+        """Close the file; lines that cannot be written are dropped."""
         with contextlib.suppress(OSError):
             super().close()
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time, level, logger, message, and the traceback where there is one."""
+    """Formats log records as JSON lines: time, level, logger, message and traceback if any."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as one line of JSON."""
+        """Format a record as one line of JSON."""
         line: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created).astimezone().isoformat(timespec="milliseconds"),
             "level": record.levelname,
@@ -211,7 +213,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def environment() -> dict[str, Any]:
-    """What a run depends on beside its configuration: versions, host, and the state of the sources in git."""
+    """Environment of a run: versions, host, and the state of the sources in git."""
     packages = {}
     for name in _PACKAGES:
         try:

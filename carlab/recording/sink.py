@@ -1,4 +1,4 @@
-"""What receives the documents of one episode: the common part of every file writer."""
+"""Sinks: the common base of the file writers of an episode's documents."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from carlab.core.outcome import EndReason
 PARTIAL_SUFFIX = ".partial"
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 MIN_FREE_BYTES = 20_000_000
-"""A recording is not begun on a disk with less room than this."""
+"""Minimum free space of the disk for a new recording [bytes]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +34,14 @@ Item = Document | LogLine
 
 
 def partial_path(path: Path) -> Path:
-    """Where a file is written until it is finished: ``0001.mcap`` -> ``0001.mcap.partial``."""
+    """Path of an incomplete file: ``0001.mcap`` -> ``0001.mcap.partial``."""
     return path.with_name(path.name + PARTIAL_SUFFIX)
 
 
 def claim(path: Path) -> Path:
-    """Make the folder of a new file and return its ``.partial`` name.
+    """Create the folder of a new file and return its ``.partial`` path.
 
-    Raises OSError where the file is there already or the disk is nearly full, before the car moves.
+    Raises OSError, before the car moves, if the file exists or the disk is nearly full.
     """
     if path.exists():
         raise FileExistsError(errno.EEXIST, "is already there", str(path))
@@ -52,28 +52,28 @@ def claim(path: Path) -> Path:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it. Raises OSError where a file stands in its place."""
+    """Create a folder and its parents. Raises OSError if a file has that path."""
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, "is a file", str(folder))
     folder.mkdir(parents=True, exist_ok=True)
 
 
 def describe_os_error(error: OSError, path: Path | str) -> str:
-    """One sentence with the next step for a file that could not be written."""
+    """One sentence with the remedy for a file that could not be written."""
     if error.errno in DISK_FULL:
         space = f"free some space{_disk_of(Path(path))}"
         return f"{path} could not be written because the disk is full; {space} and start again."
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return f"{path} may not be written; check the permissions of its folder or choose another one."
+        return f"{path} may not be written; check the permissions of its folder or choose another folder."
     if isinstance(error, FileExistsError):
-        return f"{path} is already there and recordings are never overwritten; choose another name."
+        return f"{path} exists and recordings are never overwritten; choose another name."
     if isinstance(error, NotADirectoryError):
-        return f"{path} cannot be made because a file stands where its folder belongs; choose another folder."
+        return f"{path} cannot be created because a file has the path of its folder; choose another folder."
     return f"{path} could not be written: {error.strerror or error}; check the disk, then start again."
 
 
 def _disk_of(path: Path) -> str:
-    """The disk that holds a path and its free space; empty where that is not known."""
+    """The disk of a path and its free space, as text; empty if unknown."""
     folder = path.absolute()
     while not os.path.ismount(folder) and folder != folder.parent:
         folder = folder.parent
@@ -84,11 +84,11 @@ def _disk_of(path: Path) -> str:
 
 
 class Sink(ABC):
-    """Writes the documents of one episode to one place.
+    """Writer of the documents of one episode.
 
-    Constructing does nothing. ``open`` makes the file; ``write`` takes documents in order, and the EpisodeEnded
-    finishes the file at once. What comes after it is ignored, so that the first EpisodeEnded wins whichever thread
-    sent it. ``close`` before an EpisodeEnded finishes the file as CRASHED. All calls come from one thread at a time.
+    Constructing does nothing. ``open`` creates the file; ``write`` takes documents in order, and an EpisodeEnded
+    completes the file at once. Later documents are ignored, so that the first EpisodeEnded of any thread counts.
+    ``close`` before an EpisodeEnded completes the file as CRASHED. Calls must come from one thread at a time.
     """
 
     def __init__(self) -> None:
@@ -101,15 +101,15 @@ class Sink(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Make the file. Raises DataError, in one sentence, where that cannot be done."""
+        """Create the file. Raises DataError if that fails."""
 
     @abstractmethod
     def flush(self) -> None:
-        """Hand everything written so far to the operating system, so that it outlives this process."""
+        """Pass everything written so far to the operating system, so that a kill loses none of it."""
 
     @abstractmethod
     def abandon(self) -> None:
-        """Let go of everything and leave what was written as it is; never raises."""
+        """Release all resources and leave the file unchanged; never raises."""
 
     @abstractmethod
     def _write(self, item: Item) -> None:
@@ -117,15 +117,15 @@ class Sink(ABC):
 
     @abstractmethod
     def _finish(self) -> None:
-        """Complete the file and give it its final name; an EpisodeEnded was written before."""
+        """Complete the file and rename it; called after an EpisodeEnded."""
 
     @property
     def finished(self) -> bool:
-        """Whether the file is complete or was abandoned: nothing more will be written."""
+        """Whether the file is complete or abandoned, so that no more is written."""
         return self._finished
 
     def write(self, item: Item) -> None:
-        """Write one document or log line. Raises OSError or DataError where that fails."""
+        """Write one document or log line. Raises OSError or DataError if that fails."""
         if self._finished:
             return
         if isinstance(item, EpisodeStarted):
@@ -153,7 +153,7 @@ class Sink(ABC):
             self._finished = True
 
     def close(self, reason: EndReason = EndReason.CRASHED, detail: str = "") -> None:
-        """Finish the file. An episode that has not ended is marked with ``reason``. Idempotent."""
+        """Complete the file. An episode that has not ended is marked with ``reason``. Idempotent."""
         if self._finished:
             return
         if self._started is None:

@@ -265,7 +265,7 @@ def test_a_report_replaces_an_older_one_and_leaves_nothing_unfinished(tmp_path: 
 
 def test_a_file_in_place_of_the_folder_is_told_in_a_sentence(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine", encoding="utf-8")
-    with pytest.raises(DataError, match="a file stands where its folder belongs; choose another folder"):
+    with pytest.raises(DataError, match="a file has the path of its folder; choose another folder"):
         write_report(material.nothing(), Exhibits(), tmp_path / "taken", material.model())
     assert (tmp_path / "taken").read_text(encoding="utf-8") == "mine"
 

@@ -31,9 +31,9 @@ from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.report import keep_row, learning_curve, restore_rows, write_report
 from carlab.experiment.campaign.training import TrainingPlan, recorded_features
 from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
-from carlab.recording.drained_file import DrainedFile
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_documents, read_episode
+from carlab.recording.pipe_file import PipeFile
 from carlab.recording.recorder import Recorder
 from carlab.recording.rerun.learning_curve import write_learning_curve
 from carlab.recording.run_folder import RunDirectory
@@ -369,12 +369,12 @@ def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.
         assert "\n" not in str(error.value)
         assert not (tmp_path / "0001").exists()
 
-    def opened(self: DrainedFile) -> None:
+    def opened(self: PipeFile) -> None:
         self._file = Path("/dev/full").open("wb", buffering=0)  # noqa: SIM115
 
     curve = tmp_path / "learn.rrd"
     curve.write_bytes(b"what was there")
-    monkeypatch.setattr(DrainedFile, "open", opened)
+    monkeypatch.setattr(PipeFile, "open", opened)
     with pytest.raises(DataError, match="the disk is full; free some space"):
         write_learning_curve(
             curve, [{"episode": 1.0}], [np.zeros((3, 6))], [(np.zeros((0, 2)), *[np.zeros((0, 2, 6))] * 2)]

@@ -157,5 +157,5 @@ class TestMcap:
         path = recording_with(tmp_path / "end.mcap", make_documents(3), monkeypatch, "statistics", text)
         message = refusal(read_episode, path)
         assert message is not None
-        assert "statistics are not numbers" in message
+        assert "statistics are not a mapping" in message
         assert str(path) in message

@@ -63,7 +63,7 @@ def test_what_cannot_be_drawn_or_written_says_why(tmp_path, episode):
         save_summary([episode], tmp_path / "nowhere" / "x.png")
     (tmp_path / "file").touch()
     for write in (write_csv, write_parquet):
-        with pytest.raises(DataError, match="a file stands where its folder belongs"):
+        with pytest.raises(DataError, match="a file has the path of its folder"):
             write(episode, tmp_path / "file" / "x")
 
 

@@ -115,7 +115,7 @@ def test_close_gives_up_on_a_disk_that_hangs_and_says_so(make_documents):
     recorder.open()
     recorder.emit(make_documents(1)[0])
     recorder.close(timeout_s=0.2)
-    assert "stood still" in recorder.failed
+    assert "made no progress" in recorder.failed
     gate.set()
     recorder.close()
 
@@ -177,7 +177,7 @@ def test_a_file_that_cannot_be_made_is_told_before_anything_moves(tmp_path, make
     (tmp_path / "0002.mcap").write_text("")
     first = McapSink(tmp_path / "0001.mcap")
     with (
-        pytest.raises(DataError, match="a file stands where its folder belongs"),
+        pytest.raises(DataError, match="a file has the path of its folder"),
         Recorder([first, McapSink(tmp_path / "taken" / "x")]),
     ):
         pass

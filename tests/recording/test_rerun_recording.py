@@ -12,7 +12,7 @@ from carlab.core.outcome import EndReason
 from carlab.recording.episode_builder import episode_from_documents
 from carlab.recording.recorder import Recorder
 from carlab.recording.rerun import blueprint as look
-from carlab.recording.rerun.screenshot import save_screenshot, vulkan_is_there
+from carlab.recording.rerun.screenshot import has_vulkan_driver, save_screenshot
 from carlab.recording.rerun.sink import RerunSink, episode_to_rrd
 
 RERUN = Path(sys.executable).with_name("rerun")
@@ -166,7 +166,7 @@ def test_an_episode_without_any_tick_is_a_sound_file_too(tmp_path, make_document
     verify(record(tmp_path / "0001.rrd", documents))
 
 
-@pytest.mark.skipif(not vulkan_is_there(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)")
+@pytest.mark.skipif(not has_vulkan_driver(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)")
 @needs_rerun
 def test_the_viewer_draws_a_picture_without_a_window(tmp_path, make_documents):
     path = record(tmp_path / "0001.rrd", make_documents(60))
@@ -185,9 +185,9 @@ def test_the_viewer_draws_a_picture_without_a_window(tmp_path, make_documents):
 
 def test_without_a_driver_the_sentence_says_what_to_install(tmp_path, monkeypatch):
     (tmp_path / "0001.rrd").write_bytes(b"")
-    monkeypatch.setattr("carlab.recording.rerun.screenshot.vulkan_is_there", lambda: False)
+    monkeypatch.setattr("carlab.recording.rerun.screenshot.has_vulkan_driver", lambda: False)
     monkeypatch.setattr("carlab.recording.rerun.screenshot.rerun_program", lambda: RERUN)
     with pytest.raises(NotReadyError, match="apt-get install mesa-vulkan-drivers libvulkan1"):
         save_screenshot(tmp_path / "0001.rrd", tmp_path / "x.png")
-    with pytest.raises(DataError, match="is not there"):
+    with pytest.raises(DataError, match="does not exist"):
         save_screenshot(tmp_path / "0002.rrd", tmp_path / "x.png")

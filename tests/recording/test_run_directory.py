@@ -69,7 +69,7 @@ def test_the_result_is_written_whole(tmp_path):
 
 def test_a_folder_that_cannot_be_made_gives_one_sentence(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(DataError, match="a file stands where its folder belongs") as caught:
+    with pytest.raises(DataError, match="a file has the path of its folder") as caught:
         RunDirectory.create(tmp_path / "file" / "runs", "x")
     assert "\n" not in str(caught.value)
     with pytest.raises(DataError, match="not a run's folder"):

@@ -195,7 +195,7 @@ class Campaign:
             return
         ends = [d.reason for d in read_documents(recordings[-1]) if isinstance(d, EpisodeEnded)]
         if STOPPED & set(ends):
-            self.run.set_aside(recordings[-1])
+            self.run.move_to_stopped(recordings[-1])
 
     def _check(self) -> None:
         """Run the quick check where the newest recording has none."""

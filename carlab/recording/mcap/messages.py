@@ -1,4 +1,4 @@
-"""Documents to MCAP messages and back: pure, and exact to the last bit in our own messages."""
+"""Conversion between documents and MCAP messages. Pure; carlab's own messages keep every number exactly."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class Stamped:
 
 
 class UnixMapping:
-    """Car clock [s] to Unix time [ns], by the two origins in the EpisodeStarted."""
+    """Conversion of the car's clock [s] to Unix time [ns] by the two origins in the EpisodeStarted."""
 
     def __init__(self, t_s: float, wall_ns: int) -> None:
         self._t_s = t_s
         self._wall_ns = wall_ns
 
     def to_ns(self, t_s: float) -> int:
-        """Unix time [ns] of a moment of the car's clock; the origin where it is not a number."""
+        """Unix time [ns] of a time on the car's clock; the origin for NaN."""
         offset_s = t_s - self._t_s
         if not math.isfinite(offset_s):
             offset_s = 0.0
@@ -52,15 +52,15 @@ class UnixMapping:
 
 
 def text(value: str) -> str:
-    """A text as UTF-8 can hold it: stray surrogates (file names in another encoding) become question marks."""
+    """Replace lone surrogates (file names in another encoding) by question marks, so that UTF-8 can encode the text."""
     return value.encode("utf-8", "replace").decode("utf-8")
 
 
 def encode(item: Item, unix: UnixMapping, now_s: float) -> Iterator[Stamped]:
-    """Yield the messages of a document, in the order in which they belong into the file.
+    """Yield the messages of a document in file order.
 
-    ``now_s`` is when the newest document was made; log lines, which know wall-clock time only, take their place
-    there. EpisodeStarted yields nothing and EpisodeEnded its last observation: the rest of them is metadata.
+    ``now_s`` is the time of the newest document; log lines, which have wall-clock time only, get this time.
+    EpisodeStarted yields no message and EpisodeEnded its last observation; the rest is metadata.
     """
     match item:
         case Tick():
@@ -241,7 +241,7 @@ def started_from_metadata(record: Mapping[str, str], config_toml: str) -> Episod
 
 
 def _json_value(record: Mapping[str, str], key: str) -> Any:
-    """The JSON value under ``key``. Raises KeyError or ValueError where there is none."""
+    """The JSON value under ``key``. Raises KeyError if it is missing, ValueError if it is invalid."""
     try:
         return json.loads(record[key])
     except RecursionError as error:
@@ -256,7 +256,7 @@ def _json_list(record: Mapping[str, str], key: str) -> list[Any]:
 
 
 def _numbers(value: Any, count: int) -> tuple[Any, ...]:
-    """``value`` as a tuple of ``count`` numbers; a whole number stays one. Raises ValueError for anything else."""
+    """``value`` as a tuple of ``count`` numbers; integers stay integers. Raises ValueError for other values."""
     if not isinstance(value, list) or len(value) != count or not all(_is_number(number) for number in value):
         raise ValueError(f"{count} numbers are expected")
     return tuple(value)
@@ -270,7 +270,7 @@ def ended_from_metadata(record: Mapping[str, str], last: Observation | None) -> 
     """The EpisodeEnded written by ``ended_to_metadata``. Raises KeyError or ValueError for another record."""
     statistics = _json_value(record, "statistics")
     if not isinstance(statistics, dict) or not all(_is_number(value) for value in statistics.values()):
-        raise ValueError("statistics are not numbers by name")
+        raise ValueError("statistics are not a mapping of names to numbers")
     return EpisodeEnded(
         t_s=float(record["end_t_s"]),
         reason=EndReason[record["end_reason"]],
@@ -283,23 +283,23 @@ def ended_from_metadata(record: Mapping[str, str], last: Observation | None) -> 
 
 
 def decode_pose(m: Any) -> PoseSample:
-    """A PoseSample message as the sample it was made from."""
+    """Decode a PoseSample message."""
     return PoseSample(m.sequence, m.t_capture_s, m.t_receive_s, m.x_m, m.y_m, m.yaw_rad, m.z_m, m.tracked)
 
 
 def decode_observation(m: Any, poses: tuple[PoseSample, ...]) -> Observation:
-    """A CarState message, with the poses that came before it, as the observation it was made from."""
+    """Decode a CarState message and the preceding poses to an observation."""
     state = CarState(m.x_m, m.y_m, m.yaw_rad, m.vx_mps, m.vy_mps, m.yaw_rate_radps)
     return Observation(state, m.t_capture_s, m.t_receive_s, m.sequence, m.tracked, m.velocity_delay_s, poses)
 
 
 def decode_action(m: Any) -> Action:
-    """An Action or Transition message as its action."""
+    """Decode the action of an Action or Transition message."""
     return Action(m.steering, m.throttle)
 
 
 def decode_transition(m: Any) -> Transition:
-    """A Transition message as the document it was made from."""
+    """Decode a Transition message."""
     return Transition(
         step=m.step,
         t_s=m.t_s,
@@ -313,18 +313,18 @@ def decode_transition(m: Any) -> Transition:
 
 
 def decode_health(m: Any) -> HealthReading:
-    """A Health message as the document it was made from."""
+    """Decode a Health message."""
     readings = dict(zip(m.reading_names, m.reading_values, strict=False))
     return HealthReading(m.t_s, Health(m.ready, tuple(m.problems), readings))
 
 
 def decode_event(m: Any) -> SafetyEvent:
-    """A SafetyEvent message as the document it was made from."""
+    """Decode a SafetyEvent message."""
     return SafetyEvent(m.t_s, m.kind, m.text)
 
 
 def decode_log(m: Any) -> LogLine:
-    """A Log message as the line it was made from; the level as the standard library counts it."""
+    """Decode a Log message; the level is that of the standard library's logging."""
     return LogLine(m.timestamp.ToNanoseconds(), _NUMBERS.get(m.level, logging.NOTSET), m.name, m.message)
 
 

@@ -1,8 +1,8 @@
-"""The messages of a recording: one table of fields with units, and the protobuf classes made from it at run time.
+"""The messages of a recording: a table of fields with units, and the protobuf classes created from it at run time.
 
-Poses, transforms and log lines are also written in Foxglove's well-known schemas, which Foxglove and rerun draw by
-themselves; those round (angles become quaternions, times become nanoseconds), so our own messages hold every number
-as it was. Field numbers are for ever: new fields get new numbers, and no number is used twice.
+Poses, transforms and log lines are also written in Foxglove's schemas, which Foxglove and rerun display. These schemas
+round (angles become quaternions, times nanoseconds); carlab's own messages keep every number exactly. Field numbers
+are permanent: new fields get new numbers, and no number is reused.
 """
 
 from __future__ import annotations

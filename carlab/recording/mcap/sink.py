@@ -1,9 +1,9 @@
-"""Writes one episode into one .mcap file, which is called .partial until it is finished.
+"""Writer of one episode to one .mcap file, named .partial until it is complete.
 
-Chunks are small and are closed at every flush, so that a reader gets back all but the last fraction of a second of a
-file whose writer was killed. ``log_time`` and ``publish_time`` are Unix time [ns]: the car's clock at the tick, and
-at the capture of the pose, both mapped by the origins ``start_t_s`` and ``start_wall_ns`` of the record
-``carlab.episode``. The messages also hold the car's clock itself, in seconds, unrounded.
+Chunks are small and are closed at every flush, so that a reader recovers all but the last fraction of a second if the
+writer was killed. ``log_time`` and ``publish_time`` are Unix times [ns] of the tick and of the capture of the pose,
+converted by the origins ``start_t_s`` and ``start_wall_ns`` of the record ``carlab.episode``. The messages also have
+the car's clock in seconds, unrounded.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class McapSink(Sink):
     """One episode in one MCAP file.
 
     Args:
-        path: The finished file, ``.../0001.mcap``; must not be there yet.
+        path: The complete file, ``.../0001.mcap``; must not exist.
         run_metadata: Facts about the run (versions, git, host), written as the metadata record ``carlab.run``.
     """
 
@@ -55,7 +55,7 @@ class McapSink(Sink):
         self._unix = UnixMapping(0.0, 0)
 
     def open(self) -> None:
-        """Make the file and write its head. Raises DataError in one sentence where that cannot be done."""
+        """Create the file and write its header. Raises DataError if that fails."""
         if self._file is not None or self._finished:
             return
         try:
@@ -73,12 +73,12 @@ class McapSink(Sink):
             raise DataError(describe_os_error(error, self.path)) from error
 
     def flush(self) -> None:
-        """Close the chunk in progress and hand it to the operating system."""
+        """Close the current chunk and pass it to the operating system."""
         if self._writer is not None:
             self._writer.flush()  # type: ignore[no-untyped-call]
 
     def abandon(self) -> None:
-        """Let go of the file; what is written stays ``.partial``. A file without any document is removed."""
+        """Close the file and leave it as ``.partial``. A file without documents is removed."""
         self._finished = True
         self._writer = None
         if self._file is None:
@@ -97,14 +97,14 @@ class McapSink(Sink):
 
     def _write(self, item: Item) -> None:
         if self._writer is None:
-            raise DataError(f"{self.path} is not open; use the sink in a recorder.")
+            raise DataError(f"{self.path} is not open; use the sink in a Recorder.")
         if isinstance(item, EpisodeStarted):
             self._unix = UnixMapping(item.t_s, item.wall_ns)
             now_ns = self._unix.to_ns(item.t_s)
             self._writer.add_attachment(
                 now_ns, now_ns, schemas.CONFIG_ATTACHMENT, "application/toml", text(item.config_toml).encode()
             )
-            # How it ended is unknown until it has ended; a reader takes the last record of this name.
+            # The end is unknown here; a reader uses the last record of this name.
             crashed = {"end_reason": EndReason.CRASHED.name, "end_sentence": EndReason.CRASHED.value}
             self._writer.add_metadata(schemas.EPISODE_RECORD, {**started_to_metadata(item), **crashed})
         for stamped in encode(item, self._unix, self._last_t_s):
@@ -116,7 +116,7 @@ class McapSink(Sink):
 
     def _put(self, stamped: Stamped) -> None:
         if self._writer is None:
-            raise DataError(f"{self.path} is not open; use the sink in a recorder.")
+            raise DataError(f"{self.path} is not open; use the sink in a Recorder.")
         self._writer.add_message(
             self._channels[stamped.topic],
             log_time=self._unix.to_ns(stamped.t_s),
@@ -139,10 +139,10 @@ class McapSink(Sink):
 
 
 def write_episode(episode: EpisodeData, path: Path | str, run_metadata: Mapping[str, str] | None = None) -> None:
-    """Write an episode of arrays (an imported one, say) as a recording; ``read_episode`` gives it back.
+    """Write an episode of arrays (for example an imported one) as a recording; ``read_episode`` is the inverse.
 
     Raises:
-        DataError: The file is already there or cannot be written.
+        DataError: The file exists or cannot be written.
     """
     sink = McapSink(path, run_metadata)
     names = [name for name in episode.extra if name not in OWN_COLUMNS]

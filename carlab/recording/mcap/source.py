@@ -1,4 +1,4 @@
-"""Reads recordings back, finished or not: whatever is complete before the first damaged byte."""
+"""Reader of recordings, complete or not: it returns all records before the first damaged byte."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ MAGIC = b"\x89MCAP0\r\n"
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Everything that one file holds.
+    """Contents of one recording.
 
-    ``documents`` are those that were emitted, in order; an EpisodeEnded is missing where the writer was killed.
-    ``recovered`` tells that the file is not complete; ``extra`` holds further columns of an imported recording.
+    ``documents`` are the emitted documents in order; without an EpisodeEnded if the writer was killed.
+    ``recovered`` is True if the file is incomplete; ``extra`` has the further columns of an imported recording.
     """
 
     path: Path
@@ -43,8 +43,8 @@ class Recording:
 def read_episode(path: Path | str) -> EpisodeData:
     """Read a recording as arrays; times are on the car's clock.
 
-    A file that was not finished gives what is complete in it, with ``recovered`` = ``true`` in the metadata and
-    ``end_reason`` = ``CRASHED``. Metadata of the run, of the episode and of its end are one flat mapping.
+    An incomplete file gives its complete ticks, with ``recovered`` = ``true`` and ``end_reason`` = ``CRASHED`` in the
+    metadata. Metadata of the run, of the episode and of its end are one flat mapping.
 
     Raises:
         DataError: The file is not a carlab recording, or holds no complete tick.
@@ -65,7 +65,7 @@ def read_documents(path: Path | str) -> tuple[Document, ...]:
 
 
 def read_recording(path: Path | str) -> Recording:
-    """Read everything in a recording. Raises DataError where it is none, or ends before its episode began."""
+    """Read a recording. Raises DataError if it is no recording, or ends before its episode starts."""
     path = Path(path)
     collector = _Collector()
     complete = False
@@ -83,8 +83,8 @@ def read_recording(path: Path | str) -> Recording:
             except OSError:
                 raise
             except Exception:
-                # Cut short or damaged: the readers of mcap, zstandard and protobuf each raise errors of their own.
-                # What came before is whole (chunks carry checksums), and `recovered` says so to the caller.
+                # Truncated or damaged: mcap, zstandard and protobuf raise different errors. The chunks before are valid
+                # (they have checksums); `recovered` informs the caller.
                 complete = False
     except FileNotFoundError as error:
         raise DataError(_missing(path)) from error
@@ -101,7 +101,7 @@ def _not_an_mcap(path: Path, head: bytes) -> str:
 
 
 def _short(error: Exception) -> str:
-    """What is wrong with a record, cut to a length that fits into a sentence: the record may be of any size."""
+    """Description of an error in a record, truncated to the length of a sentence."""
     reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
     return reason if len(reason) <= 120 else f"{reason[:120]}..."
 
@@ -109,12 +109,12 @@ def _short(error: Exception) -> str:
 def _missing(path: Path) -> str:
     unfinished = partial_path(path)
     if unfinished.exists():
-        return f"{path} was never finished; read {unfinished.name} in the same folder instead."
-    return f"{path} is not there; check the name (recordings lie in runs/<run>/episodes/)."
+        return f"{path} is incomplete; read {unfinished.name} in the same folder instead."
+    return f"{path} does not exist; check the name (recordings are in runs/<run>/episodes/)."
 
 
 class _Collector:
-    """Puts messages together again into the documents they were made from."""
+    """Converts messages back to documents."""
 
     def __init__(self) -> None:
         self._topics: dict[int, str] = {}
@@ -130,10 +130,10 @@ class _Collector:
         self._actions: dict[str, tuple[int, Action]] = {}
         self._handlers: dict[str, Callable[[Any], None]] = {
             schemas.SAMPLE_TOPIC: lambda m: self._poses.append(messages.decode_pose(m)),
-            schemas.STATE_TOPIC: self._take_state,
-            schemas.REQUESTED_TOPIC: lambda m: self._take_action("requested", m),
-            schemas.SENT_TOPIC: lambda m: self._take_action("sent", m),
-            schemas.TICK_TOPIC: self._take_tick,
+            schemas.STATE_TOPIC: self._handle_state,
+            schemas.REQUESTED_TOPIC: lambda m: self._handle_action("requested", m),
+            schemas.SENT_TOPIC: lambda m: self._handle_action("sent", m),
+            schemas.TICK_TOPIC: self._handle_tick,
             schemas.LOG_TOPIC: lambda m: self._log.append(messages.decode_log(m)),
             schemas.EXTRA_TOPIC: lambda m: self._extra.__setitem__(m.step, dict(zip(m.names, m.values, strict=False))),
         }
@@ -141,7 +141,7 @@ class _Collector:
     def take(self, record: object) -> None:
         match record:
             case Message():
-                self._take_message(self._topics.get(record.channel_id, ""), record.data)
+                self._handle_message(self._topics.get(record.channel_id, ""), record.data)
             case Channel():
                 self._topics[record.id] = record.topic
             case Metadata(name=schemas.RUN_RECORD):
@@ -153,7 +153,7 @@ class _Collector:
             case Header():
                 self._library = record.library
 
-    def _take_message(self, topic: str, data: bytes) -> None:
+    def _handle_message(self, topic: str, data: bytes) -> None:
         if topic not in self._handlers and topic not in messages.DECODERS:
             return
         message = schemas.TOPIC_CLASSES[topic]()
@@ -163,14 +163,14 @@ class _Collector:
         else:
             self._documents.append(messages.DECODERS[topic](message))
 
-    def _take_state(self, m: Any) -> None:
+    def _handle_state(self, m: Any) -> None:
         self._state = (m.step, messages.decode_observation(m, tuple(self._poses)))
         self._poses.clear()
 
-    def _take_action(self, which: str, m: Any) -> None:
+    def _handle_action(self, which: str, m: Any) -> None:
         self._actions[which] = (m.step, messages.decode_action(m))
 
-    def _take_tick(self, m: Any) -> None:
+    def _handle_tick(self, m: Any) -> None:
         parts = (self._state, self._actions.get("requested"), self._actions.get("sent"))
         if any(part is None or part[0] != m.step for part in parts):
             return

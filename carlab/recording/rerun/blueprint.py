@@ -1,7 +1,7 @@
-"""Entity paths of our rerun recordings, their look, and the layout in which the viewer opens them.
+"""Entity paths of carlab's rerun recordings, their styles, and the layout of the viewer.
 
-Paths are the MCAP topics without their first slash where the two correspond. The plan view is a three-dimensional
-view from straight above: rerun's two-dimensional views point y downwards, which would mirror every turn.
+A path that has an MCAP topic is the topic without its first slash. The plan view is a three-dimensional view from
+above, since rerun's two-dimensional views have y downwards, which would mirror every turn.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ HEALTH = "car/health"
 OVERLAY = "overlay"
 
 CAR_SIZE_M = (0.42, 0.19, 0.12)
-"""Length, width and height of the drawn car: a race car of scale 1:10."""
+"""Length, width and height of the drawn car [m]: a race car of scale 1:10."""
 
-# Okabe and Ito's palette, which people with any colour vision tell apart (https://jfly.uni-koeln.de/color/).
+# Okabe and Ito's palette, which suits colour-blind readers (https://jfly.uni-koeln.de/color/).
 ORANGE, SKY, GREEN, YELLOW = (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66)
 BLUE, VERMILION, PURPLE, GREY = (0, 114, 178), (213, 94, 0), (204, 121, 167), (150, 150, 150)
 OVERLAY_COLORS = (ORANGE, PURPLE, YELLOW, GREEN)
@@ -59,7 +59,7 @@ SERIES: dict[str, tuple[str, tuple[int, int, int]]] = {
 
 
 def overlay_series(name: str) -> dict[str, str]:
-    """Paths of the series of one overlay by the path of the recorded series that they lie beside."""
+    """Paths of the series of one overlay, by the path of the corresponding recorded series."""
     channels = ("vx_mps", "vy_mps", "yaw_rate_radps")
     return {f"car/state/{channel}": f"{OVERLAY}/{name}/{channel}" for channel in channels}
 
@@ -75,17 +75,17 @@ def overlay_car(name: str) -> str:
 
 
 def drive_blueprint(points_m: FloatArray, overlays: Sequence[str] = ()) -> rrb.Blueprint:
-    """The layout: plan, safety and log on the left; commands, velocities, latencies and reward on the right.
+    """Layout: plan view, safety and log on the left; commands, velocities, latencies and reward on the right.
 
     Args:
         points_m: Points that the plan view must show, shape (n, 2) [m]; n may be 0.
-        overlays: Names of further cars drawn beside the recorded one.
+        overlays: Names of further cars drawn in addition to the recorded one.
     """
     drive = rrb.Horizontal(
         rrb.Vertical(
             _plan(points_m, overlays),
             rrb.StateTimelineView(origin="/safety", contents=[f"/{SAFETY_STATE}"], name="Safety gate"),
-            _texts("What happened"),
+            _texts("Events and log"),
             row_shares=[6, 1.2, 1.8],
         ),
         rrb.Vertical(
@@ -117,7 +117,7 @@ def drive_blueprint(points_m: FloatArray, overlays: Sequence[str] = ()) -> rrb.B
 def _plan(points_m: FloatArray, overlays: Sequence[str]) -> rrb.Spatial3DView:
     low, high = (points_m.min(axis=0), points_m.max(axis=0)) if len(points_m) else ((-2.0, -2.0), (2.0, 2.0))
     x_m, y_m = 0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1])
-    # The view's opening angle shows about as many metres across as the eye is high.
+    # The width of the view is about the height of the eye.
     height_m = 1.15 * max(float(high[0] - low[0]), float(high[1] - low[1]), 1.0)
     so_far = rrb.VisibleTimeRanges(
         [
@@ -134,7 +134,7 @@ def _plan(points_m: FloatArray, overlays: Sequence[str]) -> rrb.Spatial3DView:
         contents=["$origin/**", f"/{POSES}"],
         name="Plan view [m]",
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.5, stroke_width=1.0, color=[128, 128, 128, 50]),
-        # An eye exactly above would leave its direction undefined; a hair to the south it is not.
+        # The eye is slightly south of the centre, since its direction is undefined exactly above.
         eye_controls=rrb.EyeControls3D(
             kind="orbital",
             position=[x_m, y_m - 1e-4 * height_m, height_m],
@@ -158,8 +158,8 @@ def _texts(name: str) -> rrb.TextLogView:
     return rrb.TextLogView(origin="/", contents=[f"/{SAFETY_EVENT}", f"/{END}", f"/{LOG}"], name=name)
 
 
-def log_look(stream: rr.RecordingStream, overlays: Sequence[str] = ()) -> None:
-    """Log what never changes: axes, names and colours of the series, the car's body and the style of the trails."""
+def log_styles(stream: rr.RecordingStream, overlays: Sequence[str] = ()) -> None:
+    """Log the static data: axes, names and colours of the series, the car's body and the style of the trails."""
     stream.log(MAP, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for path, (name, color) in SERIES.items():
         stream.log(path, rr.SeriesLines(names=name, colors=color, widths=1.5), static=True)

@@ -1,4 +1,4 @@
-"""Rows of an episode as columns of a rerun recording: the entities that a live and a later recording share."""
+"""Rows of an episode as columns of a rerun recording, for live recordings and for conversions from arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from carlab.core.quantities import ACTION_NAMES, FloatArray, Observation
 from carlab.recording.rerun import blueprint as look
 
 Row = tuple[int, float, Observation]
-"""Step, time on the car's clock [s] and what was seen then."""
+"""Step, time on the car's clock [s] and observation."""
 
 
 def entity_part(name: str) -> str:
@@ -38,7 +38,7 @@ class Columns:
         ]
 
     def states(self, rows: Sequence[Row]) -> None:
-        """Pose, trail, velocities and age of the pose of some observations, and the raw poses that came with them."""
+        """Send pose, trail, velocities, age of the pose and raw poses of observations."""
         if not rows:
             return
         indexes = self.indexes([t_s for _, t_s, _ in rows], [step for step, _, _ in rows])
@@ -57,7 +57,7 @@ class Columns:
             self._stream.send_columns(look.POSES, indexes, columns)
 
     def ticks(self, ticks: Sequence[Tick]) -> None:
-        """Commands asked for and sent, lateness and time of the policy."""
+        """Send requested and sent commands, lateness and computing time of the policy."""
         if not ticks:
             return
         indexes = self.indexes([tick.t_s for tick in ticks], [tick.step for tick in ticks])
@@ -69,13 +69,13 @@ class Columns:
         self._scalars("episode/tick/policy_ms", indexes, [1e3 * tick.policy_s for tick in ticks])
 
     def rewards(self, transitions: Sequence[Transition]) -> None:
-        """The reward of each transition, at the time of its arrival."""
+        """Send the reward of each transition at the time of its observation."""
         if transitions:
             indexes = self.indexes([row.t_s for row in transitions], [row.step + 1 for row in transitions])
             self._scalars("episode/transition/reward", indexes, [row.reward for row in transitions])
 
     def overlay(self, name: str, times_s: Sequence[float], steps: Sequence[int], states: FloatArray) -> None:
-        """Another car beside the recorded one; rows that are NaN are left out."""
+        """Send the states of an additional car; rows with NaN are omitted."""
         count = min(len(times_s), len(states))
         whole = np.isfinite(states[:count]).all(axis=1)
         states = states[:count][whole]
@@ -94,7 +94,7 @@ class Columns:
         zeros = np.zeros(len(states))
         turns = np.column_stack([zeros, zeros, np.sin(half_rad), np.cos(half_rad)])
         self._stream.send_columns(car, indexes, rr.Transform3D.columns(translation=places, quaternion=turns))
-        # One piece of the trail a row, from the place before: the view shows all pieces up to its time.
+        # One segment of the trail per row, from the previous position: the view shows all segments up to its time.
         starts = np.vstack([places[:1] if previous is None else previous, places[:-1]])
         strips = list(np.stack([starts, places], axis=1))
         self._stream.send_columns(trail, indexes, rr.LineStrips3D.columns(strips=strips))
@@ -117,7 +117,7 @@ def log_surroundings(
     path_m: Sequence[tuple[float, float]],
     goal: tuple[float, float, float] | None,
 ) -> None:
-    """Arena, reference path and goal of the plan view."""
+    """Log arena, reference path and goal of the plan view."""
     width = rr.Radius.ui_points(1.5)
     if arena_m:
         line = rr.LineStrips3D([closed(arena_m)], radii=width, colors=look.VERMILION, labels="arena", show_labels=False)

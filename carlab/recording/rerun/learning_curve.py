@@ -23,15 +23,15 @@ def write_learning_curve(
     """Write a recording: every figure as a curve over the episodes, paths in the plan view, states over the ticks.
 
     Args:
-        path: of the .rrd file; replaced whole.
+        path: of the .rrd file; replaced atomically.
         rows: figures by name, one mapping an episode, ``episode`` among them.
         driven: states of each episode (T + 1, 6).
         predictions: of the prediction windows of each episode the ticks (S, N), and mean and standard deviation of
             the states there (S, N, 6).
-        diagnoses: text of the quick check after each episode; empty where there is none.
+        diagnoses: text of the quick check after each episode; empty without a check.
 
     Raises:
-        DataError: it cannot be written; what was there stays.
+        DataError: it cannot be written; an existing file is unchanged.
     """
     with rerun_file(path, recording_id=path.parent.name) as stream:
         texts = diagnoses or [""] * len(rows)

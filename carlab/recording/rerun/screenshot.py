@@ -1,4 +1,4 @@
-"""A picture of a recording as the rerun viewer shows it, made without a window."""
+"""Screenshot of a recording in the rerun viewer, without a window."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _NO_DRIVER = (
 )
 
 
-def vulkan_is_there() -> bool:
-    """Whether a Vulkan driver is registered on this computer (on macOS and Windows the system brings its own)."""
+def has_vulkan_driver() -> bool:
+    """Whether a Vulkan driver is registered on this computer (macOS and Windows include one)."""
     if sys.platform != "linux":
         return True
     named = (os.environ.get(name, "") for name in ("VK_DRIVER_FILES", "VK_ICD_FILENAMES"))
@@ -48,7 +48,7 @@ def rerun_program() -> Path | None:
 def save_screenshot(
     rrd_path: Path | str, png_path: Path | str, *, size: tuple[int, int] = (1600, 1000), timeout_s: float = 60.0
 ) -> None:
-    """Open an .rrd in the headless viewer and save what it shows once the picture stands still.
+    """Open an .rrd in the headless viewer and save its picture once it no longer changes.
 
     Args:
         rrd_path: The recording.
@@ -57,16 +57,16 @@ def save_screenshot(
         timeout_s: Give up after this long [s]; drawing on a processor takes about eight seconds.
 
     Raises:
-        DataError: The recording is not there, or the picture cannot be written.
-        NotReadyError: The viewer cannot run here; the message says what to install.
+        DataError: The recording does not exist, or the picture cannot be written.
+        NotReadyError: The viewer cannot run here; the message names the packages to install.
     """
     rrd_path, png_path = Path(rrd_path), Path(png_path)
     if not rrd_path.is_file():
-        raise DataError(f"{rrd_path} is not there; make it with carlab view RECORDING --save {rrd_path.name}.")
+        raise DataError(f"{rrd_path} does not exist; create it with carlab view RECORDING --save {rrd_path.name}.")
     program = rerun_program()
     if program is None:
         raise NotReadyError(_CANNOT, ["the program 'rerun' is not installed; install rerun-sdk with pip"])
-    if not vulkan_is_there():
+    if not has_vulkan_driver():
         raise NotReadyError(_CANNOT, [_NO_DRIVER])
     port = _free_port()
     with tempfile.TemporaryDirectory(prefix="carlab-") as folder, (Path(folder) / "log").open("w+") as log:
@@ -94,7 +94,7 @@ def save_screenshot(
 
 
 def _end(viewer: subprocess.Popen[bytes]) -> None:
-    """End the viewer with its children: the program on the path is a script that starts the real one."""
+    """End the viewer with its children: the program on the path is a script that starts the viewer."""
     if sys.platform == "win32":
         viewer.kill()
     else:
@@ -110,7 +110,7 @@ def _free_port() -> int:
 
 
 def _settled_picture(viewer: subprocess.Popen[bytes], port: int, folder: Path, give_up_ns: int) -> bytes:
-    """Bytes of the first picture that equals the one before: the axes have found their ranges, messages are gone."""
+    """Bytes of the first picture that equals the previous one, when axis ranges are final and messages have gone."""
     from rerun.experimental import ViewerClient
 
     pause = threading.Event()

@@ -1,7 +1,7 @@
-"""Writes one episode into one .rrd file for the rerun viewer, which is called .partial until it is finished.
+"""Writer of one episode to one .rrd file for the rerun viewer, named .partial until it is complete.
 
-Documents are gathered and sent as columns at every flush: a tick costs microseconds, and the live recording and one
-made afterwards from arrays (``episode_to_rrd``) have the same entities.
+Documents are collected and sent as columns at every flush: a tick costs microseconds, and live recordings and
+conversions from arrays (``episode_to_rrd``) have the same entities.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import FloatArray
-from carlab.recording.drained_file import DrainedFile
 from carlab.recording.episode_builder import documents_from_episode
+from carlab.recording.pipe_file import PipeFile
 from carlab.recording.rerun import blueprint as look
 from carlab.recording.rerun.columns import Columns, Row, entity_part, log_surroundings
 from carlab.recording.sink import Item, LogLine, Sink, claim, describe_os_error, partial_path
@@ -38,10 +38,10 @@ class RerunSink(Sink):
     """One episode in one .rrd file, with its layout.
 
     Args:
-        path: The finished file, ``.../0001.rrd``; must not be there yet.
-        title: Name of the recording in the viewer; made from the EpisodeStarted unless given.
-        overlays: Further cars to draw beside the recorded one: name -> states (T + 1, 6) at the times of the ticks.
-        extent_m: Points that the plan view must show beside arena, goal and path, shape (n, 2) [m].
+        path: The complete file, ``.../0001.rrd``; must not exist.
+        title: Name of the recording in the viewer; by default from the EpisodeStarted.
+        overlays: Additional cars: name -> states (T + 1, 6) at the times of the ticks.
+        extent_m: Points that the plan view must show besides arena, goal and path, shape (n, 2) [m].
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class RerunSink(Sink):
         self._overlays = {entity_part(name): states for name, states in (overlays or {}).items()}
         self._extent_m = np.zeros((0, 2)) if extent_m is None else extent_m
         self._stream: rr.RecordingStream | None = None
-        self._file = DrainedFile(partial_path(self.path))
+        self._file = PipeFile(partial_path(self.path))
         self._opened = False
         self._origin_s = 0.0
         self._columns: Columns | None = None
@@ -70,7 +70,7 @@ class RerunSink(Sink):
         self._step = 0
 
     def open(self) -> None:
-        """Claim the file. Raises DataError in one sentence where it cannot be made."""
+        """Create the file. Raises DataError if that fails."""
         if self._opened or self._finished:
             return
         try:
@@ -81,13 +81,13 @@ class RerunSink(Sink):
         self._opened = True
 
     def flush(self) -> None:
-        """Send the rows gathered so far and wait until rerun has handed them to the operating system."""
+        """Send the collected rows and wait until rerun has passed them to the operating system."""
         if self._stream is not None and self._columns is not None:
             self._send_rows(self._columns)
             self._flush_stream(self._stream)
 
     def abandon(self) -> None:
-        """Let go of the stream; what is written stays ``.partial``. A file without any document is removed."""
+        """Close the stream and leave the file as ``.partial``. A file without documents is removed."""
         self._finished = True
         stream, self._stream = self._stream, None
         if stream is not None:
@@ -101,7 +101,7 @@ class RerunSink(Sink):
 
     def _write(self, item: Item) -> None:
         if not self._opened:
-            raise DataError(f"{self.path} is not open; use the sink in a recorder.")
+            raise DataError(f"{self.path} is not open; use the sink in a Recorder.")
         if isinstance(item, EpisodeStarted):
             self._stream = self._begin(item)
             self._columns = Columns(self._stream, item.t_s)
@@ -143,7 +143,7 @@ class RerunSink(Sink):
         points_m = np.array([*outline, *self._extent_m.tolist()], dtype=np.float64).reshape(-1, 2)
         overlays = tuple(self._overlays)
         stream = rr.RecordingStream(APPLICATION)
-        # From here on the stream is known to abandon(), which has to disconnect it.
+        # abandon() must disconnect the stream from here on.
         self._stream = stream
         stream.save(self._file.start(), default_blueprint=look.drive_blueprint(points_m, overlays))
         reality = started.reality.value
@@ -166,7 +166,7 @@ class RerunSink(Sink):
         _send_end(stream, EndReason.CRASHED, "", 0, math.nan)
         if started.config_toml:
             stream.log("episode/config", rr.TextDocument(started.config_toml), static=True)
-        look.log_look(stream, overlays)
+        look.log_styles(stream, overlays)
         log_surroundings(stream, started.arena_m, started.path_m, started.goal)
         return stream
 
@@ -230,17 +230,17 @@ def _send_end(stream: rr.RecordingStream, reason: EndReason, detail: str, steps:
 def episode_to_rrd(
     episode: EpisodeData, path: Path | str, title: str = "", overlays: Mapping[str, FloatArray] | None = None
 ) -> None:
-    """Write an episode of arrays, imported ones included, as an .rrd with the entities and the layout of a live one.
+    """Write an episode of arrays as an .rrd with the entities and the layout of a live recording.
 
     Args:
-        episode: What to draw.
+        episode: The episode, possibly imported.
         path: The new file, ``.rrd``.
-        title: Name of the recording in the viewer; made from the metadata unless given.
-        overlays: Further cars to draw beside the recorded one, ``{"predicted": states}``, states (T + 1, 6) at the
-            times of ``episode``; NaN rows are left out.
+        title: Name of the recording in the viewer; by default from the metadata.
+        overlays: Additional cars, ``{"predicted": states}``, states (T + 1, 6) at the times of ``episode``; rows with
+            NaN are omitted.
 
     Raises:
-        DataError: The file is already there or cannot be written, or an overlay has another number of rows.
+        DataError: The file exists or cannot be written, or an overlay has a wrong number of rows.
     """
     for name, states in (overlays or {}).items():
         if states.shape != episode.states.shape:

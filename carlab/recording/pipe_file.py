@@ -1,7 +1,7 @@
-"""A file that takes whatever another writer sends through a pipe, and remembers errors instead of passing them on.
+"""A file that is written through a pipe, so that the writer never gets an error.
 
-rerun writes files in a thread of its own; when that thread meets a full disk, later calls may wait for ever, and so
-may the program's exit. Through a pipe that is always emptied rerun never meets an error: they all happen here.
+rerun writes files in its own thread. If that thread gets an error (full disk), later calls and the program's exit may
+wait for ever. Here rerun writes to a pipe that is always read; errors occur in this module and are stored.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import IO
 
 _READ_BYTES = 1 << 16
-_LOOK_S = 0.1
+_POLL_S = 0.1
 
 
-class DrainedFile:
-    """Copies a pipe into a new file in a thread of its own.
+class PipeFile:
+    """Copies a pipe into a new file in a separate thread.
 
     Args:
-        path: The file to make; must not be there yet.
+        path: The new file; must not exist.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,11 +33,11 @@ class DrainedFile:
         self._error: OSError | None = None
 
     def open(self) -> None:
-        """Make the file. Raises OSError."""
+        """Create the file. Raises OSError."""
         self._file = self._path.open("xb", buffering=0)
 
     def start(self) -> Path:
-        """Start to copy; returns the path that the other writer must open."""
+        """Start copying; returns the path that the writer must open."""
         if self._file is None:
             raise OSError(f"{self._path} is not open")
         self._ends = os.pipe()
@@ -48,12 +48,12 @@ class DrainedFile:
         return Path(f"/dev/fd/{self._ends[1]}")
 
     def check(self) -> None:
-        """Raise the OSError that writing met, if any."""
+        """Raise the stored OSError of writing, if any."""
         if self._error is not None:
             raise self._error
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Copy what is still in the pipe and close the file; the other writer has closed its end. Idempotent."""
+        """Copy the rest of the pipe and close the file after the writer has closed its end. Idempotent."""
         self._complete.set()
         if self._thread is not None and self._thread.is_alive():
             self._thread.join(timeout_s)
@@ -69,8 +69,8 @@ class DrainedFile:
 
     def _copy(self, end: int, file: IO[bytes]) -> None:
         while True:
-            complete = self._complete.is_set()  # asked before looking, so that nothing is left in the pipe
-            if not select.select([end], [], [], 0.0 if complete else _LOOK_S)[0]:
+            complete = self._complete.is_set()  # read before polling, so that no bytes remain in the pipe
+            if not select.select([end], [], [], 0.0 if complete else _POLL_S)[0]:
                 if complete:
                     break
                 continue
