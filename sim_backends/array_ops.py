@@ -1,8 +1,7 @@
-"""The few elementary functions that the model's equations are written in, for floats and for NumPy arrays.
+"""Elementary functions for the model's equations, on floats and on NumPy arrays.
 
-The equations stand once in the code, as functions of such a set: one car on plain floats (no array library at all,
-about ten times as fast for one car as NumPy scalars), or a batch of cars on NumPy arrays or, in ``torch_ops``, on
-tensors.
+The equations are written once, with such a set of functions as an argument: one car on floats (about ten times as fast
+as NumPy scalars), or a batch of cars on NumPy arrays or, with ``torch_ops``, on tensors.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ class Ops(Protocol):
     def atan(self, x: Value, /) -> Value: ...  # noqa: D102
     def atan2(self, y: Value, x: Value, /) -> Value: ...  # noqa: D102
     def slope_angle(self, y: Value, x: Value, /) -> Value:
-        """``atan2(y, x)`` for positive x, the fastest way."""
+        """``atan2(y, x)`` for positive x, by the fastest function."""
 
     def tanh(self, x: Value, /) -> Value: ...  # noqa: D102
     def exp(self, x: Value, /) -> Value: ...  # noqa: D102
@@ -138,7 +137,7 @@ class NumpyOps:
 
 
 def has_wide_vectors(dtype: np.dtype) -> bool:
-    """Whether NumPy on this processor computes ``arctan2`` of this type in wide vectors, not one by one."""
+    """Whether NumPy vectorises ``arctan2`` of this type on this processor (SIMD)."""
     found = introspect.opt_func_info(func_name="^arctan2$").get("arctan2", {})
     target = found.get(dtype.char * 3, {}).get("current", "baseline")
     return not str(target).startswith("baseline")

@@ -1,4 +1,4 @@
-"""The numbers of one simulated car, and the car file (TOML) that they come from."""
+"""The parameters of a simulated car, and their car file (TOML)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim_backends.effects.base import GRAVITY_MPS2, MODEL_KINDS, ModelKind
 from sim_backends.registry import REGISTRY, ParameterInfo, section
 
 TABLES = ("vehicle", "tyre", "motor", "steering", "timing", "model", "mocap", "effects")
-"""Tables of a car file that describe the simulator; a real car's ``[hardware]`` is not among them."""
+"""Tables of a car file with the simulator's parameters, without ``[hardware]``."""
 
 LATENCY = "mocap.latency"
 
@@ -49,7 +49,7 @@ class CarParameters:
 
 @dataclass(frozen=True, slots=True)
 class MocapParameters:
-    """What the motion capture of a simulated car is like. ``dropout`` is the share of frames lost [1]."""
+    """Parameters of the motion capture of a simulated car. ``dropout`` is the share of lost frames [1]."""
 
     rate_hz: float = 120.0
     position_std_m: float = 0.0003
@@ -60,14 +60,13 @@ class MocapParameters:
 
 @dataclass(frozen=True, slots=True)
 class SimulatorConfig:
-    """A whole simulator: parameters, timing, kind of model, motion capture, effects, and what is known of each.
+    """Configuration of a simulator: parameters, timing, kind of model, motion capture, effects, and prior knowledge.
 
-    ``effects`` maps ids of the catalogue to their parameters (all of them, in SI units; a choice may be given by its
-    word and is kept as its position). ``priors`` maps dotted names to (low, high) where the car file gives a range;
-    ``parameter_std`` maps them to a standard deviation where it gives one, as the model file of a diagnosis does.
-    ``unknown`` names what the car file does not state although every car has its own: the latency of
-    motion capture; its value is a default then, and a diagnosis estimates it. Building one checks it: ConfigError says
-    what is wrong.
+    ``effects`` maps ids of the catalogue to all their parameters in SI units; a choice may be given by its word and is
+    stored as its position. ``priors`` maps dotted names to the ranges (low, high) of the car file, ``parameter_std``
+    to the standard deviations, as in the model file of a diagnosis. ``unknown`` holds ``mocap.latency`` if the car file
+    does not state it; then its value is a default, and a diagnosis estimates it. Construction raises ConfigError for
+    invalid values.
     """
 
     parameters: CarParameters = CarParameters()
@@ -99,11 +98,11 @@ class SimulatorConfig:
                 raise ConfigError(problem)
         for name, (low, high) in self.priors.items():
             if not low <= self.values()[name] <= high:
-                raise ConfigError(f"{name} = {self.values()[name]:g} lies outside its own range {low:g} to {high:g}.")
+                raise ConfigError(f"{name} = {self.values()[name]:g} lies outside its range {low:g} to {high:g}.")
         check_keys(self.parameter_std, REGISTRY, "the standard deviations")
         for name, std in self.parameter_std.items():
             if not 0.0 < std < float("inf") or REGISTRY[name].choices:
-                raise ConfigError(f"The std of {name} is {std:g}; give a number above zero, and none to a word.")
+                raise ConfigError(f"The std of {name} is {std:g}; it must be above zero, and a choice has none.")
         for channel, delay_s in zip(("steering", "throttle"), self.delays_s(), strict=True):
             if delay_s < 0.0:
                 raise ConfigError(f"The delay of {channel} adds up to {delay_s:g} s; raise command_delay to 0 or more.")
@@ -114,7 +113,7 @@ class SimulatorConfig:
         return float(getattr(self._owner(info.same_as), _FIELD_OF[info.same_as]))
 
     def values(self) -> dict[str, float]:
-        """Every number of this simulator by its dotted name: the base ones, and those of the effects it has."""
+        """All numbers of this simulator by dotted name: base parameters and those of its effects."""
         found = {name: float(getattr(self._owner(name), attribute)) for name, attribute in _FIELD_OF.items()}
         for effect_id, given in self.effects.items():
             found |= {f"effects.{effect_id}.{name}": value for name, value in given.items()}
@@ -125,7 +124,7 @@ class SimulatorConfig:
         return self if table == "timing" else self.mocap if table == "mocap" else self.parameters
 
     def with_values(self, changes: Mapping[str, float]) -> Self:
-        """The same simulator with other numbers, by dotted names; naming an effect switches it on."""
+        """Copy with changed numbers by dotted name; an effect with a number is added."""
         check_keys(changes, REGISTRY, "the parameters")
         grouped: dict[str, dict[str, Any]] = {"parameters": {}, "mocap": {}, "timing": {}}
         effects = {effect_id: dict(given) for effect_id, given in self.effects.items()}
@@ -146,7 +145,7 @@ class SimulatorConfig:
         )
 
     def delays_s(self) -> tuple[float, float]:
-        """Time from a command to its effect on steering and on throttle [s], effects included."""
+        """Total delay of steering and of throttle with all effects [s]."""
         steering_s = throttle_s = self.command_delay_s
         for effect_id, given in self.effects.items():
             effect = EFFECTS[effect_id]
@@ -194,7 +193,7 @@ class SimulatorConfig:
             raise ConfigError(f"{where}: {error}") from None
 
     def to_tables(self) -> dict[str, Any]:
-        """The tables that ``from_tables`` reads back to an equal simulator, without what is unknown; ready for TOML."""
+        """Tables for TOML, without unknown values; the inverse of ``from_tables``."""
         tables: dict[str, Any] = {}
         for name, value in self.values().items():
             if name in self.unknown:
@@ -218,15 +217,15 @@ class SimulatorConfig:
 
     @classmethod
     def from_preset(cls, name: str = "rc_car") -> Self:
-        """One of the cars that come with the package, see ``preset_names``."""
+        """Create a preset of the package, see ``preset_names``."""
         if name not in preset_names():
-            raise ConfigError(f"There is no preset '{name}'; there are: {', '.join(preset_names())}.")
+            raise ConfigError(f"There is no preset '{name}'; choose one of {', '.join(preset_names())}.")
         text = (resources.files("sim_backends") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
         return cls.from_tables(tomllib.loads(text), f"preset {name}")
 
 
 def preset_names() -> tuple[str, ...]:
-    """Names of the cars that come with the package."""
+    """Names of the presets of the package."""
     folder = resources.files("sim_backends") / "presets"
     return tuple(sorted(Path(str(f)).stem for f in folder.iterdir() if f.name.endswith(".toml")))
 

@@ -1,4 +1,4 @@
-"""The measurement model: what motion capture and the velocity filter make of true states. Written once for all engines.
+"""The measurement model: motion capture and velocity filter applied to true states, for all engines.
 
     y(t) = F( W( h( x(t - latency) ) ) )
 
@@ -32,7 +32,7 @@ def observation_effects(effects: Iterable[str]) -> list[ObservationEffect]:
 
 
 def is_measured(name: str) -> bool:
-    """Whether a number of the car file belongs to what is measured: motion capture's, or an observation effect's."""
+    """Whether a parameter belongs to the measurement: motion capture, or an observation effect."""
     table, _, rest = name.partition(".")
     return table == "mocap" or (table == "effects" and EFFECTS[rest.partition(".")[0]].kind == "observation")
 
@@ -49,15 +49,15 @@ class MeasurementModel:
     Args:
         ops: Functions of the array library of ``values``.
         values: Numbers by dotted name, ``mocap.latency`` and those of the effects among them.
-        effects: Ids of effects; those of the observation are used here.
+        effects: Ids of effects; those of class ObservationEffect are used.
     """
 
     def __init__(self, ops: Ops, values: Mapping[str, Value], effects: Iterable[str]) -> None:
         self._ops = ops
         self.latency_s: Value = values[LATENCY]
-        """Age of what is measured [s]."""
+        """Latency of the measurement [s]."""
         self.velocity_time_constant_s: Value | None = None
-        """Time constant of the filter on the velocities [s]; None where there is none."""
+        """Time constant of the filter on the velocities [s]; None without a filter."""
         self._static: list[tuple[ObservationEffect, Parameters]] = []
         for effect in observation_effects(effects):
             own = effect.numbers(values)
@@ -127,7 +127,7 @@ class MeasurementModel:
 def filter_step(ops: Ops, output: State, first: State, last: State, step_s: Value, lag_s: Value) -> State:
     """First-order filter over one step, exact for an input that goes from ``first`` to ``last`` in a straight line.
 
-    ``lag_s dy/dt = u - y``; a time constant of 0 passes the input on unchanged.
+    ``lag_s dy/dt = u - y``; with a time constant of 0 the output is the input.
     """
     weights = lag_weights(ops, lag_s, 2.0 * step_s)
     return tuple(weights.after_half(y, u0, u1) for y, u0, u1 in zip(output, first, last, strict=True))
@@ -136,7 +136,7 @@ def filter_step(ops: Ops, output: State, first: State, last: State, step_s: Valu
 def filter_velocities(
     ops: Ops, inputs: Sequence[State], period_s: Value, lag_s: Value, begin: State | None = None
 ) -> list[State]:
-    """Outputs of the first-order filter at even ticks; settled at the first input unless it begins at ``begin``."""
+    """Outputs of the first-order filter at even ticks; it starts at ``begin``, by default at the first input."""
     outputs = [inputs[0] if begin is None else begin]
     for first, last in itertools.pairwise(inputs):
         outputs.append(filter_step(ops, outputs[-1], first, last, period_s, lag_s))
@@ -144,9 +144,9 @@ def filter_velocities(
 
 
 def windowed(ops: Ops, states: Sequence[State], period_s: Value, variance_s2: float) -> list[State]:
-    """Velocities as a symmetric window of a variance [s2] gives them: ``v + variance / 2 d2v/dt2``, to fourth order.
+    """Velocities averaged over a symmetric window with a variance [s2]: ``v + variance / 2 d2v/dt2``, to fourth order.
 
-    The first and the last state stay as they are.
+    The first and the last state are unchanged.
     """
     found = [states[0]]
     for before, now, after in zip(states[:-2], states[1:-1], states[2:], strict=True):
@@ -170,9 +170,9 @@ def velocity_curvature(ops: Ops, before: State, now: State, after: State, period
 
 
 def delay_as_recorded_s(ops: Ops, values: Mapping[str, Value], effects: Iterable[str], latency_s: Value) -> Value:
-    """The ``timing.command_delay`` [s] seen from a recording: measured states are old, so commands act that much later.
+    """The ``timing.command_delay`` [s] relative to a recording: measured states are old, so commands act later by that.
 
-    It is raised where it and the delay effects would add up to less than 0.
+    It is raised if its sum with the delay effects would be negative.
     """
     base = values[COMMAND_DELAY] + latency_s
     extras: list[Value] = [0.0, 0.0]
@@ -182,7 +182,7 @@ def delay_as_recorded_s(ops: Ops, values: Mapping[str, Value], effects: Iterable
             extras = [a + b for a, b in zip(extras, effect.extra_delays_s(own), strict=True)]
     for extra in extras:
         negative = base + extra < 0.0
-        if isinstance(negative, bool):  # plain numbers, whatever the library of the others
+        if isinstance(negative, bool):  # both are floats
             base = -extra if negative else base
         else:
             base = ops.where(negative, 0.0 * base - extra, base)

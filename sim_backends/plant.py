@@ -17,11 +17,11 @@ from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.measurement import MeasurementModel
 
 MEMORY_S = 1.0
-"""How far back poses can be asked for [s]."""
+"""Time span of stored poses [s]."""
 
 
 class Pose(NamedTuple):
-    """Place and heading of the tracked point: x, y [m], yaw [rad] in [-pi, pi)."""
+    """Position and heading of the tracked point: x, y [m], yaw [rad] in [-pi, pi)."""
 
     x_m: float
     y_m: float
@@ -33,18 +33,18 @@ class _Node(NamedTuple):
     state: State
     memory: ActuatorState
     commands: tuple[float, float]
-    """What acted from the node before until this one."""
+    """Acting commands between the previous node and this one."""
 
 
 class Plant:
-    """A car that moves as its commands tell it, each from its own delay after it was given.
+    """Simulation of one car with delayed commands.
 
     A command given at ``t`` acts exactly from ``t + delay`` on: integration steps end where a command begins to act.
-    Not thread-safe; time is what the caller says it is. Effects that depend on time count it from ``reset``.
+    Not thread-safe; the caller supplies the time. Effects that depend on time count it from ``reset``.
 
     Args:
         config: The car.
-        seed: Kept for plants with random physics; the base model and its effects have none.
+        seed: For plants with random physics; the base model and its effects have none.
     """
 
     def __init__(self, config: SimulatorConfig, seed: int = 0) -> None:
@@ -64,7 +64,7 @@ class Plant:
         self.reset(CarState(), 0.0)
 
     def reset(self, state: CarState, t_s: float) -> None:
-        """Put the car at ``state`` at ``t_s`` with neutral commands acting, none on its way, all else settled."""
+        """Set the state at ``t_s``, with neutral commands acting, none pending, and hidden states in steady state."""
         self._t_s = self._start_s = t_s
         body = tuple(float(v) for v in astuple(state))
         neutral = self._model.actuation(*self._chain.settled_output((0.0, 0.0)))
@@ -78,7 +78,7 @@ class Plant:
 
     @property
     def t_s(self) -> float:
-        """Time up to which the car was moved [s]."""
+        """Time up to which the car was simulated [s]."""
         return self._t_s
 
     @property
@@ -88,9 +88,9 @@ class Plant:
         return CarState(x, y, wrap(yaw), vx, vy, yaw_rate)
 
     def command(self, t_s: float, action: Action) -> None:
-        """Give a command at ``t_s``; it acts from ``t_s`` plus each channel's delay until the next one does.
+        """Issue a command at ``t_s``; it acts from ``t_s`` plus each channel's delay until the next one does.
 
-        Commands come in the order of their times. One that should act before ``t_s`` of the plant acts at once.
+        Commands must be in order of time. A command due before the plant's ``t_s`` acts at once.
         """
         for queue, delay_s, value in zip(
             self._pending, self._delays_s, (action.steering, action.throttle), strict=True
@@ -98,7 +98,7 @@ class Plant:
             queue.append((t_s + delay_s, value))
 
     def advance(self, t_s: float) -> CarState:
-        """Move the car to ``t_s`` (never back) and return the true state there."""
+        """Simulate up to ``t_s`` (never back) and return the true state."""
         while self._t_s < t_s:
             self._apply_due()
             until_s = min([t_s, *(queue[0][0] for queue in self._pending if queue)])
@@ -122,9 +122,9 @@ class Plant:
         return self.state
 
     def pose_at(self, t_s: float) -> Pose:
-        """True pose at ``t_s``: the car is moved there, or, within the last second, looked up by cubic interpolation.
+        """True pose at ``t_s``: by simulation, or within the last second by cubic interpolation.
 
-        Asked for a time before that (or before ``reset``), it gives the oldest pose it knows.
+        For an earlier time (or before ``reset``) it is the oldest stored pose.
         """
         x, y, yaw = self._true_at(t_s)[:3]
         return Pose(x, y, wrap(yaw))

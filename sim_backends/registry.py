@@ -19,8 +19,8 @@ from sim_backends.effects import CATALOGUE, EFFECTS, Effect
 class ParameterInfo:
     """One number of the car file.
 
-    ``default`` is what a file without it means; None where that is the number named by ``same_as``. ``positive`` says
-    that ``low`` itself is not allowed. A choice among ``choices`` is a word in car files and its position elsewhere.
+    ``default`` applies if the file does not state the number; None if the number ``same_as`` replaces it. ``positive``
+    excludes ``low`` itself. A choice among ``choices`` is a word in car files and its position elsewhere.
     """
 
     name: str
@@ -34,7 +34,7 @@ class ParameterInfo:
     choices: tuple[str, ...] = ()
 
     def number(self, value: object, where: str = "the simulator") -> float:
-        """The number for what a car file says: itself, or the position of a choice. Raises ConfigError."""
+        """Convert a value of a car file to a number; a choice becomes its position. Raises ConfigError."""
         if isinstance(value, str) and value in self.choices:
             return float(self.choices.index(value))
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -43,7 +43,7 @@ class ParameterInfo:
         return float(value)
 
     def problem(self, value: float) -> str | None:
-        """What is impossible about ``value`` and what to do; None where nothing is."""
+        """Message with the remedy if ``value`` is invalid; None if it is valid."""
         if self.choices and value not in range(len(self.choices)):
             return f"{self.name} is {value:g}; it must be one of {', '.join(self.choices)}, by position from 0."
         if math.isnan(value) or (math.isinf(value) and not self.name.startswith("effects.")):
@@ -96,13 +96,13 @@ for _effect in EFFECTS.values():
 
 
 def register(effect: Effect) -> None:
-    """Make an effect known to car files, all engines, the diagnosis, its reports, and the prior of learning.
+    """Add an effect to car files, all engines, the diagnosis, its reports, and the prior of learning.
 
     Raises:
-        ConfigError: its id is taken, or it has no parameters.
+        ConfigError: its id exists, or it has no parameters.
     """
     if effect.id in EFFECTS:
-        raise ConfigError(f"There is an effect '{effect.id}' already; give the new one another id.")
+        raise ConfigError(f"There is an effect '{effect.id}' already; choose another id for the new effect.")
     if not effect.parameters:
         raise ConfigError(f"Effect '{effect.id}' has no parameters; give it at least one EffectParameter.")
     EFFECTS[effect.id] = effect

@@ -16,23 +16,23 @@ from sim_backends.measurement import MeasurementModel
 from sim_backends.plant import Pose
 
 
-class HasPose(Protocol):
-    """What a sensor looks at: a plant, or anything that knows where its tracked point is."""
+class PoseProvider(Protocol):
+    """Source of true poses for a sensor, for example a plant."""
 
     def measured_pose(self, t_s: float) -> Pose:
         """Pose of the tracked point at ``t_s``, without noise."""
 
 
 class MocapSensor:
-    """Samples a plant at the rate of the car file. Time is what the caller says it is, simulated or by the wall.
+    """Samples a plant at the rate of the car file. The caller supplies the time, simulated or real.
 
-    Exposure ``k`` after ``reset`` is at ``start + k / rate`` and has its own random numbers, so what is measured
-    depends on the seed and the exposure alone, not on how often or when the sensor is asked.
+    Exposure ``k`` after ``reset`` is at ``start + k / rate`` and has its own random numbers, so measurements depend on
+    the seed and the exposure only, not on the times of the calls.
 
     Args:
         config: Rate, noise, latency and share of lost frames; effects that change the latency.
-        seed: Of the noise.
-        extra_latency_s: Added to the latency, for a wire that was measured [s].
+        seed: Seed of the noise.
+        extra_latency_s: Additional latency, for example of a measured wire [s].
     """
 
     def __init__(self, config: SimulatorConfig, seed: int = 0, *, extra_latency_s: float = 0.0) -> None:
@@ -51,17 +51,17 @@ class MocapSensor:
         return self._mocap.rate_hz
 
     def reset(self, t_s: float) -> None:
-        """Start anew with the first exposure at ``t_s``; nothing is in flight. Sequence numbers and noise go on."""
+        """Restart with the first exposure at ``t_s`` and no samples in flight; sequence numbers and noise continue."""
         self._start_s = t_s
         self._next = 0
         self._in_flight.clear()
 
     def next_exposure_s(self) -> float:
-        """When the next exposure is due [s]."""
+        """Time of the next exposure [s]."""
         return self._start_s + self._next / self._mocap.rate_hz
 
-    def expose(self, t_s: float, plant: HasPose) -> PoseSample | None:
-        """One exposure at ``t_s``; None where the frame is lost. Counts sequence numbers, keeps no schedule."""
+    def expose(self, t_s: float, plant: PoseProvider) -> PoseSample | None:
+        """Make one exposure at ``t_s``; None if the frame is lost. Does not change the schedule."""
         x_noise, y_noise, yaw_noise = self._rng.standard_normal(3)
         lost = self._rng.random() < self._mocap.dropout
         sequence = self._sequence
@@ -79,9 +79,9 @@ class MocapSensor:
             yaw_rad=wrap(pose.yaw_rad + self._mocap.yaw_std_rad * float(yaw_noise)),
         )
 
-    def samples_until(self, t_s: float, plant: HasPose) -> list[PoseSample]:
+    def samples_until(self, t_s: float, plant: PoseProvider) -> list[PoseSample]:
         """Make the exposures due up to ``t_s`` and return the samples that have arrived by then, oldest first."""
-        # A nanosecond of slack, so that rounding does not put off an exposure that is due exactly now.
+        # A nanosecond of tolerance, so that rounding does not delay an exposure that is due now.
         while self.next_exposure_s() <= t_s + 1e-9:
             due_s = self.next_exposure_s()
             self._next += 1
@@ -93,6 +93,6 @@ class MocapSensor:
         return arrived
 
     def settling_time_s(self, window_s: float) -> float:
-        """Time after which a velocity window of ``window_s`` is full of samples that have arrived [s]."""
+        """Time until a velocity window of ``window_s`` is filled with arrived samples [s]."""
         periods = math.ceil(window_s * self._mocap.rate_hz) + 2
         return periods / self._mocap.rate_hz + self.latency_s

@@ -1,4 +1,4 @@
-"""A car whose physics runs in the process: the same contract as a real one, on a clock that need not wait."""
+"""A simulated car with the interface of a real car, on a simulated or a real clock."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sim_backends.sensor import MocapSensor
 
 
 class _Approach:
-    """A tracked point that moves at a constant body velocity and is at ``state`` at ``t_s``: what the camera saw."""
+    """A tracked point with constant body velocity that reaches ``state`` at ``t_s``, for samples before placing."""
 
     def __init__(self, config: SimulatorConfig, state: CarState, t_s: float) -> None:
         self._measurement = MeasurementModel(FLOATS, config.values(), config.effects)
@@ -41,18 +41,18 @@ class _Approach:
 class SimulatedCar(Car):
     """Physics, motion capture and state estimator in one process.
 
-    Time passes when the clock is slept on; ``observe`` moves the car up to the clock. A seed fixes every number.
+    Time advances by the clock; ``observe`` simulates up to the clock's time. Results are reproducible by the seed.
 
     Args:
-        config: The car; the default preset unless given.
-        seed: Of the sensor's noise.
-        start: Where the car stands when it is opened.
-        clock: A simulated clock unless given; with a ``MonotonicClock`` the car runs in real time.
+        config: The simulator; by default ``SimulatorConfig()``.
+        seed: Seed of the sensor's noise.
+        start: State of the car after opening.
+        clock: By default a simulated clock; with a ``MonotonicClock`` the car runs in real time.
         limits: Largest commands.
-        watchdog_s: A command that is not followed by another for this long [s] gives way to neutral.
-        extra_command_latency_s: Added on the way of commands, for a wire that was measured [s].
-        extra_pose_latency_s: Added on the way of poses [s].
-        window_s: Of the velocity fit [s].
+        watchdog_s: Time without a new command after which the car gets neutral [s].
+        extra_command_latency_s: Additional latency of commands, for example of a measured wire [s].
+        extra_pose_latency_s: Additional latency of poses [s].
+        window_s: Window of the velocity fit [s].
     """
 
     reality = Reality.SIMULATED
@@ -88,17 +88,17 @@ class SimulatedCar(Car):
         self._unseen: list[PoseSample] = []
 
     def open(self) -> None:
-        """Put the car at its start and wait until motion capture has filled the velocity window."""
+        """Put the car at its start; the clock advances until the velocity window is filled."""
         if self._open:
             return
         self._open, self._armed, self._fault = True, False, None
         self.place(self._start)
 
     def place(self, state: CarState) -> bool:
-        """Put the car at ``state`` with neutral acting and no command on its way; takes about 0.1 s of the clock.
+        """Put the car at ``state`` with neutral acting and no command pending; takes about 0.1 s of the clock.
 
-        The car is at ``state`` when this returns. Motion capture saw it come there at its own velocity, so that the
-        estimated state is right at once.
+        The car is at ``state`` when this returns. The preceding samples are those of a motion with the velocities of
+        ``state``, so that the estimated velocities are correct at once.
         """
         self._require_open()
         begin_s = self.clock.now_s()
@@ -115,20 +115,20 @@ class SimulatedCar(Car):
 
     @property
     def true_state(self) -> CarState:
-        """Where the car really is now, which no car on the road can tell."""
+        """True state at the clock's time (simulation only)."""
         self._require_open()
         self._run_to(self.clock.now_s())
         return self._plant.state
 
     def observe(self) -> Observation:
-        """Newest state that has arrived by now."""
+        """Newest state that has arrived."""
         self._require_open()
         self._run_to(self.clock.now_s())
         estimate, newest = self._estimator.estimate(), self._estimator.newest
         poses = tuple(self._unseen)
         self._unseen.clear()
         if estimate is None or newest is None:
-            raise PoseLostError("No pose has arrived yet; lower [mocap] dropout or wait a little after open().")
+            raise PoseLostError("No pose has arrived yet; lower [mocap] dropout or wait after open().")
         state, velocity_delay_s = estimate
         return Observation(
             state=self._velocities.state(state),
@@ -141,23 +141,23 @@ class SimulatedCar(Car):
         )
 
     def arm(self) -> None:
-        """Let commands through."""
+        """Enable commands."""
         self._require_open()
         self._require_no_fault()
         self._armed = True
 
     def command(self, action: Action) -> Action:
-        """Hand over a command."""
+        """Issue a command."""
         self._require_open()
         self._require_no_fault()
         self.check(action)
         if not self._armed and not action.is_neutral:
-            raise NotArmedError(f"Car '{self.name}' is not armed and takes only neutral; call arm() first.")
+            raise NotArmedError(f"Car '{self.name}' is not armed and accepts only neutral; call arm() first.")
         self._send(action)
         return action
 
     def stop(self, *, planned: bool) -> None:
-        """Neutral, and disarm."""
+        """Send neutral and disarm."""
         if not self._open:
             return
         self._armed = False
@@ -189,7 +189,7 @@ class SimulatedCar(Car):
         return Health(ready=not problems, problems=tuple(problems), readings=readings)
 
     def close(self) -> None:
-        """Neutral, then closed."""
+        """Send neutral and close the car."""
         self.stop(planned=True)
         self._open = False
 
@@ -199,7 +199,7 @@ class SimulatedCar(Car):
 
     def _require_no_fault(self) -> None:
         if self._fault is not None:
-            raise ActuatorFaultError(f"Car '{self.name}' takes no command: {self._fault}; call reset_fault(), arm().")
+            raise ActuatorFaultError(f"Car '{self.name}' is stopped: {self._fault}; call reset_fault() and arm().")
 
     def _send(self, action: Action) -> None:
         now_s = self.clock.now_s()
@@ -225,7 +225,7 @@ class SimulatedCar(Car):
 
 
 class _MeasuredVelocities:
-    """What the measurement model makes of the estimated velocities: its effects on velocities and its filter."""
+    """The measurement model for estimated velocities: its effects on velocities and its filter."""
 
     def __init__(self, config: SimulatorConfig) -> None:
         self._model = MeasurementModel(FLOATS, config.values(), config.effects)
@@ -250,7 +250,7 @@ class _MeasuredVelocities:
         self._t_s, self._input = newest.t_capture_s, velocity
 
     def state(self, state: CarState) -> CarState:
-        """The state that a car reports for an estimated one."""
+        """The reported state for an estimated state."""
         if self._t_s is None:
             return CarState(*self._model.observe_velocities(astuple(state)))
         return CarState(state.x_m, state.y_m, state.yaw_rad, *self._output)

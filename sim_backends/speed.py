@@ -1,4 +1,4 @@
-"""How fast the simulator is, as ratios measured in one run on one core: what ``carlab bench speed`` prints."""
+"""Benchmark of the simulator on one core, as ratios, for ``carlab bench speed``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TICKS = 30
 
 
 def _best_s(function: Callable[[], object], repeats: int) -> float:
-    """Shortest of several runs [s]: what the machine can do when nobody else takes its time."""
+    """Shortest time of several runs [s], which has the least disturbance by other processes."""
     times = []
     for _ in range(repeats):
         begin = time.perf_counter()
@@ -30,8 +30,8 @@ def _best_s(function: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-class OneThread:
-    """One core for torch while it lasts."""
+class SingleTorchThread:
+    """Context in which torch uses one thread."""
 
     def __enter__(self) -> None:
         self._before = torch.get_num_threads()
@@ -56,7 +56,7 @@ def copy_bandwidth_bytes_per_s(megabytes: int = 256, repeats: int = 5) -> float:
 
 
 def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -> dict[str, float]:
-    """Car-steps a second of the batched simulator against plain loops over single cars that do the same work.
+    """Car-steps per second of the batched simulator and of loops over single cars.
 
     A car-step is one control period of the default car (1/30 s) in four Runge-Kutta steps of at most 10 ms, which is
     ``16`` evaluations of the model. ``plain_numpy_loop`` is the straightforward NumPy form; ``plain_python_loop`` is
@@ -68,7 +68,7 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
     """
     config = SimulatorConfig()
     found: dict[str, float] = {}
-    with OneThread():
+    with SingleTorchThread():
         for count in (1, cars):
             start, commands = _drive(count)
             rollout(config, start, commands)
@@ -118,7 +118,7 @@ def gradient_speed(cars: int = 2048, repeats: int = 3, batch: int = 4096) -> dic
     names = [n for n in config.values() if n.split(".")[0] in ("vehicle", "tyre", "motor", "steering")]
     numbers = 6 + 2 * TICKS + len(names)
     found: dict[str, float] = {"numbers": float(numbers), "cars": float(cars)}
-    with OneThread():
+    with SingleTorchThread():
         for label, count in (("", cars), ("one_car_", 1)):
             by_gradient = _best_s(lambda count=count: _gradient(config, names, count), repeats + 1)  # type: ignore[misc]
             size = min(batch, 2 * numbers * count)

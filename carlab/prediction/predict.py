@@ -16,7 +16,7 @@ import torch
 from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.array_ops import ARRAYS
-from sim_backends.batch.inputs import with_effects_of
+from sim_backends.batch.inputs import with_effects_of_values
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
@@ -114,7 +114,7 @@ def simulate_windows(
     """
     given = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in (values or {}).items()}
     sets = max((len(v) for v in given.values()), default=1)
-    whole = with_effects_of(config, given)
+    whole = with_effects_of_values(config, given)
     numbers: dict[str, float | FloatArray] = {**whole.values(), **given}
     shaped = {name: _broadcast(value, sets)[:, None] for name, value in numbers.items()}
     measurement = MeasurementModel(ARRAYS, shaped, whole.effects)

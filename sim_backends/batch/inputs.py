@@ -1,4 +1,4 @@
-"""What a batched rollout is given: checked, and its delays and latency added up over the effects."""
+"""Inputs of a batched rollout: checks, and the sums of delays and latency over the effects."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from sim_backends.registry import REGISTRY
 
 
 class Past(NamedTuple):
-    """What happened before the first tick: commands (N, H, 2), and states (N, H, 6) where they are known."""
+    """History before the first tick: commands (N, H, 2), and states (N, H, 6) or None."""
 
     commands: torch.Tensor
     states: torch.Tensor | None
 
     @classmethod
     def of(cls, commands: torch.Tensor | None, states: torch.Tensor | None, like: torch.Tensor) -> Past | None:
-        """From commands and states that may be missing; None where there is no tick before the first."""
+        """Create a history from commands and states; None without ticks before the first."""
         if commands is None or not commands.shape[1]:
             return None
         return cls(commands.to(like), None if states is None else states.to(like))
 
     def cut(self, cars: slice) -> Past:
-        """The same for some of the cars."""
+        """The history of a slice of the cars."""
         return Past(self.commands[cars], None if self.states is None else self.states[cars])
 
 
-def plain_number(value: Number) -> Number:
-    """A number where a tensor holds one without a gradient, or the same for all cars."""
+def number_if_shared(value: Number) -> Number:
+    """Convert a tensor without gradient whose value is the same for all cars to a float; otherwise return it."""
     if isinstance(value, torch.Tensor) and not value.requires_grad:
         first = value.reshape(-1)[0] if value.numel() else value.new_zeros(())
         if bool((value == first).all()):
@@ -44,25 +44,25 @@ def plain_number(value: Number) -> Number:
 
 
 def total_delays_s(numbers: Mapping[str, Number], effects: Iterable[str]) -> tuple[Number, Number]:
-    """Delay of steering and of throttle with all effects [s]. Raises ConfigError for less than zero."""
+    """Total delay of steering and of throttle with all effects [s]. Raises ConfigError if it is negative."""
     steering = throttle = numbers["timing.command_delay"]
     for effect in (EFFECTS[name] for name in effects):
         if isinstance(effect, DelayEffect):
             own = effect.numbers(numbers)
             extra_steering, extra_throttle = effect.extra_delays_s(own)
-            if steering is throttle and extra_steering is extra_throttle:  # keep what is one number one number
+            if steering is throttle and extra_steering is extra_throttle:  # equal delays stay the same object
                 steering = throttle = steering + extra_steering
             else:
                 steering, throttle = steering + extra_steering, throttle + extra_throttle
     for channel, delay in (("steering", steering), ("throttle", throttle)):
         if bool((delay < 0).any()) if isinstance(delay, torch.Tensor) else delay < 0:
-            raise ConfigError(f"The delay of {channel} adds up to less than 0 s; raise command_delay.")
-    first = plain_number(steering)
-    return first, first if steering is throttle else plain_number(throttle)
+            raise ConfigError(f"The total delay of {channel} is less than 0 s; raise command_delay.")
+    first = number_if_shared(steering)
+    return first, first if steering is throttle else number_if_shared(throttle)
 
 
-def with_effects_of(config: SimulatorConfig, given: Iterable[str]) -> SimulatorConfig:
-    """The simulator with the effects switched on whose numbers (dotted names) are ``given``."""
+def with_effects_of_values(config: SimulatorConfig, given: Iterable[str]) -> SimulatorConfig:
+    """The simulator with all effects added whose numbers (dotted names) are ``given``."""
     named = {name.split(".")[1] for name in given if name.startswith("effects.")}
     missing = named - set(config.effects)
     return replace(config, effects={**config.effects, **{name: {} for name in sorted(missing)}}) if missing else config
@@ -74,7 +74,7 @@ def check_shapes(
     history: torch.Tensor | None,
     history_states: torch.Tensor | None,
 ) -> int:
-    """Number of cars. Raises DataError where a shape does not fit."""
+    """Check shapes and return the number of cars. Raises DataError for a wrong shape."""
     cars = int(start.shape[0])
     if start.ndim != 2 or start.shape[1] != 6:
         raise DataError(f"start has shape {tuple(start.shape)}; it must be (cars, 6).")
@@ -89,7 +89,7 @@ def check_shapes(
 
 
 def check_values(given: Mapping[str, Number], t0_s: Number, cars: int) -> None:
-    """Raise ConfigError for names that a rollout does not take, DataError for shapes that do not fit."""
+    """Raise ConfigError for unknown or unsupported names, DataError for wrong shapes."""
     check_keys(given, REGISTRY, "the values of a rollout")
     if "timing.control_period" in given:
         raise ConfigError("timing.control_period is shared by all cars; change it in the simulator instead.")

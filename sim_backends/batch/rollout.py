@@ -1,10 +1,9 @@
-"""Many cars at once in torch: rollouts that are differentiable in states, commands and every parameter.
+"""Batched rollouts in torch, differentiable in states, commands and every parameter.
 
 The equations are those of ``single_track``. On a CPU a Runge-Kutta step of them and its derivative are compiled to
-straight-line NumPy code (``compiled_step``) that works on the memory of the tensors, chunk by chunk so that a chunk
-stays in the cache. Where no gradient is asked for, nothing of autograd runs. Measured on one core with AVX-512 (NumPy
-2.4, torch 2.13, float32): 2.5 times as fast as torch's operators forward, 4 times with the gradient. On a GPU, and for
-second derivatives, torch's operators run.
+straight-line NumPy code (``compiled.step``) on the memory of the tensors, in chunks that fit the cache. Without a
+gradient autograd is not used. On one core with AVX-512 (NumPy 2.4, torch 2.13, float32) it is 2.5 times as fast as
+torch's operators forward, 4 times with the gradient. On a GPU, and for second derivatives, torch's operators run.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from sim_backends.batch.inputs import (
     Past,
     check_shapes,
     check_values,
-    plain_number,
+    number_if_shared,
     total_delays_s,
-    with_effects_of,
+    with_effects_of_values,
 )
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
@@ -35,10 +34,10 @@ from sim_backends.dynamics.torch_ops import torch_ops
 from sim_backends.measurement import MeasurementModel, filter_step
 
 CARS_AT_ONCE = 4096
-"""Cars of a chunk where no gradient is asked for, on a CPU."""
+"""Cars per chunk on a CPU without a gradient."""
 _COMPILED_TYPES = (torch.float32, torch.float64)
 FEW_CARS = 512
-"""Up to here NumPy is faster on every processor."""
+"""Number of cars up to which NumPy is faster on every processor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +45,8 @@ class Rollout:
     """Trajectories of N cars over T commands.
 
     states    (N, T + 1, 6)  true x, y [m], yaw [rad] (not wrapped), vx, vy [m/s], yaw rate [rad/s]; 0 is the start
-    measured  (N, T + 1, 6)  the same as the observation effects and the latency of motion capture make of it, without
-                             noise; None unless asked for. Before the start the car moved at its first body velocity
+    measured  (N, T + 1, 6)  measured states with observation effects and latency, without noise; None if not requested.
+                             Before the start the car moves at its first body velocity
     """
 
     states: torch.Tensor
@@ -67,29 +66,29 @@ def rollout(
     max_step_s: float = MAX_STEP_S,
     engine: Literal["fastest", "operators"] = "fastest",
 ) -> Rollout:
-    """Drive N cars from their starts by commands given at control ticks.
+    """Simulate N cars from their initial states with commands at control ticks.
 
     Args:
         config: The simulator.
-        start: States at the first tick, shape (N, 6), float32 or float64, on any device; all else follows it.
+        start: States at the first tick, shape (N, 6), float32 or float64, on any device; they set dtype and device.
         commands: Steering and throttle in [-1, 1] at ticks 0 to T - 1, shape (N, T, 2).
-        history: Commands before the first tick, oldest first, shape (N, H, 2); neutral where there is none. Hidden
-            states of effects begin settled on its first row.
+        history: Commands before the first tick, oldest first, shape (N, H, 2); by default neutral. Hidden states of
+            effects start in steady state for its first row.
         history_states: States of the body at the ticks of ``history``, shape (N, H, 6), for hidden states that depend
-            on its motion (tyre relaxation, wheel slip, roll); at the start's velocities unless given.
+            on its motion (tyre relaxation, wheel slip, roll); by default the velocities of the start.
         values: Numbers that replace those of ``config``, by dotted name (``tyre.front.mu``), each a number or a
-            tensor of shape () or (N,). Naming an effect switches it on. Not ``timing.control_period``.
+            tensor of shape () or (N,). An effect with a value is added. Not ``timing.control_period``.
         t0_s: Time of the first tick since the first row of the recording [s], a number or of shape () or (N,).
         measured: Also return measured states.
         max_step_s: Longest Runge-Kutta step [s].
-        engine: "operators" runs on torch's operators alone, for ``torch.func`` and for second derivatives; "fastest"
-            (first derivatives only) compiles the step where it pays.
+        engine: "operators" uses torch's operators only, for ``torch.func`` and for second derivatives; "fastest"
+            (first derivatives only) compiles the step if that is faster.
 
     Returns:
-        Trajectories, differentiable in every tensor given that requires a gradient.
+        Trajectories, differentiable in every argument that requires a gradient.
 
     Raises:
-        DataError: A shape does not fit.
+        DataError: A wrong shape.
         ConfigError: An unknown name, or delays that add up to less than zero.
     """
     cars = check_shapes(start, commands, history, history_states)
@@ -97,7 +96,7 @@ def rollout(
     past = Past.of(history, history_states, start)
     given = dict(values or {})
     check_values(given, t0_s, cars)
-    config = with_effects_of(config, given)
+    config = with_effects_of_values(config, given)
     tensors = [start, commands, t0_s, *(past or ()), *given.values()]
     needs_gradient = torch.is_grad_enabled() and any(isinstance(t, torch.Tensor) and t.requires_grad for t in tensors)
     may_compile = engine == "fastest" and start.device.type == "cpu" and start.dtype in _COMPILED_TYPES
@@ -127,33 +126,33 @@ def _joined(parts: Sequence[Rollout]) -> Rollout:
     return Rollout(torch.cat([part.states for part in parts]), torch.cat(measured) if measured else None)
 
 
-class _Stretch(NamedTuple):
-    """A piece of the period as what the equations run on."""
+class _Segment(NamedTuple):
+    """A piece of the period in the array type of the equations."""
 
     start_s: Value
     length_s: Value
     step_s: Value
     steps: int
-    looks: Value
-    look_step_s: Value | None
-    look_steps: int
+    has_capture: Value
+    capture_step_s: Value | None
+    capture_steps: int
 
     @classmethod
-    def of(cls, piece: Piece, local: Callable[[Value], Value]) -> _Stretch:
-        after = None if piece.look_after_s is None else local(piece.look_after_s / piece.look_steps)
+    def of(cls, piece: Piece, local: Callable[[Value], Value]) -> _Segment:
+        after = None if piece.capture_after_s is None else local(piece.capture_after_s / piece.capture_steps)
         start, length, step = (local(v) for v in (piece.start_s, piece.length_s, piece.length_s / piece.steps))
-        return cls(start, length, step, piece.steps, local(piece.looks), after, piece.look_steps)
+        return cls(start, length, step, piece.steps, local(piece.has_capture), after, piece.capture_steps)
 
 
 class _Moment(NamedTuple):
     state: State
     memory: ActuatorState
     filtered: State
-    """Measured velocities after the filter, where there is one."""
+    """Measured velocities after the filter, if any."""
 
 
 class _Batch:
-    """One chunk of cars with everything as rows of length N."""
+    """One chunk of cars; all values are rows of length N."""
 
     def __init__(
         self,
@@ -176,29 +175,29 @@ class _Batch:
         self.on_arrays = arrays is not None
         self.ops = torch_ops(like) if arrays is None else arrays
         self.number_rows = {name: self._row(value, like) for name, value in self.numbers.items()}
-        full = {name: self._local(row) for name, row in self.number_rows.items()}
+        full = {name: self._convert(row) for name, row in self.number_rows.items()}
         self.measurement = MeasurementModel(self.ops, full, config.effects)
         self.model = SingleTrack(self.ops, config.kind, full, config.effects)
         self.chain = ActuatorChain(self.ops, full, config.effects)
         self.stepper: Stepper | None = None
         if compiled:
             self.stepper = CompiledStepper(self.ops, config.kind, config.effects, full)
-        self.t0_s = self._local(self._row(t0_s, like)) if isinstance(t0_s, torch.Tensor) else t0_s
+        self.t0_s = self._convert(self._row(t0_s, like)) if isinstance(t0_s, torch.Tensor) else t0_s
         self.past = 0 if past is None else int(past.commands.shape[1])
         self.past_rows: list[State] = []
         if past is not None and past.states is not None:
-            self.past_rows = [tuple(map(self._local, tick.contiguous())) for tick in past.states.permute(1, 2, 0)]
+            self.past_rows = [tuple(map(self._convert, tick.contiguous())) for tick in past.states.permute(1, 2, 0)]
         self.ticks = int(commands.shape[1])
         parts = [commands.new_zeros(len(like), 1, 2)] if past is None else [past.commands[:, :1], past.commands]
-        # (2, ticks, cars): what came before all that is known, the history, the commands.
+        # (2, ticks, cars): the command before the history, the history, the commands.
         self.issued = torch.cat([*parts, commands], dim=1).permute(2, 1, 0).contiguous()
 
     @staticmethod
     def _row(value: Number, like: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(value, dtype=like.dtype, device=like.device).expand(like.shape).contiguous()
 
-    def _local(self, value: Value) -> Value:
-        """A tensor as what the equations run on."""
+    def _convert(self, value: Value) -> Value:
+        """Convert a tensor to the array type of the equations."""
         return value.numpy() if self.on_arrays and isinstance(value, torch.Tensor) else value
 
     def _stacked(self, rows: Any) -> torch.Tensor:
@@ -210,14 +209,14 @@ class _Batch:
     def run(self, measured: bool) -> Rollout:
         latency_s = MeasurementModel(self.ops, self.numbers, self.config.effects).latency_s if measured else 0.0
         delays_s = total_delays_s(self.numbers, self.config.effects)
-        plan = plan_period(self.period_s, delays_s, plain_number(latency_s), self.max_step_s)
+        plan = plan_period(self.period_s, delays_s, number_if_shared(latency_s), self.max_step_s)
         before = self.past if self.chain.has_memory or self.model.extra_states else 0
-        acting = [tuple(map(self._local, pair)) for pair in self._acting(plan, before)]
-        pieces = [_Stretch.of(piece, self._local) for piece in plan.pieces]
+        acting = [tuple(map(self._convert, pair)) for pair in self._acting_commands(plan, before)]
+        pieces = [_Segment.of(piece, self._convert) for piece in plan.pieces]
 
         lag_s = self.measurement.velocity_time_constant_s if measured else None
-        body: State = tuple(map(self._local, self.rows))
-        extra, memory = self._before_the_start(body, pieces, acting, before)
+        body: State = tuple(map(self._convert, self.rows))
+        extra, memory = self._initial_hidden_states(body, pieces, acting, before)
         now = _Moment((*body, *extra), memory, self.measurement.observe(body)[3:6])
         trajectory, captured = [body], []
         for k in range(self.ticks):
@@ -226,10 +225,10 @@ class _Batch:
                 held = (commands[0][before + k], commands[1][before + k])
                 t_s = self.t0_s + k * self.period_s + piece.start_s
                 after = self._advance(t_s, now, held, piece.step_s, piece.steps, lag_s)
-                if measured and piece.looks is not False:
-                    look_s, steps = piece.look_step_s, piece.look_steps
-                    looked_at = after if look_s is None else self._advance(t_s, now, held, look_s, steps, lag_s)
-                    seen = self._choose(piece.looks, self._shown(looked_at, lag_s), seen)
+                if measured and piece.has_capture is not False:
+                    capture_s, steps = piece.capture_step_s, piece.capture_steps
+                    looked_at = after if capture_s is None else self._advance(t_s, now, held, capture_s, steps, lag_s)
+                    seen = self._choose(piece.has_capture, self._measured_now(looked_at, lag_s), seen)
                 now = after
             trajectory.append(now.state[:6])
             captured.append(seen)
@@ -239,14 +238,14 @@ class _Batch:
         shown = self._delayed(self._stacked(captured) if captured else None, plan, latency_s)
         return Rollout(states, torch.stack(shown).permute(2, 1, 0))
 
-    def _before_the_start(
-        self, start: State, pieces: list[_Stretch], acting: list[tuple[Value, ...]], before: int
+    def _initial_hidden_states(
+        self, start: State, pieces: list[_Segment], acting: list[tuple[Value, ...]], before: int
     ) -> tuple[State, ActuatorState]:
-        """Hidden states of the body and of the actuators at the first tick, carried through the history.
+        """Hidden states of body and actuators at the first tick, simulated through the history.
 
-        They begin settled. The body moves as ``past_rows`` say, or at the velocities of the start.
+        They start in steady state. The body has the states ``past_rows``, or the velocities of the start.
         """
-        oldest = tuple(self._local(row) for row in self.issued[:, 0])
+        oldest = tuple(self._convert(row) for row in self.issued[:, 0])
         memory = self.chain.settled((oldest[0], oldest[1]))
         if not self.model.extra_states:
             for k in range(before):
@@ -271,7 +270,7 @@ class _Batch:
     def _advance(
         self, t_s: Value, now: _Moment, held: tuple[Value, Value], step_s: Value, steps: int, lag_s: Value | None
     ) -> _Moment:
-        """Integrate the car, and the filter on its measured velocities where there is one."""
+        """Integrate the car, and the filter on its measured velocities if any."""
         if lag_s is None:
             state, memory = integrate_held(
                 self.model, self.chain, t_s, now.state, now.memory, held, step_s, steps, self.stepper
@@ -286,8 +285,8 @@ class _Batch:
             now = _Moment(state, memory, filtered)
         return now
 
-    def _acting(self, plan: PeriodPlan, before: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Steering and throttle that act in each piece of each period, each (before + ticks, cars)."""
+    def _acting_commands(self, plan: PeriodPlan, before: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+        """Steering and throttle acting in each piece of each period, each (before + ticks, cars)."""
         period = torch.arange(-before, self.ticks, device=self.issued.device)[:, None] + 1 + self.past
         both = []
         for channel in range(2):
@@ -303,8 +302,8 @@ class _Batch:
             for piece in plan.pieces
         ]
 
-    def _shown(self, moment: _Moment, lag_s: Value | None) -> State:
-        """What is measured at a moment, before the latency."""
+    def _measured_now(self, moment: _Moment, lag_s: Value | None) -> State:
+        """Measured state at an instant, without latency."""
         seen = self.measurement.observe(moment.state[:6])
         return seen if lag_s is None else (*seen[:3], *moment.filtered)
 
@@ -314,7 +313,7 @@ class _Batch:
         return tuple(self.ops.where(which, a, b) for a, b in zip(yes, no, strict=True))
 
     def _delayed(self, captured: torch.Tensor | None, plan: PeriodPlan, latency_s: Number) -> tuple[torch.Tensor, ...]:
-        """Six rows (ticks + 1, cars) of the states that have arrived at each tick."""
+        """Six rows (ticks + 1, cars) of the newest measured states that have arrived at each tick."""
         like = self.rows[0]
         tick = torch.arange(self.ticks + 1, device=like.device)[:, None]
         x, y, yaw, vx, vy, yaw_rate = self.rows
@@ -337,7 +336,7 @@ class _Batch:
 
 
 def _arrays_are_faster(start: torch.Tensor) -> bool:
-    """Measured: few cars, by NumPy's smaller cost of a call; float32, by its wide vectors (not so for float64)."""
+    """Whether NumPy is faster than torch: for few cars (less overhead), and for float32 with SIMD ``arctan2``."""
     return len(start) <= FEW_CARS or (start.dtype == torch.float32 and has_wide_vectors(np.dtype(np.float32)))
 
 

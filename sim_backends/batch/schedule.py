@@ -1,13 +1,13 @@
-"""When commands begin to act within a control period, and what acts when: exact, for whole batches of cars.
+"""Schedule of the acting commands within a control period: exact, for batches of cars.
 
 A command given at tick ``k`` acts from ``k T + delay``. With ``delay = m T + phase`` the command of tick ``k - m``
 takes over at ``phase`` into period ``k``; so each channel switches once in each period, at the same phase. The period
-is cut there, and each piece is integrated with held commands. Nothing is rounded or averaged: the result is exact for
-any delay, and its derivative by the delay is that of the pieces' lengths. Where motion capture looks within a piece,
-that piece is integrated once more up to there, so that being looked at changes nothing.
+is cut there, and each piece is integrated with held commands. The result is exact for any delay, and its derivative by
+the delay is that of the pieces' lengths. For a capture of motion capture within a piece, the piece is integrated
+a second time up to the capture, so that measuring does not change the trajectory.
 
-Delays that are the same for all cars make a plan of plain numbers: with one shared delay it costs no more steps than
-none. Delays of one value per car make pieces of one length per car, each with as many steps as the longest needs.
+Delays that are equal for all cars give a plan of floats: one shared delay costs no more steps than no delay. Delays
+per car give pieces with one length per car, each with the number of steps of the longest.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ import torch
 from sim_backends.dynamics.integrate import substeps_for
 
 Number: TypeAlias = "float | torch.Tensor"
-_SAME_S = 1e-9
-"""Instants closer than this are one [s]."""
+_TOLERANCE_S = 1e-9
+"""Difference below which two instants are equal [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A stretch of a control period. Flags are for all cars or one per car."""
+    """A piece of a control period. Flags are for all cars or one per car."""
 
     start_s: Number
     length_s: Number
     steps: int
     new_command: tuple[bool | torch.Tensor, bool | torch.Tensor]
     """Whether the later of the period's two commands acts, for steering and throttle."""
-    looks: bool | torch.Tensor
-    """Whether motion capture looks in this piece."""
-    look_after_s: Number | None
-    """How far into the piece; None where at its end."""
-    look_steps: int
+    has_capture: bool | torch.Tensor
+    """Whether a capture lies in this piece."""
+    capture_after_s: Number | None
+    """Time of the capture after the start of the piece [s]; None at its end."""
+    capture_steps: int
 
 
 @dataclass(frozen=True, slots=True)
 class PeriodPlan:
-    """The pieces of each period, and how many whole periods commands and poses are late."""
+    """The pieces of each period, and the delays of commands and poses in whole periods."""
 
     pieces: tuple[Piece, ...]
     command_periods: tuple[int | torch.Tensor, int | torch.Tensor]
@@ -51,35 +51,35 @@ class PeriodPlan:
 
 
 def plan_period(period_s: float, delays_s: tuple[Number, Number], latency_s: Number, max_step_s: float) -> PeriodPlan:
-    """Cut a control period of ``period_s`` for delays of steering and throttle and the latency of what is measured.
+    """Cut a control period for the delays of steering and throttle and the latency of measurements [s].
 
-    Delays and latency are numbers or one per car, and must not be negative. A latency of zero costs nothing.
+    Delays and latency are numbers or one per car, and not negative. A latency of zero needs no extra steps.
     """
     if any(isinstance(v, torch.Tensor) for v in (*delays_s, latency_s)):
         return _plan_per_car(period_s, delays_s, latency_s, max_step_s)
     steering, throttle, latency = float(delays_s[0]), float(delays_s[1]), float(latency_s)
     periods, phases = zip(*(_split(d, period_s) for d in (steering, throttle)), strict=True)
     late_periods, late_s = _split(latency, period_s)
-    look_s = period_s - late_s
+    capture_s = period_s - late_s
     ends: list[float] = []
     for instant_s in sorted((*phases, period_s)):
-        if instant_s > _SAME_S and (not ends or instant_s - ends[-1] > _SAME_S):
+        if instant_s > _TOLERANCE_S and (not ends or instant_s - ends[-1] > _TOLERANCE_S):
             ends.append(instant_s)
     ends[-1] = period_s
     pieces = []
     start_s = 0.0
     for end_s in ends:
-        new_steering, new_throttle = (phase <= start_s + _SAME_S for phase in phases)
+        new_steering, new_throttle = (phase <= start_s + _TOLERANCE_S for phase in phases)
         length_s = end_s - start_s
-        looks = start_s + _SAME_S < look_s <= end_s + _SAME_S
-        after_s = look_s - start_s if looks and look_s < end_s - _SAME_S else None
+        has_capture = start_s + _TOLERANCE_S < capture_s <= end_s + _TOLERANCE_S
+        after_s = capture_s - start_s if has_capture and capture_s < end_s - _TOLERANCE_S else None
         pieces.append(
             Piece(
                 start_s,
                 length_s,
                 substeps_for(length_s, max_step_s),
                 (new_steering, new_throttle),
-                looks,
+                has_capture,
                 after_s,
                 0 if after_s is None else substeps_for(after_s, max_step_s),
             )
@@ -89,9 +89,9 @@ def plan_period(period_s: float, delays_s: tuple[Number, Number], latency_s: Num
 
 
 def _split(delay_s: float, period_s: float) -> tuple[int, float]:
-    periods = math.floor(delay_s / period_s + _SAME_S / period_s)
+    periods = math.floor(delay_s / period_s + _TOLERANCE_S / period_s)
     phase_s = delay_s - periods * period_s
-    return periods, phase_s if phase_s > _SAME_S else 0.0
+    return periods, phase_s if phase_s > _TOLERANCE_S else 0.0
 
 
 def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: Number, max_step_s: float) -> PeriodPlan:
@@ -106,12 +106,12 @@ def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: N
     phases = [steering - whole[0] * period_s, throttle - whole[1] * period_s]
     look = period_s - (latency - whole[2] * period_s)
     distinct = [phases[0]]
-    # Two delays that are equal now may still depend on different numbers.
+    # Two equal delays may depend on different parameters.
     differentiable = phases[0].requires_grad or phases[1].requires_grad
     if not shared and (differentiable or not torch.equal(phases[0], phases[1])):
         distinct.append(phases[1])
     sorted_phases, order = torch.stack(distinct).sort(dim=0, stable=True)
-    # Which command is taken over first; two that are taken over together still have a piece of no length between.
+    # Order of the switches; between two simultaneous switches there is a piece of length zero.
     places = [order.argsort(dim=0)[channel % len(distinct)] for channel in range(2)]
     ends = torch.cat([sorted_phases, torch.full_like(look, period_s)[None]])
     starts = torch.cat([torch.zeros_like(look)[None], ends[:-1]])
@@ -121,15 +121,15 @@ def _plan_per_car(period_s: float, delays_s: tuple[Number, Number], latency_s: N
         longest_s = float(length.detach().max())
         if longest_s <= 0.0 and not length.requires_grad:
             continue
-        looks = (look.detach() > start.detach()) & (look.detach() <= end.detach())
-        after = torch.where(looks, look - start, torch.zeros_like(look)) if bool(looks.any()) else None
+        has_capture = (look.detach() > start.detach()) & (look.detach() <= end.detach())
+        after = torch.where(has_capture, look - start, torch.zeros_like(look)) if bool(has_capture.any()) else None
         pieces.append(
             Piece(
                 start,
                 length,
                 substeps_for(longest_s, max_step_s),
                 (places[0] < index, places[1] < index),
-                looks if after is not None else False,
+                has_capture if after is not None else False,
                 after,
                 0 if after is None else substeps_for(float(after.detach().max()), max_step_s),
             )

@@ -1,7 +1,7 @@
 """A Runge-Kutta step of the model, and its derivative, compiled to straight-line NumPy code.
 
-The ordinary equations (``rk4_step`` of ``SingleTrack``) are traced once for each kind of model and set of effects. The
-generated function calls NumPy with a few reused buffers and nothing else: no temporaries, no dispatch, no autograd.
+The equations (``rk4_step`` of ``SingleTrack``) are traced once for each kind of model and set of effects. The generated
+function calls only NumPy functions on a few reused buffers, without temporaries, dispatch or autograd.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ _NUMPY = {
     "abs": "abs",
 }
 _NO_OUTPUT = ("less", "less_equal", "where")
-"""Operations whose result is a new array: of booleans, or because NumPy offers no other way."""
+"""Operations whose result is a new array: boolean results, or no ``out`` argument in NumPy."""
 _NO_SCALARS = ("maximum", "minimum")
-"""Operations that NumPy does slowly with a scalar, and that take their output by keyword only."""
+"""Operations that are slow in NumPy with a scalar and take ``out`` by keyword only."""
 FEW_CARS = 2048
-"""Up to here results go to buffers of their own, above they replace arguments that are not needed any more."""
+"""Number of cars up to which each result has a separate buffer; above, results overwrite unused arguments."""
 CHUNK_CARS = 2048
-"""Cars whose intermediate results the derivative keeps at a time, so that they fit the cache."""
+"""Cars per chunk of the derivative, so that its intermediate results fit the cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class Graph:
-    """The traced step: inputs by group, outputs, and what can be computed before the first step.
+    """The traced step: inputs by group, outputs, and nodes that are constant over the steps.
 
     ``fixed`` are the nodes that depend on parameters and the step length alone; the step takes them as inputs.
     """
@@ -75,7 +75,7 @@ class Graph:
 
 
 def _apply(ops: Ops, operation: str, arguments: list[Value]) -> Value:
-    if all(isinstance(a, float) for a in arguments):  # of the step's length alone
+    if all(isinstance(a, float) for a in arguments):  # depends on the step length only
         return fold(operation, *arguments)
     match operation:
         case "add":
@@ -139,16 +139,16 @@ Step = Callable[[Sequence[Value], Sequence[FloatRow], Sequence[FloatRow], Sequen
 
 
 _SHARED = threading.local()
-_SIZES_KEPT = 4
+_MAX_BUFFER_SIZES = 4
 
 
 def _shared_buffers(count: int, cars: int, dtype: np.dtype[Any]) -> list[FloatRow]:
-    """Scratch rows of this thread, the same for every function: only one of them runs at a time."""
+    """Scratch rows of this thread, shared by all functions since one runs at a time."""
     pools: dict[tuple[int, np.dtype[Any]], list[FloatRow]] = _SHARED.__dict__.setdefault("pools", {})
     pool = pools.pop((cars, dtype), [])
     pool += [np.empty(cars, dtype) for _ in range(count - len(pool))]
     pools[cars, dtype] = pool
-    while len(pools) > _SIZES_KEPT:
+    while len(pools) > _MAX_BUFFER_SIZES:
         del pools[next(iter(pools))]
     return pool[:count]
 
@@ -162,13 +162,13 @@ class Code:
     buffers_few: int
     buffers_many: int
     constants: tuple[tuple[float, bool], ...]
-    """Each number, and whether it is needed for every car."""
+    """Each constant, and whether it is needed as a row of cars."""
     operands: int
-    """Rows that one run reads and writes, counted once for each operation."""
+    """Number of rows read and written in one run, over all operations."""
     _scratch: threading.local = field(default_factory=threading.local)
 
     def run(self, inputs: Sequence[Value], outputs: Sequence[FloatRow]) -> None:
-        """Compute ``outputs``, rows of one length and type, from ``inputs``, such rows or numbers."""
+        """Compute ``outputs`` (rows of equal length and dtype) from ``inputs`` (such rows, or numbers)."""
         cars, dtype = outputs[0].shape[0], outputs[0].dtype
         in_place = cars > FEW_CARS
         kept = getattr(self._scratch, "kept", None)
@@ -182,16 +182,16 @@ class Code:
 
 @functools.lru_cache(maxsize=256)
 def compile_step(kind: ModelKind, effects: tuple[Effect, ...], held: bool) -> Code:
-    """The step: inputs are those that are fixed and those that vary, outputs the rows of the new state."""
+    """Compile the step: inputs are the fixed and the varying ones, outputs the rows of the new state."""
     graph = trace_step(kind, effects, held)
     return _generate([*graph.fixed, *graph.varying], graph.outputs)
 
 
 @functools.lru_cache(maxsize=512)
 def compile_gradient(kind: ModelKind, effects: tuple[Effect, ...], held: bool, wanted: tuple[bool, ...]) -> Code:
-    """The derivative of the step: inputs are those of the step, then one seed for each of its outputs.
+    """Compile the derivative of the step: inputs are those of the step, then one seed for each of its outputs.
 
-    ``wanted`` says for which inputs; the function has as many outputs as there are True.
+    ``wanted`` selects the inputs to differentiate by; the function has one output for each True.
     """
     graph = trace_step(kind, effects, held)
     inputs = [*graph.fixed, *graph.varying]
@@ -203,7 +203,7 @@ def compile_gradient(kind: ModelKind, effects: tuple[Effect, ...], held: bool, w
     tracer._known = {key: moved[node.index] for key, node in tracer._known.items()}
     seeds = [tracer.input(f"seed{i}") for i in range(len(graph.outputs))]
     sources = [moved[node.index] for node, want in zip(inputs, wanted, strict=True) if want]
-    # What is fixed is given: its own derivation from the parameters is differentiated by the caller.
+    # Fixed nodes are inputs; the caller differentiates them by the parameters.
     for node in graph.fixed:
         moved[node.index].operation, moved[node.index].arguments = "input", ()
     results = gradients([moved[o.index] if isinstance(o, Node) else o for o in graph.outputs], seeds, sources)
@@ -211,10 +211,10 @@ def compile_gradient(kind: ModelKind, effects: tuple[Effect, ...], held: bool, w
 
 
 def _generate(inputs: Sequence[Node], outputs: Sequence[Any]) -> Code:
-    """Write and compile the straight-line code of ``outputs``, once for few cars and once for many.
+    """Generate and compile the straight-line code of ``outputs``, once for few cars and once for many.
 
-    For many cars a result takes the place of an argument that is not needed any more, which saves memory traffic; for
-    few the check for overlap that NumPy then makes costs more than it saves.
+    For many cars a result overwrites an argument that is not needed any more, which saves memory traffic; for few cars
+    NumPy's check for overlap costs more than it saves.
     """
     given = {node.index: f"i{k}" for k, node in enumerate(inputs)}
     order: dict[int, Node] = {}
@@ -231,7 +231,7 @@ def _generate(inputs: Sequence[Node], outputs: Sequence[Any]) -> Code:
 
 
 class _Writer:
-    """Writes the code of a list of nodes, with as few buffers as it can do with."""
+    """Generates the code of a list of nodes with a small number of buffers."""
 
     def __init__(self, given: Mapping[int, str], nodes: Sequence[Node], outputs: Sequence[Any], in_place: bool) -> None:
         self.buffers = 0
@@ -282,7 +282,7 @@ class _Writer:
         return buffer
 
     def function(self) -> Step:
-        """Compile what was written."""
+        """Compile the generated code."""
         unpack = []
         for letter, count in (("i", len(self._given)), ("b", self.buffers), ("o", len(self._outputs))):
             unpack += [f"{''.join(f'{letter}{k}, ' for k in range(count))} = {letter}"] if count else []

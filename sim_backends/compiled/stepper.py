@@ -1,4 +1,4 @@
-"""Takes compiled steps: on NumPy arrays without gradients, on CPU tensors with first derivatives."""
+"""Stepper with the compiled step: NumPy arrays without gradients, CPU tensors with first derivatives."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ class CompiledStepper:
         return tuple(outputs)
 
     def _fixed_for(self, key: Key, step_s: Value) -> list[Value]:
-        """What depends on parameters and step length alone, computed once for each length."""
+        """Values that depend on parameters and step length only, computed once for each length."""
         name = (key[2], step_s if isinstance(step_s, float) else id(step_s))
         if name not in self._fixed:
             fixed = trace_step(*key).fixed_values(self._ops, self._values, step_s)
-            # NumPy takes longer for a Python number than for an array without dimensions.
+            # NumPy is slower for a Python number than for a zero-dimensional array.
             self._fixed[name] = (step_s, [np.asarray(v, self._dtype) if isinstance(v, float) else v for v in fixed])
         return self._fixed[name][1]
 
@@ -76,7 +76,7 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *seeds: torch.Tensor) -> tuple[Any, ...]:
-        if torch.is_grad_enabled():  # create_graph=True: a second derivative would silently lack this step's part
+        if torch.is_grad_enabled():  # create_graph=True: a second derivative would be wrong
             raise NotImplementedError("The compiled step has first derivatives only; call rollout(engine='operators').")
         saved = iter(ctx.saved_tensors)
         inputs = [_plain(next(saved) if v is None else v) for v in ctx.numbers]

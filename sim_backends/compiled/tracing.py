@@ -1,6 +1,6 @@
-"""Records the model's equations as a graph, so that they can be compiled and differentiated without a second copy.
+"""Tracing of the model's equations to a graph, for compilation and differentiation.
 
-Calling the ordinary equations with ``Tracer`` as their functions and ``Node`` as their values yields the graph of
+Calling the equations with ``Tracer`` as their functions and ``Node`` as their values yields the graph of
 elementary operations (equal ones merged, constants folded). ``gradients`` adds the reverse-mode derivative of the graph
 to the graph itself (Griewank and Walther, "Evaluating Derivatives", ch. 3).
 """
@@ -101,7 +101,7 @@ class Tracer:
     _known: dict[tuple[Any, ...], Node] = field(default_factory=dict)
 
     def as_ops(self) -> Ops:
-        """Itself, as what the equations take."""
+        """This tracer, typed as ``Ops``."""
         return cast(Ops, self)
 
     def input(self, name: str) -> Node:
@@ -111,7 +111,7 @@ class Tracer:
         return node
 
     def make(self, operation: str, *arguments: Any) -> Any:
-        """The node of an operation: an equal one where there is, a number where all arguments are."""
+        """The node of an operation: an existing equal node, or a number if all arguments are numbers."""
         if not any(isinstance(a, Node) for a in arguments):
             return fold(operation, *arguments)
         if (same := _neutral(operation, arguments)) is not None:
@@ -151,7 +151,7 @@ class Tracer:
 
 
 def _neutral(operation: str, arguments: tuple[Any, ...]) -> Any:
-    """Result of an operation with 0 or 1 that needs no computing; None otherwise."""
+    """Result of an operation with a neutral element (x + 0, x * 1 ...); None if there is none."""
     first, last = arguments[0], arguments[-1]
     constants = [a for a in arguments if not isinstance(a, Node)]
     if operation == "add" and constants and constants[0] == 0.0:
@@ -166,7 +166,7 @@ def _neutral(operation: str, arguments: tuple[Any, ...]) -> Any:
 
 
 def gradients(outputs: Sequence[Any], seeds: Sequence[Node], inputs: Sequence[Node]) -> list[Any]:
-    """Nodes of ``sum_i seeds_i d(outputs_i)/d(input)`` for each input; 0.0 where nothing depends on it.
+    """Nodes of ``sum_i seeds_i d(outputs_i)/d(input)`` for each input; 0.0 if no output depends on it.
 
     At a kink the derivative is that of torch: ``maximum(x, c)`` passes it where ``x >= c``, ``abs`` and ``sign`` give
     0 at 0, ``hypot`` 0 at the origin.
@@ -188,7 +188,7 @@ def gradients(outputs: Sequence[Any], seeds: Sequence[Node], inputs: Sequence[No
     needed = _depending(tracer.nodes, inputs)
     for node in reversed(tracer.nodes[: max(nodes) + 1]):
         if node.index in adjoint and node.index in needed and node.operation != "input":
-            for argument, value in _pull(tracer, node, adjoint[node.index]):
+            for argument, value in _adjoint_terms(tracer, node, adjoint[node.index]):
                 if isinstance(argument, Node) and argument.index in needed:
                     give(argument, value)
     return [adjoint.get(node.index, 0.0) for node in inputs]
@@ -247,14 +247,14 @@ _PULLBACKS: dict[str, Callable[[Tracer, Node, Any], tuple[Any, ...]]] = {
         t.make("where", n.arguments[0], 0.0, g),
     ),
 }
-"""By operation: from its node and the node's adjoint, the adjoint of each argument; None where it is flat.
+"""By operation: from its node and the node's adjoint, the adjoint of each argument; None if it is zero.
 
-Operations that are not here (sign, comparisons) are flat.
+Operations without an entry (sign, comparisons) have zero derivative.
 """
 
 
-def _pull(tracer: Tracer, node: Node, adjoint: Any) -> list[tuple[Any, Any]]:
-    """Arguments of an operation that are not flat, with their adjoints."""
+def _adjoint_terms(tracer: Tracer, node: Node, adjoint: Any) -> list[tuple[Any, Any]]:
+    """Arguments of an operation with non-zero derivative, with their adjoints."""
     pullback = _PULLBACKS.get(node.operation)
     if pullback is None:
         return []

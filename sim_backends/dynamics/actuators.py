@@ -1,4 +1,4 @@
-"""From delayed commands to wheel angle and throttle: the input effects of a car in their order."""
+"""Actuators: input effects from delayed commands to wheel angle and throttle, in their order."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ActuatorChain:
     Args:
         ops: Functions of the array library of ``values``.
         values: Numbers by dotted name, as of ``SimulatorConfig.values``.
-        effects: Ids of effects; those that stand between command and actuator are used here.
+        effects: Ids of effects; those of class ActuatorEffect are used.
     """
 
     def __init__(self, ops: Ops, values: Mapping[str, Value], effects: Iterable[str] = ()) -> None:
@@ -30,7 +30,7 @@ class ActuatorChain:
         self.has_memory = any(e.has_state for e in chosen)
 
     def settled(self, commands: tuple[Value, Value]) -> ActuatorState:
-        """Actuator state after ``commands`` have acted for ever."""
+        """Steady state of the actuators for constant ``commands``."""
         signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
         memory = []
         for effect, values in self._links:
@@ -42,7 +42,7 @@ class ActuatorChain:
         return tuple(memory)
 
     def settled_output(self, commands: tuple[Value, Value]) -> tuple[Value, Value]:
-        """Wheel angle [rad] and throttle [1] after ``commands`` have acted for ever."""
+        """Steady wheel angle [rad] and throttle [1] for constant ``commands``."""
         signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
         for effect, values in self._links:
             if not effect.has_state:
@@ -59,7 +59,7 @@ class ActuatorChain:
     def step(
         self, commands: tuple[Value, Value], memory: ActuatorState, step_s: Value
     ) -> tuple[tuple[Triple, Triple], ActuatorState]:
-        """Wheel angle and throttle at start, middle and end of a step with held commands; the memory at its end."""
+        """Wheel angle and throttle at start, middle and end of a step with held commands, and the state at its end."""
         angle = self._max_angle * commands[0]
         signals: dict[str, Triple] = {"steering": (angle, angle, angle), "throttle": (commands[1],) * 3}
         left = iter(memory)

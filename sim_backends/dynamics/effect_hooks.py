@@ -1,4 +1,4 @@
-"""The dynamics effects of one car in their order, around the forces of the base model."""
+"""Hooks of a car's dynamics effects, called in their order during the evaluation of the forces."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from sim_backends.effects import EFFECTS
 from sim_backends.effects.base import DynamicsEffect, Forces, ModelKind, Parameters, StepStart, StiffStep
 
 HOOKS = ("on_load", "on_grip", "on_drive", "on_traction", "on_body", "on_transfer", "on_tyre", "on_motion")
-_REPEATS = 2
-"""Times that load transfer and limits of the driven axle are repeated where there are both."""
+_N_ITERATIONS = 2
+"""Iterations of load transfer and limits of the driven axle if both are present."""
 
 
 class _Bound(NamedTuple):
@@ -21,12 +21,12 @@ class _Bound(NamedTuple):
 
 
 class EffectHooks:
-    """Which effects a model has, with their numbers, by hook.
+    """Dynamics effects of a model with their parameters, by hook.
 
     Args:
         ops: Functions of the array library of ``values``.
         values: Numbers by dotted name.
-        effects: Ids of effects; those of the dynamics are used here.
+        effects: Ids of effects; those of class DynamicsEffect are used.
     """
 
     def __init__(self, ops: Ops, values: Mapping[str, Value], effects: Iterable[str]) -> None:
@@ -47,7 +47,7 @@ class EffectHooks:
         self.states = tuple(f"{e.id}.{name}" for e in dynamics for name in e.states)
 
     def base_model(self, kind: ModelKind, tyre: Mapping[str, Value]) -> tuple[ModelKind, Mapping[str, Value]]:
-        """The form of the base model and its tyre numbers, as the effects change them."""
+        """Kind of the base model and its tyre parameters, as changed by the effects."""
         for effect in self._effects:
             kind, tyre = effect.base_model(kind, tyre, self.values[effect.id])
         return kind, tyre
@@ -57,12 +57,12 @@ class EffectHooks:
         return {e.id: e.stiff_step(self._ops, start, self.values[e.id]) for e in self._effects if e.stiff}
 
     def run(self, name: str, forces: Forces) -> None:
-        """Call one hook of every effect that has it."""
+        """Call one hook of every effect that overrides it."""
         for _, hook, values in self._by_hook[name]:
             hook(self._ops, forces, values)
 
     def before_tyres(self, forces: Forces, damping: Value, settle: bool) -> None:
-        """From the motor's force to all forces along the car but the tyres' side forces."""
+        """Evaluate all forces except the tyres' side forces."""
         for name in ("on_load", "on_grip", "on_drive"):
             self.run(name, forces)
         if self.has_transfer:  # until here it is the shape of the front's side force
@@ -75,7 +75,7 @@ class EffectHooks:
             return
         load_front, load_rear = forces.load_front, forces.load_rear
         self.run("on_transfer", forces)
-        for _ in range(_REPEATS if self._by_hook["on_traction"] else 0):
+        for _ in range(_N_ITERATIONS if self._by_hook["on_traction"] else 0):
             before = forces.axle_force
             self._traction(forces, demand, settle)
             forces.force_x = forces.force_x + (forces.axle_force - before)

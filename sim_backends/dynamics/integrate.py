@@ -1,4 +1,4 @@
-"""Fixed-step Runge-Kutta integration of the single-track model over a stretch of time with held commands."""
+"""Fixed-step Runge-Kutta integration of the single-track model over an interval with held commands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_STEP_S = 0.01
 
 
 def substeps_for(duration_s: float, max_step_s: float = MAX_STEP_S) -> int:
-    """Number of equal steps of at most ``max_step_s`` (1e-6 of slack for rounding); at least one."""
+    """Number of equal steps of at most ``max_step_s`` (relative tolerance 1e-6); at least one."""
     return max(1, math.ceil(duration_s / max_step_s - 1e-6))
 
 
@@ -26,8 +26,8 @@ def rk4_step(
 ) -> State:
     """One classical fourth-order Runge-Kutta step with the actuation given at its start, middle and end.
 
-    ``step_s`` is a number or one per car. Where no effect depends on the place, x and y are not carried through the
-    stages: they are pure integrals. Effects with stiff states step them by methods of their own.
+    ``step_s`` is a number or one per car. If no effect depends on the position, x and y are omitted in the stages,
+    since they are pure integrals. Effects with stiff states integrate these by their own methods.
     """
     ops = model.ops
     half_s = 0.5 * step_s
@@ -72,12 +72,12 @@ def _stiff_steps(
 
 
 class Stepper(Protocol):
-    """What advances a state by one step: ``rk4_step`` of a model, or its compiled form."""
+    """Function that advances a state by one step: ``rk4_step`` of a model, or its compiled form."""
 
     def __call__(
         self, t_s: Value, state: State, step_s: Value, start: Actuation, middle: Actuation, end: Actuation
     ) -> State:
-        """State after ``step_s``, with the actuation at start, middle and end (the same object where it is held)."""
+        """State after ``step_s``, with the actuation at start, middle and end (the same object if it is held)."""
 
 
 def integrate_held(
@@ -91,7 +91,7 @@ def integrate_held(
     steps: int,
     stepper: Stepper | None = None,
 ) -> tuple[State, ActuatorState]:
-    """Advance by ``steps`` steps of ``step_s`` each while the delayed commands stay as they are.
+    """Advance by ``steps`` steps of ``step_s`` each with constant delayed commands.
 
     Args:
         model: The car.
@@ -99,10 +99,10 @@ def integrate_held(
         t_s: Time at the start [s].
         state: State at the start.
         memory: State of the actuators at the start.
-        commands: Steering and throttle that act, in [-1, 1].
+        commands: Acting steering and throttle in [-1, 1].
         step_s: A number or one per car.
         steps: Number of Runge-Kutta steps.
-        stepper: What takes a step; ``rk4_step`` of ``model`` unless given.
+        stepper: Function for one step; by default ``rk4_step`` of ``model``.
 
     Returns:
         State of car and actuators at the end.

@@ -1,7 +1,6 @@
-"""The base model once more, the plain way: one car at a time, NumPy, a Python loop.
+"""Reference implementation of the base model: one car at a time, NumPy, a Python loop.
 
-This is what the batched simulator is measured against and tested against. It shares no code with it, and is written as
-one would write it first: nothing is done to make it slow, nothing to make it fast.
+The batched simulator is tested and benchmarked against it. It shares no code with the simulator and is not optimised.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ def rk4(state: FloatArray, steering: float, throttle: float, p: CarParameters, s
 
 
 def rollout_one_by_one(config: SimulatorConfig, start: FloatArray, commands: FloatArray) -> FloatArray:
-    """Drive cars one after the other; same meaning and shapes as ``batch_rollout.rollout`` without history.
+    """Simulate cars one after the other; same meaning and shapes as ``batch.rollout.rollout`` without history.
 
     Args:
         config: A simulator of kind "dynamic" without effects.

@@ -20,7 +20,7 @@ from sim_backends.dynamics.effect_hooks import EffectHooks
 from sim_backends.effects.base import Forces, StiffStep
 
 SLIP_FLOOR_MPS = 0.3
-"""Least speed in the denominator of the slip angle [m/s]."""
+"""Minimum speed in the denominator of the slip angle [m/s]."""
 RELAXATION_S = 0.05
 """Time constant with which the kinematic car's side speed and yaw rate settle [s]."""
 BLEND_FROM_MPS, BLEND_OVER_MPS = 0.3, 0.2
@@ -34,7 +34,7 @@ State = tuple[Value, ...]
 
 
 class Actuation(NamedTuple):
-    """What drives the car at one instant: the front wheel angle [rad], its sine and cosine, the throttle [1]."""
+    """Input of the dynamics at one instant: front wheel angle [rad], its sine and cosine, throttle [1]."""
 
     angle: Value
     sin: Value
@@ -47,9 +47,9 @@ class SingleTrack:
 
     Args:
         ops: Functions of the array library of ``values``.
-        kind: Which form of the model.
+        kind: Kind of the model.
         values: Numbers by dotted name (``vehicle.mass``), as of ``SimulatorConfig.values``.
-        effects: Ids of effects; those of the dynamics are used here.
+        effects: Ids of effects; those of class DynamicsEffect are used.
     """
 
     def __init__(self, ops: Ops, kind: ModelKind, values: Mapping[str, Value], effects: Iterable[str] = ()) -> None:
@@ -78,7 +78,7 @@ class SingleTrack:
         self.per_inertia = 1.0 / self.inertia
         self.per_wheelbase = 1.0 / wheelbase
         self.front_peak, self.rear_peak = -self.front_mu * self.front_load, -self.rear_mu * self.rear_load
-        if not self._has_hooks:  # then forces are needed by nobody: work with forces per mass
+        if not self._has_hooks:  # forces are not needed: use forces per mass
             self.drive_gain, self.damping = self.drive_gain * self.per_mass, self.damping * self.per_mass
             self.front_peak, self.rear_peak = self.front_peak * self.per_mass, self.rear_peak * self.per_mass
             self.front_arm, self.rear_arm = self.front_arm * self.mass, self.rear_arm * self.mass
@@ -97,7 +97,7 @@ class SingleTrack:
         return self.evaluate(t_s, state, actuation, stiff)[0]
 
     def settled(self, t_s: Value, body: State, actuation: Actuation) -> State:
-        """The extra states after the body has moved at its first six values, driven as given, for ever."""
+        """Steady extra states for a constant motion of the body (six values) and a constant actuation."""
         if not self.extra_states:
             return ()
         _, forces = self.evaluate(t_s, body, actuation, settle=True)
@@ -112,14 +112,14 @@ class SingleTrack:
         stiff: Mapping[str, StiffStep] = NO_STIFF_STEPS,
         settle: bool = False,
     ) -> tuple[State, Forces | None]:
-        """The derivative and, where there are effects of the dynamics, all forces.
+        """The derivative and, if there are dynamics effects, all forces.
 
         Args:
             t_s: Time [s].
             state: State; with ``settle`` its first six values.
-            actuation: What drives the car.
+            actuation: Wheel angle and throttle.
             stiff: Within a Runge-Kutta step: the steps of stiff states by effect id.
-            settle: Find the extra states at which they stay, instead of reading them.
+            settle: Compute the steady extra states instead of reading them.
         """
         ops = self.ops
         _, _, yaw, vx, vy, r = state[:6]
@@ -148,7 +148,7 @@ class SingleTrack:
         if forces is None or not self.extra_states:
             return rates, forces
         self.hooks.on_motion(forces, accelerations[0])
-        still = 0.0 * vx  # a state that nothing moves: a kinematic car's tyres, or one with a step of its own
+        still = 0.0 * vx  # rate of an unused state (tyres of a kinematic car) or of a stiff state
         return (*rates, *(forces.rates.get(name, still) for name in self.extra_states)), forces
 
     def _with_tyres(
@@ -182,7 +182,7 @@ class SingleTrack:
         return blended[0], blended[1], blended[2]
 
     def _side_shapes(self, vx: Value, vy: Value, r: Value, sin_d: Value, cos_d: Value) -> tuple[Value, Value]:
-        """Lateral force of each axle as a share of the most that it can be, positive to the right."""
+        """Lateral force of each axle divided by its maximum, positive to the right."""
         ops = self.ops
         front = ops.fma(self.front_axle, r, vy)
         rear = ops.fms(self.rear_axle, r, vy)
@@ -216,8 +216,8 @@ class SingleTrack:
     ) -> tuple[Value, Value, Value]:
         """Accelerations of the kinematic car: the wheels roll without slip.
 
-        ``tan(beta) = l_r tan(d) / (l_f + l_r)``. The tyres' constraint forces do no work, so the forward speed
-        changes by ``force_x / m`` alone: with the ``vy r`` of the dynamic model it would gain energy in each curve.
+        ``tan(beta) = l_r tan(d) / (l_f + l_r)``. The tyres' constraint forces do no work, so the forward acceleration
+        is ``force_x / m``; with the ``vy r`` of the dynamic model the car would gain energy in curves.
         """
         curvature = sin_d / cos_d * self.per_wheelbase
         yaw_rate = vx * curvature

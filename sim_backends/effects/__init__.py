@@ -1,9 +1,9 @@
-"""Physics beyond the base model: each effect is one class that holds all that is known of it.
+"""Effects: physics beyond the base model. Each effect is one class with its equation, parameters and texts.
 
-To add an effect of your own, write its class and call ``sim_backends.registry.register``. To add one to the package,
+To add your own effect, write its class and call ``sim_backends.registry.register``. To add an effect to the package,
 list it here.
 
-What acts before what: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity,
+Acting order: command -> delays -> steering (dead band, rate limit, lag, backlash, asymmetry, nonlinearity,
 offset) and throttle (dead band, nonlinearity, lag) -> loads (downforce) -> friction (drift, patch) -> drive (sag, brake
 asymmetry, saturation) -> driven axle (traction limit, wheel slip) -> body (resistances, slope, bias, moments) -> load
 transfer -> side forces (ellipse, roll, relaxation) -> motion -> what is measured (marker offset, yaw misalignment,
@@ -90,11 +90,11 @@ _ALL: tuple[Effect, ...] = (
 CATALOGUE: dict[str, Effect] = {effect.id: effect for effect in _ALL}
 """The effects that a diagnosis names, by id, in the order of the catalogue."""
 EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in UNCATALOGUED}}
-"""Everything that a simulator can have: the catalogue, then physics outside it. ``register`` adds to both."""
+"""All effects: the catalogue, then uncatalogued physics. ``register`` adds to both."""
 
 
 def separation(one: str, other: str) -> Confusable | None:
-    """How two effects are separated, whichever of both lists the pair; None where none does."""
+    """The ``Confusable`` entry of a pair of effects, from either effect; None if neither lists the pair."""
     for effect_id, confused in ((one, other), (other, one)):
         for entry in EFFECTS[effect_id].confusable if effect_id in EFFECTS else ():
             if entry.effect == confused:
@@ -103,7 +103,7 @@ def separation(one: str, other: str) -> Confusable | None:
 
 
 def confusable_effects() -> dict[str, tuple[str, ...]]:
-    """For each effect of the catalogue, those that may be taken for it: pairs both ways, in the catalogue's order."""
+    """Confusable effects of each effect of the catalogue; symmetric, in the catalogue's order."""
     pairs = {(e.id, entry.effect) for e in CATALOGUE.values() for entry in e.confusable}
     pairs |= {(b, a) for a, b in pairs}
     return {name: tuple(other for other in CATALOGUE if (name, other) in pairs) for name in CATALOGUE}

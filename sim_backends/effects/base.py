@@ -1,4 +1,4 @@
-"""What an effect is: one of three kinds of operator around the base model, with a value at which it does nothing.
+"""Base classes of effects: three kinds of operators around the base model, each with an identity value.
 
     measured = O( integrate f + D, driven by I(command) )
 
@@ -6,7 +6,7 @@
 * D, dynamics: changes a load, a grip, a drive, tyre or body force, or adds a state (``DynamicsEffect``).
 * O, observation: acts on what is measured (``ObservationEffect``).
 
-An effect holds no numbers: its parameters come with each call, as floats or as one value per car. So the simulator,
+An effect stores no numbers: its parameters are arguments of each call, as floats or as one value per car. So simulator,
 system identification and the prior over simulators treat them like every other parameter.
 """
 
@@ -41,10 +41,10 @@ class EffectParameter:
         identity: The value at which the effect does nothing; None means the number of the car file ``same_as``.
         low: Lower physical bound; with ``positive`` the number is above it.
         high: Upper physical bound.
-        typical: A size that a small race car may have.
+        typical: A typical value for a small race car.
         positive: Whether ``low`` itself is not allowed.
-        same_as: Dotted name of the car file's number that a missing value is taken from.
-        choices: Words of a choice; its number is their position, 0.0 for the first, and car files have the word.
+        same_as: Dotted name of the car file's number that replaces a missing value.
+        choices: Words of a choice; its number is the position, 0.0 for the first; car files have the word.
         reduces: Dotted name of the car file's number that a negative value reduces, at most to 0.
     """
 
@@ -62,12 +62,12 @@ class EffectParameter:
 
 @dataclass(frozen=True, slots=True)
 class Confusable:
-    """Another effect that may be taken for this one.
+    """A confusable effect and the manoeuvre that separates both.
 
     Attributes:
         effect: Its id.
-        drive: Manoeuvre that separates both; "" where none is known or none can.
-        reason: Why it separates them, a clause; where no drive can, what to do instead, in sentences.
+        drive: Manoeuvre that separates both effects; "" if there is none.
+        reason: Why it separates them, a clause; without a manoeuvre, what to do instead, in sentences.
     """
 
     effect: str
@@ -76,7 +76,7 @@ class Confusable:
 
 
 class ScreeningProbe(Protocol):
-    """What an effect may ask of the recording when it chooses its screening points."""
+    """Data of the recording and the fitted simulator for the choice of screening points."""
 
     @property
     def values(self) -> Mapping[str, float]:
@@ -97,10 +97,10 @@ class ScreeningProbe(Protocol):
 
 
 class Effect:
-    """Base of all effects: equation, parameters, what it depends on, and its texts, in one class.
+    """Base of all effects: equation, parameters, dependencies and texts.
 
-    Subclasses are stateless. ``sim_backends.registry.register`` makes an effect known to all engines, to the diagnosis
-    and to the prior of learning; nothing else knows an effect by its id.
+    Subclasses are stateless. ``sim_backends.registry.register`` adds an effect to all engines, to the diagnosis and to
+    the prior of learning; no other code contains effect ids.
     """
 
     id: ClassVar[str]
@@ -109,17 +109,17 @@ class Effect:
     order: ClassVar[int] = 50
     """Effects of a kind act in ascending order, then by id."""
     depends_on: ClassVar[frozenset[Dependency]] = frozenset()
-    """Beyond the state in the car's own frame: time since the first row, place in the world, heading in the world."""
+    """Dependencies besides the body-frame state: time since the first row, place in the world, heading in the world."""
     lag_parameter: ClassVar[str] = ""
-    """The parameter that says by how long the effect delays a signal."""
+    """The parameter that is the delay or time constant of the effect [s]."""
     command: ClassVar[Literal["steering", "throttle"]] = "steering"
-    """The command that the effect acts on, or whose changes show it most."""
+    """The command that the effect acts on, or whose changes excite it most."""
     disc_parameters: ClassVar[tuple[str, ...]] = ()
     """The parameters x, y and radius [m] of the disc in which the effect acts."""
     base_models: ClassVar[tuple[ModelKind, ...]] = MODEL_KINDS
-    """Forms of the base model beside which the effect can be identified."""
+    """Kinds of the base model for which the effect is identifiable."""
     confusable: ClassVar[tuple[Confusable, ...]] = ()
-    """Effects that may be taken for it; a pair is listed at one of both."""
+    """Confusable effects; each pair is listed at one of both effects."""
 
     name: ClassVar[str] = ""
     """A noun phrase with its article."""
@@ -130,27 +130,27 @@ class Effect:
     refuted_if: ClassVar[str] = ""
     """Observation that would refute the effect, a clause after "if"."""
     catalogued: ClassVar[bool] = True
-    """Whether a diagnosis may name it; otherwise it is a rival, described by ``class_statement``."""
+    """Whether a diagnosis may name the effect; otherwise it is rival physics, described by ``class_statement``."""
     class_statement: ClassVar[str] = ""
 
     screening_scaled: ClassVar[tuple[str, ...] | None] = None
-    """Parameters that screening scales along the best point's direction; None means all that are added to."""
+    """Parameters that screening scales along the direction of the best point; None means all additive ones."""
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray | None:
-        """Coordinates (P, n) at which screening tries the effect; None for the general rule.
+        """Screening points (P, n) of the effect; None for the general rule.
 
-        The general rule takes one number both ways from its identity at three sizes of the change that it makes in the
-        prediction, and several numbers on a grid about their typical sizes.
+        The general rule varies one number in both directions from its identity, at three sizes of the change in the
+        prediction; several numbers are on a grid around their typical values.
         """
         return None
 
     def numbers(self, values: Mapping[str, Value]) -> dict[str, Value]:
-        """The effect's own numbers by parameter, from numbers by dotted name."""
+        """The effect's parameters by name, from numbers by dotted name."""
         return {p.name: values[f"effects.{self.id}.{p.name}"] for p in self.parameters}
 
 
 class DelayEffect(Effect):
-    """Makes commands act later."""
+    """A delay of commands."""
 
     kind: ClassVar[Kind] = "input"
 
@@ -160,7 +160,7 @@ class DelayEffect(Effect):
 
 
 class ActuatorEffect(Effect):
-    """Stands between the delayed command and the wheel angle [rad] or the throttle [1]."""
+    """An effect between the delayed command and the wheel angle [rad] or the throttle [1]."""
 
     kind: ClassVar[Kind] = "input"
     has_state: ClassVar[bool] = False
@@ -174,18 +174,18 @@ class ActuatorEffect(Effect):
     ) -> tuple[Triple, Value]:
         """Output over a step of ``duration_s`` and the state at its end, for an effect with memory.
 
-        ``command[0]`` is the value just after the start. A command that is held has three times the same object.
+        ``command[0]`` is the value just after the start. A held command has the same object three times.
         """
         raise NotImplementedError
 
     def settled(self, command: Value) -> Value:
-        """State after ``command`` has been held for ever."""
+        """Steady state for a constant ``command``."""
         return command
 
 
 @dataclass(slots=True)
 class Forces:
-    """Everything that acts on a car at one instant; dynamics effects read and change it.
+    """Forces on a car at one instant with their inputs; dynamics effects read and change them.
 
     Units: t_s [s] since the first row of the recording, positions [m], velocities [m/s, rad/s] in the body frame,
     forces [N] in the body frame (side forces in the wheel frame, positive left), moment [N m] about the centre of
@@ -299,14 +299,14 @@ class DynamicsEffect(Effect):
         """Set rates that depend on dvx/dt."""
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
-        """States after the car has driven on as in ``forces`` (all forces found) for ever, by name."""
+        """Steady states for constant ``forces`` (all forces evaluated), by name."""
         return {}
 
 
 class ObservationEffect(Effect):
-    """Changes what motion capture and the velocity filter say of the true state.
+    """Changes the measurement of the true state by motion capture and velocity filter.
 
-    An effect on poses shows in the velocities too, since they come from the poses; ``observe`` changes both.
+    An effect on poses also changes the velocities, which are computed from the poses; ``observe`` changes both.
     """
 
     kind: ClassVar[Kind] = "observation"
@@ -325,9 +325,9 @@ class ObservationEffect(Effect):
         return newton_inverse(ops, lambda state: self.observe(ops, state, values), measured)
 
     def latency_s(self, values: Parameters) -> Value | None:
-        """Age of what is measured [s], in place of the car file's; None where the effect leaves it alone."""
+        """Latency of the measurement [s], replacing the car file's; None if the effect does not change it."""
         return None
 
     def velocity_time_constant_s(self, values: Parameters) -> Value | None:
-        """Time constant of a first-order filter on the velocities [s]; None where there is none."""
+        """Time constant of a first-order filter on the velocities [s]; None without a filter."""
         return None

@@ -1,4 +1,4 @@
-"""Forces and moments on the body of the car. A kinematic car has no use for side forces and moments."""
+"""Forces and moments on the body of the car. A kinematic car ignores side forces and moments."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class RoadSlope(DynamicsEffect):
     """Force ``m g sin(angle)`` down the slope; ``direction`` is the world heading of steepest ascent.
 
     In the body frame ``F_x = -m g sin(angle) cos(direction - yaw)`` and ``F_y = -m g sin(angle) sin(direction - yaw)``.
-    The wheels' load (a factor cos(angle)) stays as it is.
+    The change of the wheels' load (a factor cos(angle)) is neglected.
     """
 
     id = "road_slope"
@@ -86,7 +86,7 @@ class RoadSlope(DynamicsEffect):
     depends_on = frozenset({"heading"})
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
-        """Eight directions of ascent, each with the angles that count in one of them."""
+        """Eight directions of ascent, each with the screening angles of the first direction."""
         headings = np.linspace(-np.pi, np.pi, 8, endpoint=False)
         sized = probe.sized([{"angle": 1.0, "direction": float(headings[0])}], held=("direction",))
         angles = sorted({row["angle"] for row in sized})

@@ -1,4 +1,4 @@
-"""The motor's force and what the driven axle can pass on. Acting order: sag, brake asymmetry, saturation, traction."""
+"""Motor force and force limit of the driven axle. Acting order: sag, brake asymmetry, saturation, traction."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 from sim_backends.array_ops import Ops
 from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
-LARGEST_FORCE_N = 1e9
-LARGEST_SHARE = 1e6
+MAX_FORCE_N = 1e9
+MAX_SHARE = 1e6
 
 
 class BatterySag(DynamicsEffect):
@@ -77,7 +77,7 @@ class MotorSaturation(DynamicsEffect):
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Clip."""
-        limit = ops.where(values["force"] < LARGEST_FORCE_N, values["force"], LARGEST_FORCE_N)
+        limit = ops.where(values["force"] < MAX_FORCE_N, values["force"], MAX_FORCE_N)
         forces.drive = ops.clip(forces.drive, -limit, limit)
 
 
@@ -110,6 +110,6 @@ class TractionLimit(DynamicsEffect):
         """Clip."""
         rear = forces.grip_rear * forces.load_rear
         grip = ops.where(values["axle"] < 0.5, rear, rear + forces.grip_front * forces.load_front)
-        limited = values["share"] < LARGEST_SHARE
+        limited = values["share"] < MAX_SHARE
         limit = ops.where(limited, values["share"], 1.0) * grip
         forces.axle_force = ops.where(limited, ops.clip(forces.axle_force, -limit, limit), forces.axle_force)

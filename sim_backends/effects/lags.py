@@ -17,7 +17,7 @@ class FirstOrderLag(ActuatorEffect):
     def step(
         self, ops: Ops, command: Triple, state: Value, duration_s: Value, values: Parameters
     ) -> tuple[Triple, Value]:
-        """Exponential approach; a time constant of zero passes the command on unchanged."""
+        """Exponential approach; with a time constant of zero the output is the command."""
         start, middle, end = command
         weights = lag_weights(ops, values["time_constant"], duration_s)
         first = start + (state - start) * weights.start

@@ -8,13 +8,13 @@ from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import GRAVITY_MPS2, Confusable, DynamicsEffect, EffectParameter, Forces, Parameters
 
 ROLL_SENSITIVITY = 0.3
-"""Share of an axle's side force that is lost when its inner wheels carry nothing, unless the car file gives another."""
-FASTEST_ROLL_HZ = 25.0
-"""Above it the roll is too quick for steps of 10 ms: its loss is scaled by ``FASTEST_ROLL_HZ / frequency``."""
+"""Default share of an axle's side force that is lost when its inner wheels carry no load."""
+MAX_ROLL_HZ = 25.0
+"""Highest roll frequency for steps of 10 ms; above, the loss is scaled by ``MAX_ROLL_HZ / frequency``."""
 
 
-LEAST_KEPT = 0.1
-"""Share of the side force that the roll leaves at least."""
+MIN_FORCE_SHARE = 0.1
+"""Minimum share of the side force that remains with roll."""
 
 
 class AerodynamicDownforce(DynamicsEffect):
@@ -67,7 +67,7 @@ class RollDynamics(DynamicsEffect):
     ``rho`` is the share of the load that has moved from the inner to the outer wheels, 1 where all of the grip is used:
     ``rho'' + 2 damping w rho' + w^2 rho = w^2 ay / (mu g)``, ``w = 2 pi frequency``, with ay of the side forces and
     ``mu g = (mu_f F_z,f + mu_r F_z,r) / m``. By the tyres' load sensitivity both axles keep ``1 - sensitivity rho^2``
-    of their side force. Above ``FASTEST_ROLL_HZ`` the loss fades, so that an infinite frequency is the base model.
+    of their side force. Above ``MAX_ROLL_HZ`` the loss fades, so that an infinite frequency is the base model.
     Source: roll and load sensitivity of Milliken and Milliken 1995, "Race Car Vehicle Dynamics".
     """
 
@@ -82,7 +82,7 @@ class RollDynamics(DynamicsEffect):
     order = 50
     states = ("shift", "shift_rate")
     base_models = ("dynamic", "kinematic", "blend")
-    """Where tyres do not saturate, the loss of grip by roll would stand for that."""
+    """With linear tyres the loss of grip by roll would replace the missing saturation."""
     parameters = (
         EffectParameter("frequency", "Hz", math.inf, 0.0, math.inf, 2.5, positive=True),
         EffectParameter("damping", "1", 0.5, 0.0, 5.0, 0.3),
@@ -99,9 +99,9 @@ class RollDynamics(DynamicsEffect):
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale both side forces and set the rates of the roll."""
         shift, rate = forces.states["roll_dynamics.shift"], forces.states["roll_dynamics.shift_rate"]
-        kept = ops.floor(1.0 - _loss(ops, values) * shift * shift, LEAST_KEPT)
+        kept = ops.floor(1.0 - _loss(ops, values) * shift * shift, MIN_FORCE_SHARE)
         forces.side_front, forces.side_rear = forces.side_front * kept, forces.side_rear * kept
-        omega = 2.0 * math.pi * ops.where(values["frequency"] < FASTEST_ROLL_HZ, values["frequency"], FASTEST_ROLL_HZ)
+        omega = 2.0 * math.pi * ops.where(values["frequency"] < MAX_ROLL_HZ, values["frequency"], MAX_ROLL_HZ)
         forces.rates["roll_dynamics.shift"] = rate
         forces.rates["roll_dynamics.shift_rate"] = omega * (
             omega * (_used_grip(ops, forces) - shift) - 2.0 * values["damping"] * rate
@@ -115,8 +115,8 @@ class RollDynamics(DynamicsEffect):
 
 
 def _loss(ops: Ops, values: Parameters) -> Value:
-    slow = values["frequency"] < FASTEST_ROLL_HZ
-    return values["sensitivity"] * ops.where(slow, 1.0, FASTEST_ROLL_HZ / values["frequency"])
+    slow = values["frequency"] < MAX_ROLL_HZ
+    return values["sensitivity"] * ops.where(slow, 1.0, MAX_ROLL_HZ / values["frequency"])
 
 
 def _used_grip(ops: Ops, forces: Forces) -> Value:

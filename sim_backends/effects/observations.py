@@ -1,4 +1,4 @@
-"""What motion capture and the velocity filter make of the true state."""
+"""Observation effects: motion capture and velocity filter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands between the steering command and the wheel angle, lags and delays apart. Angles in rad.
+"""Effects between the steering command and the wheel angle, except lags and delays. Angles in rad.
 
 Acting order: dead band (the servo's electronics), rate limit, lag (its motor), backlash, asymmetry, nonlinearity (the
 linkage), offset (how it is mounted).
@@ -11,10 +11,10 @@ import math
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters, Triple
 
-FASTEST_RADPS = 1e6
-"""A rate limit above this is none."""
-LARGEST_RAD = 1e6
-"""A saturation above this is none."""
+MAX_RATE_RADPS = 1e6
+"""Rate limits above this value are inactive [rad/s]."""
+MAX_SATURATION_RAD = 1e6
+"""Saturations above this value are inactive [rad]."""
 
 
 class SteeringDeadband(ActuatorEffect):
@@ -45,7 +45,7 @@ class SteeringDeadband(ActuatorEffect):
 class SteeringRateLimit(ActuatorEffect):
     """``|dd/dt| <= rate``: the wheel angle turns towards its command at no more than ``rate``.
 
-    Over a step with a held command this is exact; the angle that counts at its start is chosen as for a lag (see
+    Over a step with a held command this is exact; the effective angle at its start is chosen as for a lag (see
     ``LagWeights.start``), so that the mean over the step tends to the command as the rate grows.
     """
 
@@ -64,8 +64,8 @@ class SteeringRateLimit(ActuatorEffect):
     ) -> tuple[Triple, Value]:
         """Ramp towards the command."""
         start, middle, end = command
-        limited = values["rate"] < FASTEST_RADPS
-        # Where there is no limit nothing infinite may enter: it would make the gradient not a number.
+        limited = values["rate"] < MAX_RATE_RADPS
+        # Without a limit the infinite rate is replaced, since it would make the gradient NaN.
         rate = ops.where(limited, values["rate"], 1.0)
         reach = 0.5 * rate * duration_s
         gap = start - state
@@ -164,7 +164,7 @@ class SteeringNonlinearity(ActuatorEffect):
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Saturate smoothly."""
-        saturates = values["saturation"] < LARGEST_RAD
+        saturates = values["saturation"] < MAX_SATURATION_RAD
         saturation = ops.where(saturates, values["saturation"], 1.0)
         return ops.where(saturates, saturation * ops.tanh(command / saturation), command)
 

@@ -1,4 +1,4 @@
-"""What stands between the throttle command and the motor, lag and delay apart: what the speed controller does to it.
+"""Effects between the throttle command and the motor (speed controller), except lag and delay.
 
 Acting order: dead band, nonlinearity, lag. Throttle in [-1, 1].
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters
 
-_SMALLEST = 1e-12
+_MIN_THROTTLE = 1e-12
 
 
 class ThrottleDeadband(ActuatorEffect):
@@ -64,6 +64,6 @@ class ThrottleNonlinearity(ActuatorEffect):
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Power of the size; at zero, where a power has no derivative, the command itself."""
         size = ops.abs(command)
-        large = size > _SMALLEST
+        large = size > _MIN_THROTTLE
         power = ops.pow(ops.where(large, size, 1.0), values["exponent"])
         return ops.where(large, ops.sign(command) * power, command)

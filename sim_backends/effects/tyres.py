@@ -21,19 +21,19 @@ from sim_backends.effects.base import (
 )
 from sim_backends.effects.first_order import LagWeights, lag_weights
 
-EDGE_M = 0.05
-"""Width over which a patch begins, centred on its radius, so that its place and size have derivatives [m]."""
+RIM_WIDTH_M = 0.05
+"""Width of a patch's rim, centred on its radius, so that position and size have derivatives [m]."""
 RELAXATION_FLOOR_MPS = 0.3
-SHORTEST_M = 1e-9
-"""A relaxation length below this is none."""
+MIN_LENGTH_M = 1e-9
+"""Relaxation lengths below this value are inactive [m]."""
 SCREENING_GRIPS = (0.4, 0.65, 0.95, 1.4)
 """Friction coefficients of each axle at which saturating tyres are screened."""
 SCREENING_SHAPE = 1.5
-"""Pacejka's C there."""
+"""Pacejka's C at these screening points."""
 SCREENING_SPACING_M, SCREENING_RADIUS_M = 0.5, 0.8
 """Spacing and radius of the discs at which a patch is screened [m]."""
-LARGEST_SHARE = 0.98
-"""Most of the friction that a longitudinal force may use up in the ellipse."""
+MAX_SHARE = 0.98
+"""Maximum share of friction used by the longitudinal force in the ellipse."""
 
 
 class TyreSaturation(DynamicsEffect):
@@ -105,7 +105,7 @@ class FrictionDrift(DynamicsEffect):
 class LowFrictionPatch(DynamicsEffect):
     """``mu (1 - loss)`` of both axles while the centre of mass is inside a disc around (x, y).
 
-    The loss grows in a straight line over ``EDGE_M`` across the rim.
+    The loss grows in a straight line over ``RIM_WIDTH_M`` across the rim.
     """
 
     id = "low_friction_patch"
@@ -125,14 +125,14 @@ class LowFrictionPatch(DynamicsEffect):
     )
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
-        """Discs over the ground that was driven on."""
+        """Discs along the driven path."""
         cells = np.unique(np.round(probe.path_m / SCREENING_SPACING_M).astype(np.int64), axis=0) * SCREENING_SPACING_M
         return probe.points({"x": x, "y": y, "radius": SCREENING_RADIUS_M, "loss": 0.1} for x, y in cells.tolist())
 
     def on_grip(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale inside."""
         distance = ops.hypot(forces.x - values["x"], forces.y - values["y"])
-        inside = ops.clip((values["radius"] - distance) * (1.0 / EDGE_M) + 0.5, 0.0, 1.0)
+        inside = ops.clip((values["radius"] - distance) * (1.0 / RIM_WIDTH_M) + 0.5, 0.0, 1.0)
         factor = 1.0 - values["loss"] * inside
         forces.grip_front, forces.grip_rear = forces.grip_front * factor, forces.grip_rear * factor
 
@@ -167,7 +167,7 @@ class FrictionEllipse(DynamicsEffect):
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale the rear's side force."""
         peak = ops.floor(forces.grip_rear * forces.load_rear, 1e-6)
-        share = ops.clip(values["scale"] * forces.axle_force / peak, -LARGEST_SHARE, LARGEST_SHARE)
+        share = ops.clip(values["scale"] * forces.axle_force / peak, -MAX_SHARE, MAX_SHARE)
         forces.side_rear = forces.side_rear * ops.sqrt(1.0 - share * share)
 
 
@@ -194,8 +194,8 @@ class TyreRelaxation(DynamicsEffect):
         if self.id in forces.stiff:
             forces.side_front, forces.side_rear = forces.stiff[self.id].at_stage(forces.vx, front, rear)
             return
-        rate = ops.floor(ops.abs(forces.vx), RELAXATION_FLOOR_MPS) / ops.floor(values["length"], SHORTEST_M)
-        lags = values["length"] >= SHORTEST_M
+        rate = ops.floor(ops.abs(forces.vx), RELAXATION_FLOOR_MPS) / ops.floor(values["length"], MIN_LENGTH_M)
+        lags = values["length"] >= MIN_LENGTH_M
         for name, steady in (("front", front), ("rear", rear)):
             force = forces.states[f"{self.id}.{name}"]
             forces.rates[f"{self.id}.{name}"] = (steady - force) * rate

@@ -1,7 +1,7 @@
 """Physics outside the catalogue, which a diagnosis does not name.
 
-The simulator can have it like any effect, and a diagnosis keeps it as a rival, so that a name of the catalogue is not
-given to what one of these explains better.
+The simulator handles these effects like all others. A diagnosis uses them as rival physics, so that no effect of the
+catalogue is named for physics that one of these explains better.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from sim_backends.effects.base import (
     ScreeningProbe,
 )
 
-AT_REST_MPS = 0.2
-"""Speed over which a force of rolling wheels builds up."""
+REST_SPEED_MPS = 0.2
+"""Speed over which a force of rolling wheels builds up [m/s]."""
 SCRUB_FLOOR_MPS = 0.3
 SCRUB_CURVATURE = 1.0
 """Curvature of the path at which the wheels of a locked axle begin to slide [1/m]."""
 STILL_AIR_M2PS2 = 1e-6
 SCREENING_COEFFICIENT = 0.15
 """Drag coefficient at which a wind is screened [N s2/m2]."""
-COASTING = 0.05
+COAST_THROTTLE = 0.05
 """Throttle below which a speed controller brakes by itself."""
 
 
@@ -54,7 +54,7 @@ class Wind(DynamicsEffect):
     screening_scaled = ("speed",)
 
     def screening_points(self, probe: ScreeningProbe) -> FloatArray:
-        """Eight directions, each with the speeds that count in one of them."""
+        """Eight directions, each with the screening speeds of the first direction."""
         start = {"speed": 1.0, "direction": 0.0, "coefficient": SCREENING_COEFFICIENT}
         sized = probe.sized([start], held=("direction", "coefficient"))
         headings = np.linspace(-np.pi, np.pi, 8, endpoint=False)
@@ -87,7 +87,7 @@ class _SideForce(DynamicsEffect):
     @staticmethod
     def push(ops: Ops, forces: Forces, values: Parameters) -> Value:
         """To the left [N]."""
-        return values["force"] * ops.tanh(ops.abs(forces.vx) * (1.0 / AT_REST_MPS))
+        return values["force"] * ops.tanh(ops.abs(forces.vx) * (1.0 / REST_SPEED_MPS))
 
 
 class FrontSideForce(_SideForce):
@@ -173,17 +173,17 @@ class CoastBrake(DynamicsEffect):
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Brake."""
-        share = forces.throttle * (1.0 / COASTING)
+        share = forces.throttle * (1.0 / COAST_THROTTLE)
         forces.force_x = ops.fms(values["coefficient"], forces.vx * ops.exp(-share * share), forces.force_x)
 
 
 class PositionScale(ObservationEffect):
-    """``p_meas = (1 + scale) p`` and so for the velocities: motion capture whose metre has another length."""
+    """``p_meas = (1 + scale) p``, also for the velocities: a scale error of motion capture."""
 
     id = "position_scale"
     catalogued = False
     order = 50
-    summary = "The metre of motion capture has another length."
+    summary = "Motion capture has a scale error."
     class_statement = "every length and speed is proportionally too long or too short, as by a scale of motion capture"
     parameters = (EffectParameter("scale", "1", 0.0, -0.5, 0.5, 0.03),)
     confusable = (Confusable("marker_offset"),)

@@ -1,4 +1,4 @@
-"""Spin of the driven wheels: a state of its own, much faster than the car, stepped implicitly."""
+"""Spin of the driven wheels: a stiff state, integrated implicitly."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParamete
 WHEEL_RADIUS_M = 0.033
 """Radius of a wheel of a 1:10 touring car; the catalogue has no parameter for it. Inertia scales with its square."""
 SLIP_FLOOR_MPS = 0.3
-"""Least speed in the denominator of the slip, as for the slip angle [m/s]."""
-LEAST_INERTIA_KGM2 = 1e-9
-"""An inertia below this is none: then the wheels pass the drive force on, as in the base model."""
+"""Minimum speed in the denominator of the slip, as for the slip angle [m/s]."""
+MIN_INERTIA_KGM2 = 1e-9
+"""Inertias below this value are inactive: the wheels transmit the drive force, as in the base model [kg m2]."""
 SUBSTEPS = 4
 _NEWTON_STEPS = 6
-_STIFFEST_N = 1e5
-_LEAST_GRIP_N = 1e-6
+MAX_STIFFNESS_N = 1e5
+_MIN_GRIP_N = 1e-6
 _SLIP_SPEED, _RIM_ACCELERATION = "longitudinal_slip.slip_speed", "longitudinal_slip.rim_acceleration"
 
 
@@ -61,12 +61,12 @@ class LongitudinalSlip(DynamicsEffect):
 
     def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """The tyres' force instead of the motor's."""
-        rolls = values["inertia"] >= LEAST_INERTIA_KGM2
+        rolls = values["inertia"] >= MIN_INERTIA_KGM2
         if self.id in forces.stiff:
             forces.axle_force = ops.where(rolls, forces.stiff[self.id].axle_force, forces.axle_force)
             return
         force = _force(ops, forces, values, forces.states[_SLIP_SPEED])
-        per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], LEAST_INERTIA_KGM2)
+        per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], MIN_INERTIA_KGM2)
         rate = per_inertia * (forces.axle_force - force)
         forces.rates[_RIM_ACCELERATION] = rate
         forces.axle_force = ops.where(rolls, force, forces.axle_force)
@@ -81,16 +81,16 @@ class LongitudinalSlip(DynamicsEffect):
         return SlipStep(ops, start, values)
 
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
-        """Slip speed at which wheels and car speed up alike; 0.95 of the limit where the wheels would spin up."""
+        """Slip speed at which wheels and car have equal acceleration; at most 0.95 of the force limit."""
         _, peak = _limits(ops, forces, values)
-        wheels = ops.floor(values["inertia"], LEAST_INERTIA_KGM2) / WHEEL_RADIUS_M**2
+        wheels = ops.floor(values["inertia"], MIN_INERTIA_KGM2) / WHEEL_RADIUS_M**2
         share = ops.clip(forces.axle_force * forces.mass / ((forces.mass + wheels) * peak), -0.95, 0.95)
         return {_SLIP_SPEED: _atanh(ops, share) / _per_speed(ops, forces.vx, forces, values)}
 
 
 def _limits(ops: Ops, forces: Forces, values: Parameters) -> tuple[Value, Value]:
-    stiffness = ops.where(values["stiffness"] < _STIFFEST_N, values["stiffness"], _STIFFEST_N)
-    return stiffness, ops.floor(forces.grip_rear * forces.load_rear, _LEAST_GRIP_N)
+    stiffness = ops.where(values["stiffness"] < MAX_STIFFNESS_N, values["stiffness"], MAX_STIFFNESS_N)
+    return stiffness, ops.floor(forces.grip_rear * forces.load_rear, _MIN_GRIP_N)
 
 
 def _per_speed(ops: Ops, vx: Value, forces: Forces, values: Parameters) -> Value:
@@ -137,14 +137,14 @@ def step_wheels(
         ops: Functions of the array library.
         forces: All forces at the start of the step.
         values: ``inertia`` and ``stiffness``.
-        demand: Force that the motor asks of the axle at the start, less damping [N].
-        damping: How much less it asks for each m/s more [N s/m].
+        demand: Motor force on the axle at the start, less damping [N].
+        damping: Decrease of the motor force per speed [N s/m].
         rest: All other forces along x, ``m vy r`` included [N].
         step_s: Length of the step.
     """
     _, peak = _limits(ops, forces, values)
     per_mass = 1.0 / forces.mass
-    per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], LEAST_INERTIA_KGM2)
+    per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], MIN_INERTIA_KGM2)
     both = per_inertia + per_mass
     short_s = step_s * (1.0 / SUBSTEPS)
     slip, vx = forces.states[_SLIP_SPEED], forces.vx

@@ -247,7 +247,7 @@ def test_an_mcap_of_another_program_is_told_apart(tmp_path):
 
 
 def test_missing_file_and_folder(tmp_path, make_documents):
-    with pytest.raises(DataError, match="not there"):
+    with pytest.raises(DataError, match="does not exist"):
         read_episode(tmp_path / "0001.mcap")
     with pytest.raises(DataError, match="folder"):
         read_episode(tmp_path)
