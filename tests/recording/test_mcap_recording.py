@@ -252,7 +252,7 @@ def test_missing_file_and_folder(tmp_path, make_documents):
     with pytest.raises(DataError, match="folder"):
         read_episode(tmp_path)
     (tmp_path / "0001.mcap.partial").write_bytes(b"")
-    with pytest.raises(DataError, match="never finished"):
+    with pytest.raises(DataError, match="is incomplete; read"):
         read_episode(tmp_path / "0001.mcap")
 
 
