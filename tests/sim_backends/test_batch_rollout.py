@@ -1,4 +1,4 @@
-"""Batched rollouts against the plain loop, the single-car plant, finite differences and each other."""
+"""Batched rollouts against the reference loop, the single-car plant, finite differences and each other."""
 
 import math
 
@@ -31,13 +31,13 @@ def some(cars, ticks, seed=0, dtype=torch.float64):
 
 
 def by_plant(config, start, commands, history=None, latency_s=None):
-    """The same drive on the single-car path."""
+    """The same simulation with the single-car plant."""
     period_s = config.control_period_s
     plant = Plant(config)
     past = 0 if history is None else len(history)
     plant.reset(CarState(), -past * period_s - 5.0)
     if past:  # carry the actuators through the history, then put the body at the start
-        plant.command(-past * period_s - 4.9, Action(*history[0]))  # what is older is like the first row
+        plant.command(-past * period_s - 4.9, Action(*history[0]))  # older commands equal the first row
         for k in range(past):
             plant.command((k - past) * period_s, Action(*history[k]))
         plant.advance(0.0)
@@ -93,7 +93,7 @@ def test_agrees_with_the_single_car_path_with_history(kind, effects):
     assert np.abs(fine - batch).max() < 5e-3
 
 
-def test_batch_equals_singles_and_chunks_do_not_matter(monkeypatch):
+def test_batch_equals_single_rollouts_for_every_chunk_size(monkeypatch):
     config = SimulatorConfig(effects={"steering_lag": {"time_constant": 0.05}})
     start, commands = some(9, 12)
     together = rollout(config, start, commands).states
@@ -103,7 +103,7 @@ def test_batch_equals_singles_and_chunks_do_not_matter(monkeypatch):
     assert torch.allclose(rollout(config, start, commands).states, together, atol=1e-13)
 
 
-def test_arrays_and_tensors_give_the_same(monkeypatch):
+def test_numpy_and_torch_engines_agree(monkeypatch):
     config = SimulatorConfig(
         kind="blend", effects={name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items()}
     )
@@ -117,7 +117,7 @@ def test_arrays_and_tensors_give_the_same(monkeypatch):
         assert torch.allclose(getattr(results[0], name), getattr(results[1], name), atol=1e-11)
 
 
-def test_per_car_parameters_equal_one_rollout_each():
+def test_per_car_parameters_equal_single_rollouts():
     start, commands = some(4, 15)
     values = {
         "tyre.rear.mu": torch.tensor([0.3, 0.4, 0.5, 0.6], dtype=torch.float64),
@@ -133,8 +133,8 @@ def test_per_car_parameters_equal_one_rollout_each():
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.005, 1 / 30, 0.05, 0.08, 0.1])
-def test_a_delay_is_exact_and_not_rounded_to_ticks(delay_s):
-    """A straight line with linear dynamics: the response to a step is that without delay, moved by the delay."""
+def test_delay_is_exact_between_ticks(delay_s):
+    """A straight line with linear dynamics: the step response is that without delay, shifted by the delay."""
     config = SimulatorConfig(command_delay_s=delay_s)
     start = torch.zeros(1, 6, dtype=torch.float64)
     commands = torch.zeros(1, 30, 2, dtype=torch.float64)
@@ -146,7 +146,7 @@ def test_a_delay_is_exact_and_not_rounded_to_ticks(delay_s):
     assert np.abs(speed - expected).max() < 1e-8
 
 
-def test_a_delay_longer_by_7_ms_moves_the_response_by_7_ms():
+def test_longer_delay_shifts_the_response_by_the_difference():
     start = torch.zeros(2, 6, dtype=torch.float64)
     commands = torch.zeros(2, 40, 2, dtype=torch.float64)
     commands[:, 2:, 0], commands[:, 2:, 1] = 0.5, 0.3
@@ -166,7 +166,7 @@ def test_history_carries_delays_and_lags_over_the_start():
     assert not torch.allclose(rollout(config, whole[:, 10], commands[:, 10:]).states[:, -1], whole[:, -1], atol=1e-3)
 
 
-def test_no_graph_unless_a_gradient_is_asked_for():
+def test_no_autograd_graph_without_a_required_gradient():
     start, commands = some(3, 5)
     assert rollout(SimulatorConfig(), start, commands).states.grad_fn is None
     commands.requires_grad_()
@@ -176,7 +176,7 @@ def test_no_graph_unless_a_gradient_is_asked_for():
 
 
 def all_effects():
-    """All but the one that turns a kinematic or linear-tyre car into a dynamic one."""
+    """All effects except tyre saturation, which turns a kinematic or linear-tyre car into a dynamic one."""
     return {n: {p.name: p.typical for p in e.parameters} for n, e in EFFECTS.items() if n != "tyre_saturation"}
 
 
@@ -260,14 +260,14 @@ def test_measured_states_are_older_by_the_latency(latency_s):
         assert (out.measured[:, k] - between).abs().max() < 1e-4
 
 
-def test_before_the_start_the_car_moved_at_its_first_velocity():
+def test_measured_states_before_the_start_extrapolate_the_first_velocity():
     start = torch.tensor([[1.0, 2.0, 0.5, 2.0, 0.0, 0.0]], dtype=torch.float64)
     config = SimulatorConfig(effects={"mocap_latency": {"latency": 0.1}})
     first = rollout(config, start, torch.zeros(1, 4, 2, dtype=torch.float64), measured=True).measured[0, 0]
     assert first[:3].tolist() == pytest.approx([1 - 0.2 * math.cos(0.5), 2 - 0.2 * math.sin(0.5), 0.5])
 
 
-def test_marker_offset_moves_the_point_and_its_velocity_alike():
+def test_marker_offset_changes_position_and_velocity_consistently():
     """On any path the body velocity of the shifted point is the derivative of its position."""
     config = SimulatorConfig(
         control_period_s=0.001,
@@ -340,7 +340,7 @@ def test_no_commands_and_commands_of_another_type():
     assert mixed.dtype == torch.float64
 
 
-def test_looking_does_not_change_the_drive():
+def test_measuring_does_not_change_the_trajectory():
     start, commands = some(3, 10)
     config = SimulatorConfig(effects=all_effects())
     seen = rollout(config, start, commands, measured=True).states

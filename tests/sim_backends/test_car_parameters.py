@@ -1,4 +1,4 @@
-"""Car files: what is read, what is refused, and that reading and writing are inverse."""
+"""Car files: valid and invalid tables, and that reading and writing are inverse."""
 
 import re
 import tomllib
@@ -44,7 +44,7 @@ dropout = 0.0
 """
 
 
-def test_the_documented_file_is_the_default():
+def test_documented_car_file_equals_the_default():
     assert SimulatorConfig.from_tables(tomllib.loads(CAR_FILE)) == SimulatorConfig()
     assert SimulatorConfig.from_tables({}) == SimulatorConfig()
 
@@ -101,7 +101,7 @@ def test_toml_round_trip_keeps_effects_and_priors():
         ({"vehicle": 3}, "must be a table"),
     ],
 )
-def test_a_wrong_file_is_refused_with_the_remedy(change, message):
+def test_invalid_file_is_refused_with_the_remedy(change, message):
     with pytest.raises(ConfigError, match=re.escape(message)) as caught:
         SimulatorConfig.from_tables(change, "car.toml")
     assert "car.toml" in str(caught.value)
@@ -123,7 +123,7 @@ def test_values_by_dotted_name_cover_the_registry_and_can_be_changed():
         config.with_values({"tyre.front.muu": 0.5})
 
 
-def test_latency_effect_without_a_number_is_the_car_files():
+def test_latency_effect_without_a_number_uses_the_car_file():
     config = SimulatorConfig.from_tables({"mocap": {"latency": 0.013}, "effects": {"mocap_latency": {}}})
     assert config.effects["mocap_latency"]["latency"] == 0.013
 
@@ -133,7 +133,7 @@ def test_delays_add_up_per_channel():
     assert config.delays_s() == pytest.approx((0.07, 0.05))
 
 
-def test_a_number_may_have_a_deviation_with_or_without_a_range():
+def test_number_may_have_a_standard_deviation_with_or_without_a_range():
     tables = {
         "motor": {
             "drive_gain": {"value": 8.2, "std": 0.5},
@@ -157,7 +157,7 @@ def test_a_number_may_have_a_deviation_with_or_without_a_range():
 
 
 def test_a_latency_that_the_car_file_does_not_state_is_unknown_until_it_is_set() -> None:
-    """The simulator uses the default; files that are written do not state it either."""
+    """The simulator uses the default; written files do not state the latency either."""
     silent = SimulatorConfig.from_tables({"mocap": {"rate": 100.0}})
     assert silent.unknown == {"mocap.latency"}
     assert silent.mocap.latency_s == SimulatorConfig().mocap.latency_s

@@ -41,7 +41,7 @@ def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_
         assert torch.allclose(ours, theirs, rtol=1e-9, atol=1e-10)
 
 
-def test_more_cars_than_a_chunk_of_the_derivative(monkeypatch):
+def test_gradient_of_more_cars_than_one_chunk(monkeypatch):
     start, commands = some(23, 4)
     gradients_found = []
     for chunk in (1000, 7):

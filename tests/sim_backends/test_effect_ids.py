@@ -1,4 +1,4 @@
-"""Only the effect classes know effects by their ids: no other code holds an id as a string."""
+"""Effect ids occur as strings in the effect classes only."""
 
 import ast
 import re
@@ -9,13 +9,13 @@ from sim_backends.effects import EFFECTS
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("carlab", "drivers", "learning", "mocap", "sim_backends")
 OWN_GENERATOR = ROOT / "carlab" / "benchmark"
-"""The proof's world is written apart from the simulator and has a catalogue of its own."""
+"""The proof's world is independent of the simulator and has its own catalogue."""
 EFFECT_CLASSES = ROOT / "sim_backends" / "effects"
 DOTTED = re.compile(rf"\beffects\.({'|'.join(EFFECTS)})\b")
 
 
 def ids_in(source: str) -> list[tuple[int, str]]:
-    """Lines and texts of string constants that are an effect's id, or a number's dotted name with one."""
+    """Lines and texts of string constants that are an effect's id, or a dotted name with an id."""
     tree = ast.parse(source)
     # The audit of recordings has ids of findings; one of them is the word of an effect.
     findings = {
@@ -31,7 +31,7 @@ def ids_in(source: str) -> list[tuple[int, str]]:
     ]
 
 
-def test_ids_are_found() -> None:
+def test_effect_ids_in_source_are_found() -> None:
     assert ids_in('if name == "steering_lag": pass') == [(1, "steering_lag")]
     assert ids_in('LATENCY = "effects.mocap_latency.latency"') == [(1, "effects.mocap_latency.latency")]
     assert ids_in('f"effects.wind.{name}"') == [(1, "effects.wind.")]

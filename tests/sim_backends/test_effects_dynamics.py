@@ -1,4 +1,4 @@
-"""Effects of the dynamics against a second writing of their equations, integrated by scipy."""
+"""Dynamics effects against an independent implementation of their equations, integrated by scipy."""
 
 import math
 
@@ -165,7 +165,7 @@ def reference_rates(t, s, d, u, p, e):
 def by_scipy(p, effects, start=START, drive=DRIVE):
     hidden = [0.0, 0.0, start[3], 0.0, 0.0]
 
-    # Hidden states begin settled at neutral: let the lagging ones run alone while the body is held.
+    # Hidden states start steady at neutral: integrate the lagging ones alone with a fixed body state.
     def held(t, s):
         return [0.0] * 6 + reference_rates(0.0, [*start, *s[6:]], 0.0, 0.0, p, effects)[6:]
 

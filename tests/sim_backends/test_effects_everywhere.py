@@ -1,4 +1,4 @@
-"""What holds for every effect: identity, engines, gradients, files, symmetries, hidden states."""
+"""Properties of every effect: identity, engines, gradients, files, symmetries, hidden states."""
 
 import math
 import tomllib
@@ -85,12 +85,12 @@ def test_the_catalogue_is_complete():
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("engine", ["fastest", "operators"])
-def test_identity_is_the_simulator_without_it_and_so_are_its_gradients(name, engine):
+def test_effect_at_its_identity_changes_neither_states_nor_gradients(name, engine):
     found = []
     for effects in ({}, {name: {}}):
         config = SimulatorConfig(effects=effects)
         numbers = {k: v for k, v in config.values().items() if k != "timing.control_period"}
-        # A latency of its own takes the place of the base model's, whose gradient is then its.
+        # The latency effect replaces the base model's latency, so their gradients differ.
         numbers = {k: v for k, v in numbers.items() if not k.startswith("mocap.")}
         values = {k: torch.full((4,), v, dtype=torch.float64, requires_grad=True) for k, v in numbers.items()}
         (start, commands), history = some(), past()
@@ -112,9 +112,9 @@ def test_identity_is_the_simulator_without_it_and_so_are_its_gradients(name, eng
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kind", ["kinematic", "linear_tyre", "blend"])
-def test_identity_on_the_other_kinds(name, kind):
+def test_effect_at_its_identity_changes_nothing_for_other_model_kinds(name, kind):
     if name == "tyre_saturation" and kind != "blend":
-        pytest.skip("turns such a car into one with Pacejka tyres whatever its numbers are")
+        pytest.skip("tyre saturation turns such a car into one with Pacejka tyres")
     start, commands = some()
     plain = rollout(SimulatorConfig(kind=kind), start, commands, measured=True)
     same = rollout(SimulatorConfig(kind=kind, effects={name: {}}), start, commands, measured=True)
@@ -125,7 +125,7 @@ def test_identity_on_the_other_kinds(name, kind):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("kind", ["dynamic", "kinematic"])
 def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeypatch):
-    """Without delay all of them cut time at the same places."""
+    """Without delay all engines use the same steps."""
     config = SimulatorConfig(kind=kind, command_delay_s=0.0, effects={name: typical(name)})
     if EFFECTS[name].kind == "input" and "delay" in name:
         config = SimulatorConfig(kind=kind, command_delay_s=0.0, effects={name: {}})
@@ -152,7 +152,7 @@ def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeyp
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_car_may_have_its_own_numbers(name):
+def test_per_car_effect_parameters_equal_single_rollouts(name):
     start, commands = some()
     shares = (0.4, 0.7, 1.0, 1.3)
     values = {}
@@ -209,7 +209,7 @@ def test_toml_round_trip(name):
         assert set(again.effects[name]) == {p.name for p in EFFECTS[name].parameters}
 
 
-def test_a_choice_is_a_word_in_the_file_and_a_number_elsewhere():
+def test_choice_is_a_word_in_car_files_and_a_position_elsewhere():
     tables = {"effects": {"traction_limit": {"share": 0.8, "axle": "all"}}}
     config = SimulatorConfig.from_tables(tables)
     assert config.values()["effects.traction_limit.axle"] == 1.0
@@ -259,7 +259,7 @@ def test_mirror_symmetry(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_moving_and_turning_the_world_with_what_is_fixed_in_it(name):
+def test_rigid_motion_of_the_world_with_its_fixed_objects(name):
     start, commands = some()
     # A scale of motion capture leaves its own origin where it is.
     turn, east, north = 1.1, *((0.0, 0.0) if name == "position_scale" else (4.0, -7.0))
@@ -285,8 +285,8 @@ def test_moving_and_turning_the_world_with_what_is_fixed_in_it(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_rollout_begun_in_the_middle_goes_on_as_the_whole_one(name):
-    """Hidden states come through the history, time through t0_s."""
+def test_rollout_with_history_continues_a_longer_rollout(name):
+    """The history sets the hidden states, t0_s the time."""
     config = SimulatorConfig(effects={name: typical(name)})
     generator = np.random.default_rng(8)
     start = torch.tensor([[0, 0, 0, 2.0, 0, 0], [1, 0, 1, 1.5, 0, 0]], dtype=torch.float64)
@@ -305,8 +305,8 @@ def test_a_rollout_begun_in_the_middle_goes_on_as_the_whole_one(name):
         assert torch.allclose(half, whole[:, 30:], rtol=0, atol=1e-9)
 
 
-def test_hidden_states_of_the_body_without_its_history_are_those_of_its_velocities():
-    """On a steady circle that is exact: nothing changes when a rollout is begun anew."""
+def test_hidden_states_without_history_are_steady_for_the_initial_velocities():
+    """On a steady circle the steady hidden states are exact: a restarted rollout does not change."""
     effects = {n: typical(n) for n in ("tyre_relaxation", "roll_dynamics", "longitudinal_slip", "steering_lag")}
     config = SimulatorConfig(effects=effects)
     start = torch.tensor([[0, 0, 0, 1.2, 0, 0]], dtype=torch.float64)
@@ -316,7 +316,7 @@ def test_hidden_states_of_the_body_without_its_history_are_those_of_its_velociti
     assert torch.allclose(again, whole[:, 360:], rtol=0, atol=1e-4)
 
 
-def test_time_since_the_first_row_counts():
+def test_time_dependent_effects_use_the_time_since_the_first_row():
     start, commands = some(cars=1)
     for name, rate in (("battery_sag", 0.01), ("friction_drift", -0.01)):
         config = SimulatorConfig(effects={name: {"rate": rate}})
@@ -337,8 +337,8 @@ def test_time_since_the_first_row_counts():
         rollout(config, start, commands, history=past(1), history_states=torch.zeros(1, 3, 6))
 
 
-def test_effects_do_not_depend_on_the_order_in_which_they_are_named():
-    """And the limits of a set: all of them at once stay finite, from rest and in reverse too."""
+def test_result_does_not_depend_on_the_listed_order_of_effects():
+    """Also, all effects at once stay finite, from rest and in reverse."""
     everything = {n: typical(n) for n in NAMES}
     backwards = dict(reversed(everything.items()))
     start, commands = some()
@@ -349,7 +349,7 @@ def test_effects_do_not_depend_on_the_order_in_which_they_are_named():
     assert torch.isfinite(one.measured).all()
 
 
-def test_misaligned_axes_turn_what_is_measured_and_nothing_else():
+def test_yaw_misalignment_changes_only_measured_states():
     angle = 0.05
     start, commands = some()
     config = SimulatorConfig(

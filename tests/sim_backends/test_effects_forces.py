@@ -1,4 +1,4 @@
-"""Single effects of the dynamics: closed forms, balances and conserved quantities."""
+"""Single dynamics effects: closed forms, balances and conserved quantities."""
 
 import math
 
@@ -13,7 +13,7 @@ from sim_backends.plant import Plant
 
 P = CarParameters()
 G = 9.81
-# With next to no grip the car goes straight on while forces as shares of the grip are what they are.
+# With almost no grip the car goes straight on, while forces relative to the grip are unchanged.
 STRAIGHT_ON = {"tyre__front__mu": 1e-7, "tyre__rear__mu": 1e-7, "motor__damping": 0.0}
 
 
@@ -40,7 +40,7 @@ def forces_at(effects, state, steering=0.0, throttle=0.0, t_s=0.0):
 
 
 def test_cornering_drag_slows_a_coasting_car_evenly():
-    """With tyres that hold nothing the car goes straight on and only the drag of the turned wheels is left."""
+    """Without side forces the car goes straight on, and the drag of the steered wheels is the only force."""
     cfg = config({"cornering_drag": {"coefficient": 3.0}}, motor__damping=0.0, tyre__front__mu=0.0, tyre__rear__mu=0.0)
     state = drive(cfg, (0, 0, 0, 2.0, 0, 0), (0.5, 0.0)).state
     assert state.vx_mps == pytest.approx(2.0 - 3.0 * 0.3 / P.mass_kg, abs=1e-6)
@@ -68,7 +68,7 @@ def test_motor_saturation_and_traction_limit_bound_the_acceleration():
             assert state.vx_mps == pytest.approx(sign * force / P.mass_kg, rel=1e-9)
 
 
-def test_brakes_have_their_own_gain():
+def test_brake_gain_applies_while_braking_only():
     cfg = config({"brake_asymmetry": {"gain_ratio": 2.0}}, motor__damping=0.0)
     assert drive(cfg, (0, 0, 0, 3.0, 0, 0), (0.0, -0.2), 0.5).state.vx_mps == pytest.approx(
         3.0 - 2.0 * 0.2 * P.drive_gain_n / P.mass_kg * 0.5
@@ -81,8 +81,8 @@ def test_brakes_have_their_own_gain():
     )
 
 
-def test_a_slope_keeps_energy_without_drive_and_resistance():
-    """Sideways and forwards on ice: kinetic energy plus m g height, height along the steepest ascent."""
+def test_slope_conserves_energy_without_drive_and_resistance():
+    """Sliding on ice in all directions: kinetic energy plus m g height is constant."""
     slope, heading = 0.1, 0.8
     ice = {"motor__damping": 0.0, "tyre__front__mu": 0.0, "tyre__rear__mu": 0.0}
     start = (0, 0, 0.3, 1.5, -0.4, 2.0)
@@ -119,7 +119,7 @@ def test_friction_drift_scales_the_largest_side_force_with_time():
 
 
 def test_load_transfer_balances_the_moments_about_the_axles():
-    """Moments about the lateral axis: m ax h = (F_z,rear - static) L, with the ax that the model ends up with."""
+    """Moments about the lateral axis: m ax h = (F_z,rear - static) L, with the model's ax."""
     height, state = 0.08, (0.0, 0.0, 0.0, 2.0, 0.1, 0.5)
     for throttle, steering in ((1.0, 0.0), (-1.0, 0.0), (0.7, 0.8), (0.0, -0.9)):
         rates, forces = forces_at({"load_transfer": {"height": height}}, state, steering, throttle)
@@ -232,7 +232,7 @@ def test_wheel_slip_is_stable_and_keeps_momentum(inertia, stiffness):
     assert abs(coasting[-1]) <= abs(coasting[0]) + 1e-9
 
 
-def test_weak_effects_of_body_forces_have_their_signs():
+def test_effects_of_body_forces_have_the_documented_signs():
     still = (0.0, 0.0, 0.0, 2.0, 0.0, 0.0)
     plain, _ = forces_at({"rolling_resistance": {}}, still, throttle=0.5)
     for effects, index, change in (

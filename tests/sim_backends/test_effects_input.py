@@ -1,4 +1,4 @@
-"""Input effects: closed forms, written-out trajectories and scipy, on the actuator chain itself."""
+"""Input effects of the actuator chain: closed forms, explicit trajectories and scipy."""
 
 import itertools
 import math
@@ -50,8 +50,8 @@ def test_rate_limit_takes_the_time_of_its_ramp():
 
 @pytest.mark.parametrize("name", ["steering_lag", "steering_rate_limit"])
 @pytest.mark.parametrize("strength", [0.1, 0.5, 1.0, 3.0, 20.0, 1000.0])
-def test_mean_over_a_step_is_close_to_exact_however_fast_the_servo_is(name, strength):
-    """Simpson's rule over start, middle and end, which is how Runge-Kutta sees the angle; strength in steps."""
+def test_mean_over_a_step_is_accurate_for_every_servo_speed(name, strength):
+    """Simpson's rule over start, middle and end, as in Runge-Kutta; ``strength`` is the rate per step."""
     step_s, jump = 0.01, 0.6
     effects = {
         "steering_lag": {"steering_lag": {"time_constant": step_s / strength}},
@@ -74,7 +74,7 @@ def test_backlash_is_the_play_operator_written_out():
     assert found == pytest.approx(expected, abs=1e-12)
 
 
-def test_backlash_does_not_care_how_fast_the_command_moves():
+def test_backlash_is_rate_independent():
     """Rate independence: a slow sweep and a jump to the same turning points end alike."""
     effects = {"steering_backlash": {"play": 0.15}}
     turning = [0.0, 0.9, -0.3, 0.5, 0.45]
@@ -163,7 +163,7 @@ def test_lag_weights_are_exact_from_no_lag_to_a_slow_one(dtype):
     assert weights.start[-1] == 1.0
     assert (weights.ramp + weights.start).sum().backward() is None
     assert torch.isfinite(time_constant.grad).all()
-    # At none the derivative is that of a small lag: a ramp is followed later by the time constant.
+    # At zero the derivative is that of a small lag: the output of a ramp is delayed by the time constant.
     assert float(time_constant.grad[0]) == pytest.approx(-2 / 0.01 + 6 / 0.01, rel=1e-5)
 
 

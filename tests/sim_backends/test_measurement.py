@@ -29,7 +29,7 @@ def model_of(config, ops=FLOATS, convert=float):
 
 
 @pytest.mark.parametrize("name", OBSERVATIONS)
-def test_the_inverse_of_every_observation_effect_gives_the_state_back(name):
+def test_inverse_of_every_observation_effect_recovers_the_state(name):
     for size in (-3.0, 0.0, 1.0, 10.0):
         low, high = EFFECTS[name].parameters[0].low, EFFECTS[name].parameters[0].high
         values = {p.name: min(max(size * p.typical, low), high) for p in EFFECTS[name].parameters}
@@ -44,14 +44,14 @@ def test_newtons_inverse_equals_the_closed_form(name):
     assert ObservationEffect.invert(effect, FLOATS, STATE, values) == pytest.approx(closed, rel=1e-11)
 
 
-def test_newtons_inverse_turns_a_quarter_round():
+def test_newtons_inverse_of_a_rotation_by_90_degrees():
     """There the first pivot is zero."""
     effect = EFFECTS["mocap_yaw_misalignment"]
     seen = effect.observe(FLOATS, STATE, {"angle": math.pi / 2})
     assert ObservationEffect.invert(effect, FLOATS, seen, {"angle": math.pi / 2}) == pytest.approx(STATE, rel=1e-11)
 
 
-def test_floats_arrays_and_tensors_measure_alike():
+def test_floats_arrays_and_tensors_give_equal_measurements():
     config = SimulatorConfig(effects=ALL)
     trajectory = [tuple(v + 0.1 * k * (i + 1) for i, v in enumerate(STATE)) for k in range(6)]
     settings = {"window_s2": 3e-4, "velocities_before": [(1.0, 0.0, 0.5), (1.2, 0.1, 0.6)]}
@@ -112,7 +112,7 @@ def test_the_window_is_the_mean_of_world_velocities_over_a_box():
     assert found[-1] == states[-1]
 
 
-def test_latency_is_the_car_files_or_that_of_an_effect():
+def test_latency_is_that_of_the_car_file_or_of_an_effect():
     config = SimulatorConfig(mocap=MocapParameters(latency_s=0.01))
     assert model_of(config).latency_s == 0.01
     late = SimulatorConfig(mocap=MocapParameters(latency_s=0.01), effects={"mocap_latency": {"latency": 0.04}})
@@ -120,7 +120,7 @@ def test_latency_is_the_car_files_or_that_of_an_effect():
     assert model_of(config).velocity_time_constant_s is None
 
 
-def test_commands_act_later_by_the_latency_and_never_before_they_are_given():
+def test_command_delay_relative_to_a_recording_includes_the_latency_and_is_not_negative():
     config = SimulatorConfig(command_delay_s=0.05, effects={"command_delay": {}, "steering_delay": {}})
     values = config.values()
     assert delay_as_recorded_s(FLOATS, values, config.effects, 0.02) == pytest.approx(0.07)
@@ -130,7 +130,7 @@ def test_commands_act_later_by_the_latency_and_never_before_they_are_given():
     assert np.allclose(delay_as_recorded_s(ARRAYS, several, config.effects, 0.02), [0.2, 0.07])
 
 
-def test_what_is_measured_is_told_from_what_drives():
+def test_measurement_parameters_are_distinguished_from_dynamics_parameters():
     assert is_measured("mocap.latency")
     assert is_measured("effects.marker_offset.ahead")
     assert not is_measured("effects.steering_lag.time_constant")

@@ -11,7 +11,7 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.plant import Plant
 
 
-def test_command_acts_exactly_its_delay_after_it_was_given():
+def test_command_acts_exactly_after_its_delay():
     p = SimulatorConfig().parameters
     for delay_s in (0.0, 0.0733, 0.08):
         plant = Plant(SimulatorConfig(command_delay_s=delay_s))
@@ -26,7 +26,7 @@ def test_command_acts_exactly_its_delay_after_it_was_given():
         )
 
 
-def test_a_delay_of_7_3_ms_more_moves_the_response_by_7_3_ms():
+def test_longer_delay_shifts_the_plant_response_by_the_difference():
     states = []
     for delay_s in (0.05, 0.0573):
         plant = Plant(SimulatorConfig(command_delay_s=delay_s))
@@ -37,7 +37,7 @@ def test_a_delay_of_7_3_ms_more_moves_the_response_by_7_3_ms():
     assert states[1] == pytest.approx(states[0], abs=1e-12)
 
 
-def test_how_often_it_is_asked_does_not_matter():
+def test_result_does_not_depend_on_the_number_of_calls():
     ends = []
     for stops in ([1.0], np.linspace(0.001, 1.0, 1000), [0.013, 0.5, 0.501, 1.0]):
         plant = Plant(SimulatorConfig(effects={"steering_lag": {"time_constant": 0.05}}))
@@ -58,7 +58,7 @@ def test_time_never_goes_back():
     assert plant.t_s == 0.5
 
 
-def test_poses_of_the_last_second_can_be_looked_up():
+def test_poses_of_the_last_second_are_interpolated():
     truth, plant = Plant(SimulatorConfig()), Plant(SimulatorConfig())
     for one in (truth, plant):
         one.command(0.0, Action(0.8, 0.6))
@@ -81,7 +81,7 @@ def test_measured_pose_is_that_of_the_marker():
     assert plant.pose_at(0.0)[:2] == pytest.approx((1.0, 2.0))
 
 
-def test_reset_forgets_commands_on_their_way():
+def test_reset_discards_pending_commands():
     plant = Plant(SimulatorConfig())
     plant.command(0.0, Action(0.5, 1.0))
     plant.advance(0.05)

@@ -32,7 +32,7 @@ def test_samples_come_at_the_rate_and_arrive_after_the_latency():
         assert s.t_receive_s == pytest.approx(s.t_capture_s + 0.025)
 
 
-def test_what_is_measured_does_not_depend_on_when_it_is_asked_for():
+def test_samples_do_not_depend_on_the_times_of_the_calls():
     rows = []
     for stops in ([1.0], [*np.arange(0.0, 1.0, 0.0137).tolist(), 1.0]):
         sensor = MocapSensor(config(dropout=0.3), seed=4)

@@ -1,4 +1,4 @@
-"""The speed measurements: that they measure what they say (the bars themselves are held by the benchmark)."""
+"""The speed measurements are consistent (the benchmark checks the limits)."""
 
 import numpy as np
 import pytest

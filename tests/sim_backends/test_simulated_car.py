@@ -1,4 +1,4 @@
-"""The simulated car keeps the contract of every car."""
+"""The simulated car implements the interface of every car."""
 
 import math
 
@@ -30,7 +30,7 @@ def drive(car, actions):
     return rows
 
 
-def test_a_drive_is_observed_as_it_happened():
+def test_observations_match_the_true_states():
     with SimulatedCar(SimulatorConfig(mocap=QUIET)) as car:
         assert car.reality is Reality.SIMULATED
         car.arm()
@@ -49,7 +49,7 @@ def test_a_drive_is_observed_as_it_happened():
         assert sequences == list(range(sequences[0], sequences[-1] + 1))
 
 
-def test_same_seed_same_bytes_other_seed_other_bytes():
+def test_equal_seeds_give_equal_bytes():
     def run(seed):
         with SimulatedCar(SimulatorConfig(mocap=MocapParameters(dropout=0.1)), seed=seed) as car:
             car.arm()
@@ -60,7 +60,7 @@ def test_same_seed_same_bytes_other_seed_other_bytes():
     assert run(3)[0] != run(4)[0]
 
 
-def test_nothing_moves_before_arm_and_every_error_is_the_right_one():
+def test_no_motion_before_arming_and_documented_errors():
     car = SimulatedCar(limits=ActionLimits(1.0, 0.5))
     car.stop(planned=True)
     car.close()
@@ -96,7 +96,7 @@ def test_nothing_moves_before_arm_and_every_error_is_the_right_one():
         car.observe()
 
 
-def test_opening_and_closing_twice_is_harmless():
+def test_open_and_close_are_idempotent():
     car = SimulatedCar()
     car.open()
     opened_s = car.clock.now_s()
@@ -109,7 +109,7 @@ def test_opening_and_closing_twice_is_harmless():
     car.close()
 
 
-def test_a_command_that_is_not_renewed_gives_way_to_neutral():
+def test_watchdog_replaces_an_old_command_by_neutral():
     p = SimulatorConfig().parameters
     with SimulatedCar(watchdog_s=0.15) as car:
         car.arm()
@@ -137,7 +137,7 @@ def test_stop_is_neutral_from_then_on(planned):
         assert car.true_state.vx_mps == pytest.approx(at_stop * math.exp(-0.5 * p.damping_nspm / p.mass_kg), rel=1e-6)
 
 
-def test_place_puts_the_car_there_with_its_velocity_already_known():
+def test_place_sets_the_state_with_a_valid_velocity_estimate():
     target = CarState(1.42, -1.04, 3.1, 0.8, 0.1, 1.5)
     with SimulatedCar(SimulatorConfig(mocap=QUIET)) as car:
         car.arm()
@@ -154,7 +154,7 @@ def test_place_puts_the_car_there_with_its_velocity_already_known():
         assert all(p.t_capture_s >= before_s for p in seen.poses)
 
 
-def test_place_at_rest_stays_at_rest_with_no_command_left_over():
+def test_place_at_rest_leaves_no_pending_command():
     with SimulatedCar(SimulatorConfig(mocap=QUIET)) as car:
         car.arm()
         drive(car, [Action(0.5, 0.5)] * 5)
@@ -163,7 +163,7 @@ def test_place_at_rest_stays_at_rest_with_no_command_left_over():
         assert car.observe().state.to_array() == pytest.approx([1.0, 2.0, -1.0, 0, 0, 0], abs=1e-9)
 
 
-def test_wire_latencies_add_to_the_car_files():
+def test_wire_latencies_add_to_those_of_the_car_file():
     def response(**extra):
         with SimulatedCar(SimulatorConfig(mocap=QUIET), **extra) as car:
             car.arm()
@@ -182,7 +182,7 @@ def test_wire_latencies_add_to_the_car_files():
     assert late.t_receive_s - late.t_capture_s == pytest.approx(0.018)
 
 
-def test_all_frames_lost_is_said_in_words():
+def test_loss_of_all_frames_is_reported():
     with (
         SimulatedCar(SimulatorConfig(mocap=MocapParameters(dropout=1.0))) as car,
         pytest.raises(PoseLostError, match="dropout"),
@@ -204,7 +204,7 @@ def test_velocity_filter_lag_slows_the_velocity_columns_only():
     assert 0.1 * slope < seen[0].vx_mps - seen[1].vx_mps < 0.3 * slope
 
 
-def test_it_also_runs_on_the_wall_clock():
+def test_simulated_car_runs_on_the_monotonic_clock():
     with SimulatedCar(clock=MonotonicClock()) as car:
         car.arm()
         car.command(Action(0.0, 0.2))

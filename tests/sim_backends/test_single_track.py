@@ -33,7 +33,7 @@ def drive(cfg, start, actions, hold_s=0.2):
 
 
 def reference_derivative(cfg, state, steering, throttle):
-    """The equations of the four kinds, written down a second time from the literature."""
+    """Independent implementation of the equations of the four kinds from the literature."""
     p = cfg.parameters
     vx, vy, r = state[3:]
     d = p.max_angle_rad * steering
@@ -162,7 +162,7 @@ def test_mirror_symmetry(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_moving_and_turning_the_world_changes_nothing(kind):
+def test_rigid_motion_of_the_world_changes_nothing(kind):
     here = drive(config(kind), (0, 0, 0.3, 1.5, 0.2, -0.5), MODERATE)
     there = drive(config(kind), (5, -7, 0.3 + 2.0, 1.5, 0.2, -0.5), MODERATE)
     c, s = math.cos(2.0), math.sin(2.0)
@@ -173,7 +173,7 @@ def test_moving_and_turning_the_world_changes_nothing(kind):
 
 
 @pytest.mark.parametrize("kind", ["dynamic", "linear_tyre"])
-def test_without_throttle_no_power_comes_in(kind):
+def test_no_power_is_added_without_throttle(kind):
     p = CarParameters()
     model = SingleTrack(ARRAYS, kind, config(kind).values())
     rng = np.random.default_rng(0)

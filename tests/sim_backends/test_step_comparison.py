@@ -1,4 +1,4 @@
-"""One Runge-Kutta step of N cars, by four ways of computing it: which one is the fastest (decision 0001).
+"""Speed comparison of four implementations of a Runge-Kutta step of N cars (decision 0001).
 
 Run it on an idle machine: ``pytest -m slow -s tests/sim_backends/test_step_comparison.py``.
 """
@@ -112,7 +112,7 @@ def seconds(run: Callable[[], object]) -> float:
     return time.perf_counter() - start_s
 
 
-def test_all_ways_give_the_same_step_and_gradient() -> None:
+def test_all_engines_give_the_same_step_and_gradient() -> None:
     rows = rows_of(64, torch.float64)
     results = [step(rows) for step in (by_operators(rows), by_compiled_step(rows))]
     gradients = [torch.autograd.grad(torch.stack(result).sum(), rows, allow_unused=True) for result in results]
