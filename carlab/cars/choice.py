@@ -86,7 +86,7 @@ def _choose(
         choice: CarChoice = plugins[name].load()(default_car() if vehicle is None else _read(vehicle), seed)
         return choice
     if vehicle is not None:
-        raise ConfigError(f"--vehicle needs --car sim or emulated; '{_name_of(name)}' is a car of its own.")
+        raise ConfigError(f"--vehicle needs --car sim or emulated; '{_name_of(name)}' has its own physics.")
     if isinstance(name, str):
         path = Path(name)
         if path.suffix != ".toml" and not path.exists() and not is_preset(path):

@@ -1,4 +1,4 @@
-"""Angles [rad]; functions take Python floats, NumPy arrays and torch tensors alike unless they say otherwise."""
+"""Angles [rad]; unless stated otherwise, functions take floats, NumPy arrays and torch tensors."""
 
 from __future__ import annotations
 

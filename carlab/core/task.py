@@ -130,7 +130,7 @@ class ParkingTask:
         return long_tail_tolerance(total, self.bound, self.margin) - self.action_cost * xp.sum(action**2, axis=-1)
 
     def parked(self, features: Any) -> Any:
-        """Whether the car stands in its spot, booleans (...,)."""
+        """Whether the car is parked, booleans (...,)."""
         xp = array_namespace(features)
         distance, yaw_error = self.errors(features)
         speed = xp.sqrt(features[..., 4] ** 2 + features[..., 5] ** 2)

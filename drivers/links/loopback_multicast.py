@@ -1,6 +1,6 @@
 """python-can's UDP multicast bus on the loopback interface: it needs no network, and no command leaves the host.
 
-python-can joins the group on the default route's interface, which fails where there is none (a container without a
+python-can joins the group on the default route's interface, which fails without a default route (a container without a
 network) and sends every frame to the local network otherwise. Here the group is joined and sent to on 127.0.0.1.
 """
 

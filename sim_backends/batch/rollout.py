@@ -227,8 +227,8 @@ class _Batch:
                 after = self._advance(t_s, now, held, piece.step_s, piece.steps, lag_s)
                 if measured and piece.has_capture is not False:
                     capture_s, steps = piece.capture_step_s, piece.capture_steps
-                    looked_at = after if capture_s is None else self._advance(t_s, now, held, capture_s, steps, lag_s)
-                    seen = self._choose(piece.has_capture, self._measured_now(looked_at, lag_s), seen)
+                    at_capture = after if capture_s is None else self._advance(t_s, now, held, capture_s, steps, lag_s)
+                    seen = self._choose(piece.has_capture, self._measured_now(at_capture, lag_s), seen)
                 now = after
             trajectory.append(now.state[:6])
             captured.append(seen)

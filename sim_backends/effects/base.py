@@ -320,7 +320,7 @@ class ObservationEffect(Effect):
     def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
         """The true state that is measured as ``measured``: the inverse of ``observe``, by Newton's method.
 
-        Override it where there is a closed form.
+        Override it if there is a closed form.
         """
         return newton_inverse(ops, lambda state: self.observe(ops, state, values), measured)
 

@@ -23,10 +23,10 @@ class YawDamping(DynamicsEffect):
     """``M -= coefficient r``."""
 
     id = "yaw_damping"
-    name = "a moment against turning"
-    summary = "A moment against turning that grows with the yaw rate, as of a locked axle."
+    name = "a yaw damping moment"
+    summary = "A yaw damping moment proportional to the yaw rate, as of a locked axle."
     sentence = "a moment of {coefficient} of yaw rate holds the car from turning, as a locked axle does"
-    refuted_if = "tight circles at walking pace are as tight as the steering says"
+    refuted_if = "circles at full lock and walking pace have the radius of the steering geometry"
     parameters = (EffectParameter("coefficient", "N m s/rad", 0.0, 0.0, 10.0, 0.05),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -38,8 +38,8 @@ class TorqueSteer(DynamicsEffect):
     """``M += coefficient u``, u the throttle that acts."""
 
     id = "torque_steer"
-    name = "a throttle that turns the car"
-    summary = "Throttle turns the car: a moment in proportion to it."
+    name = "torque steer"
+    summary = "Torque steer: a yaw moment proportional to the throttle."
     sentence = "full throttle turns the car to the {coefficient:left|right} with a moment of {coefficient:size}"
     refuted_if = "the car pulls to that side when it rolls with no throttle, too"
     parameters = (EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.1),)
@@ -75,7 +75,7 @@ class RoadSlope(DynamicsEffect):
     """
 
     id = "road_slope"
-    name = "a floor that slopes"
+    name = "a slope of the floor"
     summary = "The floor slopes."
     sentence = "the floor slopes by {angle}; straight up is where a heading of {direction} points"
     refuted_if = "the pull does not change sign when the car drives the other way"

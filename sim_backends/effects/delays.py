@@ -1,4 +1,4 @@
-"""Commands that act later than the car file says."""
+"""Additional delays of commands."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ class CommandDelay(DelayEffect):
 
     id = "command_delay"
     name = "a command delay that is not the car file's"
-    summary = "Both commands act later than the car file says."
-    sentence = "both commands act {extra_delay:size} {extra_delay:later|earlier} than the car file says"
+    summary = "Both commands act later than the car file states."
+    sentence = "both commands act {extra_delay:size} {extra_delay:later|earlier} than the car file states"
     refuted_if = (
         "steering and throttle turn out late by different amounts, or a delay measured at the car is the car file's"
     )
@@ -32,7 +32,7 @@ class SteeringDelay(DelayEffect):
     summary = "The steering command acts later than the throttle command."
     sentence = "the steering command acts {delay} later than the throttle command"
     refuted_if = (
-        "the wheels start to move at once and only arrive late, or fast steering comes out weaker than slow steering"
+        "the wheels start to move at once but reach their angle late, or fast steering has a weaker response than slow"
     )
     lag_parameter = "delay"
     parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03),)

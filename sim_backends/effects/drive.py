@@ -43,8 +43,8 @@ class BrakeAsymmetry(DynamicsEffect):
 
     id = "brake_asymmetry"
     command = "throttle"
-    name = "a brake that is not the drive reversed"
-    summary = "The motor brakes with another gain than it drives."
+    name = "a brake gain that differs from the drive gain"
+    summary = "The motor's gain differs between braking and driving."
     sentence = "the motor brakes with {gain_ratio} times the force with which it drives at the same throttle"
     refuted_if = "braking from several speeds needs several such ratios"
     order = 20
@@ -62,8 +62,8 @@ class MotorSaturation(DynamicsEffect):
     id = "motor_saturation"
     command = "throttle"
     name = "a limit of the motor's force"
-    summary = "The motor gives no more than a certain force."
-    sentence = "the motor gives no more than {force} of drive force, whatever the throttle"
+    summary = "The motor's drive force is limited."
+    sentence = "the motor's drive force is limited to {force} at any throttle"
     refuted_if = "the limit moves with the grip of the floor, or with the load on the wheels"
     order = 30
     parameters = (EffectParameter("force", "N", math.inf, 0.0, math.inf, 3.0),)
@@ -90,8 +90,8 @@ class TractionLimit(DynamicsEffect):
     id = "traction_limit"
     command = "throttle"
     name = "a limit of traction"
-    summary = "The driven wheels pass on no more force than their grip allows."
-    sentence = "the driven wheels ({axle:choice rear|all}) pass on no more than {share} times the force of full grip"
+    summary = "The force of the driven wheels is limited by their grip."
+    sentence = "the force of the driven wheels ({axle:choice rear|all}) is limited to {share} times their full grip"
     refuted_if = "the same limit is reached on a floor with more grip (then it is the motor's)"
     order = 40
     parameters = (

@@ -46,7 +46,7 @@ class LoadTransfer(DynamicsEffect):
     """
 
     id = "load_transfer"
-    name = "load that moves between the axles"
+    name = "load transfer between the axles"
     summary = "Speeding up presses the rear wheels to the ground and braking the front wheels."
     sentence = "speeding up and braking move load between the axles, as of a centre of mass {height} above the floor"
     refuted_if = "braking and speeding up change the balance in the same direction (then they share the tyres' grip)"
@@ -72,7 +72,7 @@ class RollDynamics(DynamicsEffect):
     """
 
     id = "roll_dynamics"
-    name = "a body that rolls"
+    name = "roll of the body"
     summary = "The body rolls and swings, which shifts grip between the sides later than the side force changes."
     sentence = (
         "the body rolls at {frequency} with a damping ratio of {damping}, and load that changes sides costs grip, "

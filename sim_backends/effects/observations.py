@@ -17,7 +17,7 @@ class MarkerOffset(ObservationEffect):
 
     id = "marker_offset"
     order = 40
-    name = "a tracked point beside the centre of mass"
+    name = "an offset of the tracked point from the centre of mass"
     summary = "Motion capture tracks a point that is not the centre of mass."
     sentence = (
         "motion capture tracks a point {ahead:size} {ahead:ahead of|behind} and {left:size} to the {left:left|right} "
@@ -71,7 +71,7 @@ class MocapYawMisalignment(ObservationEffect):
     """
 
     id = "mocap_yaw_misalignment"
-    name = "a heading that motion capture measures askew"
+    name = "a yaw misalignment of motion capture"
     summary = "Motion capture's forward axis of the car is not the car's."
     sentence = "motion capture sees the car turned {angle:size} to the {angle:left|right} of where it points"
     refuted_if = "driving straight with the steering centred, the measured side velocity does not grow with speed"
@@ -96,7 +96,7 @@ class MocapLatency(ObservationEffect):
 
     id = "mocap_latency"
     name = "a motion-capture latency that is not the car file's"
-    summary = "Motion capture is older than the car file says."
+    summary = "The latency of motion capture differs from the car file."
     sentence = "all that motion capture measures is {latency} old"
     refuted_if = "a latency measured against a known event, such as a tap on the car, equals the car file's"
     lag_parameter = "latency"
@@ -105,7 +105,7 @@ class MocapLatency(ObservationEffect):
         Confusable(
             "command_delay",
             reason=(
-                "No drive tells a command that acts late from a picture that comes late. Measure the latency of the "
+                "No manoeuvre separates a command delay from a measurement latency. Measure the latency of the "
                 "motion capture by itself, against an event at a known time, and write it into the car file."
             ),
         ),

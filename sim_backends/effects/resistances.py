@@ -39,7 +39,7 @@ class AerodynamicDrag(DynamicsEffect):
         Confusable(
             "motor_saturation",
             "coast_down",
-            "with no throttle the motor's limit has no say, drag still slows the car",
+            "without throttle the motor's limit has no effect, while drag still slows the car",
         ),
     )
 

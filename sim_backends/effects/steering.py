@@ -32,7 +32,7 @@ class SteeringDeadband(ActuatorEffect):
         Confusable(
             "steering_backlash",
             "steering_chirp",
-            "play opens at each turn back, a dead band only around straight ahead",
+            "play acts at each reversal, a dead band only around straight ahead",
         ),
     )
 
@@ -90,7 +90,7 @@ class SteeringBacklash(ActuatorEffect):
     id = "steering_backlash"
     name = "play in the steering"
     summary = "The steering linkage has play: the wheels follow only when it is taken up."
-    sentence = "the steering linkage has {play} of play, which is taken up anew at each turn back"
+    sentence = "the steering linkage has {play} of play, which is taken up at each reversal"
     refuted_if = "commands are ignored around straight ahead only, whichever way the wheels moved before"
     command = "steering"
     has_state = True
@@ -120,7 +120,7 @@ class SteeringAsymmetry(ActuatorEffect):
     """``d = d_cmd (1 + gain sign(d_cmd))``."""
 
     id = "steering_asymmetry"
-    name = "a steering that turns farther to one side"
+    name = "an asymmetry of the steering"
     summary = "The wheels turn farther to one side than to the other."
     sentence = (
         "the wheels turn {gain:size percent} farther to the {gain:left|right} than commanded, and as much less to "
@@ -147,10 +147,10 @@ class SteeringNonlinearity(ActuatorEffect):
     """``d = saturation tanh(d_cmd / saturation)``."""
 
     id = "steering_nonlinearity"
-    name = "a steering that yields less towards full lock"
+    name = "a nonlinearity of the steering towards full lock"
     summary = "The wheel angle grows less than the command towards full lock."
     sentence = "the wheel angle grows ever less than its command and would never exceed {saturation}"
-    refuted_if = "a slow circle at full lock, where tyres do not slip, is as tight as the linear steering says"
+    refuted_if = "a slow circle at full lock, where tyres do not slip, has the radius of the linear steering"
     command = "steering"
     order = 60
     parameters = (EffectParameter("saturation", "rad", math.inf, 0.0, math.inf, 0.5, positive=True),)
@@ -173,7 +173,7 @@ class SteeringOffset(ActuatorEffect):
     """``d = d_cmd + angle``."""
 
     id = "steering_offset"
-    name = "a steering that is not centred"
+    name = "an offset of the steering"
     summary = "The wheels are not straight when the steering command is zero."
     sentence = "with a steering command of zero the wheels point {angle:size} to the {angle:left|right}"
     refuted_if = "the pull to one side fades as speed grows, or the heading is off without the path being curved"
@@ -190,7 +190,7 @@ class SteeringOffset(ActuatorEffect):
             "mocap_yaw_misalignment",
             "throttle_ramp",
             (
-                "wheels off centre curve the path; a heading measured askew only shows as side velocity growing with "
+                "wheels off centre curve the path; a yaw misalignment appears only as a side velocity proportional to "
                 "speed"
             ),
         ),

@@ -16,8 +16,8 @@ class ThrottleDeadband(ActuatorEffect):
 
     id = "throttle_deadband"
     name = "a dead band of the throttle"
-    summary = "The motor does not answer to small throttle commands."
-    sentence = "the motor does not answer to throttle commands smaller than {width:percent} of full"
+    summary = "The motor does not respond to small throttle commands."
+    sentence = "the motor does not respond to throttle commands smaller than {width:percent} of full"
     refuted_if = "the car slows down just as strongly when it rolls with no throttle at all (a resistance)"
     command = "throttle"
     order = 10
@@ -26,7 +26,7 @@ class ThrottleDeadband(ActuatorEffect):
         Confusable(
             "rolling_resistance",
             "coast_down",
-            "with no throttle a dead band has no say, a resistance still slows the car",
+            "without throttle a dead band has no effect, while a resistance still slows the car",
         ),
     )
 
@@ -52,12 +52,12 @@ class ThrottleNonlinearity(ActuatorEffect):
         Confusable(
             "motor_saturation",
             "throttle_ramp",
-            "a limit shows as a corner in the force over the throttle, a curve bends all the way",
+            "a limit is a corner in the force over the throttle, a curve bends over the whole range",
         ),
         Confusable(
             "throttle_deadband",
             "throttle_ramp",
-            "a dead band shows as a corner at small throttle, a curve bends all the way",
+            "a dead band is a corner at small throttle, a curve bends over the whole range",
         ),
     )
 

@@ -37,7 +37,7 @@ MAX_SHARE = 0.98
 
 
 class TyreSaturation(DynamicsEffect):
-    """Pacejka tyres where the car file says kinematic or linear_tyre: then the car is of kind "dynamic".
+    """Pacejka tyres for a car file of kind kinematic or linear_tyre: the car becomes of kind "dynamic".
 
     ``F = -mu F_z sin(C atan(B a))`` with these numbers; each is the car file's own where it is not given. There is no
     value that switches it off; in a car file that has Pacejka tyres already it does nothing.
@@ -109,7 +109,7 @@ class LowFrictionPatch(DynamicsEffect):
     """
 
     id = "low_friction_patch"
-    name = "a slippery place"
+    name = "a low-friction patch"
     summary = "There is a place on the floor where grip is low."
     sentence = "grip falls by {loss:percent} within {radius} of the place x = {x}, y = {y}"
     refuted_if = "the car slides alike elsewhere at the same speed and turn, or does not slide there on another lap"
@@ -175,11 +175,11 @@ class TyreRelaxation(DynamicsEffect):
     """``(length / max(|vx|, 0.3 m/s)) dF/dt = F_steady - F`` for the side force of each axle, in its wheels' frame.
 
     Source: Pacejka 2012, "Tire and Vehicle Dynamics", ch. 7 (first-order relaxation in distance travelled). A step
-    takes the pole by its closed form (``RelaxedSides``): stable for every length, and the base model at length 0.
+    uses the closed form of the lag (``RelaxedSides``): stable for every length, and the base model at length 0.
     """
 
     id = "tyre_relaxation"
-    name = "the rolling distance in which side force builds up"
+    name = "the relaxation of the tyres' side force"
     summary = "The tyres must roll some way before their side force has built up."
     sentence = "the tyres roll {length} before their side force has built up"
     refuted_if = "the side force is late by the same time, rather than by the same distance, at two speeds"
@@ -211,7 +211,7 @@ class TyreRelaxation(DynamicsEffect):
 
 
 class RelaxedSides:
-    """Side forces at the four stages of one Runge-Kutta step, from the steady ones that each stage finds.
+    """Side forces at the four stages of one Runge-Kutta step, from the steady forces of each stage.
 
     Between stages the steady force goes in straight lines and the lag is exact (an exponential integrator: Hochbruck
     and Ostermann 2010, "Exponential integrators"), at the speed of the start and then of the middle of the step.

@@ -31,7 +31,7 @@ STILL_AIR_M2PS2 = 1e-6
 SCREENING_COEFFICIENT = 0.15
 """Drag coefficient at which a wind is screened [N s2/m2]."""
 COAST_THROTTLE = 0.05
-"""Throttle below which a speed controller brakes by itself."""
+"""Throttle below which a speed controller brakes."""
 
 
 class Wind(DynamicsEffect):

@@ -50,7 +50,7 @@ class LongitudinalSlip(DynamicsEffect):
         Confusable(
             "motor_lag",
             "throttle_steps",
-            "a lag lasts as long for a small as for a large step; spinning wheels come with the large one",
+            "a lag is equal for small and large steps; wheels spin at large steps only",
         ),
         Confusable(
             "traction_limit",
@@ -166,7 +166,7 @@ def step_wheels(
 
 
 def _root(ops: Ops, q: Value, c: Value) -> Value:
-    """Solve ``z + q tanh z = c`` for z by Newton's method, which comes from one side from this start."""
+    """Solve ``z + q tanh z = c`` for z by Newton's method, which converges monotonically from this start."""
     z = ops.where(ops.abs(c) < 1.0 + q, c / (1.0 + q), c - ops.sign(c) * q)
     for _ in range(_NEWTON_STEPS):
         t = ops.tanh(z)

@@ -125,7 +125,7 @@ def test_every_pair_of_look_alikes_has_a_drive_that_can_be_driven_or_says_that_n
     assert len(separating_reason(one, (other,))) > 20
     if {one, other} == INSEPARABLE:
         assert drive == ""
-        assert "No drive tells" in separating_reason(one, (other,))
+        assert "No manoeuvre separates" in separating_reason(one, (other,))
     else:
         assert drive in MANOEUVRES
 
@@ -141,7 +141,7 @@ def test_a_mismatch_names_its_effects_and_its_sets() -> None:
     assert (
         "leaves out two things: a lag of the motor (or a delay of the throttle: these recordings cannot tell)" in text
     )
-    assert "and a moment against turning" in text
+    assert "and a yaw damping moment" in text
     assert "from 4 to 2.5 noise floors, which removes 50 % of the error above the noise" in text
     assert "cannot tell" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
 
@@ -203,7 +203,7 @@ def test_the_next_drive_separates_the_strongest_set() -> None:
     assert drive_command(drive) == "carlab drive --policy throttle_steps"
     drive, why = next_drive(diagnosis("mismatch", finding("command_delay", ("mocap_latency",))))
     assert drive == ""
-    assert "No drive tells" in why
+    assert "No manoeuvre separates" in why
 
 
 def test_confidence_words_are_no_stronger_than_the_number() -> None:
