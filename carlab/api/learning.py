@@ -201,18 +201,18 @@ class _Progress:
     rows: list[EpisodeFigures] = field(default_factory=list)
 
     def on_figures(self, row: EpisodeFigures) -> None:
-        from carlab.experiment.campaign.report import keep_row
+        from carlab.experiment.campaign.report import save_row
 
         self.rows.append(row)
-        keep_row(self.run, row)
+        save_row(self.run, row)
         self.hooks.on_figures(row)
 
     def on_check(self, check: QuickCheck) -> None:
-        from carlab.experiment.campaign.report import keep_check
+        from carlab.experiment.campaign.report import save_check
 
         if self.rows and self.rows[-1].episode == check.episode:
             self.rows[-1] = self.rows[-1].with_check(check)
-        keep_check(self.run, check)
+        save_check(self.run, check)
         self.hooks.on_check(check)
 
     def campaign_hooks(self, interrupts: Interrupts) -> CampaignHooks:
@@ -232,12 +232,12 @@ class _Progress:
 
 def _learn(request: _Request, hooks: LearnHooks) -> LearnRun:
     from carlab.cars import choose_car
-    from carlab.experiment.campaign.campaign import seed_of
+    from carlab.experiment.campaign.campaign import saved_seed
     from carlab.experiment.campaign.report import write_report
     from carlab.experiment.episodes.interrupts import Interrupts
 
     _check(request)
-    started = None if request.resume is None else seed_of(request.resume)
+    started = None if request.resume is None else saved_seed(request.resume)
     choice = choose_car(
         request.car,
         vehicle=request.vehicle,
@@ -256,7 +256,7 @@ def _learn(request: _Request, hooks: LearnHooks) -> LearnRun:
         elif request.episodes is not None and request.episodes != campaign.episodes:
             campaign.episodes = request.episodes
             campaign.write_plan()
-        for result in campaign.go_on():
+        for result in campaign.run_episodes():
             results.append(result)
             hooks.on_result(result)
             write_report(campaign.run, campaign.plan, progress.rows[-1])
@@ -280,13 +280,13 @@ def _begun(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: conte
     run = stack.enter_context(new_run(request.out, request.name, choice, hooks, keep="models"))
     return Campaign(
         choice, plan, request.episodes or EPISODES, run, CampaignHooks(), request.ticks, request.place, request.rerun,
-        _questioned(request), request.typed,
+        _checked_simulator(request), request.typed,
     )  # fmt: skip
 
 
 def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
     from carlab.experiment.campaign.campaign import CampaignHooks, check_same_car, resumed_campaign
-    from carlab.experiment.campaign.report import restore_rows
+    from carlab.experiment.campaign.report import restore_missing_rows
     from learning.devices import available
 
     assert request.resume is not None
@@ -296,7 +296,7 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
     available(campaign.plan.device)
     _check_as_before(request, campaign.plan, choice)
     campaign.set_aside_stopped_episode()
-    restore_rows(run, campaign.plan.task)
+    restore_missing_rows(run, campaign.plan.task)
     return campaign
 
 
@@ -346,7 +346,7 @@ def _name_of(car: str | CarFile) -> str:
     return car if isinstance(car, str) else car.name
 
 
-def _questioned(request: _Request) -> SimulatorConfig | None:
+def _checked_simulator(request: _Request) -> SimulatorConfig | None:
     """The simulator that episodes are checked against, where it is not that of the car's file."""
     return None if request.prior in ("kinematic", "nominal") else _prior_file(request.prior).simulator
 

@@ -182,7 +182,7 @@ class Learn:
         )
 
     def _report(self, run: LearnRun) -> int:
-        from carlab.experiment.campaign.campaign import CONTINUING_ENDS
+        from carlab.experiment.campaign.campaign import CONTINUE_REASONS
 
         if not run.folder.is_dir():
             console.print("Nothing was learned; start again.")
@@ -221,7 +221,7 @@ class Learn:
             last = run.end
             return (
                 EXIT_SAFETY_STOP
-                if last is not None and last.is_safety_stop and last not in CONTINUING_ENDS
+                if last is not None and last.is_safety_stop and last not in CONTINUE_REASONS
                 else EXIT_INTERRUPTED
             )
         return 0

@@ -55,7 +55,7 @@ class ModelEnv(VecEnv):
         envelope: limits of the safety gate, which slews commands and stops a car that could not stop inside the arena.
         period_s: control period, for the slew limits [s].
         bonus: additional reward (cars,) for features (cars, 7 + 2 H) after a step; not part of the returns of
-            ``rolled_out``.
+            ``roll_out``.
         seed: of starts, particles and noise.
         device: where the model's tensors are.
 
@@ -140,7 +140,7 @@ class ModelEnv(VecEnv):
             seen[ended] = policy_view(self._start(ended))
         return seen, reward.cpu().numpy().astype(np.float32), done, infos
 
-    def rolled_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
+    def roll_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
         """Drive every car once from a start of the task by a policy, to the end.
 
         Args:

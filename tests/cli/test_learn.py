@@ -101,14 +101,14 @@ def test_a_run_goes_on_with_its_own_car_alone(carlab: Carlab, learned: tuple[int
     for options in (("--car", "emulated"), ("--car", "eth_rc_car"), ("--dry-run",)):
         code, text = carlab("learn", "--resume", folder, *options)
         assert code == 2
-        assert "was started with other options; go on with '--car sim'" in text
+        assert "was started with other options; resume it with '--car sim'" in text
     heavier = tmp_path / "heavier.toml"
     text = (folder / "config.toml").read_text()
     assert text.count("value = 1.65") == 1
     heavier.write_text(text.replace("value = 1.65", "value = 1.69"))
     code, text = carlab("learn", "--resume", folder, "--car", heavier)
     assert code == 2
-    assert "was started with other options; go on with '--car sim'" in text
+    assert "was started with other options; resume it with '--car sim'" in text
     assert {path: path.read_bytes() for path in files} == files
 
 
@@ -139,7 +139,7 @@ def test_a_learned_car_of_another_version_is_learned_anew_once_its_folder_is_rem
     code, text = carlab(*options)
     assert code == 1
     assert "is of version 1" in text
-    assert "remove its folder, and it is learned anew." in text
+    assert "remove its folder to train again." in text
     shutil.rmtree(folder / "models" / done[-1])
     code, text = carlab(*options)
     assert code == 0
@@ -166,7 +166,7 @@ def test_only_a_run_of_learning_is_resumed_again(carlab: Carlab, tmp_path: Path)
     driven = RunDirectory.create(tmp_path, "driven")
     code, text = carlab("learn", "--resume", driven.path)
     assert code == 1
-    assert "is no run of carlab learn that can be resumed" in text
+    assert "cannot be resumed" in text
 
 
 def test_an_impossible_prior_file_is_named(carlab: Carlab, tmp_path: Path) -> None:

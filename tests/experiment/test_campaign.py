@@ -28,7 +28,7 @@ from carlab.core.quantities import Action, CarState, Reality
 from carlab.experiment.campaign import training
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
 from carlab.experiment.campaign.figures import EpisodeFigures
-from carlab.experiment.campaign.report import keep_row, learning_curve, restore_rows, write_report
+from carlab.experiment.campaign.report import learning_curve, restore_missing_rows, save_row, write_report
 from carlab.experiment.campaign.training import TrainingPlan, recorded_features
 from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
 from carlab.recording.mcap.sink import McapSink
@@ -83,7 +83,7 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
         hooks.on_figures = found.figures.append
         campaign = Campaign(choice, found.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
         campaign.write_plan()
-        for result in campaign.go_on():
+        for result in campaign.run_episodes():
             found.results.append(result)
             write_report(run, found.plan, found.figures[-1])
 
@@ -112,7 +112,7 @@ def test_a_run_goes_on_where_it_was_ended(story: Story) -> None:
     assert story.after_the_stop == ["models/0001"]
     assert story.after_the_kill == ["episodes/0001.mcap", "models/0001"]
     assert "exit code -9" in story.said
-    assert "go on with --resume" in story.said
+    assert "Resume the run with --resume" in story.said
     assert "\n" not in story.said
     assert names(story.run) == ["episodes/0001.mcap", "episodes/0002.mcap", "models/0001", "models/0002"]
     assert [r.reason for r in story.results] == [EndReason.COMPLETED] * 2
@@ -125,7 +125,7 @@ def test_a_run_goes_on_where_it_was_ended(story: Story) -> None:
 def test_a_run_that_has_all_its_episodes_does_nothing(story: Story) -> None:
     before = names(story.run)
     choice = choose_car("sim")
-    assert list(Campaign(choice, story.plan, 2, story.run).go_on()) == [], "the car is not even open"
+    assert list(Campaign(choice, story.plan, 2, story.run).run_episodes()) == [], "the car is not even open"
     assert names(story.run) == before
 
 
@@ -229,7 +229,7 @@ def test_over_the_wire_a_row_ends_in_what_the_firmware_heard(
     choice.log_to(run.path)
     heard = listened_to(choice)
     with choice.car:
-        (result,) = Campaign(choice, story.plan, 1, run, max_ticks=TICKS, record_rerun=False).go_on()
+        (result,) = Campaign(choice, story.plan, 1, run, max_ticks=TICKS, record_rerun=False).run_episodes()
     driven = read_episode(result.path)
     rows = transitions_of([driven], HISTORY)
     assert len(rows) > TICKS // 2
@@ -265,7 +265,7 @@ def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_somethi
     )
     with choice.car:
         campaign = Campaign(choice, story.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
-        assert len(list(campaign.go_on())) == 2
+        assert len(list(campaign.run_episodes())) == 2
     assert len(ticks_s) > TICKS
     assert not {"training", "quick check"} & set(alive)
     learning = np.array(learning_s)
@@ -300,11 +300,11 @@ def test_an_episode_that_somebody_ended_is_driven_again(story: Story, tmp_path: 
     hooks = CampaignHooks(SessionHooks(on_tick=on_tick), on_figures=figures.append)
     campaign = Campaign(choice, story.plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False)
     with choice.car:
-        assert list(campaign.go_on()) == []
+        assert list(campaign.run_episodes()) == []
         assert (run.recordings(), figures) == ([], [])
         cut = read_episode(run.stopped / "0001.mcap")
         assert (cut.ticks, cut.metadata["end_reason"]) == (5, "STOP_REQUESTED")
-        (result,) = campaign.go_on()
+        (result,) = campaign.run_episodes()
     assert [p.name for p in run.recordings()] == ["0002.mcap"], "its number is not given twice"
     assert (result.data.ticks, result.reason, figures[0].episode) == (TICKS, EndReason.COMPLETED, 1)
 
@@ -343,11 +343,11 @@ def test_a_row_that_was_not_written_is_made_up_from_the_recording(story: Story, 
         shutil.copytree(model, run.models / model.name)
     whole = json.loads((story.run.path / "learn.json").read_text())
     (run.path / "learn.json").write_text(json.dumps({**whole, "episodes": whole["episodes"][:1]}))
-    restore_rows(run, story.plan.task)
+    restore_missing_rows(run, story.plan.task)
     wanted = [replace(f, verdict="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in story.figures]
     assert str(learning_curve(run)[1]) == str(wanted[1])
     before = (run.path / "learn.json").read_bytes()
-    restore_rows(run, story.plan.task)
+    restore_missing_rows(run, story.plan.task)
     assert (run.path / "learn.json").read_bytes() == before
 
 
@@ -382,7 +382,7 @@ def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.
     assert curve.read_bytes() == b"what was there"
     (story.run.path / "learn.json.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match="the disk is full; free some space"):
-        keep_row(story.run, story.figures[0])
+        save_row(story.run, story.figures[0])
 
 
 @pytest.mark.parametrize(("reality", "driven"), [(Reality.SIMULATED, 2), (Reality.REAL, 1)])
@@ -396,7 +396,7 @@ def test_a_real_car_that_nobody_puts_at_its_start_drives_no_more_after_a_safety_
         shutil.copytree(story.run.models / model, run.models / model)
     with choice.car as car:
         car.place(CarState(5.0, 5.0))
-        results = list(Campaign(choice, story.plan, 2, run, place=False, record_rerun=False).go_on())
+        results = list(Campaign(choice, story.plan, 2, run, place=False, record_rerun=False).run_episodes())
     assert [r.reason.name for r in results] == ["GEOFENCE"] * driven
 
 

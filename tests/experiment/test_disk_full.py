@@ -80,7 +80,7 @@ def test_learning_ends_with_the_sentence_and_drives_no_further_episode(
 
     monkeypatch.setattr("carlab.experiment.campaign.campaign.SacAgent.load", lambda *arguments: Untrained())
     with choice.car, pytest.raises(DataError, match=r"the disk is full; free some space on the disk of .* MB free"):
-        list(Campaign(choice, plan, 2, run, max_ticks=20, record_rerun=False).go_on())
+        list(Campaign(choice, plan, 2, run, max_ticks=20, record_rerun=False).run_episodes())
     assert run.recordings() == []
 
 

@@ -84,9 +84,9 @@ def test_a_signal_leaves_a_question_at_once_and_nothing_else() -> None:
             signal.raise_signal(signal.SIGTERM)
             answers.append("it went on waiting")
 
-        interrupts.ask(question)
+        interrupts.prompt(question)
         assert interrupts.reason() is EndReason.STOP_REQUESTED
-        interrupts.ask(lambda: answers.append("asked although it is over"))
+        interrupts.prompt(lambda: answers.append("asked although it is over"))
         signal.raise_signal(signal.SIGINT)
         assert interrupts.urgent.is_set()
     assert answers == []
@@ -99,9 +99,9 @@ def test_a_question_without_a_signal_is_asked_and_its_errors_pass() -> None:
         raise EOFError
 
     with Interrupts() as interrupts:
-        interrupts.ask(lambda: answers.append("asked"))
+        interrupts.prompt(lambda: answers.append("asked"))
         with pytest.raises(EOFError):
-            interrupts.ask(fail)
+            interrupts.prompt(fail)
         signal.raise_signal(signal.SIGINT)  # Raises nothing here.
     assert answers == ["asked"]
 
@@ -146,7 +146,7 @@ def test_a_beating_or_resting_loop_is_left_alone() -> None:
         for _ in range(10):
             watch.beat("driving")
             time.sleep(0.07)
-        watch.rest()
+        watch.pause()
         time.sleep(0.7)
     assert stopped == []
 

@@ -47,7 +47,7 @@ def learned(folder: Path, device: str, episodes: int) -> RunDirectory:
     with choice.car:
         going = Campaign(choice, plan, episodes, run, max_ticks=SMALL["ticks"], record_rerun=False)
         going.write_plan()
-        assert len(list(going.go_on())) == episodes
+        assert len(list(going.run_episodes())) == episodes
     return run
 
 

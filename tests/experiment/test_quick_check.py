@@ -14,7 +14,7 @@ from carlab.core.errors import DataError
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.quick_check import QuickCheck, check, check_path, run_check_subprocess
-from carlab.experiment.campaign.report import keep_check, keep_row, learning_curve
+from carlab.experiment.campaign.report import learning_curve, save_check, save_row
 from carlab.experiment.campaign.training import TrainingPlan
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
@@ -53,7 +53,7 @@ def test_what_goes_wrong_is_told_in_one_sentence(tmp_path: Path) -> None:
     assert check_result is not None
     assert check_result.verdict == "failed"
     (sentence,) = check_result.sentences
-    assert "learning goes on" in sentence
+    assert "learning continues" in sentence
     assert "MCAP" in sentence
     assert "\n" not in sentence
     assert json.loads(check_path(run, 1).read_text())["verdict"] == "failed", "it is not tried again"
@@ -65,30 +65,30 @@ def test_a_check_that_is_stopped_leaves_nothing_and_is_made_up_for(tmp_path: Pat
     run = a_run(tmp_path, SIMULATOR, 1)
     assert run_check_subprocess(run, SIMULATOR, stop=lambda: True) is None
     assert not check_path(run, 1).exists()
-    keep_row(run, ROW)
+    save_row(run, ROW)
     heard: list[QuickCheck] = []
 
     def on_check(check_result: QuickCheck) -> None:
         heard.append(check_result)
-        keep_check(run, check_result)
+        save_check(run, check_result)
 
     campaign = Campaign(choose_car("sim"), TrainingPlan(""), 1, run, CampaignHooks(on_check=on_check))
-    assert list(campaign.go_on()) == []
+    assert list(campaign.run_episodes()) == []
     assert [t.verdict for t in heard] == ["explains"]
     (row,) = learning_curve(run)
     assert (row.verdict, row.excess) == ("explains", heard[0].excess)
     assert row.diagnosis == heard[0].sentences[0]
     assert row.total_reward == ROW.total_reward
-    assert list(campaign.go_on()) == []
+    assert list(campaign.run_episodes()) == []
     assert len(heard) == 1, "once an episode"
 
 
 def test_rows_of_a_learning_curve_come_back_with_a_check_without_and_from_older_runs(tmp_path: Path) -> None:
     run = a_run(tmp_path, SIMULATOR, 0)
     check_result = QuickCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
-    keep_row(run, replace(ROW, episode=2))
-    keep_check(run, check_result)
-    keep_row(run, ROW)
+    save_row(run, replace(ROW, episode=2))
+    save_check(run, check_result)
+    save_row(run, ROW)
     content = json.loads((run.path / "learn.json").read_text())
     for name in ("verdict", "excess", "excess_std", "diagnosis"):
         del content["episodes"][0][name]
@@ -107,7 +107,7 @@ def test_rows_of_the_first_version_are_read_under_their_new_names(tmp_path: Path
     (run.path / "learn.json").write_text(json.dumps({"schema": "carlab.learn/1", "episodes": [row]}))
     (read,) = learning_curve(run)
     assert (read.predicted_return, read.verdict) == (31.5, "left")
-    keep_row(run, replace(ROW, episode=ROW.episode + 1))
+    save_row(run, replace(ROW, episode=ROW.episode + 1))
     content = json.loads((run.path / "learn.json").read_text())
     assert content["schema"] == "carlab.learn/2"
     assert content["episodes"][0]["predicted_return"] == 31.5
@@ -117,7 +117,7 @@ def test_rows_of_the_first_version_are_read_under_their_new_names(tmp_path: Path
 def test_a_row_that_is_none_is_refused_in_a_sentence(tmp_path: Path, changed: dict[str, object]) -> None:
     run = a_run(tmp_path, SIMULATOR, 0)
     (run.path / "learn.json").write_text(json.dumps({"episodes": [{**ROW.to_dict(), **changed}]}))
-    with pytest.raises(DataError, match=r"cannot be read .*remove it, and it is written anew\.$"):
+    with pytest.raises(DataError, match=r"cannot be read .*remove it, and the next run restores it\.$"):
         learning_curve(run)
 
 

@@ -301,7 +301,7 @@ def test_a_world_of_learned_cars(device: str, task: ParkingTask | PathTask) -> N
         ended += int(found[2].sum())
     assert ended > 10
     close(there.features, here.features)
-    for a, b in zip(*(env.rolled_out(lambda seen: -0.5 * seen[:, :2]) for env in (there, here)), strict=True):
+    for a, b in zip(*(env.roll_out(lambda seen: -0.5 * seen[:, :2]) for env in (there, here)), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 

@@ -102,7 +102,7 @@ def test_a_bonus_is_learned_from_and_not_counted() -> None:
     commands = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
     (_, without, _, _), (_, rewards, _, _) = plain.step(commands), other.step(commands)
     np.testing.assert_allclose(rewards - without, REWARD_SCALE * other.features[:, 0].numpy(), atol=1e-4)
-    totals = [env.rolled_out(lambda seen: np.zeros((6, 2), np.float32))[0] for env in (plain, other)]
+    totals = [env.roll_out(lambda seen: np.zeros((6, 2), np.float32))[0] for env in (plain, other)]
     assert torch.equal(*totals)
 
 
@@ -242,7 +242,7 @@ def test_a_rollout_counts_each_car_until_its_end() -> None:
         views.append(seen.copy())
         return commands
 
-    total, last = env.rolled_out(act)
+    total, last = env.roll_out(act)
     assert len(views) == 60
     assert views[0].shape == (12, WIDTH)
     lengths = []
@@ -267,9 +267,9 @@ def test_a_rollout_ends_a_car_that_has_parked() -> None:
         TASK, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9,
         stop_when_parked=True,
     )  # fmt: skip
-    total, _ = ModelEnv(Still(), task, 3).rolled_out(lambda seen: np.zeros((3, 2), np.float32))
+    total, _ = ModelEnv(Still(), task, 3).roll_out(lambda seen: np.zeros((3, 2), np.float32))
     assert total.tolist() == pytest.approx([1.0] * 3), "one tick within the bound"
-    total, _ = ModelEnv(Still(), replace(task, stop_when_parked=False), 3).rolled_out(lambda s: np.zeros((3, 2)))
+    total, _ = ModelEnv(Still(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
     assert total.tolist() == pytest.approx([9.0] * 3)
 
 

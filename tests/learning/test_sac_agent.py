@@ -75,7 +75,7 @@ def test_it_learns_what_is_evident(trained: SacAgent) -> None:
     steering, throttle = answers(trained).T
     assert np.all(steering < -0.8)
     assert np.all(throttle * np.sign(X_M) > 0.3)
-    total, _ = world(64, seed=3).rolled_out(trained.act)
+    total, _ = world(64, seed=3).roll_out(trained.act)
     assert float(total.mean()) > 15.0, "20 are to be had in ten ticks"
 
 
@@ -106,7 +106,7 @@ def test_a_policy_that_was_read_acts_alike_and_learns_on_from_there(trained: Sac
     assert not np.array_equal(answers(again), answers(trained))
     fresh = SacAgent(SETTINGS, seed=1)
     fresh.train(world(seed=5), 32)
-    learned, new = (float(world(64, seed=3).rolled_out(a.act)[0].mean()) for a in (again, fresh))
+    learned, new = (float(world(64, seed=3).roll_out(a.act)[0].mean()) for a in (again, fresh))
     assert learned > 15.0 > new + 3.0
 
 

@@ -1,13 +1,13 @@
 """The outer loop: fit the car, train a policy in the learned car, drive an episode, repeat.
 
-Algorithm 2 of Rothfuss et al., arXiv 2403.16644. A run may be stopped at any time: its next step follows from the
-files in its folder.
+Algorithm 2 of Rothfuss et al., arXiv 2403.16644. A run may be stopped at any time: the files in its folder determine
+its next step.
 
 | finished recordings | models/000k, k = recordings + 1 | next step |
 | --- | --- | --- |
-| fewer than wanted | absent | train |
-| fewer than wanted | present | drive |
-| as many as wanted | | none |
+| fewer than the target | absent | train |
+| fewer than the target | present | drive |
+| target reached | | none |
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ from learning.policy.sac_agent import SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
 
 CAMPAIGN_FILE = "campaign.json"
-CONTINUING_ENDS = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOFENCE, EndReason.OVERSPEED})
-"""Ends after which the next episode follows; an untrained policy may leave the arena."""
+CONTINUE_REASONS = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOFENCE, EndReason.OVERSPEED})
+"""End reasons after which the run continues; an untrained policy may leave the arena."""
 PAPER_HISTORY, MAX_HISTORY = 3, 8
 STOPPED = frozenset({EndReason.STOP_REQUESTED, EndReason.LOOP_HUNG})
-"""Ends after which the same episode is driven again."""
-SPREAD = 0.3
-"""Relative half-width of the prior range of a number for which the car file gives none."""
+"""End reasons after which the same episode is driven again."""
+PRIOR_HALF_WIDTH = 0.3
+"""Relative half-width of the prior range of a parameter without a range in the car file."""
 DRY_RUN = "--dry-run"
 PERIOD_TOLERANCE = 0.02
 """Relative difference between control periods that counts as equal."""
-UNCERTAIN = (
+UNCERTAIN_PARAMETERS = (
     *("vehicle.yaw_inertia", "tyre.front.B", "tyre.front.mu", "tyre.rear.B", "tyre.rear.mu"),
     *("motor.drive_gain", "motor.damping", "steering.max_angle"),
 )
-KINEMATIC_UNCERTAIN = ("motor.drive_gain", "motor.damping", "steering.max_angle")
+KINEMATIC_PARAMETERS = ("motor.drive_gain", "motor.damping", "steering.max_angle")
 
 
 def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"]) -> SimulatorConfig:
-    """Make the simulator that is the prior: the car's own (nominal), or one whose wheels do not slip (kinematic).
+    """Make the simulator of the prior: the car file's (nominal), or a kinematic one (no wheel slip).
 
-    Ranges are those of the car file. Where it has none, the parameters in ``UNCERTAIN`` have a range of ``SPREAD``
+    Ranges are those of the car file. Without them, the ``UNCERTAIN_PARAMETERS`` have a range of ``PRIOR_HALF_WIDTH``
     about their values.
 
     Args:
@@ -75,12 +75,12 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
     """
     values = car.values()
     if kind == "kinematic":
-        spans = {n: car.priors.get(n, _about(values[n])) for n in KINEMATIC_UNCERTAIN}
-        return replace(car, kind="kinematic", effects={}, priors=spans, parameter_std={})
+        ranges = {n: car.priors.get(n, _range_about(values[n])) for n in KINEMATIC_PARAMETERS}
+        return replace(car, kind="kinematic", effects={}, priors=ranges, parameter_std={})
     if car.priors or car.parameter_std:
         return car
-    names = KINEMATIC_UNCERTAIN if car.kind == "kinematic" else UNCERTAIN
-    return replace(car, priors={n: _about(values[n]) for n in names})
+    names = KINEMATIC_PARAMETERS if car.kind == "kinematic" else UNCERTAIN_PARAMETERS
+    return replace(car, priors={n: _range_about(values[n]) for n in names})
 
 
 def needed_history(car: SimulatorConfig) -> int:
@@ -93,17 +93,17 @@ def needed_history(car: SimulatorConfig) -> int:
     return min(max(round(span_s / car.control_period_s), PAPER_HISTORY), MAX_HISTORY)
 
 
-def _about(value: float) -> tuple[float, float]:
-    return value * (1.0 - SPREAD), value * (1.0 + SPREAD)
+def _range_about(value: float) -> tuple[float, float]:
+    return value * (1.0 - PRIOR_HALF_WIDTH), value * (1.0 + PRIOR_HALF_WIDTH)
 
 
 def check_period(prior: SimulatorConfig, period_s: float, of: str) -> None:
-    """Raise ConfigError where a prior's control period is not that of a car or its recordings (``of``)."""
-    own = prior.control_period_s
-    if abs(own - period_s) > PERIOD_TOLERANCE * period_s:
+    """Raise ConfigError if a prior's control period differs from that of a car or its recordings (``of``)."""
+    prior_period_s = prior.control_period_s
+    if abs(prior_period_s - period_s) > PERIOD_TOLERANCE * period_s:
         raise ConfigError(
-            f"The prior has a control_period of {own:.4g} s, {of} one of {period_s:.4g} s, and one step of the one is "
-            "no step of the other; name a prior with the same control_period."
+            f"The control_period of the prior is {prior_period_s:.4g} s, that of {of} is {period_s:.4g} s; name a "
+            "prior with the same control_period."
         )
 
 
@@ -124,8 +124,8 @@ class CampaignHooks:
 class Campaign:
     """A run of ``carlab learn`` on an open car.
 
-    ``questioned`` is the simulator of the quick check after each episode; that of the car's file unless given.
-    ``car`` holds the command-line options that name the car.
+    ``checked_simulator`` is the simulator of the quick check after each episode; by default that of the car file.
+    ``car`` holds the command-line options that select the car.
     """
 
     choice: CarChoice
@@ -136,21 +136,21 @@ class Campaign:
     max_ticks: int | None = None
     place: bool = True
     record_rerun: bool = True
-    questioned: SimulatorConfig | None = None
+    checked_simulator: SimulatorConfig | None = None
     car: str = ""
 
     def write_plan(self) -> None:
         """Write the settings that resuming the run needs."""
-        wanted: dict[str, Any] = {"episodes": self.episodes, "ticks": self.max_ticks}
-        wanted |= {"place": self.place, "rerun": self.record_rerun, "car": self.car}
-        if self.questioned is not None:
-            wanted["questioned"] = self.questioned.to_tables()
-        self.run.write_json(CAMPAIGN_FILE, {**wanted, "plan": plan_as_json(self.plan)})
+        settings: dict[str, Any] = {"episodes": self.episodes, "ticks": self.max_ticks}
+        settings |= {"place": self.place, "rerun": self.record_rerun, "car": self.car}
+        if self.checked_simulator is not None:
+            settings["questioned"] = self.checked_simulator.to_tables()
+        self.run.write_json(CAMPAIGN_FILE, {**settings, "plan": plan_as_json(self.plan)})
 
-    def go_on(self) -> Iterator[EpisodeResult]:
-        """Train and drive until there are enough episodes; yields each result.
+    def run_episodes(self) -> Iterator[EpisodeResult]:
+        """Train and drive until the run has all its episodes; yields each result.
 
-        Ends early on request, or after an episode whose end needs a person.
+        Ends early on request, or after an episode whose end reason requires a person.
 
         Raises:
             DataError: training failed, or a recording could not be written.
@@ -179,17 +179,17 @@ class Campaign:
                 return
             if result.reason is EndReason.RECORDER_ERROR:
                 raise DataError(result.data.metadata["end_detail"])
-            goes_on = self._may_go_on(result.reason)
-            if goes_on and result.reason.is_safety_stop:
+            continues = self._may_continue(result.reason)
+            if continues and result.reason.is_safety_stop:
                 self.choice.car.reset_fault()
             self.hooks.on_figures(figures_of(result, self._training(done + 1)))
             self._check()
             yield result
-            if not goes_on:
+            if not continues:
                 return
 
     def set_aside_stopped_episode(self) -> None:
-        """Move the last recording to ``stopped`` where a person ended it or the loop hung; it is driven again."""
+        """Move the last recording to ``stopped`` if a person ended it or the loop hung; the episode is repeated."""
         recordings = self.run.recordings()
         if not recordings or model_folder(self.run.models, len(recordings) + 1).is_dir():
             return
@@ -198,26 +198,26 @@ class Campaign:
             self.run.move_to_stopped(recordings[-1])
 
     def _check(self) -> None:
-        """Run the quick check where the newest recording has none."""
+        """Run the quick check of the newest recording, unless its result exists."""
         number = len(self.run.recordings())
         path = check_path(self.run, number)
         if not number or not path.parent.is_dir() or path.is_file() or self.hooks.stop():
             return
         self.hooks.on_checking()
-        check = run_check_subprocess(self.run, self.questioned or self.choice.simulator, self.hooks.stop)
+        check = run_check_subprocess(self.run, self.checked_simulator or self.choice.simulator, self.hooks.stop)
         if check is not None:
             self.hooks.on_check(check)
 
-    def _may_go_on(self, reason: EndReason) -> bool:
-        """Whether the next episode may follow; after a safety stop of a real car only where a person places the car."""
-        asked = self.place or self.choice.car.reality is not Reality.REAL
-        return reason in CONTINUING_ENDS and (asked or not reason.is_safety_stop)
+    def _may_continue(self, reason: EndReason) -> bool:
+        """Whether the run may continue; after a safety stop of a real car only if a person places the car."""
+        is_placed = self.place or self.choice.car.reality is not Reality.REAL
+        return reason in CONTINUE_REASONS and (is_placed or not reason.is_safety_stop)
 
     @property
     def _envelope(self) -> SafetyEnvelope:
-        """The car's limits, in the arena of the task where the car has none of its own."""
-        own = self.choice.envelope
-        return own if own.arena_m else replace(own, arena_m=self.plan.task.arena_m)
+        """The car's limits; the task's arena if the car has no arena."""
+        envelope = self.choice.envelope
+        return envelope if envelope.arena_m else replace(envelope, arena_m=self.plan.task.arena_m)
 
     def _drive(self, number: int) -> EpisodeResult | None:
         agent = SacAgent.load(model_folder(self.run.models, number), SacSettings(), self.plan.seed)
@@ -242,43 +242,43 @@ class Campaign:
     def _training(self, number: int) -> dict[str, Any]:
         path = model_folder(self.run.models, number) / FIGURES_FILE
         try:
-            found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise DataError(f"{path} cannot be read ({error}); remove its folder, and it is learned anew.") from error
-        return found
+            raise DataError(f"{path} cannot be read ({error}); remove its folder to train again.") from error
+        return figures
 
 
-WIRES = ("hardware", "mocap")
+CONNECTION_TABLES = ("hardware", "mocap")
 """Tables of a car file that describe its connections, not the car."""
 
 
-def check_same_car(run: RunDirectory, choice: CarChoice, typed: str) -> None:
-    """Raise ConfigError where a campaign was started with another car, other parameters of it, or another dry run.
+def check_same_car(run: RunDirectory, choice: CarChoice, car_options: str) -> None:
+    """Raise ConfigError if a campaign was started with another car, other parameters or another ``--dry-run``.
 
     Args:
         run: folder of the campaign.
-        choice: the car to go on with.
-        typed: the command-line options that name the car.
+        choice: the car that resumes the campaign.
+        car_options: the command-line options that select the car.
     """
     try:
         content = json.loads((run.path / CAMPAIGN_FILE).read_text(encoding="utf-8"))
-        was, now = run.config_toml, choice.config_toml
-        numbers = [{k: v for k, v in tomllib.loads(text).items() if k not in WIRES} for text in (was, now)]
-        before = str(content.get("car", typed))
+        texts = (run.config_toml, choice.config_toml)
+        tables = [{k: v for k, v in tomllib.loads(text).items() if k not in CONNECTION_TABLES} for text in texts]
+        saved_options = str(content.get("car", car_options))
     except (OSError, ValueError, AttributeError):
         return  # No campaign: ``resumed_campaign`` raises.
-    kinds = [text.partition("\n")[0] for text in (was, now)]
-    if kinds[0] == kinds[1] and numbers[0] == numbers[1] and (DRY_RUN in before) == (DRY_RUN in typed):
+    kinds = [text.partition("\n")[0] for text in texts]
+    if kinds[0] == kinds[1] and tables[0] == tables[1] and (DRY_RUN in saved_options) == (DRY_RUN in car_options):
         return
-    what = "other options" if before != typed else "other numbers in the car's file"
+    difference = "other options" if saved_options != car_options else "other parameters in the car file"
     raise ConfigError(
-        f"{run.path} was started with {what}; go on with '{before.strip() or '--car sim'}' and what is in "
-        f"{run.path / 'config.toml'}, or start a new run."
+        f"{run.path} was started with {difference}; resume it with '{saved_options.strip() or '--car sim'}' and the "
+        f"parameters in {run.path / 'config.toml'}, or start a new run."
     )
 
 
-def seed_of(folder: Path) -> int | None:
-    """The seed of a run; None where the folder is no campaign, for which ``resumed_campaign`` raises."""
+def saved_seed(folder: Path) -> int | None:
+    """The seed of a run; None if the folder is not a campaign (``resumed_campaign`` raises then)."""
     try:
         return int(json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]["seed"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -286,7 +286,7 @@ def seed_of(folder: Path) -> int | None:
 
 
 def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device: str | None = None) -> Campaign:
-    """Resume a run with its own settings, or on another device. Raises DataError where it is no campaign."""
+    """Resume a run with its saved settings, optionally on another device. Raises DataError if it is not a campaign."""
     path = run.path / CAMPAIGN_FILE
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -294,15 +294,15 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
         plan = plan if device is None else replace(plan, device=device)
         SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
         ticks, tables = content["ticks"], content.get("questioned")
-        questioned = None if tables is None else SimulatorConfig.from_tables(tables)
+        checked_simulator = None if tables is None else SimulatorConfig.from_tables(tables)
         return Campaign(
             choice, plan, int(content["episodes"]), run, hooks, None if ticks is None else int(ticks),
-            bool(content["place"]), bool(content["rerun"]), questioned, str(content.get("car", "")),
+            bool(content["place"]), bool(content["rerun"]), checked_simulator, str(content.get("car", "")),
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
-            f"{run.path} is no run of carlab learn that can be resumed ({CAMPAIGN_FILE}: {error}); start a new "
-            "run, or name the folder of one."
+            f"{run.path} cannot be resumed ({CAMPAIGN_FILE}: {error}); name the folder of a run of carlab learn, or "
+            "start a new run."
         ) from error
 
 
@@ -315,5 +315,5 @@ __all__ = [
     "needed_history",
     "prior_simulator",
     "resumed_campaign",
-    "seed_of",
+    "saved_seed",
 ]

@@ -17,9 +17,9 @@ from learning.world.car_dynamics import OneStep
 
 HORIZON_S = 1.0
 STRICT_POSITION_M, STRICT_YAW_RAD = 0.05, 0.2
-"""Largest errors of the final pose by which the authors of Sim-FSVGD call an episode successful."""
-_EARLIER_NAMES = {"foretold": "predicted_return", "reality": "verdict"}
-"""Keys of learn.json, version 1, that have another name since."""
+"""Maximum errors of the final pose in a successful episode, by the criterion of the authors of Sim-FSVGD."""
+_RENAMED_KEYS = {"foretold": "predicted_return", "reality": "verdict"}
+"""Keys of learn.json, version 1, that version 2 renames."""
 _TYPES: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "bool": bool, "str": str}
 
 
@@ -34,17 +34,17 @@ class EpisodeFigures:
         parked: whether the car ended within 0.2 m and 0.35 rad of the goal and slower than 0.3 m/s (``ParkingTask``).
         distance_m, yaw_error_rad, speed_mps: errors of the final pose, and the final speed.
         rows: number of recorded transitions that the model was fitted to.
-        last_episode_nll: negative log-likelihood of the episode before under the model that had not seen it [nat a
+        last_episode_nll: negative log-likelihood of the previous episode under the model fitted before it [nat per
             step]; NaN for the first.
         last_episode_calibration_error: calibration error of the same predictions.
         model_seconds, policy_seconds: durations of the fit and of the training [s].
         updates: gradient steps of SAC.
-        end: why the episode ended.
-        verdict: verdict of the quick check of all episodes so far (explains, left, undecided, failed); empty
-            where there is none.
-        excess: errors of the simulator beyond the noise floor, in noise floors; NaN where not known.
+        end: name of the episode's end reason.
+        verdict: verdict of the quick check of all episodes so far (explains, left, undecided, failed); empty without
+            a quick check.
+        excess: errors of the simulator beyond the noise floor, in noise floors; NaN if unknown.
         excess_std: its standard error.
-        diagnosis: what the quick check says, in words.
+        diagnosis: messages of the quick check.
     """
 
     episode: int
@@ -71,16 +71,16 @@ class EpisodeFigures:
         return {k: None if isinstance(v, float) and v != v else v for k, v in asdict(self).items()}
 
     def with_check(self, check: QuickCheck) -> EpisodeFigures:
-        """The same with what a quick check says."""
+        """Copy with the result of a quick check."""
         text = " ".join(check.sentences)
         return replace(self, verdict=check.verdict, excess=check.excess, excess_std=check.excess_std, diagnosis=text)
 
     @classmethod
     def from_dict(cls, row: Mapping[str, Any]) -> EpisodeFigures:
-        """Read what ``to_dict`` of any version gave. Raises TypeError or ValueError for anything else."""
-        named: dict[str, Any] = {_EARLIER_NAMES.get(k, k): float("nan") if v is None else v for k, v in row.items()}
+        """Read the output of ``to_dict`` of any version. Raises TypeError or ValueError for other content."""
+        values: dict[str, Any] = {_RENAMED_KEYS.get(k, k): float("nan") if v is None else v for k, v in row.items()}
         types = {f.name: _TYPES[str(f.type)] for f in fields(cls)}
-        return cls(**{k: types[k](v) if k in types else v for k, v in named.items()})
+        return cls(**{k: types[k](v) if k in types else v for k, v in values.items()})
 
     @property
     def is_strictly_parked(self) -> bool:
@@ -124,13 +124,13 @@ class WindowPredictions:
 
 
 def predict_windows(dynamics: OneStep, episode: EpisodeData, seed: int = 0) -> WindowPredictions:
-    """Predict consecutive windows of one second by draws of particles and noise; none of a shorter episode."""
+    """Predict consecutive windows of one second by draws of particles and noise; a shorter episode has no window."""
     history = dynamics.history
     length = max(round(HORIZON_S / episode.period_s), 1)
     starts = np.arange(history, episode.ticks - length + 1, length)
     if not len(starts):
-        none = np.zeros((0, length + 1, 6))
-        return WindowPredictions(np.zeros((0, length + 1), dtype=np.int64), none, none)
+        empty = np.zeros((0, length + 1, 6))
+        return WindowPredictions(np.zeros((0, length + 1), dtype=np.int64), empty, empty)
     past = episode.sent[starts[:, None] - np.arange(history, 0, -1)]
     commands = episode.sent[starts[:, None] + np.arange(length)]
     paths = sample_paths(dynamics, episode.states[starts], past, commands, seed=seed)

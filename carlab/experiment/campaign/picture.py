@@ -1,4 +1,4 @@
-"""A run of learning as a picture: the learning curve, and the last episode beside its prediction."""
+"""Picture of a run of learning: the learning curve, and the last episode with its prediction."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def draw(
     """Write a PNG.
 
     Args:
-        rows: one an episode.
-        number: number of the episode that is shown.
+        rows: one for each episode.
+        number: number of the shown episode.
         episode: data of that episode.
-        predictions: of that episode, by the model before it.
+        predictions: of that episode, by the model fitted before it.
         task: goal and arena.
-        path: to write to.
+        path: file to write.
     """
     import matplotlib
 
@@ -54,10 +54,10 @@ def draw(
     curve.set(xlabel="episode", ylabel="return")
     curve.legend(fontsize=8)
     likelihood.plot(numbers, [r.last_episode_nll for r in rows], marker="o", color="tab:purple")
-    likelihood.set(xlabel="episode", ylabel="negative log-likelihood of the episode before [nat a step]")
-    other = likelihood.twinx()
-    other.plot(numbers, [r.distance_m for r in rows], marker=".", linestyle=":", color="tab:gray")
-    other.set_ylabel("distance from the goal at the end [m]", color="tab:gray")
+    likelihood.set(xlabel="episode", ylabel="negative log-likelihood of the previous episode [nat per step]")
+    distance = likelihood.twinx()
+    distance.plot(numbers, [r.distance_m for r in rows], marker=".", linestyle=":", color="tab:gray")
+    distance.set_ylabel("final distance from the goal [m]", color="tab:gray")
     for axis in (curve, likelihood):
         axis.grid(alpha=0.3)
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))

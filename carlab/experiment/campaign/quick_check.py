@@ -1,7 +1,7 @@
 """The quick check after each episode: whether the simulator still explains the recordings, in another process.
 
-The result is a file beside the model of the episode (``models/0003/diagnosis.json``). An error of the check is part of
-the result and ends no run.
+The result is a file in the model folder of the episode (``models/0003/diagnosis.json``). An error of the check becomes
+part of the result; the run continues.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CHECK_FILE = "diagnosis.json"
 SIMULATOR_FILE = "simulator.toml"
 POLL_S = 0.1
 MIN_DIAGNOSIS_EPISODES = 4
-"""Number of recordings that a full diagnosis needs, some to fit and some held out."""
+"""Minimum number of recordings of a full diagnosis, which fits to some and validates on the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class QuickCheck:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> QuickCheck:
-        """Read the content of a file. Raises KeyError, TypeError or ValueError for anything else."""
+        """Read the content of a file. Raises KeyError, TypeError or ValueError for other content."""
         excess, excess_std = (
             float("nan") if content[k] is None else float(content[k]) for k in ("excess", "score_std")
         )
@@ -58,9 +58,9 @@ def check_path(run: RunDirectory, episode: int) -> Path:
 def run_check_subprocess(
     run: RunDirectory, simulator: SimulatorConfig, stop: Callable[[], bool] = lambda: False
 ) -> QuickCheck | None:
-    """Check all recordings so far against the simulator, in another process; None where it was stopped.
+    """Check all recordings so far against the simulator, in another process; None if it was stopped.
 
-    The check of the last episode is written into its model's folder, the simulator into ``simulator.toml`` of the run.
+    The result is written to the model folder of the last episode, the simulator to ``simulator.toml`` of the run.
     """
     import tomli_w
 
@@ -83,11 +83,11 @@ def run_check_subprocess(
     except (OSError, ValueError, KeyError, TypeError) as error:
         code = f"exit code {child.exitcode}" if child.exitcode else str(error)
         log.warning("The quick check of episode %d failed: %s", number, error)
-        return QuickCheck.from_dict(_kept(path, number, _failed(f"its process failed ({code})")))
+        return QuickCheck.from_dict(_saved(path, number, _failed(f"its process failed ({code})")))
 
 
 def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict[str, Any]:
-    """Make the content of the file: the quick check of recordings, with its messages.
+    """Run the quick check of recordings; returns the content of the file, with the messages.
 
     Raises:
         CarlabError: a recording cannot be read.
@@ -102,7 +102,7 @@ def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict
     decide = f"carlab diagnose decides, from {MIN_DIAGNOSIS_EPISODES} episodes on"
     command = next_step(run)
     if len(driven) >= MIN_DIAGNOSIS_EPISODES:
-        decide = f"what decides: {command}"
+        decide = f"this command decides: {command}"
     return {
         **result.to_dict(), "sentences": sentences(result, decide), "short": short(result), "next": command,
         "recordings": [path.name for path in driven],
@@ -119,7 +119,7 @@ def _child(path: Path, run: Path, recordings: list[Path], simulator_toml: str) -
 
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the process that drives; it ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles ^C and terminates this process.
     torch.set_num_threads(1)
     try:
         result = check(run, recordings, SimulatorConfig.from_tables(tomllib.loads(simulator_toml)))
@@ -128,15 +128,16 @@ def _child(path: Path, run: Path, recordings: list[Path], simulator_toml: str) -
     except Exception as error:
         log.exception("The quick check failed")
         result = _failed(f"{type(error).__name__}: {error}")
-    _kept(path, len(recordings), result)
+    _saved(path, len(recordings), result)
 
 
-def _failed(why: str) -> dict[str, Any]:
-    text = f"The quick check of this episode failed, learning goes on: {why.rstrip('.')}."
-    return {"verdict": "failed", "why": why, "excess": None, "score_std": None, "sentences": [text], "short": ""}
+def _failed(reason: str) -> dict[str, Any]:
+    text = f"The quick check of this episode failed ({reason.rstrip('.')}); learning continues."
+    return {"verdict": "failed", "why": reason, "excess": None, "score_std": None, "sentences": [text], "short": ""}
 
 
-def _kept(path: Path, episode: int, result: dict[str, Any]) -> dict[str, Any]:
+def _saved(path: Path, episode: int, result: dict[str, Any]) -> dict[str, Any]:
+    """Write the content of the file; returns it."""
     content = {"episode": episode, **result}
     unfinished = path.with_name(f"{path.name}.partial")
     try:

@@ -26,49 +26,49 @@ CURVE_FILE = "learn.json"
 
 
 def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
-    """Read the rows of learn.json, of version 1 or 2. Raises DataError where the file is broken."""
+    """Read the rows of learn.json, version 1 or 2. Raises DataError if the file is invalid."""
     path = run.path / CURVE_FILE
     if not path.is_file():
         return []
     try:
         return [EpisodeFigures.from_dict(row) for row in json.loads(path.read_text(encoding="utf-8"))["episodes"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} cannot be read ({error}); remove it, and it is written anew.") from error
+        raise DataError(f"{path} cannot be read ({error}); remove it, and the next run restores it.") from error
 
 
-def keep_row(run: RunDirectory, row: EpisodeFigures) -> list[EpisodeFigures]:
-    """Put an episode's row into learn.json in place of the one that it has, if any; all rows."""
+def save_row(run: RunDirectory, row: EpisodeFigures) -> list[EpisodeFigures]:
+    """Add or replace the row of an episode in learn.json; returns all rows."""
     rows = sorted([r for r in learning_curve(run) if r.episode != row.episode] + [row], key=lambda r: r.episode)
     run.write_json(CURVE_FILE, {"schema": "carlab.learn/2", "episodes": [r.to_dict() for r in rows]})
     return rows
 
 
-def restore_rows(run: RunDirectory, task: ParkingTask) -> None:
-    """Make the rows of episodes that have none: the program was ended between their last tick and their row."""
+def restore_missing_rows(run: RunDirectory, task: ParkingTask) -> None:
+    """Restore the missing rows of recorded episodes: the program ended between their last tick and ``save_row``."""
     known = {row.episode for row in learning_curve(run)}
     for number, path in enumerate(run.recordings(), start=1):
         if number in known or not has_ticks(path):
             continue
         try:
             training = json.loads((model_folder(run.models, number) / FIGURES_FILE).read_text(encoding="utf-8"))
-            keep_row(run, figures_of(result_of(number, read_episode(path), task, path), training))
+            save_row(run, figures_of(result_of(number, read_episode(path), task, path), training))
         except (OSError, ValueError, KeyError) as error:
-            log.warning("Episode %d stays without a row in %s: %s", number, CURVE_FILE, error)
+            log.warning("The row of episode %d in %s cannot be restored: %s", number, CURVE_FILE, error)
 
 
-def keep_check(run: RunDirectory, check: QuickCheck) -> None:
-    """Add a quick check to the row of its episode, where there is one."""
+def save_check(run: RunDirectory, check: QuickCheck) -> None:
+    """Add a quick check to the row of its episode; without a row, do nothing."""
     for row in learning_curve(run):
         if row.episode == check.episode:
-            keep_row(run, row.with_check(check))
+            save_row(run, row.with_check(check))
 
 
 def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> None:
     """Add an episode to learn.json, learn.png and learn.rrd of a run.
 
-    An earlier episode is left out of learn.rrd where its learned car was removed or is of another version.
+    learn.rrd omits an earlier episode if its learned car was removed or has another file version.
     """
-    rows = keep_row(run, row)
+    rows = save_row(run, row)
     recordings = run.recordings()
     driven, predictions = [], []
     shown = [r for r in rows if r.episode <= len(recordings) and has_ticks(recordings[r.episode - 1])]
@@ -88,11 +88,11 @@ def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> 
 
 
 def _learned(run: RunDirectory, episode: int) -> LearnedCar | None:
-    """The car as it was learned before an episode; None where it was removed, or is of another program."""
+    """The learned car before an episode; None if it was removed or has another file version."""
     try:
         return load_car(model_folder(run.models, episode) / DYNAMICS_FILE)
     except DataError:
         return None
 
 
-__all__ = ["CURVE_FILE", "keep_check", "keep_row", "learning_curve", "restore_rows", "write_report"]
+__all__ = ["CURVE_FILE", "learning_curve", "restore_missing_rows", "save_check", "save_row", "write_report"]

@@ -1,6 +1,6 @@
 """Training between two episodes: fit the car to all recordings, then train a policy in the learned car.
 
-The result appears in the run's folder (``models/0003``) complete, or not at all.
+The result (``models/0003`` in the run's folder) is written atomically.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ DYNAMICS_FILE = "dynamics.pt"
 FIGURES_FILE = "training.json"
 N_EVALUATION_CARS = 64
 PARKED_BONUS, PARKED_SCORE = 0.3, 10.0
-"""Reward for each tick at which the learned car is parked, in addition to the task's reward; and score of a policy that
-always parks, in addition to its return. The paper's reward is only 2 % lower 0.2 m from the goal."""
+"""Reward for each tick at which the learned car is parked, additional to the task's reward; and score of a policy that
+always parks, additional to its return. The paper's reward decreases by only 2 % at 0.2 m from the goal."""
 EXTRA_REACTION_S = 0.12
-"""Additional reaction time of the safety gate of the learned car: a margin to the real gate of 0.24 m at 2 m/s."""
+"""Additional reaction time of the learned car's safety gate: a margin of 0.24 m at 2 m/s to the gate of the car."""
 EPISODES_BEFORE_HISTORY_CHOICE = 3
-"""Number of episodes after which the number of past commands that matter is estimated."""
+"""Number of episodes after which the number of relevant past commands is estimated."""
 SMALLER_STEP_FACTOR = 0.25
 """Factor of the learning rate after a divergence."""
 Progress = Callable[[str, int, int], None]
@@ -60,13 +60,13 @@ class TrainingPlan:
     """Settings of model and policy training, the same before every episode of a run.
 
     Attributes:
-        prior_toml: car file of the simulator that is the prior, with ranges and effects.
+        prior_toml: car file of the prior simulator, with ranges and effects.
         history: number of past commands that model and policy observe.
-        method: ``sim-fsvgd`` has the simulator as prior; ``fsvgd`` has none; ``fsvgd-authors`` has the settings of the
+        method: ``sim-fsvgd`` has a simulator prior; ``fsvgd`` has none; ``fsvgd-authors`` has the settings of the
             authors of Sim-FSVGD.
-        model_steps: steps of the particles' optimiser; the default of the method where None.
+        model_steps: steps of the particles' optimiser; None: the default of the method.
         updates: gradient steps of SAC (``updates_before``).
-        ticks: ticks of an episode; those of the task where None.
+        ticks: ticks of an episode; None: those of the task.
         seed: seed of all random numbers.
         threads: number of threads of torch.
         device: device of the training; the policy drives on the CPU.
@@ -84,14 +84,14 @@ class TrainingPlan:
 
     @property
     def task(self) -> ParkingTask:
-        """The task, with the history of the model and the ticks of this run."""
+        """The task with the history of the model and the ticks of this run."""
         task = ParkingTask(history_length=self.history)
         return task if self.ticks is None else replace(task, max_ticks=self.ticks)
 
     def updates_before(self, episode: int) -> int:
         """Gradient steps of SAC before an episode: 1.5 times ``updates`` before the first, 3 / episode after the third.
 
-        The policy goes on from the earlier one, and the share of new rows shrinks.
+        Training continues from the previous policy, and the share of new rows decreases.
         """
         if episode == 1:
             return self.updates * 3 // 2
@@ -116,10 +116,10 @@ def train(
         progress: called with the name of the stage, the steps done and the number of steps.
 
     Returns:
-        Figures, which are also written beside the result.
+        Figures, which are also written to ``training.json`` of the result.
 
     Raises:
-        DataError: the recordings hold no row, or something diverged. Nothing is left behind.
+        DataError: the recordings hold no row, or model or policy diverged. No partial result remains.
     """
     import torch
 
@@ -161,7 +161,7 @@ def train(
 
 
 def _usable_episodes(recordings: list[Path], history: int) -> tuple[list[EpisodeData], EpisodeData | None]:
-    """Recorded episodes with at least one row to learn from, and the newest recording where it is one of them."""
+    """Recorded episodes with at least one complete transition, and the newest recording if it is one of them."""
     from carlab.recording.mcap.source import read_episode
 
     episodes = [read_episode(path) if has_ticks(path) else None for path in recordings]
@@ -171,14 +171,14 @@ def _usable_episodes(recordings: list[Path], history: int) -> tuple[list[Episode
 
 
 def _prior_model(plan: TrainingPlan, episodes: list[EpisodeData]) -> CarModel:
-    """The simulator that is the prior, with the velocity delay of the recordings."""
+    """The prior simulator with the velocity delay of the recordings."""
     simulator = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
     return CarModel(simulator, plan.history, known_ranges(simulator), velocity_delay_s=velocity_delay_s(episodes))
 
 
 def _history_figures(episodes: list[EpisodeData], progress: Progress) -> dict[str, Any]:
-    """The number of past commands that the recordings ask for, and its message; empty where they do not say."""
-    progress("how many past commands count", 0, 1)
+    """The number of past commands that the recordings support, and its message; empty if the data are too few."""
+    progress("choosing the number of past commands", 0, 1)
     choice = find_history(episodes)
     return {} if choice is None else {"history_asked": choice.history, "history_words": choice.message()}
 
@@ -186,7 +186,7 @@ def _history_figures(episodes: list[EpisodeData], progress: Progress) -> dict[st
 def _worlds(
     plan: TrainingPlan, dynamics: LearnedCar, episodes: list[EpisodeData], envelope: SafetyEnvelope, seed: int
 ) -> tuple[ModelEnv, ModelEnv]:
-    """The learned car as a world to train in and as one to evaluate in, which has the task's reward alone."""
+    """Environments of the learned car for training and for evaluation; the latter has the task's reward alone."""
     from learning.policy.sac_agent import SacSettings
     from learning.world import model_env
 
@@ -207,13 +207,13 @@ def _worlds(
 def _trained_policy(
     plan: TrainingPlan, world: ModelEnv, evaluation: ModelEnv, earlier: Path | None, updates: int, progress: Progress
 ) -> tuple[SacAgent, dict[str, Any]]:
-    """A policy trained in a world, from the earlier one where there is one, and its figures.
+    """Train a policy, starting from the previous one if it exists; returns the policy and its figures.
 
     Args:
         plan: settings of the run.
-        world: world to train in.
-        evaluation: world to select the best policy in.
-        earlier: folder of the earlier policy.
+        world: environment of the training.
+        evaluation: environment of the evaluation, which selects the best policy.
+        earlier: folder of the previous policy.
         updates: gradient steps.
         progress: as for ``train``.
     """
@@ -223,11 +223,11 @@ def _trained_policy(
     figures: dict[str, Any] = {}
 
     def evaluate(candidate: SacAgent) -> float:
-        total, ends = evaluation.rolled_out(candidate.act)
+        total, ends = evaluation.roll_out(candidate.act)
         return float(total.mean() + PARKED_SCORE * task.parked(ends).float().mean())
 
-    def trained(slower: float) -> SacAgent:
-        settings = replace(sac, learning_rate=slower * sac.learning_rate)
+    def trained(rate_factor: float) -> SacAgent:
+        settings = replace(sac, learning_rate=rate_factor * sac.learning_rate)
         agent = SacAgent(settings, plan.seed, plan.device)
         if earlier is not None:
             agent = SacAgent.load(earlier, settings, plan.seed, plan.device)
@@ -236,7 +236,7 @@ def _trained_policy(
         return agent
 
     agent = _with_smaller_steps(trained, "policy")
-    total, ends = evaluation.rolled_out(agent.act)
+    total, ends = evaluation.roll_out(agent.act)
     figures |= {"updates": updates, "return_in_model": float(total.mean())}
     return agent, figures | {"parked_in_model": float(task.parked(ends).float().mean())}
 
@@ -255,27 +255,27 @@ def _fitted(
     from learning.world.car_dynamics import CarDynamics
     from learning.world.car_fit import CarFitSettings, fit_car
 
-    ours = plan.method != "fsvgd-authors"
-    steps = plan.model_steps or (CarFitSettings().steps if ours else STEPS)
+    is_authors = plan.method == "fsvgd-authors"
+    steps = plan.model_steps or (STEPS if is_authors else CarFitSettings().steps)
 
-    def at(done: int) -> None:
+    def report_step(done: int) -> None:
         progress("learning the car", done, steps)
 
-    at(0)
-    if not ours:
-        return fit_authors_fsvgd(episodes, plan.history, steps, seed, at, plan.device)
+    report_step(0)
+    if is_authors:
+        return fit_authors_fsvgd(episodes, plan.history, steps, seed, report_step, plan.device)
     settings = CarFitSettings(plan.method, steps, seed=seed)
     earlier = before if isinstance(before, CarDynamics) else None
 
-    def fitted(slower: float) -> LearnedCar:
-        own = replace(settings, learning_rate=slower * settings.learning_rate)
-        return fit_car(rows, model, own, before=earlier, progress=at, device=plan.device)
+    def fitted(rate_factor: float) -> LearnedCar:
+        scaled = replace(settings, learning_rate=rate_factor * settings.learning_rate)
+        return fit_car(rows, model, scaled, before=earlier, progress=report_step, device=plan.device)
 
     return _with_smaller_steps(fitted, "model")
 
 
 def _with_smaller_steps(learn: Callable[[float], Learned], what: str) -> Learned:
-    """Learn with the usual learning rate, or with a smaller one after a divergence.
+    """Call ``learn`` with a factor of 1 on the learning rate, after a divergence with ``SMALLER_STEP_FACTOR``.
 
     Raises:
         DivergedError: both diverged.
@@ -283,18 +283,19 @@ def _with_smaller_steps(learn: Callable[[float], Learned], what: str) -> Learned
     try:
         return learn(1.0)
     except DivergedError as error:
-        log.warning("The %s diverged (%s); it is learned again with steps of %g.", what, error, SMALLER_STEP_FACTOR)
+        log.warning("The %s diverged (%s); learning rate reduced by a factor %g.", what, error, SMALLER_STEP_FACTOR)
     try:
         return learn(SMALLER_STEP_FACTOR)
     except DivergedError as error:
         raise DivergedError(
-            f"The {what} diverged, with smaller steps as well; what was recorded is kept: if the last recording shows "
-            "what no car does (carlab replay), take it out of the run's folder, or start a run with another --prior."
+            f"The {what} diverged twice, the second time with a smaller learning rate; the recordings are kept. View "
+            "the last recording (carlab replay) and remove it if it is implausible, or start a run with another "
+            "--prior."
         ) from error
 
 
 def velocity_delay_s(episodes: Sequence[EpisodeData]) -> float:
-    """Median delay of measured velocities in recordings [s]; that of the state estimator where they have none."""
+    """Median delay of measured velocities in recordings [s]; without any, that of the state estimator."""
     import numpy as np
 
     delays = [np.asarray(e.extra[VELOCITY_DELAY], dtype=np.float64) for e in episodes if VELOCITY_DELAY in e.extra]
@@ -303,17 +304,17 @@ def velocity_delay_s(episodes: Sequence[EpisodeData]) -> float:
 
 
 def has_ticks(recording: Path) -> bool:
-    """Whether a recording has a completed tick; the safety gate or a hang may end an episode before it."""
+    """Whether a recording has a completed tick; the safety gate or a hang may end an episode before the first one."""
     from carlab.recording.mcap.source import read_documents
 
     documents = read_documents(recording)
     steps = [document.step for document in documents if isinstance(document, Tick)]
-    seen = [d.steps for d in documents if isinstance(d, EpisodeEnded) and d.last is not None]
-    return len(steps) > 1 or bool(steps and seen and seen[0] > steps[-1])
+    completed = [d.steps for d in documents if isinstance(d, EpisodeEnded) and d.last is not None]
+    return len(steps) > 1 or bool(steps and completed and completed[0] > steps[-1])
 
 
 def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
-    """Features (R, 7 + 2 H) of recorded states with the commands before them."""
+    """Features (R, 7 + 2 H) of recorded states with the H commands before each."""
     import numpy as np
 
     found = []
@@ -339,20 +340,20 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
 
 
 def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
-    """The plan for a file."""
+    """The plan as values for a JSON file."""
     return asdict(plan)
 
 
 def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
-    """Read what ``plan_as_json`` gave. Raises TypeError or ValueError for other names, types or ranges."""
+    """Read the output of ``plan_as_json``. Raises TypeError or ValueError for wrong names, types or ranges."""
     plan = TrainingPlan(**content)
     if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
         raise ValueError("prior, method or device of the plan")
-    for name, least in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():
+    for name, minimum in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():
         value = getattr(plan, name)
         if value is None and name in ("model_steps", "ticks"):
             continue
-        if type(value) is not int or value < least:
+        if type(value) is not int or value < minimum:
             raise ValueError(f"{name} of the plan is {value!r}")
     return plan
 

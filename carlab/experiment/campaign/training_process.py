@@ -1,4 +1,4 @@
-"""Training in another process, so that the process that drives keeps its timing."""
+"""Training in another process, so that it does not delay the control loop."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def train_in_subprocess(
         recordings: as for ``train``.
         envelope: as for ``train``.
         progress: as for ``train``.
-        stop: polled; once true, the process is ended and nothing is left behind.
+        stop: polled; once true, the process is terminated and its partial result removed.
 
     Returns:
-        The figures; None where it was stopped.
+        The figures; None if ``stop`` ended it.
 
     Raises:
-        DataError: what ``train`` says, or that its process died.
+        DataError: ``train`` raised an error, or its process died.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -60,8 +60,8 @@ def train_in_subprocess(
                 except EOFError:
                     child.join()
                     raise DataError(
-                        f"The training process died (exit code {child.exitcode}; -9 is often too little memory); "
-                        "what was recorded is kept; go on with --resume."
+                        f"The training process died (exit code {child.exitcode}; -9 often means too little memory); "
+                        "the recordings are kept. Resume the run with --resume."
                     ) from None
                 if kind == "done":
                     figures: dict[str, Any] = content
@@ -83,7 +83,7 @@ def _child(
 ) -> None:
     import signal
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # ^C is for the process that drives; it ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles ^C and terminates this process.
     try:
         pipe.send(("done", train(plan, models, recordings, envelope, lambda *what: pipe.send(("at", what)))))
     except CarlabError as error:
@@ -92,7 +92,7 @@ def _child(
         pass
     except Exception as error:
         log.exception("Training failed")
-        pipe.send(("failed", f"Training failed: {type(error).__name__}: {error}; what was recorded is kept."))
+        pipe.send(("failed", f"Training failed: {type(error).__name__}: {error}; the recordings are kept."))
     finally:
         pipe.close()
 

@@ -1,8 +1,8 @@
-"""One episode: observe, decide, pass the gate, send, wait; and always neutral at the end.
+"""The control loop of one episode. The car is in neutral at the end, whatever the end reason.
 
 observe ──> encode ──> policy ──> SafeCar (the gate) ──> Car.command ──> wait for the next deadline ─┐
 ^                                                                                                 │
-└──────────────── emit Tick, Transition (recorders listen; the loop knows none of them) <─────────┘
+└──────────────── emit Tick, Transition to ``EpisodeHooks.emit`` (recorders) <────────────────────┘
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class EpisodeHooks:
 
     Attributes:
         emit: receives each document.
-        stop_requested: the reason for which the episode is to end, asked before each tick.
-        recorder_failed: why the recording failed, asked before each tick.
+        stop_requested: reason to end the episode, or None; called before each tick.
+        recorder_failed: error of the recording, or None; called before each tick.
         heartbeat: called with the name of the next stage before it begins.
     """
 
@@ -54,7 +54,7 @@ class EpisodeHooks:
 
 @dataclass(slots=True)
 class _Rows:
-    """The arrays of an episode while they grow, and the newest observation."""
+    """The rows of a running episode, and the newest observation."""
 
     times_s: list[float] = field(default_factory=list)
     states: list[FloatArray] = field(default_factory=list)
@@ -88,7 +88,7 @@ class _Rows:
 
 
 class _LateTicks:
-    """Ends an episode when more than half of the last ticks woke later than half a period."""
+    """Detects a late loop: more than half of the last ticks started later than half a period."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
@@ -100,7 +100,7 @@ class _LateTicks:
 
 
 class _End(Exception):
-    """Leaves the loop with a reason."""
+    """Ends the loop with a reason."""
 
     def __init__(self, reason: EndReason, detail: str = "") -> None:
         self.reason, self.detail = reason, detail
@@ -108,8 +108,8 @@ class _End(Exception):
 
 
 def first_observation(car: Car, heartbeat: Callable[[str], None] = lambda where: None) -> Observation:
-    """Wait for the first pose with a speed. Raises PoseLostError after two seconds of the car's clock."""
-    give_up_s = car.clock.now_s() + FIRST_POSE_TIMEOUT_S
+    """Wait for the first pose with a valid velocity. Raises PoseLostError after two seconds of the car's clock."""
+    deadline_s = car.clock.now_s() + FIRST_POSE_TIMEOUT_S
     while True:
         heartbeat("waiting for the first pose")
         try:
@@ -117,12 +117,12 @@ def first_observation(car: Car, heartbeat: Callable[[str], None] = lambda where:
             if observation.tracked and observation.velocity_valid:
                 return observation
         except PoseLostError:
-            if car.clock.now_s() > give_up_s:
+            if car.clock.now_s() > deadline_s:
                 raise
         else:
-            if car.clock.now_s() > give_up_s:
+            if car.clock.now_s() > deadline_s:
                 raise PoseLostError(
-                    "Motion capture comes too rarely to know the car's speed; raise its frame rate."
+                    "The frame rate of motion capture is too low to estimate the car's velocity; raise it."
                     if observation.tracked
                     else "Motion capture runs but does not see the car; check its markers and the volume."
                 )
@@ -146,23 +146,24 @@ def run_episode(
     """Drive one episode on an open car and return it as arrays.
 
     Args:
-        car: an open car; it is armed here and left stopped and disarmed.
-        policy: decides each tick; None from ``act`` ends the episode.
-        task: gives reward, end, goal and length of the action history.
+        car: an open car. The episode arms it, and finally stops and disarms it.
+        policy: called at each tick; None from ``act`` ends the episode.
+        task: reward, termination, goal and length of the action history.
         envelope: limits of the safety gate.
         period_s: control period [s].
-        max_ticks: ticks to drive; the task's number where None.
-        hooks: where documents go and who may stop the episode.
+        max_ticks: ticks to drive; None: the task's number.
+        hooks: callbacks that receive documents and may stop the episode.
         episode: number of this episode, from 1.
         seed: written into the recording.
         config_toml: configuration as text, written into the recording.
         metadata: further texts for the recording.
 
     Returns:
-        The episode, also one that ended early; ``metadata`` has ``end_reason``, ``end_sentence`` and ``end_detail``.
+        The episode, complete or ended early; ``metadata`` has ``end_reason``, ``end_sentence`` and ``end_detail``.
 
     Raises:
-        NotReadyError, ActuatorFaultError, PoseLostError: nothing has moved. Any other error: the car was stopped.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved.
+        Exception: any other error, after the car was stopped.
     """
     hooks = hooks or EpisodeHooks()
     safe, rows, pacer = SafeCar(car, envelope, hooks.emit), _Rows(), Pacer(car.clock, period_s)
@@ -174,7 +175,8 @@ def run_episode(
     ))  # fmt: skip
     reason, detail = EndReason.CRASHED, ""
     try:
-        encode(np.zeros(6), ActionHistory(task.history_length).rows)  # Imports for seconds: before any heartbeat.
+        # The first call imports modules for seconds; it precedes the first heartbeat.
+        encode(np.zeros(6), ActionHistory(task.history_length).rows)
         policy.reset()
         first_observation(car, hooks.heartbeat)
         hooks.heartbeat("arming")
@@ -200,7 +202,7 @@ def _drive(
     hooks: EpisodeHooks,
     ticks: int,
 ) -> EndReason:
-    """Drive the ticks of an episode on an armed car into ``rows``. Any early end but the task's is raised."""
+    """Drive the ticks of an episode on an armed car into ``rows``. Raises _End for an end other than the task's."""
     car, period_s = safe.car, pacer.period_s
     history, late = ActionHistory(task.history_length), _LateTicks(period_s)
     next_health_s = -math.inf
@@ -212,7 +214,7 @@ def _drive(
     for step in range(ticks):
         _raise_requested_end(hooks)
         view = PolicyInput(features, observation, step, now_s - start_s)
-        requested, policy_s = _ask(policy, view, car, hooks, safe.envelope.lost_pose_s)
+        requested, policy_s = _act(policy, view, car, hooks, safe.envelope.lost_pose_s)
         hooks.heartbeat("commanding")
         sent = safe.command(requested, observation, period_s)
         history.push(sent)
@@ -241,24 +243,24 @@ def _drive(
 def _observe(car: Car, rows: _Rows, hooks: EpisodeHooks) -> tuple[float, Observation]:
     """The time [s] and the newest observation."""
     hooks.heartbeat("observing")
-    seen = car.observe()
+    observation = car.observe()
     now_s = car.clock.now_s()
-    rows.newest = seen
-    return now_s, seen
+    rows.newest = observation
+    return now_s, observation
 
 
 def _raise_requested_end(hooks: EpisodeHooks) -> None:
-    """Raise _End where someone asked for the end, or where the recording failed."""
+    """Raise _End if a stop was requested or the recording failed."""
     requested_end = hooks.stop_requested()
     if requested_end is not None:
         raise _End(requested_end)
-    failed = hooks.recorder_failed()
-    if failed is not None:
-        raise _End(EndReason.RECORDER_ERROR, failed)
+    recorder_error = hooks.recorder_failed()
+    if recorder_error is not None:
+        raise _End(EndReason.RECORDER_ERROR, recorder_error)
 
 
-def _ask(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeout_s: float) -> tuple[Action, float]:
-    """The policy's action and the time it took [s]. Raises _End where it has none, fails or takes longer."""
+def _act(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeout_s: float) -> tuple[Action, float]:
+    """The policy's action and its computation time [s]. Raises _End for no action, an error or a time-out."""
     hooks.heartbeat(f"inside the policy '{policy.name}'")
     began_s = car.clock.now_s()
     try:
@@ -271,7 +273,7 @@ def _ask(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeo
     if action is None:
         raise _End(EndReason.POLICY_FINISHED)
     if not isinstance(action, Action):
-        raise _End(EndReason.POLICY_ERROR, f"It returned a {type(action).__name__} where an Action is wanted.")
+        raise _End(EndReason.POLICY_ERROR, f"It returned a {type(action).__name__} instead of an Action.")
     policy_s = car.clock.now_s() - began_s
     if policy_s > timeout_s:
         raise _End(EndReason.LATE_LOOP, f"The policy '{policy.name}' took {policy_s:.1f} s for one tick.")
@@ -279,10 +281,10 @@ def _ask(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeo
 
 
 def _end_of(error: BaseException, state: SafetyState, *, driven: bool) -> tuple[EndReason, str, bool]:
-    """Reason and detail of an episode that an error ended, and whether the episode is returned despite it.
+    """End reason and detail of an error, and whether ``run_episode`` returns the episode instead of raising.
 
     Args:
-        error: what left the loop.
+        error: raised by the loop.
         state: of the safety gate.
         driven: whether a tick was completed.
     """
@@ -301,8 +303,8 @@ def _end_of(error: BaseException, state: SafetyState, *, driven: bool) -> tuple[
 
 
 def _stop(safe: SafeCar, pacer: Pacer, rows: _Rows, hooks: EpisodeHooks, reason: EndReason, detail: str) -> None:
-    """Stop the car, then emit the end of the episode; each whatever becomes of the other."""
-    # A car that was never armed has done nothing that a fault would have to remember.
+    """Stop the car, then emit the end of the episode; an error of one step does not prevent the other."""
+    # A car that was never armed has not moved: its stop must not latch a fault.
     planned = safe.state is SafetyState.DISARMED or not reason.is_safety_stop
 
     def emit_end() -> None:
@@ -318,7 +320,7 @@ def _stop(safe: SafeCar, pacer: Pacer, rows: _Rows, hooks: EpisodeHooks, reason:
             )
         )
 
-    with contextlib.ExitStack() as stack:  # Runs from the last entry to the first.
+    with contextlib.ExitStack() as stack:  # Callbacks run from the last to the first.
         stack.callback(emit_end)
         stack.callback(safe.stop, planned=planned)
         stack.callback(hooks.heartbeat, "stopping the car")

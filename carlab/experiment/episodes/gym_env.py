@@ -1,4 +1,4 @@
-"""A simulated car and a task as a Gymnasium environment, with the same encoder and reward as every other world.
+"""A simulated car and a task as a Gymnasium environment, with the observation and reward of real episodes.
 
 ``carlab.experiment.episodes.gym_registration`` registers ``carlab/Parking-v0`` and ``carlab/Path-v0``. The observation
 holds the last H actions, oldest first, as in Rothfuss et al., arXiv 2403.16644.
@@ -23,7 +23,7 @@ from carlab.core.outcome import EndReason
 from carlab.core.quantities import Action, Observation, Reality
 from carlab.core.task import TASKS, Task
 
-# Finite bounds that no car of this size reaches; what is measured is clipped to them.
+# Bounds of the observation space, beyond the range of a car of this size; observations are clipped to them.
 STATE_BOUNDS = np.array([20.0, 20.0, 1.0, 1.0, 20.0, 20.0, 60.0])
 
 
@@ -31,8 +31,8 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """A car and a task.
 
     Action: Box(2,) float32, steering and throttle in [-1, 1]. Observation: Box(7 + 2 H,) float32, the features of
-    ``carlab.core.observation``. ``terminated`` only where the task itself ends; ticks used up or the arena left is
-    ``truncated`` with the reason's name in ``info["end_reason"]``. ``info`` also has the task's summary figures.
+    ``carlab.core.observation``. ``terminated`` is the task's termination; ``truncated`` follows the last tick or the
+    exit from the arena. ``info["end_reason"]`` names the reason; ``info`` also has the task's summary figures.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
@@ -53,14 +53,14 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Put the car at a start drawn by the task. A seed also seeds the car's sensors."""
+        """Put the car at a start pose drawn by the task. A seed also seeds the car's sensors."""
         super().reset(seed=seed)
         if self._car is None or seed is not None:
             self.close()
             car = self._car_of_seed(int(self.np_random.integers(2**31)))
             if car.reality is not Reality.SIMULATED:
                 raise ConfigError(
-                    f"'{car.name}' is no simulated car; drive it with run_episode, which has a safety gate."
+                    f"'{car.name}' is not a simulated car; drive it with run_episode, which has a safety gate."
                 )
             self._car = car
             self._car.open()
@@ -71,18 +71,18 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._pacer = Pacer(self._car.clock, self._period_s)
         self._pacer.start()
         self._steps = 0
-        observation = self._see()
+        observation = self._observe()
         return self._output(), self._info(observation)
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Send a clipped action, let one period pass."""
+        """Send the clipped action and wait one period."""
         if self._car is None or self._pacer is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
         before = self._features
         sent = self._car.command(Action.from_array(np.clip(action, -1.0, 1.0)))
         self._history.push(sent)
         self._pacer.wait()
-        observation = self._see()
+        observation = self._observe()
         self._steps += 1
         reward = float(self._task.reward(before, sent.to_array(), self._features))
         terminated = bool(self._task.terminated(self._features))
@@ -102,7 +102,7 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._car.close()
             self._car = None
 
-    def _see(self) -> Observation:
+    def _observe(self) -> Observation:
         assert self._car is not None
         observation = self._car.observe()
         self._features = encode(observation.state.to_array(), self._history.rows)
@@ -118,12 +118,12 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def make_env(task: str = "parking", vehicle: str | Path | None = None) -> CarEnv:
-    """A simulated car on a task by name; ``vehicle`` is a car file, the default car without it."""
+    """Create the environment of a task by name; ``vehicle`` is a car file, by default the default car's."""
     from carlab.cars import choose_car
 
     def car_of_seed(seed: int) -> Car:
         return choose_car("sim", vehicle=None if vehicle is None else Path(vehicle), seed=seed).car
 
     period_s = choose_car("sim", vehicle=None if vehicle is None else Path(vehicle), seed=0).control_period_s
-    made: Task = TASKS[task]()
-    return CarEnv(car_of_seed, made, period_s)
+    chosen_task: Task = TASKS[task]()
+    return CarEnv(car_of_seed, chosen_task, period_s)

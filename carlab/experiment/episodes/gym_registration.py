@@ -1,10 +1,10 @@
-"""Importing this module makes the environments known to Gymnasium: ``carlab/Parking-v0`` and ``carlab/Path-v0``.
+"""Importing this module registers the Gymnasium environments ``carlab/Parking-v0`` and ``carlab/Path-v0``.
 
     import gymnasium
     import carlab.experiment.episodes.gym_registration
     env = gymnasium.make("carlab/Parking-v0")
 
-or, in one, ``gymnasium.make("carlab.experiment.episodes.gym_registration:carlab/Parking-v0")``.
+or in one step: ``gymnasium.make("carlab.experiment.episodes.gym_registration:carlab/Parking-v0")``.
 """
 
 from __future__ import annotations

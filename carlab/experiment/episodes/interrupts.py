@@ -1,7 +1,7 @@
-"""^C, SIGTERM and a loop that hangs.
+"""^C, SIGTERM and a watchdog for a hanging loop.
 
-Signals set an event and nothing else: the first asks the loop to end after its tick, the second does not wait for it.
-A watch thread acts when the loop has hung, or has not obeyed: it stops the car, finishes the recording and leaves.
+Signal handlers only set flags: the first signal requests the end of the loop after its tick, the second the immediate
+end. A watchdog thread acts if the loop hangs or does not end: it stops the car and finishes the recording.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ POLL_S = 0.02
 
 
 class Flag:
-    """Like ``threading.Event``, for signal handlers: without a lock.
+    """``threading.Event`` without a lock, for signal handlers.
 
-    The handler of a second signal, coming while that of the first one holds the lock, would wait for ever.
+    With a lock, a second signal during the handler of the first one would deadlock.
     """
 
     def __init__(self) -> None:
         self._is_set = False
 
     def set(self) -> None:
-        """Set it, for good."""
+        """Set the flag permanently."""
         self._is_set = True
 
     def is_set(self) -> bool:
-        """Whether it is set."""
+        """Whether the flag is set."""
         return self._is_set
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until it is set, or for ``timeout_s``; whether it is set."""
+        """Wait until the flag is set, at most ``timeout_s``; returns whether it is set."""
         clock = MonotonicClock()
         end_s = clock.now_s() + timeout_s
         while not self._is_set and (now_s := clock.now_s()) < end_s:
@@ -48,13 +48,13 @@ class Flag:
 
 
 class Interrupts:
-    """Turns signals into a request to stop while the context is entered (main thread only)."""
+    """Context in which signals become stop requests (main thread only)."""
 
     def __init__(self) -> None:
         self.count = 0
         self.urgent = Flag()
         self.requested = Flag()
-        self._breaks = False
+        self._is_prompting = False
         self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Self:
@@ -67,43 +67,43 @@ class Interrupts:
             signal.signal(number, handler)
             outer = getattr(handler, "__self__", None)
             if self.requested.is_set() and isinstance(outer, Interrupts):
-                outer.requested.set()  # Who asked in here did not ask in there, and means the whole program.
+                outer.requested.set()  # The signal did not reach the outer context; its request holds for both.
         self._previous.clear()
 
     def reason(self) -> EndReason | None:
         """The reason to end the episode, for ``EpisodeHooks.stop_requested``."""
         return EndReason.STOP_REQUESTED if self.requested.is_set() else None
 
-    def ask(self, question: Callable[[], None]) -> None:
-        """Call what waits for a person while nothing is driven; a signal leaves it at once, and nothing else.
+    def prompt(self, question: Callable[[], None]) -> None:
+        """Call a function that waits for a person between episodes; a signal interrupts it.
 
-        Otherwise a signal during ``input()`` would be heard only after Enter was pressed.
+        Without this, a signal during ``input()`` would take effect only after Enter.
         """
         try:
-            self._breaks = True
+            self._is_prompting = True
             if not self.requested.is_set():
                 question()
         except KeyboardInterrupt:
             if not self.requested.is_set():
                 raise
         finally:
-            self._breaks = False
+            self._is_prompting = False
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
         self.requested.set()
         if self.count > 1:
             self.urgent.set()
-        if self._breaks:
-            self._breaks = False
+        if self._is_prompting:
+            self._is_prompting = False
             raise KeyboardInterrupt
 
 
 class LoopWatch:
-    """Calls ``on_hang(where, stack)`` from a thread of its own when no heartbeat came for ``timeout_s``.
+    """Watchdog thread: calls ``on_hang(where, stack)`` once after ``timeout_s`` without a heartbeat.
 
-    Also when ``urgent`` is set and the loop did not end within ``grace_s``. It acts once, and does nothing before:
-    a log handler or a terminal may be what the loop hangs in.
+    It also calls it if ``urgent`` is set and the loop does not end within ``grace_s``. It neither logs nor prints
+    before the call, because the loop may hang in a log handler or a terminal.
     """
 
     def __init__(
@@ -140,13 +140,13 @@ class LoopWatch:
         self._thread = None
 
     def beat(self, where: str) -> None:
-        """The loop is alive and about to do ``where``."""
+        """Report a heartbeat; ``where`` names the next stage of the loop."""
         self._where = where
         self._beat_s = self._clock.now_s()
         self._active = True
 
-    def rest(self) -> None:
-        """Nothing is being driven: silence is fine until the next beat."""
+    def pause(self) -> None:
+        """Suspend the watchdog until the next heartbeat."""
         self._active = False
 
     def _run(self) -> None:

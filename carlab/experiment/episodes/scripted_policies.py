@@ -1,4 +1,4 @@
-"""Policies that need no learning: manoeuvres, recorded actions, standing still, and a feedback parking policy."""
+"""Policies without learning: manoeuvres, replay of recorded actions, neutral, and a feedback parking policy."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from sim_backends.car_parameters import SimulatorConfig
 
 
 class NeutralPolicy:
-    """Does nothing."""
+    """Neutral at every tick."""
 
     name = "neutral"
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
         """Neutral."""
@@ -28,22 +28,22 @@ class NeutralPolicy:
 
 
 class ManoeuvrePolicy:
-    """Plays a manoeuvre by the clock."""
+    """A manoeuvre as a function of time."""
 
     def __init__(self, manoeuvre: Manoeuvre) -> None:
         self.name = manoeuvre.name
         self._manoeuvre = manoeuvre
 
     def reset(self) -> None:
-        """A manoeuvre depends on time alone."""
+        """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
-        """The manoeuvre's action at this time."""
+        """Action of the manoeuvre at this time."""
         return self._manoeuvre.command(view.elapsed_s + 1e-9)
 
 
 class ReplayPolicy:
-    """Sends recorded actions (T, 2) again, each at its own time [s] (T,) since the first, held until the next."""
+    """Replays recorded actions (T, 2) at their times [s] (T,) since the first, each held until the next."""
 
     name = "replay"
 
@@ -53,10 +53,10 @@ class ReplayPolicy:
         self._end_s = float(self._times_s[-1] + (np.median(np.diff(self._times_s)) if len(times_s) > 1 else 0.0))
 
     def reset(self) -> None:
-        """Replay depends on time alone."""
+        """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
-        """The action held at this time; a tick that wakes a hair early counts as on time."""
+        """The action held at this time, with a tolerance of 1 ms for an early tick."""
         elapsed_s = view.elapsed_s + 1e-3
         if elapsed_s >= self._end_s:
             return None
@@ -65,12 +65,12 @@ class ReplayPolicy:
 
 @dataclass(slots=True)
 class ReverseParkingPolicy:
-    """Backs into a pose by feedback; a baseline to compare a learned policy with.
+    """Reverse parking by feedback: a baseline for learned policies.
 
-    The reversed car drives along its tail. Its course is drawn onto the line through the goal by a vector field
-    (Nelson et al., "Vector field path following for miniature air vehicles", IEEE Transactions on Robotics 2007): far
-    from the line across it, on the line along it. Speed follows what braking at ``braking_mps2`` allows, held by a
-    proportional throttle with feed-forward. State is predicted over the reaction time before anything is decided.
+    The car drives in reverse. A vector field determines its course (Nelson et al., "Vector field path following for
+    miniature air vehicles", IEEE Transactions on Robotics 2007): perpendicular to the line through the goal far from
+    it, along the line on it. The speed limit follows from braking at ``braking_mps2``; a proportional throttle with
+    feed-forward controls the speed. The state is predicted over the reaction time first.
     """
 
     goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -91,7 +91,7 @@ class ReverseParkingPolicy:
 
     @classmethod
     def for_car(cls, simulator: SimulatorConfig) -> ReverseParkingPolicy:
-        """Gains for a car as its file describes it."""
+        """Create the policy with the parameters of a simulator."""
         p = simulator.parameters
         return cls(
             wheelbase_m=p.wheelbase_m,
@@ -103,31 +103,31 @@ class ReverseParkingPolicy:
         )
 
     def reset(self) -> None:
-        """Feedback has no memory."""
+        """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
         """Steering and throttle of this tick."""
         state = view.observation.state
         yaw = state.yaw_rad + state.yaw_rate_radps * self.reaction_s
-        middle = state.yaw_rad + 0.5 * state.yaw_rate_radps * self.reaction_s
-        x = state.x_m + self.reaction_s * (state.vx_mps * math.cos(middle) - state.vy_mps * math.sin(middle))
-        y = state.y_m + self.reaction_s * (state.vx_mps * math.sin(middle) + state.vy_mps * math.cos(middle))
-        # Along and left of the line that leads, tail first, into the goal.
+        mid_yaw = state.yaw_rad + 0.5 * state.yaw_rate_radps * self.reaction_s
+        x = state.x_m + self.reaction_s * (state.vx_mps * math.cos(mid_yaw) - state.vy_mps * math.sin(mid_yaw))
+        y = state.y_m + self.reaction_s * (state.vx_mps * math.sin(mid_yaw) + state.vy_mps * math.cos(mid_yaw))
+        # Distances along the line, in reverse direction of the goal's heading, and to its left.
         line = self.goal[2] + math.pi
         dx, dy = self.goal[0] - x, self.goal[1] - y
         ahead = dx * math.cos(line) + dy * math.sin(line)
         left = dx * math.sin(line) - dy * math.cos(line)
-        wanted = -self.approach_rad * (2.0 / math.pi) * math.atan(left / self.line_width_m)
-        # Tyres let the heading swing on: what counts is where it will point.
-        pointing = wrap(yaw + self.swing_s * state.yaw_rate_radps + math.pi - line)
-        turn = wrap(wanted - pointing)
+        desired_course = -self.approach_rad * (2.0 / math.pi) * math.atan(left / self.line_width_m)
+        # The yaw rate persists because of tyre lag; the course is predicted over ``swing_s``.
+        course = wrap(yaw + self.swing_s * state.yaw_rate_radps + math.pi - line)
+        course_error = wrap(desired_course - course)
         limit = math.tan(self.max_angle_rad) / self.wheelbase_m
-        curvature = min(max(self.turn_gain_per_m * turn, -limit), limit)
-        # Turning left along the tail is turning the front wheels right.
+        curvature = min(max(self.turn_gain_per_m * course_error, -limit), limit)
+        # In reverse, a left turn of the course needs front wheels to the right.
         steering = -math.atan(self.wheelbase_m * curvature) / self.max_angle_rad
-        rest = ahead + self.left_weight * abs(left)
-        # Braking at a constant rate asks for too much at the very end: there, in proportion to the rest.
-        braked = min(math.sqrt(2.0 * self.braking_mps2 * abs(rest)), 2.5 * abs(rest))
-        speed = -math.copysign(min(self.cruise_mps, braked), rest) if abs(rest) > 0.02 else 0.0
-        push = self.mass_kg * 6.0 * (speed - state.vx_mps) + self.damping_nspm * speed
-        return Action(min(max(steering, -1.0), 1.0), min(max(push / self.drive_gain_n, -1.0), 1.0))
+        distance = ahead + self.left_weight * abs(left)
+        # Near the goal, speed proportional to the distance replaces the square-root law of constant braking.
+        max_speed = min(math.sqrt(2.0 * self.braking_mps2 * abs(distance)), 2.5 * abs(distance))
+        speed = -math.copysign(min(self.cruise_mps, max_speed), distance) if abs(distance) > 0.02 else 0.0
+        force = self.mass_kg * 6.0 * (speed - state.vx_mps) + self.damping_nspm * speed
+        return Action(min(max(steering, -1.0), 1.0), min(max(force / self.drive_gain_n, -1.0), 1.0))

@@ -1,7 +1,7 @@
 """Several recorded episodes on one car.
 
-The car is opened once; each episode has a recorder of its own. Signals ask the loop to end. Where the loop does not
-end, a watch thread stops the car, writes the reason into the recording, finishes the files and calls ``on_abandon``.
+The car is opened once; each episode has its own recorder. Signals request the end of the loop. If the loop does not
+end, a watchdog thread stops the car, writes the reason into the recording, finishes the files and calls ``on_abandon``.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """An episode that was driven. ``summary`` are the task's figures of the final state."""
+    """A completed episode. ``summary`` holds the task's figures of the final state."""
 
     episode: int
     data: EpisodeData
@@ -54,7 +54,7 @@ class EpisodeResult:
 
 
 def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
-    """The result of a recorded episode."""
+    """Result of a recorded episode."""
     final = CarState.from_array(data.states[-1])
     return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], task.summary(final), path)
 
@@ -63,9 +63,9 @@ def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> Episode
 class SessionHooks:
     """Callbacks of a session.
 
-    ``place_by_hand`` is called where the car cannot put itself at its start; it returns when it stands there.
-    ``on_tick`` sees each tick, for a progress bar. ``stop_reason`` may end an episode (a dead-man, say).
-    ``on_abandon`` is called last when the loop hung: reason, detail; the process must end there.
+    ``place_by_hand`` is called if the car cannot move to its start pose by itself; it returns when the car is there.
+    ``on_tick`` receives each tick, for a progress bar. ``stop_reason`` may end an episode (dead-man control).
+    ``on_abandon`` is called last if the loop hung, with reason and detail; it must end the process.
     """
 
     place_by_hand: Callable[[CarState], None] = lambda start: None
@@ -96,7 +96,7 @@ class Session:
     record_rerun: bool = True
 
     def drive(self, episodes: int) -> list[EpisodeResult]:
-        """Drive; ends early when asked to stop or when an episode ended for safety. Raises what run_episode raises."""
+        """Drive episodes; ends early on a stop request or after a safety stop. Raises the errors of run_episode."""
         results: list[EpisodeResult] = []
         starts = np.random.SeedSequence(self.seed).spawn(episodes)
         with Interrupts() as interrupts:
@@ -104,7 +104,7 @@ class Session:
                 start = self.task.sample_start(np.random.default_rng(starts[index]))
                 if not (self.place and self.car.place(start)):
                     if self.place:
-                        interrupts.ask(functools.partial(self.hooks.place_by_hand, start))
+                        interrupts.prompt(functools.partial(self.hooks.place_by_hand, start))
                     if not interrupts.requested.is_set():
                         wait_until_still(self.car)
                 if interrupts.requested.is_set():
@@ -146,11 +146,11 @@ class Session:
                 config_toml=self.config_toml,
                 metadata=self.metadata,
             )
-            watch.rest()
+            watch.pause()
         return result_of(number, _with_recorder_error(data, recorder.failed), self.task, path)
 
     def _abandon(self, recorder: Recorder, emitter: _Emitter, interrupts: Interrupts, where: str, stack: str) -> None:
-        """Stop the car and finish the recording in place of a loop that hangs; called from the watch thread."""
+        """Stop the car and finish the recording of a hanging loop; called from the watchdog thread."""
         reason = EndReason.STOP_REQUESTED if interrupts.urgent.is_set() else EndReason.LOOP_HUNG
         detail = f"The loop hung while {where}."
         log_text = f"The control loop hangs while {where}:\n{stack}"
@@ -170,9 +170,9 @@ class Session:
 
 
 class _Emitter:
-    """Hands documents to a recorder until the episode has ended.
+    """Passes documents to a recorder until the episode has ended.
 
-    The loop and the watch thread may both end the episode. The first of them does; the loop is silent from then on.
+    Either the loop or the watchdog thread ends the episode; later documents of the loop are discarded.
     """
 
     def __init__(self, recorder: Recorder, on_tick: Callable[[Tick], None]) -> None:
@@ -197,7 +197,7 @@ class _Emitter:
 
 
 def _with_recorder_error(data: EpisodeData, failed: str | None) -> EpisodeData:
-    """An episode whose recording could not be finished has not been completed, whatever its driving ended with."""
+    """Set the end reason to RECORDER_ERROR if the recording failed, unless the episode ended with a safety stop."""
     if failed is None or EndReason[data.metadata["end_reason"]].is_safety_stop:
         return data
     reason = EndReason.RECORDER_ERROR
@@ -207,7 +207,7 @@ def _with_recorder_error(data: EpisodeData, failed: str | None) -> EpisodeData:
 
 @contextlib.contextmanager
 def _logged(recorder: Recorder) -> Iterator[None]:
-    """Write the program's log into the recording meanwhile."""
+    """Record the program's log within this context."""
     handler = recorder.log_handler()
     root = logging.getLogger()
     root.addHandler(handler)
@@ -218,12 +218,12 @@ def _logged(recorder: Recorder) -> Iterator[None]:
 
 
 def wait_until_still(car: Car, timeout_s: float = 3.0, speed_mps: float = 0.05) -> bool:
-    """Wait, in neutral, until the car is seen to stand; False where it is not within ``timeout_s`` of its clock."""
-    give_up_s = car.clock.now_s() + timeout_s
-    while car.clock.now_s() <= give_up_s:
+    """Wait until the measured speed is at most ``speed_mps``; False after ``timeout_s`` of the car's clock."""
+    deadline_s = car.clock.now_s() + timeout_s
+    while car.clock.now_s() <= deadline_s:
         with contextlib.suppress(PoseLostError):
-            seen = car.observe()
-            if seen.velocity_valid and seen.state.speed_mps <= speed_mps:
+            observation = car.observe()
+            if observation.velocity_valid and observation.state.speed_mps <= speed_mps:
                 return True
         car.clock.sleep_until(car.clock.now_s() + 0.02)
     return False

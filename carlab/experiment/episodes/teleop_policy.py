@@ -1,7 +1,7 @@
-"""Driving by hand, gamepad or keyboard, with a dead-man control.
+"""Teleoperation by gamepad or keyboard, with a dead-man control.
 
-Nothing moves unless the dead-man is held: release gives neutral within one tick. The device is polled each tick, so a
-held button sends no events and is still seen; an unplugged gamepad or a window that lost the focus counts as released.
+The car moves only while the dead-man control is held; its release gives neutral within one tick. The device is polled
+at each tick. An unplugged gamepad or a window without focus counts as a release.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from carlab.core.quantities import NEUTRAL, Action
 
 @dataclass(frozen=True, slots=True)
 class TeleopInput:
-    """What the driver's hands say at one moment. Steering and throttle in [-1, 1], steering positive to the left."""
+    """State of an input device. Steering and throttle in [-1, 1], steering positive to the left."""
 
     steering: float = 0.0
     throttle: float = 0.0
@@ -29,23 +29,23 @@ class TeleopInput:
 
 
 class InputSource(Protocol):
-    """A device in somebody's hands. Constructing does nothing."""
+    """An input device; ``open`` connects to it."""
 
     name: str
 
     def open(self) -> None:
-        """Find the device. Raises NotReadyError with what to do."""
+        """Open the device. Raises NotReadyError with a remedy."""
 
     def poll(self) -> TeleopInput:
-        """The state of the device now, without blocking."""
+        """Current state of the device, without blocking."""
 
     def close(self) -> None:
-        """Let go of the device. Idempotent."""
+        """Release the device. Idempotent."""
 
 
 @dataclass(frozen=True, slots=True)
 class GamepadMapping:
-    """Axes and buttons by number, as SDL counts them on common gamepads; triggers rest at -1 and end at +1."""
+    """SDL numbers of axes and buttons of common gamepads; triggers read -1 when released and +1 when pressed."""
 
     steering_axis: int = 0
     forward_axis: int = 5
@@ -57,7 +57,7 @@ class GamepadMapping:
 
 
 def gamepad_input(axes: list[float], buttons: list[bool], mapping: GamepadMapping) -> TeleopInput:
-    """Translate raw axes in [-1, 1] and buttons. An axis or button that the device lacks reads as rest."""
+    """Convert raw axes in [-1, 1] and buttons; a missing axis or button counts as released."""
 
     def axis(index: int, rest: float) -> float:
         return axes[index] if index < len(axes) else rest
@@ -81,7 +81,7 @@ def gamepad_input(axes: list[float], buttons: list[bool], mapping: GamepadMappin
 
 
 def _pygame(*, window: bool) -> Any:
-    """Import pygame on demand, quietly; without a window it runs on SDL's dummy video driver."""
+    """Import pygame on demand, without its banner; without a window it uses SDL's dummy video driver."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     if not window:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -92,18 +92,18 @@ def _pygame(*, window: bool) -> Any:
 
 @dataclass(slots=True)
 class GamepadSource:
-    """The first gamepad, or number ``index``."""
+    """Gamepad number ``index``, by default the first."""
 
     index: int = 0
     mapping: GamepadMapping = field(default_factory=GamepadMapping)
     name: str = "gamepad"
     _pygame: Any = None
     _stick: Any = None
-    # SDL reports triggers as 0 until they are first touched; read as pressed half-way, they would move the car.
+    # SDL reports triggers as 0 (pressed half-way) until their first event; until then they count as released.
     _touched: set[int] = field(default_factory=set)
 
     def open(self) -> None:
-        """Find the gamepad."""
+        """Open the gamepad. Raises NotReadyError if it is not connected."""
         self._pygame = _pygame(window=False)
         self._pygame.display.init()
         self._pygame.joystick.init()
@@ -111,13 +111,13 @@ class GamepadSource:
         if self.index >= count:
             self.close()
             raise NotReadyError(
-                "Gamepad", [f"{count} found, number {self.index} wanted; plug it in, press a button, try again."]
+                "Gamepad", [f"number {self.index} is missing ({count} found); plug it in, press a button, try again."]
             )
         self._stick = self._pygame.joystick.Joystick(self.index)
         self._stick.init()
 
     def poll(self) -> TeleopInput:
-        """The gamepad's state; released where it is gone."""
+        """Current state of the gamepad; ``present`` is False if it was unplugged."""
         if self._stick is None:
             return TeleopInput(present=False)
         for event in self._pygame.event.get():
@@ -135,7 +135,7 @@ class GamepadSource:
         return gamepad_input(axes, buttons, self.mapping)
 
     def close(self) -> None:
-        """Let go of the gamepad."""
+        """Release the gamepad. Idempotent."""
         self._stick = None
         self._touched.clear()
         if self._pygame is not None:
@@ -145,7 +145,7 @@ class GamepadSource:
 
 @dataclass(slots=True)
 class KeyboardSource:
-    """Arrow keys or WASD in a small window; hold shift (dead-man), space stops at once, escape ends."""
+    """Arrow keys or WASD in a small window; shift is the dead-man control, space stops at once, escape ends."""
 
     throttle: float = 0.4
     name: str = "keyboard"
@@ -166,7 +166,7 @@ class KeyboardSource:
         self._pygame.display.set_caption("carlab: hold SHIFT, drive with the arrows, SPACE stops, ESC ends")
 
     def poll(self) -> TeleopInput:
-        """The keys held now; none where the window has lost the focus."""
+        """Currently held keys; none if the window has lost the focus."""
         if self._pygame is None:
             return TeleopInput(present=False)
         pg = self._pygame
@@ -203,7 +203,7 @@ class KeyboardSource:
 
 
 class TeleopPolicy:
-    """A policy that asks an input source each tick. ``stop_reason`` goes into the episode's hooks."""
+    """A policy that polls an input source at each tick; pass ``stop_reason`` to the episode's hooks."""
 
     def __init__(self, source: InputSource, max_throttle: float = 1.0) -> None:
         self.name = f"teleop:{source.name}"
@@ -219,22 +219,22 @@ class TeleopPolicy:
         self._source.close()
 
     def reset(self) -> None:
-        """Forget an earlier stop."""
+        """Clear an earlier stop."""
         self._stop = None
 
     def act(self, view: PolicyInput) -> Action | None:
-        """What the hands say while the dead-man is held, else neutral; None when the driver ends the episode."""
-        hands = self._source.poll()
-        if not hands.present:
+        """The driver's action while the dead-man control is held, else neutral; None once the driver ends."""
+        driver = self._source.poll()
+        if not driver.present:
             self._stop = EndReason.DEADMAN_RELEASED
-        elif hands.emergency_stop:
+        elif driver.emergency_stop:
             self._stop = EndReason.EMERGENCY_STOP
-        elif hands.finish:
+        elif driver.finish:
             return None
-        if self._stop is not None or not hands.deadman:
+        if self._stop is not None or not driver.deadman:
             return NEUTRAL
-        return Action(hands.steering, hands.throttle * self._max_throttle)
+        return Action(driver.steering, driver.throttle * self._max_throttle)
 
     def stop_reason(self) -> EndReason | None:
-        """Emergency stop, or a device that is gone; None while neither."""
+        """Emergency stop or lost device; None without either."""
         return self._stop
