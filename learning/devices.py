@@ -1,7 +1,7 @@
 """Devices of tensors: the CPU, or a CUDA device.
 
-Random numbers are drawn on the CPU and moved, so that a seed means the same draws everywhere. Files hold CPU tensors;
-a car is driven from the CPU.
+Random numbers are drawn on the CPU and moved, so that a seed gives the same draws on every device. Files hold CPU
+tensors; the policy of a car runs on the CPU.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ DeviceName = Literal["cpu", "cuda"]
 
 
 def available(name: str) -> str:
-    """The name of an available device. Raises ConfigError where torch does not find it."""
+    """Check that a device is available; returns its name. Raises ConfigError if torch does not find it."""
     if torch.device(name).type == "cuda" and not torch.cuda.is_available():
         built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
         raise ConfigError(
@@ -28,12 +28,12 @@ def available(name: str) -> str:
     return name
 
 
-def described(name: str) -> str:
-    """The device for a file of figures."""
+def device_name(name: str) -> str:
+    """Name of the device for reports, with the model of a GPU."""
     return f"{name}: {torch.cuda.get_device_name()}" if torch.device(name).type == "cuda" else name
 
 
-def settle(device: torch.device | str) -> None:
+def synchronise(device: torch.device | str) -> None:
     """Wait until a device has finished, for timing."""
     if torch.device(device).type == "cuda":
         torch.cuda.synchronize()
@@ -53,4 +53,4 @@ def denormals_flushed() -> Iterator[None]:
         torch.set_flush_denormal(was)
 
 
-__all__ = ["DeviceName", "available", "denormals_flushed", "described", "settle"]
+__all__ = ["DeviceName", "available", "denormals_flushed", "device_name", "synchronise"]

@@ -21,12 +21,12 @@ class Mixture:
 
     Attributes:
         means: (L, N, O).
-        stds: scales, broadcast against the means: standard deviations where ``dof`` is infinite; of decorrelated errors
-            where there is a ``decorrelation``.
+        stds: scales, broadcast against the means: standard deviations if ``dof`` is infinite; of decorrelated errors
+            if ``decorrelation`` is given.
         dof: degrees of freedom of the components' multivariate Student-t distributions, in which one random scale
             multiplies all outputs (Lange, Little and Taylor 1989, section 2); infinite for Gaussians.
-        decorrelation: matrix (O, O) that multiplies a component's errors from the left; the identity where it is None.
-        correlation: of these errors within each component (O, O); the identity where it is None.
+        decorrelation: matrix (O, O) that multiplies a component's errors from the left; None is the identity.
+        correlation: of these errors within each component (O, O); None is the identity.
     """
 
     means: Tensor
@@ -49,10 +49,10 @@ class Mixture:
     def aleatoric_std(self) -> Tensor:
         """Root mean variance of the components (N, O); infinite for two degrees of freedom or fewer."""
         if math.isinf(self.dof):
-            widened = 1.0
+            variance_factor = 1.0
         else:
-            widened = self.dof / (self.dof - 2.0) if self.dof > 2.0 else math.inf
-        return (widened * self.marginal_scales**2).expand_as(self.means).mean(dim=0).sqrt()
+            variance_factor = self.dof / (self.dof - 2.0) if self.dof > 2.0 else math.inf
+        return (variance_factor * self.marginal_scales**2).expand_as(self.means).mean(dim=0).sqrt()
 
     @property
     def marginal_scales(self) -> Tensor:
@@ -74,14 +74,14 @@ class Mixture:
         return (self.epistemic_std**2 + self.aleatoric_std**2).sqrt()
 
     def smoothed(self, bandwidth: float = 0.9) -> Mixture:
-        """Kernel-smooth the components: the same mean and, of Gaussians, variance, with components that overlap.
+        """Kernel-smooth the components: they overlap, and the mean and (for Gaussians) the variance are unchanged.
 
-        Components are moved to the mean by ``sqrt(1 - b^2)`` and widened by the share ``b^2`` of their variance (West
-        1993, "Approximating posterior distributions by mixture", section 3.2). Where the tails are heavy, the added
-        variance has them, too.
+        Deviations from the mean shrink by ``sqrt(1 - b^2)``; the components' variance grows by ``b^2`` times the
+        variance of their means (West 1993, "Approximating posterior distributions by mixture", section 3.2). For
+        Student-t components the added variance has the same tails.
 
         Args:
-            bandwidth: b, from 0 to 1; at 1 all components are equal.
+            bandwidth: b, from 0 to 1; all components are equal for 1.
         """
         shrink = math.sqrt(1.0 - bandwidth**2)
         deviation = self.means - self.mean
@@ -89,7 +89,7 @@ class Mixture:
         return replace(self, means=self.mean + shrink * deviation, stds=(self.stds**2 + spread**2).sqrt())
 
     def gaussians(self, each: int = 20) -> Mixture:
-        """Approximation by Gaussians, ``each`` of a Student-t component; the far tails are lost."""
+        """Approximation by Gaussians, ``each`` for a Student-t component; it has lighter far tails."""
         if math.isinf(self.dof):
             return self
         scales = tail_scales(self.dof, each).to(self.stds)[:, None, None, None]

@@ -1,8 +1,8 @@
 """Robust statistics of rows: leave-one-out errors, Student-t noise, correlation of outputs.
 
-A collision, a slipped marker or a stale pose spoils all outputs of a row at once. With multivariate Student-t noise
-each row has a weight, which falls with its squared Mahalanobis distance (Lange, Little and Taylor 1989, "Robust
-statistical modeling using the t distribution", section 3).
+A collision, a slipped marker or a stale pose corrupts all outputs of a row at once. With multivariate Student-t noise
+the weight of a row decreases with its squared Mahalanobis distance (Lange, Little and Taylor 1989, "Robust statistical
+modeling using the t distribution", section 3).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 
 DOF_CANDIDATES = (2.5, 3.0, 4.0, 6.0, 10.0, 20.0, math.inf)
 DOF_MIN_GAIN_NATS = 1.0
-"""Log-likelihood by which more degrees of freedom must beat fewer."""
+"""Minimum gain in log-likelihood at which more degrees of freedom replace fewer."""
 INITIAL_WEIGHT_ITERATIONS = 5
 _MEDIAN_CHI2 = 0.455
 """Median of a squared standard normal number."""
@@ -38,7 +38,7 @@ LOG_MEDIAN_VARIANCE = 1.36
 def initial_row_weights(residual: Tensor, covariance: Callable[[Tensor], Tensor], noise_std: Tensor) -> Tensor:
     """Weights (n,) of rows under the prior covariance: low for rows that a typical discrepancy does not explain.
 
-    Weights come before the covariance is fitted, because a fitted one would follow gross outliers.
+    The weights precede the fit of the covariance, because a fitted covariance would follow gross outliers.
 
     Args:
         residual: of a simulator (n, O).
@@ -49,7 +49,7 @@ def initial_row_weights(residual: Tensor, covariance: Callable[[Tensor], Tensor]
     for _ in range(INITIAL_WEIGHT_ITERATIONS):
         standardised, _ = leave_one_out(residual, covariance(weights), noise_std, weights)
         square = standardised**2
-        # The median row sets the scale, whatever the prior discrepancy and noise are.
+        # The median row determines the scale; the result does not depend on the size of the prior covariance.
         median_excess = (square.median(dim=0).values / _MEDIAN_CHI2).clamp_min(1.0)
         _, weights = student_weights((square / median_excess).sum(dim=1), residual.shape[1])
     return weights
@@ -64,7 +64,7 @@ def leave_one_out(
         residual: (n, O).
         covariance: of the rows, their weighted noise included (O, n, n).
         noise_std: of a row of weight 1 (O,).
-        row_weights: the rows' noise variance is divided by these (n,).
+        row_weights: weights (n,); the noise variance of a row is divided by its weight.
 
     Returns:
         Errors in units of their predictive standard deviation at weight 1 (n, O), and that variance (n, O).
@@ -81,7 +81,7 @@ def output_correlation(standardised: Tensor) -> tuple[Tensor, Tensor]:
     """Robust correlation and scales of errors of several outputs.
 
     Expectation maximisation of a multivariate Student-t distribution (Lange, Little and Taylor 1989, section 3).
-    Correlations that the rows cannot tell from zero are zero.
+    Correlations that do not differ significantly from zero are set to zero.
 
     Args:
         standardised: errors in units of their standard deviation (n, O).
@@ -103,7 +103,7 @@ def output_correlation(standardised: Tensor) -> tuple[Tensor, Tensor]:
     significant = torch.where(correlation.abs() > MIN_CORRELATION_Z / math.sqrt(count), correlation, 0.0)
     significant = significant.fill_diagonal_(1.0)
     smallest = float(torch.linalg.eigvalsh(significant)[0])
-    # Without its weak entries a correlation may not be positive definite.
+    # With weak entries set to zero, the matrix may not be positive definite.
     return (correlation if smallest < MIN_EIGENVALUE else significant), scales
 
 
@@ -129,10 +129,10 @@ def mahalanobis_sq(standardised: Tensor, correlation: Tensor) -> Tensor:
 
 
 def decorrelation_of(correlation: Tensor, error_std: Tensor) -> Tensor:
-    """Matrix (O, O) that decorrelates errors from the left and keeps the size of each.
+    """Matrix (O, O) that decorrelates errors from the left, in the units of each error.
 
-    The largest error stays as it is; each other one is reduced by its regression on the larger ones (Cholesky factor in
-    order of size): a step, say, by its share of the velocity that is its difference.
+    The largest error is unchanged; each other error is reduced by its regression on the larger ones (Cholesky factor in
+    order of size).
 
     Args:
         correlation: of the errors (O, O).
@@ -170,9 +170,9 @@ def student_weights(square: Tensor, outputs: int) -> tuple[float, Tensor]:
 
 
 def median_scale(square: Tensor, dof: float) -> Tensor:
-    """Factor (O,) on a predictive standard deviation with which half of the rows lie within its central half.
+    """Factor (O,) on a predictive standard deviation so that its central 50 % interval covers half of the rows.
 
-    Shrunk towards 1 by the sampling error of the median (``SCALE_LOG_STD``, ``LOG_MEDIAN_VARIANCE``).
+    The factor is shrunk towards 1 according to the sampling error of the median (``LOG_MEDIAN_VARIANCE``).
 
     Args:
         square: squared standardised errors (n, O).

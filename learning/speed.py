@@ -1,6 +1,6 @@
 """Speed of learning: training and prediction of particles and gradient steps of SAC, each relative to a reference.
 
-Also durations that a user waits for: the fit of a car to its rows, predictions in raw units, steps of the learned car.
+Also absolute durations: the fit of a car to its rows, predictions in raw units, steps of the learned car.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.state_estimator import StateEstimator
-from learning.devices import settle
+from learning.devices import synchronise
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.policy.sac import FastSac
@@ -42,14 +42,14 @@ SIZES = {
 CAR_FIT = CarFitSettings()
 FITTED_ROWS, FITTED_HISTORY = 100, 3
 KINEMATIC = ("motor.drive_gain", "motor.damping", "steering.max_angle")
-"""Uncertain numbers of the kinematic prior."""
+"""Uncertain parameters of the kinematic prior."""
 DIFFERENCE_DELAY_S = 0.5 * StateEstimator().window_s
-"""Delay of velocities that are differences of poses."""
+"""Delay of velocities from differences of poses."""
 SAC_SIZES = {"64 x 64, batch 64": ([64, 64], 64), "64 x 64, batch 256": ([64, 64], 256)}
 
 
 def training_speed(device: str = "cpu") -> dict[str, Any]:
-    """Steps of the particles' optimiser per second at the sizes of the paper, and seconds of a whole fit of a car."""
+    """Steps of the particles' optimiser per second at the sizes of the paper, and duration of the fit of a car."""
     found: dict[str, Any] = {}
     for name, (particles, sets, width) in SIZES.items():
         generator = torch.Generator().manual_seed(0)
@@ -59,13 +59,13 @@ def training_speed(device: str = "cpu") -> dict[str, Any]:
         clock = MonotonicClock()
         began_s = clock.now_s()
         target = infer(None, inputs, outputs, units, torch.full((7,), 0.02).to(device))
-        settle(device)
+        synchronise(device)
         inferred_s = clock.now_s()
         points = torch.randn((4096, width), generator=generator).to(device)
         steps = [0.0, 0.0]
 
         def note_time(done: int, at: list[float] = steps, clock: MonotonicClock = clock) -> None:
-            settle(device)
+            synchronise(device)
             at[0] = at[0] or clock.now_s()
             at[1] = clock.now_s()
 
@@ -83,7 +83,7 @@ def training_speed(device: str = "cpu") -> dict[str, Any]:
 
 
 def _whole_fit_s(device: str) -> float:
-    """Duration of learning a car [s]: units, inference with the kinematic prior, and particles."""
+    """Duration of the fit of a car [s]: units, inference with the kinematic prior, and particles."""
     car = SimulatorConfig.from_preset()
     ranges = {name: car.priors[name] for name in KINEMATIC}
     truth = CarModel(car, FITTED_HISTORY, {}, velocity_delay_s=DIFFERENCE_DELAY_S)
@@ -91,21 +91,21 @@ def _whole_fit_s(device: str) -> float:
     generator = torch.Generator().manual_seed(0)
     inputs = truth.inputs(FITTED_ROWS, generator)
     outputs = truth(inputs, draw_parameters(truth, 1, generator))[0]
-    seen = outputs + 0.5 * torch.tensor(NOISE_STD) * torch.randn(outputs.shape, generator=generator)
+    measured = outputs + 0.5 * torch.tensor(NOISE_STD) * torch.randn(outputs.shape, generator=generator)
     number = np.arange(FITTED_ROWS)
-    rows = Transitions(inputs.double().numpy(), seen.double().numpy(), 0 * number, number, FITTED_HISTORY)
+    rows = Transitions(inputs.double().numpy(), measured.double().numpy(), 0 * number, number, FITTED_HISTORY)
     clock = MonotonicClock()
     began_s = clock.now_s()
     fit_car(rows, prior, CAR_FIT, device=device)
-    settle(device)
+    synchronise(device)
     return clock.now_s() - began_s
 
 
 def prediction_speed(device: str = "cpu") -> dict[str, Any]:
-    """Durations of 256 one-step predictions of 20 particles, relative to a matrix product of as many operations.
+    """Durations of 256 one-step predictions of 20 particles, relative to a matrix product with as many operations.
 
-    ``batch_ms``: the networks alone. ``posterior_ms``: a whole prediction with clipping, trend, decorrelation and
-    noise, in raw units. ``learned_car_ms``: 256 samples as a learned car is stepped, each row by one particle.
+    ``batch_ms``: the networks alone. ``posterior_ms``: a complete prediction with clipping, trend, decorrelation and
+    noise, in raw units. ``learned_car_ms``: 256 samples of the learned car, each row by one particle.
     """
     network = Network(15, 6, activation=DistillationSettings().activation)
     generator = torch.Generator().manual_seed(0)
@@ -132,7 +132,7 @@ def prediction_speed(device: str = "cpu") -> dict[str, Any]:
 
 
 def _posterior(network: Network, numbers: Tensor) -> ParticlePosterior:
-    """Particles as a fit returns them: with decorrelation, trend, and correlated Student-t noise."""
+    """Particles with decorrelation, trend, and correlated Student-t noise, like those of a fit."""
     generator = torch.Generator().manual_seed(1)
     width, outputs = network.inputs, network.outputs
     eye = torch.eye(outputs)
@@ -146,13 +146,14 @@ def _posterior(network: Network, numbers: Tensor) -> ParticlePosterior:
 
 
 def sac_speed(device: str = "cpu") -> dict[str, Any]:
-    """Gradient steps of SAC per second, ours and those of stable-baselines3, at the same sizes."""
+    """Gradient steps per second of ``FastSac`` and of stable-baselines3's SAC, at the same sizes."""
     found: dict[str, Any] = {}
     for name, (hidden, batch) in SAC_SIZES.items():
         rates = {}
         for label, kind in (("stable_baselines3", SAC), ("ours", FastSac)):
             agent = kind(
-                "MlpPolicy", _Room(), policy_kwargs={"net_arch": hidden}, learning_starts=1000, seed=0, device=device
+                "MlpPolicy", _NoiseEnv(), policy_kwargs={"net_arch": hidden}, learning_starts=1000, seed=0,
+                device=device,
             )  # fmt: skip
             agent.set_logger(Logger(None, []))
             agent.learn(1000)
@@ -164,7 +165,7 @@ def sac_speed(device: str = "cpu") -> dict[str, Any]:
     return found
 
 
-class _Room(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class _NoiseEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     """An environment with the parking task's spaces and random observations."""
 
     observation_space = gym.spaces.Box(-5.0, 5.0, (13,), np.float32)
@@ -186,12 +187,12 @@ def _seconds(work: Any, device: str, times: int = 50) -> float:
     clock = MonotonicClock()
     for _ in range(max(times // 10, 1)):
         work()
-    settle(device)
+    synchronise(device)
     taken = []
     for _ in range(times):
         began_s = clock.now_s()
         work()
-        settle(device)
+        synchronise(device)
         taken.append(clock.now_s() - began_s)
     return float(np.median(taken))
 

@@ -1,7 +1,8 @@
 """Stein variational gradient descent on function values.
 
 Liu and Wang 2016 ("Stein Variational Gradient Descent"), in function space as in Wang et al. 2019 ("Function Space
-Particle Optimization for Bayesian Neural Networks"): the particles are the values of functions at a measurement set.
+Particle Optimization for Bayesian Neural Networks"): a particle is the vector of a function's values at a measurement
+set.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ class RbfKernel:
         return torch.exp(distance * (-0.5 / self.bandwidth**2))
 
     def repulsion(self, values: Tensor, matrix: Tensor) -> Tensor:
-        """``sum_i`` of the gradient of ``k(h_i, h_l)`` by ``h_i``, for each l: (L, F)."""
-        # A particle does not repel itself; its two equal terms would cancel only up to rounding.
+        """``sum_i`` of the gradient of ``k(h_i, h_l)`` with respect to ``h_i``, for each l: (L, F)."""
+        # The term i = l is zero; it is omitted because its two parts would cancel only up to rounding.
         weight = (matrix - torch.diag(matrix.diagonal())) / self.bandwidth**2
         return weight.sum(dim=1, keepdim=True) * values - weight @ values
 
@@ -45,13 +46,13 @@ def median_bandwidth(values: Tensor) -> float:
 def natural_direction(values: Tensor, score: Tensor, precision: Tensor, kernel: RbfKernel) -> Tensor:
     """Ascent direction by the matrix-valued kernel ``Q^-1 k(a, b)`` with a scalar kernel k and a precision Q.
 
-    Wang, Tang, Bajaj and Liu 2019 ("Stein Variational Gradient Descent with Matrix-Valued Kernels", section 3.1): the
-    target stays the same; the preconditioner removes differences between its narrow and wide directions. For a Gaussian
+    Wang, Tang, Bajaj and Liu 2019 ("Stein Variational Gradient Descent with Matrix-Valued Kernels", section 3.1). The
+    preconditioner does not change the target; it equalises convergence in narrow and wide directions. For a Gaussian
     target with precision Q the driving term points to its mean.
 
     Args:
         values: function values (L, N, O).
-        score: gradient of the log density by each particle's own values (L, N, O).
+        score: gradient of the log density with respect to each particle's values (L, N, O).
         precision: of each output over the points (O, N, N), symmetric and positive definite.
         kernel: between the flattened values.
 
@@ -71,7 +72,7 @@ def stein_direction(values: Tensor, score: Tensor, kernel: RbfKernel) -> Tensor:
 
     Args:
         values: function values (L, N, O).
-        score: gradient of the log density by each particle's own values (L, N, O).
+        score: gradient of the log density with respect to each particle's values (L, N, O).
         kernel: between the flattened values.
 
     Returns:
@@ -88,25 +89,25 @@ def moment_direction(values: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
 
     Its fixed points are exactly the particles that have the Gaussian's mean and covariance (Liu and Wang 2018, "Stein
     Variational Gradient Descent as Moment Matching", theorem 3). Whitening is the matrix-valued kernel of
-    ``natural_direction``. A set must have fewer points than there are particles, for L particles have a covariance of
-    rank L - 1.
+    ``natural_direction``. A set must have fewer points than particles, because the covariance of L particles has rank
+    L - 1.
 
     Args:
-        values: values of L particles at G sets of N points, one output a set (L, G, N).
+        values: values of L particles at G sets of N points, one output per set (L, G, N).
         mean: of the Gaussian (G, N).
         factor: Cholesky factor of its covariance (G, N, N).
 
     Returns:
-        Directions (L, G, N), in units of the values; those of far particles nearly point to the mean.
+        Directions (L, G, N), in units of the values; those of distant particles point almost to the mean.
     """
     deviation = (values - mean).permute(1, 2, 0)  # (G, N, L)
     white = torch.linalg.solve_triangular(factor, deviation, upper=False)
     gram = white.transpose(1, 2) @ white  # (G, L, L)
     count, points = values.shape[0], values.shape[2]
-    # The kernel's width c: the particles' mean square while they are far, as with the median heuristic.
+    # The kernel's width c is the particles' mean square (at least 1), in analogy to the median heuristic.
     width = (gram.diagonal(dim1=1, dim2=2).sum(dim=1) / (count * points)).clamp_min(1.0)[:, None, None]
-    moved = (white - white @ gram / count) / width - white.mean(dim=2, keepdim=True)
-    direction: Tensor = (factor @ moved).permute(2, 0, 1)
+    white_direction = (white - white @ gram / count) / width - white.mean(dim=2, keepdim=True)
+    direction: Tensor = (factor @ white_direction).permute(2, 0, 1)
     return direction
 
 

@@ -1,7 +1,8 @@
 """One-step transitions of a car, independent of its position and heading.
 
-Position and heading enter the motion of a car only through exact kinematics, so a model sees body-frame velocities and
-the last commands, and predicts the change of pose and velocities in the body frame of the step's start.
+Position and heading enter the motion of a car only through exact kinematics. Therefore the inputs of a model are
+body-frame velocities and the last commands; it predicts the change of pose and velocities in the body frame at the
+step's start.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 
 OUTPUTS = ("ahead_m", "left_m", "yaw_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
-"""Changes over one step: of place and velocities along the body axes of the step's start, of yaw, of the yaw rate."""
+"""Changes over one step: of position and velocities along the body axes at the step's start, of yaw, of yaw rate."""
 MAX_STEP_PERIODS = 1.5
-"""A longer step spans missing rows and is dropped."""
+"""Maximum duration of a step; a longer step spans missing rows and is dropped."""
 MAX_POSE_JITTER_PERIODS = 0.75
-"""Largest deviation of the time between two poses from its median."""
+"""Maximum deviation of the time between two poses from its median."""
 MIN_DELAY_S = 0.002
-"""A shorter delay of the velocities counts as none."""
+"""Smaller delays of the velocities count as zero."""
 TRIMMING_ITERATIONS = 4
 TRIMMED_QUANTILE = 0.9
 """Quantile of the absolute error above which rows are dropped from the least squares."""
@@ -31,11 +32,11 @@ TRIMMED_QUANTILE = 0.9
 
 @dataclass(frozen=True, slots=True)
 class Transitions:
-    """Rows for a model of one step.
+    """Rows for a one-step model.
 
     Attributes:
-        inputs: (n, 3 + 2 (H + 1)): vx, vy [m/s], yaw rate [rad/s], then steering and throttle sent at t - H ... t, the
-            oldest first; the last two are those sent at the step's start.
+        inputs: (n, 3 + 2 (H + 1)): vx, vy [m/s], yaw rate [rad/s], then steering and throttle sent at t - H ... t,
+            oldest first; the last two are sent at the step's start.
         targets: (n, 6) in the order of ``OUTPUTS``.
         episode: number of each row's episode (n,).
         tick: number of each row's command in its episode (n,).
@@ -57,21 +58,21 @@ class Transitions:
 
 
 def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions:
-    """Every complete step of some episodes with ``history`` commands before the one at its start.
+    """Complete steps of episodes with ``history`` commands before the command at the step's start.
 
-    Dropped are steps over missing time, with missing numbers, or with an incomplete history; steps over a jump of the
-    poses (where ``segment`` of an imported recording changes); and steps to or from a pose that was not renewed in time
-    (``pose_age_s``), whose poses are not one period apart.
+    Dropped are steps with a gap in time, missing numbers, or an incomplete history; steps over a jump of the poses
+    (``segment`` of an imported recording changes); and steps whose poses are not one period apart, because one of them
+    was not updated in time (``pose_age_s``).
 
     Args:
         episodes: recordings.
         history: H.
 
     Raises:
-        DataError: no step is complete, or ``history`` is negative.
+        DataError: no complete step, or a negative ``history``.
     """
     if history < 0:
-        raise DataError(f"A history of {history} commands makes no sense; give 0 or more.")
+        raise DataError(f"A history of {history} commands is negative; give 0 or more.")
     inputs, targets, origin, ticks = [], [], [], []
     for number, episode in enumerate(episodes):
         count = episode.ticks
@@ -81,7 +82,7 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
         steps = np.diff(episode.times_s)
         whole = (steps > 0) & (steps < MAX_STEP_PERIODS * np.median(steps))
         rows = np.arange(history, count)
-        # Each command of the history must have been held for a period, too.
+        # Each command of the history must also have been held for one period.
         good = np.array([whole[k - history : k + 1].all() for k in rows], dtype=bool)
         past = np.stack([episode.sent[rows - back] for back in range(history, -1, -1)], axis=1)
         given = np.hstack([states[rows, 3:], past.reshape(len(rows), -1)])
@@ -102,8 +103,8 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
         ticks.append(rows[good])
     if not inputs or not sum(len(i) for i in inputs):
         raise DataError(
-            f"The recordings hold no whole step with {history} commands before it; record longer episodes, or use a "
-            "shorter history."
+            f"The recordings hold no complete step with {history} commands before it; record longer episodes, or use "
+            "a shorter history."
         )
     return Transitions(
         np.concatenate(inputs), np.concatenate(targets), np.concatenate(origin), np.concatenate(ticks), history
@@ -118,14 +119,13 @@ def _between_consecutive_poses(episode: EpisodeData) -> np.ndarray:
     if "pose_age_s" in episode.extra:
         between = np.diff(episode.times_s - episode.extra["pose_age_s"])
         usual = np.nanmedian(between) if np.isfinite(between).any() else np.nan
-        valid &= ~(
-            np.abs(between - usual) > MAX_POSE_JITTER_PERIODS * usual
-        )  # A NaN comparison keeps steps of unknown age.
+        # Comparisons with NaN are false: steps of unknown age remain.
+        valid &= ~(np.abs(between - usual) > MAX_POSE_JITTER_PERIODS * usual)
     return valid
 
 
 def has_whole_step(episode: EpisodeData, history: int) -> bool:
-    """Whether ``transitions_of`` finds a row in an episode; a short episode may have none."""
+    """Whether ``transitions_of`` finds a row in an episode."""
     try:
         return bool(len(transitions_of([episode], history)))
     except DataError:
@@ -135,27 +135,27 @@ def has_whole_step(episode: EpisodeData, history: int) -> bool:
 def velocity_delay_s(rows: Transitions, period_s: float) -> float:
     """Delay of the velocities behind the poses [s]; about half a period for backward differences.
 
-    A step's displacement is a weighted mean of the velocities at its ends, with equal weights where these are on time.
-    The weight of the later one is fitted by trimmed least squares, so that collisions have no influence. A delay below
+    A step's displacement is a weighted mean of the velocities at its ends; without a delay the weights are equal. The
+    weight of the later velocity is fitted by trimmed least squares, so that collisions have no influence. A delay below
     ``MIN_DELAY_S`` is zero.
 
     Args:
-        rows: rows.
+        rows: transitions.
         period_s: their period [s].
 
     Raises:
-        DataError: there are no rows.
+        DataError: no rows.
     """
     if not len(rows):
-        raise DataError("There are no rows to estimate the delay of the velocities from; record longer drives.")
+        raise DataError("The delay of the velocities cannot be estimated without rows; record longer drives.")
     first, change = rows.inputs[:, [0, 2]], rows.targets[:, [3, 5]]
     excess = rows.targets[:, [0, 2]] / period_s - first
-    weight, kept, square = np.full(2, 0.5), np.ones(excess.shape, dtype=bool), np.zeros(2)
+    weight, mask, square = np.full(2, 0.5), np.ones(excess.shape, dtype=bool), np.zeros(2)
     for _ in range(TRIMMING_ITERATIONS):
-        square = (kept * change * change).sum(axis=0)
-        weight = np.where(square > 0.0, (kept * excess * change).sum(axis=0) / np.maximum(square, 1e-12), 0.5)
+        square = (mask * change * change).sum(axis=0)
+        weight = np.where(square > 0.0, (mask * excess * change).sum(axis=0) / np.maximum(square, 1e-12), 0.5)
         error = np.abs(excess - weight * change)
-        kept = error <= np.quantile(error, TRIMMED_QUANTILE, axis=0)
+        mask = error <= np.quantile(error, TRIMMED_QUANTILE, axis=0)
     delay_s = float(np.clip(weight[square > 0.0].mean() - 0.5, 0.0, 1.0)) * period_s if square.any() else 0.0
     return delay_s if delay_s > MIN_DELAY_S else 0.0
 

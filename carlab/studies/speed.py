@@ -25,13 +25,13 @@ def measure_speed(
         Figures by part and name; the names say the unit.
     """
     from drivers.speed import sender_lateness
-    from learning.devices import described
+    from learning.devices import device_name
     from learning.speed import prediction_speed, sac_speed, training_speed
     from mocap.speed import natnet_decode_speed
     from sim_backends.speed import SingleTorchThread, gradient_speed, simulation_speed
 
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
-    machine = {"cores_count": len(cores), "python": platform.python_version(), "learning_device": described(device)}
+    machine = {"cores_count": len(cores), "python": platform.python_version(), "learning_device": device_name(device)}
     figures: dict[str, Any] = {"machine": machine}
     one = {min(cores)}
     where = "one core" if device == "cpu" else device

@@ -1,6 +1,6 @@
 """Deep ensemble: networks that differ by their initial weights (Lakshminarayanan et al. 2017).
 
-Each network also leaves out one fold of the rows, so that errors on held-out rows determine the noise and the weight of
+Each network is fitted without one fold of the rows; errors on these held-out rows determine the noise and the weight of
 the networks' disagreement.
 """
 
@@ -22,12 +22,12 @@ from learning.posterior.residuals import ResidualDistribution, fit_residuals
 
 N_FOLDS = 5
 MIN_ROWS = 5
-"""With fewer rows or fewer than four networks no rows are held out, and the noise is the networks' own."""
+"""With fewer rows or fewer than four networks no rows are held out, and the noise is that fitted with the networks."""
 DISAGREEMENT_WEIGHTS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
 """Candidate factors on the networks' variance in the predictive variance."""
 N_NOISE_ITERATIONS = 40
 MIN_NOISE_SHARE = 1e-3
-"""Lower bound of the noise variance, relative to the errors' mean square."""
+"""Lower bound of the noise variance, relative to the mean square of the errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +35,10 @@ class Ensemble:
     """Networks and the distribution of their mean's errors.
 
     Attributes:
-        networks: fitted one by one, in decorrelated outputs.
-        noise_std: of these (O,); None where no rows were held out.
-        disagreement_weight: factor on the networks' variance, which is added to the noise's.
-        residuals: distribution of errors in units of both; None where no rows were held out.
+        networks: fitted independently, in decorrelated outputs.
+        noise_std: of the decorrelated outputs (O,); None without held-out rows.
+        disagreement_weight: factor on the networks' variance, which is added to the noise variance.
+        residuals: distribution of errors in units of the total standard deviation; None without held-out rows.
     """
 
     networks: ParticlePosterior
@@ -68,7 +68,7 @@ class Ensemble:
 
 
 def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, settings: FsvgdSettings) -> Ensemble:
-    """Fit every network by itself to the likelihood, with weight decay as the only prior.
+    """Fit every network independently to the likelihood, with weight decay as the only prior.
 
     Args:
         inputs: (n, D), n > 0.
@@ -77,7 +77,7 @@ def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, setti
         settings: of the fit; kernel and preconditioning are not used.
 
     Raises:
-        DataError: there is no data, rows of inputs and outputs differ in number, or numbers are missing or infinite.
+        DataError: no data, different numbers of rows of inputs and outputs, or missing or infinite numbers.
         DivergedError: the networks diverged.
     """
     check_rows(inputs, outputs)
@@ -94,13 +94,13 @@ def deep_ensemble(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, setti
     mean = (mask * errors).sum(dim=0) / mask.sum(dim=0)
     disagreement = (mask * (errors - mean) ** 2).sum(dim=0) / (mask.sum(dim=0) - 1.0).clamp_min(1.0)
     candidates = [(*_noise(mean, weight * disagreement), weight) for weight in DISAGREEMENT_WEIGHTS]
-    _, noise_std, weight = max(candidates, key=lambda each: each[0])
+    _, noise_std, weight = max(candidates, key=lambda candidate: candidate[0])
     residuals = fit_residuals(mean / (noise_std**2 + weight * disagreement).sqrt())
     return Ensemble(networks, noise_std.to(outputs), weight, residuals.to(outputs))
 
 
 def _decorrelated(normaliser: Normaliser, inputs: Tensor, outputs: Tensor) -> Normaliser:
-    """With outputs in which the errors of a ridge regression are uncorrelated."""
+    """Normaliser with outputs in which the errors of a ridge regression are uncorrelated."""
     ridge = Ridge.fit(*(v.cpu().double().numpy() for v in (inputs, normaliser.outputs(outputs))))
     correlation, width = output_correlation(torch.from_numpy(ridge.errors))
     return normaliser.decorrelated(decorrelation_of(correlation, width).to(outputs))
@@ -119,11 +119,11 @@ def _noise(errors: Tensor, known_variance: Tensor) -> tuple[float, Tensor]:
         The log-likelihood, and the noise's standard deviation (O,).
     """
     variance = errors.square().mean(dim=0).clamp_min(1e-18)
-    least = MIN_NOISE_SHARE * variance
+    min_variance = MIN_NOISE_SHARE * variance
     for _ in range(N_NOISE_ITERATIONS):
         square = torch.minimum(errors**2, 9.0 * (variance + known_variance))
         weight = (variance + known_variance) ** -2
-        variance = torch.maximum((weight * (square - known_variance)).sum(dim=0) / weight.sum(dim=0), least)
+        variance = torch.maximum((weight * (square - known_variance)).sum(dim=0) / weight.sum(dim=0), min_variance)
     total = variance + known_variance
     log_likelihood = -0.5 * (total.log() + (errors**2 / total).clamp_max(9.0) + math.log(2.0 * math.pi)).sum()
     return float(log_likelihood), variance.sqrt()

@@ -1,4 +1,4 @@
-"""Ridge regression with leave-one-out errors: the baseline that every learned model must beat."""
+"""Ridge regression with leave-one-out errors: the simplest baseline."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Ridge:
 
     @classmethod
     def fit(cls, inputs: FloatArray, targets: FloatArray) -> Ridge:
-        """Fit with the penalty of each output that has the smallest leave-one-out error, in closed form.
+        """Fit in closed form, with the penalty that minimises the leave-one-out error of each output.
 
         Args:
             inputs: (n, D).
@@ -39,7 +39,7 @@ class Ridge:
             DataError: fewer than three rows.
         """
         if len(inputs) < 3:
-            raise DataError(f"A regression needs three rows at least, not {len(inputs)}; record more.")
+            raise DataError(f"A regression needs at least three rows, not {len(inputs)}; record more.")
         mean, scale = inputs.mean(axis=0), inputs.std(axis=0)
         scale = np.where(scale > 1e-9, scale, 1.0)
         design = (inputs - mean) / scale
@@ -52,7 +52,7 @@ class Ridge:
             shrink = singular**2 / (singular**2 + penalty)
             fitted = left @ (shrink[:, None] * rotated)
             leverage = np.minimum((left**2 * shrink).sum(axis=1) + 1.0 / len(inputs), 1.0 - 1e-9)
-            # The leave-one-out error is the residual over one less the leverage (Allen 1974).
+            # The leave-one-out error is the residual divided by one minus the leverage (Allen 1974).
             error = (targets - centre - fitted) / (1.0 - leverage)[:, None]
             square = (error**2).mean(axis=0)
             better = square < best

@@ -1,4 +1,4 @@
-"""Maximum likelihood over a simulator's parameters (SysID), and the same with networks for its residual (GreyBox)."""
+"""Maximum likelihood of a simulator's parameters (SysID), also with networks for its residual (GreyBox)."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from learning.priors.domain_models import DomainModel, draw_parameters
 from learning.priors.function_prior import RbfCovariance
 
 N_SCREENED = 1024
-"""Draws of the parameters among which restarts are chosen."""
+"""Draws of the parameters from which restarts are selected."""
 N_RESTARTS = 16
 STEPS = 600
 LEARNING_RATE = 0.05
 N_REFINEMENTS, REFINEMENT_STEPS, REFINEMENT_RATE = 3, 150, 0.01
-"""Alternations between the errors' distribution and the parameters under it."""
+"""Alternations between the distribution of the errors and the parameters given it."""
 PRIOR_WIDTH_FACTOR = 4.0
 """Factor on the prior's standard deviation of each parameter in the penalty."""
 PRIOR_ROWS = 1.0
@@ -101,7 +101,7 @@ class _Problem:
 
     @property
     def fitted_rows(self) -> float:
-        """Parameters for each output: the rows that their fit uses up."""
+        """Fitted parameters divided by the outputs: the rows (degrees of freedom) used by their fit."""
         return float(self.free.sum()) / self.outputs.shape[1]
 
     def parameters(self, offsets: Tensor) -> Tensor:
@@ -138,8 +138,8 @@ def identify(
 ) -> IdentifiedSimulator:
     """Fit a simulator's parameters by penalised maximum likelihood, with restarts.
 
-    First with independent Gaussian errors whose variance is concentrated out; then with correlated Student-t errors
-    (``fit_residuals``), alternating between their distribution and the parameters.
+    The first fit assumes independent Gaussian errors and concentrates out their variance. The second one assumes
+    correlated Student-t errors (``fit_residuals``) and alternates between their distribution and the parameters.
 
     Args:
         model: simulator with a distribution of its parameters.
@@ -149,7 +149,7 @@ def identify(
         seed: of the restarts.
 
     Raises:
-        DataError: there is no data, or no restart gives finite numbers.
+        DataError: no data, or no restart with finite outputs.
     """
     if len(inputs) == 0:
         raise DataError("Parameters cannot be identified without data; record an episode first.")
@@ -169,7 +169,7 @@ def identify(
 
 
 def _fit_gaussian(problem: _Problem, drawn: Tensor) -> Tensor:
-    """Offset (K,) of the lowest concentrated loss, from the best of some drawn parameters (S, K)."""
+    """Offset (K,) of the lowest concentrated loss, with restarts from the best of the drawn parameters (S, K)."""
     offsets = torch.where(problem.free, (drawn - problem.prior_mean) / problem.prior_std.clamp_min(1e-9), 0.0)
     with torch.no_grad():
         losses = torch.nan_to_num(problem.concentrated_loss(offsets), nan=torch.inf)
@@ -179,7 +179,7 @@ def _fit_gaussian(problem: _Problem, drawn: Tensor) -> Tensor:
 
 
 def _descend(losses: Losses, starts: Tensor, free: Tensor, steps: int, learning_rate: float) -> Tensor:
-    """Offsets (S, K) after Adam from some starts (S, K); those that are not free (K,) stay."""
+    """Offsets (S, K) after Adam from initial offsets (S, K); only those in the mask ``free`` (K,) change."""
     offsets = starts.clone().requires_grad_()
     optimiser = torch.optim.Adam([offsets], lr=learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, eta_min=1e-2 * learning_rate)
@@ -192,13 +192,13 @@ def _descend(losses: Losses, starts: Tensor, free: Tensor, steps: int, learning_
 
 
 def _best(losses: Losses, starts: Tensor, ends: Tensor) -> Tensor:
-    """The offset (K,) of the lowest finite loss among starts and ends; an end may have none where its start has."""
+    """The offset (K,) with the lowest finite loss among starts and ends; the loss of an end may be infinite."""
     offsets = torch.cat([starts, ends])
     with torch.no_grad():
-        last = torch.nan_to_num(losses(offsets), nan=torch.inf)
-    if not torch.isfinite(last).any():
+        values = torch.nan_to_num(losses(offsets), nan=torch.inf)
+    if not torch.isfinite(values).any():
         raise DataError("The simulator gives no finite outputs for this data; check the car file and the rows.")
-    return offsets[last.argmin()]
+    return offsets[values.argmin()]
 
 
 def grey_box(
@@ -218,12 +218,11 @@ def grey_box(
         outputs: (n, O).
         pool: inputs of the domain (M, D).
         covariance: of the residual, on normalised inputs and in normalised outputs.
-        normaliser: of inputs and residuals; its output mean is taken to be zero.
+        normaliser: of inputs and residuals; its output mean is ignored (zero).
         settings: of the fit.
     """
     centred = replace(normaliser, output_mean=torch.zeros_like(normaliser.output_mean))
-    everything = centred.inputs(torch.cat([inputs, pool]))
-    prior = GaussianProcessPrior(everything, covariance)
+    prior = GaussianProcessPrior(centred.inputs(torch.cat([inputs, pool])), covariance)
     with torch.no_grad():
         residual = outputs - simulator.mean(inputs)
     return GreyBox(simulator, fit_fsvgd(inputs, residual, pool, prior, centred, settings))

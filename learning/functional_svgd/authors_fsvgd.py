@@ -1,9 +1,9 @@
 """FSVGD of the online-learning experiment with the settings of the authors' public code, for comparison.
 
-Settings and state are those of lasgroup/simulation_transfer at 547fa14 (``bnn_fsvgd.py`` and ``online_rl_loop.py``). A
-network sees the car's pose and velocities in the world and predicts their changes, with sine and cosine of the yaw as
-independent numbers. The Gaussian-process prior has a weight of ``1 / (L (batch + points))``, because the authors
-average its score over particles and points and sum the likelihood. There is no simulator.
+Settings and state are those of lasgroup/simulation_transfer at 547fa14 (``bnn_fsvgd.py`` and ``online_rl_loop.py``).
+Inputs of a network are pose and velocities in the world frame; it predicts their changes, with sine and cosine
+of the yaw as independent outputs. The weight of the Gaussian-process prior is ``1 / (L (batch + points))``, because the
+authors average its score over particles and points and sum the likelihood. The prior has no simulator.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from learning.transitions import transitions_of
 
 STATE_STD = (3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0)
 CHANGE_STD = (0.127, 0.123, 0.060, 0.056, 2.86, 2.86, 5.65)
-"""Units of the world's x, y [m], sin, cos, vx, vy [m/s], yaw rate [rad/s] and of their changes."""
+"""Units of x, y [m], sin, cos, vx, vy [m/s, world frame], yaw rate [rad/s] and of their changes."""
 NOISE_STD = (0.0222, 0.0222, 0.0366, 0.0366, 0.1642, 0.1642, 0.7358)
 PARTICLES, BATCH, POINTS, STEPS = 10, 32, 16, 40_000
-MAX_PLACE_M, MAX_SPEED_MPS, MAX_YAW_RATE_RADPS = 4.0, 6.0, 8.0
+MAX_POSITION_M, MAX_SPEED_MPS, MAX_YAW_RATE_RADPS = 4.0, 6.0, 8.0
 POOL_POINTS = 4096
 HELD_OUT_SHARE = 0.2
 LENGTHSCALE = 0.2
 PATIENCE = 3
-"""Evaluations without improvement that end a fit. The authors' fit goes on and keeps the same networks in the end."""
+"""Evaluations without improvement that end a fit. The authors' fit continues but keeps the same networks."""
 
 
 def authors_settings(steps: int, seed: int) -> FsvgdSettings:
-    """The authors' settings, for the direction and prior weight of their code."""
+    """The authors' settings, with the direction and prior weight of their code."""
     noise = tuple(s / o for s, o in zip(NOISE_STD, CHANGE_STD, strict=True))
     return FsvgdSettings(
         particles=PARTICLES, steps=steps, batch=BATCH, measurement_points=POINTS, bandwidth=0.2, natural=False,
@@ -73,8 +73,8 @@ class WorldDynamics:
         yaw = torch.atan2(after[:, 2:3], after[:, 3:4])
         ahead, left = _in_body(after[:, 4], after[:, 5], yaw[:, 0])
         state = torch.cat([after[:, :2], yaw, ahead[:, None], left[:, None], after[:, 6:7]], dim=1)
-        found: Tensor = encode(state, push_action(decode_history(features), action))
-        return found
+        next_features: Tensor = encode(state, push_action(decode_history(features), action))
+        return next_features
 
     def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps, seven outputs [nat per step], and calibration error."""
@@ -91,7 +91,7 @@ def in_world(features: Tensor) -> Tensor:
 
 
 def world_rows(episodes: Sequence[EpisodeData], history: int) -> tuple[Tensor, Tensor]:
-    """Inputs (n, 7 + 2 (H + 1)) and changes (n, 7) of every complete step. Raises DataError where there is none."""
+    """Inputs (n, 7 + 2 (H + 1)) and changes (n, 7) of every complete step. Raises DataError without a step."""
     rows = transitions_of(episodes, history)
     inputs, changes = [], []
     for number, episode in enumerate(episodes):
@@ -111,7 +111,7 @@ def fit_authors_fsvgd(
     progress: Callable[[int], None] = lambda step: None,
     device: torch.device | str = "cpu",
 ) -> WorldDynamics:
-    """Fit from scratch to all episodes; without episodes, networks with their initial weights as in the authors' code.
+    """Fit from scratch to all episodes; without episodes, return networks with initial weights as the authors do.
 
     Args:
         episodes: recordings.
@@ -137,7 +137,7 @@ def fit_authors_fsvgd(
     inputs, changes = world_rows(episodes, history)
     held_out_count = int(HELD_OUT_SHARE * len(inputs))
     if held_out_count == 0:
-        raise DataError(f"{len(inputs)} rows are too few to hold some out; record a longer episode.")
+        raise DataError(f"{len(inputs)} rows are too few for a validation split; record a longer episode.")
     order = torch.randperm(len(inputs), generator=generator).to(device)
     rows, held_out = order[held_out_count:], order[:held_out_count]
     pool = _domain_points(history, generator).to(device)
@@ -154,7 +154,7 @@ def fit_authors_fsvgd(
 def _domain_points(history: int, generator: torch.Generator) -> Tensor:
     """Inputs (``POOL_POINTS``, 7 + 2 (H + 1)), uniform in the domain."""
     half_width = torch.tensor(
-        [MAX_PLACE_M, MAX_PLACE_M, np.pi, 0.0, MAX_SPEED_MPS, MAX_SPEED_MPS, MAX_YAW_RATE_RADPS]
+        [MAX_POSITION_M, MAX_POSITION_M, np.pi, 0.0, MAX_SPEED_MPS, MAX_SPEED_MPS, MAX_YAW_RATE_RADPS]
         + [1.0] * (2 * history + 2)
     )
     pool = half_width * (2.0 * torch.rand((POOL_POINTS, len(half_width)), generator=generator) - 1.0)

@@ -2,8 +2,8 @@
 
 Algorithm 1 of Rothfuss et al. (arXiv 2403.16644); the update in function space is that of Wang et al. 2019 ("Function
 Space Particle Optimization for Bayesian Neural Networks"). Each step draws a measurement set (a minibatch of the data
-and points of the domain), adds the score of the likelihood to that of the prior's Gaussian marginals there, and moves
-the particles along Stein's direction, pulled back to their parameters.
+and points of the domain), adds the score of the likelihood to that of the prior's Gaussian marginal at the set, and
+moves the particles along Stein's direction, pulled back to their parameters.
 
 Departures from the authors' code: driving and repulsive term are both averaged over the particles; draws of the
 simulator are taken once, for the data and for a pool of domain points, from which measurement sets are drawn;
@@ -86,23 +86,23 @@ class FsvgdSettings:
         particles: L, their number.
         hidden: widths of each particle's hidden layers.
         steps: of the optimiser.
-        batch: rows of data in a measurement set; all rows where there are fewer.
+        batch: rows of data in a measurement set, at most all of them.
         measurement_points: points of the domain in a measurement set.
-        bandwidth: of the kernel; by the median heuristic at each step if None.
-        interacting: whether particles interact; without it each particle finds a maximum a posteriori, an ensemble.
+        bandwidth: of the kernel; None: the median heuristic at each step.
+        interacting: whether particles interact; if not, they are an ensemble of maximum a posteriori estimates.
         natural: precondition by the posterior's covariance on the measurement set (a matrix-valued kernel). False is
             the update of the paper.
-        learning_rate: of Adam at the start; it falls to a hundredth along a half cosine.
+        learning_rate: initial rate of Adam; it falls to a hundredth along a half cosine.
         weight_decay: of AdamW, on the networks alone.
-        noise_std: standard deviation of the likelihood at the start, normalised, one or one for each output.
-        fit_noise: whether it is fitted.
-        noise_rows: weight of ``noise_std`` in rows then (inverse-gamma prior).
+        noise_std: initial standard deviation of the likelihood, normalised; a number, or one for each output.
+        fit_noise: whether the noise is fitted.
+        noise_rows: weight of ``noise_std`` in rows if the noise is fitted (inverse-gamma prior).
         noise_rate: learning rate of the noise relative to that of the networks.
         likelihood_exponent: power of the likelihood.
         prior_exponent: power of the prior.
         anneal_rate: whether the learning rate falls.
-        validation_period: steps between evaluations on held-out rows, where there are any; the best networks are kept.
-        patience: evaluations without improvement after which the fit ends; 0: never.
+        validation_period: steps between evaluations on held-out rows, if given; the best networks are kept.
+        patience: evaluations without improvement after which the fit ends; 0 disables early stopping.
         seed: of all draws.
     """
 
@@ -142,7 +142,7 @@ def check_rows(inputs: Tensor, outputs: Tensor, *others: Tensor) -> None:
 
 @dataclass
 class _Optimiser:
-    """Networks and the logarithm of the noise, as the leaves of AdamW."""
+    """Networks and the logarithm of the noise as parameters of AdamW."""
 
     networks: Tensor
     log_noise: Tensor
@@ -166,17 +166,17 @@ class _Optimiser:
             group["lr"] = rate * group.get("rate_factor", 1.0)
 
     def posterior(self, network: Network, normaliser: Normaliser, input_clip: Tensor) -> ParticlePosterior:
-        """A copy of the present particles."""
+        """A copy of the current particles."""
         noise = self.log_noise.exp().clamp_min(MIN_NOISE)
         return ParticlePosterior(network, self.networks.detach().clone(), noise, normaliser, input_clip=input_clip)
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """Normalised inputs of data and pool (n + M, D), normalised outputs of the data (n, O), and what is fitted to them.
+    """Normalised inputs of data and pool (n + M, D), normalised outputs of the data (n, O), prior and settings.
 
     Attributes:
-        row_mask: whether each particle is fitted to each row (L, n); to all where it is None.
+        row_mask: whether each particle is fitted to each row (L, n); None: to all.
     """
 
     network: Network
@@ -201,19 +201,18 @@ def fit_fsvgd(
     """Fit particles to data and prior by functional SVGD.
 
     Args:
-        inputs: raw inputs of the data (n, D); may be empty, then the prior alone is fitted.
+        inputs: raw inputs of the data (n, D); if empty, the prior alone is fitted.
         outputs: raw outputs (n, O).
         pool: raw inputs of the domain (M, D).
-        prior: over functions, its pool being the data's inputs and then ``pool``; may be None where there is data.
+        prior: over functions; its pool is the data's inputs followed by ``pool``. May be None if there is data.
         normaliser: of inputs and outputs.
         settings: of the fit.
         progress: called with the number of steps done, every ``PROGRESS_PERIOD_STEPS``.
-        held_out: raw inputs and outputs of rows that choose the step whose particles are kept.
-        row_mask: whether each particle is fitted to each row (L, n), for particles that do not interact; to all unless
-            given.
+        held_out: raw inputs and outputs of validation rows; the particles with the lowest loss on them are kept.
+        row_mask: whether each particle is fitted to each row (L, n), for particles that do not interact; None: to all.
 
     Raises:
-        DataError: there is nothing to fit, or numbers are missing or infinite.
+        DataError: neither data nor prior is given, or numbers are missing or infinite.
         DivergedError: the particles diverged.
     """
     count = len(inputs)
@@ -243,10 +242,10 @@ def fit_fsvgd(
             best.evaluate(optimiser.posterior(network, normaliser, input_clip), *held_out)
             if best.exhausted:
                 break
-    found = optimiser.posterior(network, normaliser, input_clip) if best.posterior is None else best.posterior
-    if not torch.isfinite(found.parameters).all():
+    posterior = optimiser.posterior(network, normaliser, input_clip) if best.posterior is None else best.posterior
+    if not torch.isfinite(posterior.parameters).all():
         raise DivergedError("The fit diverged; fit again with a smaller learning rate.")
-    return found
+    return posterior
 
 
 @dataclass
@@ -256,17 +255,17 @@ class _EarlyStopping:
     patience: int
     posterior: ParticlePosterior | None = None
     nll: float = math.inf
-    since: int = 0
+    n_without_gain: int = 0
 
     def evaluate(self, posterior: ParticlePosterior, inputs: Tensor, outputs: Tensor) -> None:
         nll = negative_log_likelihood(posterior.predict(inputs), outputs)
-        self.since += 1
+        self.n_without_gain += 1
         if nll < self.nll:
-            self.posterior, self.nll, self.since = posterior, nll, 0
+            self.posterior, self.nll, self.n_without_gain = posterior, nll, 0
 
     @property
     def exhausted(self) -> bool:
-        return 0 < self.patience <= self.since
+        return 0 < self.patience <= self.n_without_gain
 
 
 def _minibatch(count: int, batch: int, generator: torch.Generator) -> Tensor:
@@ -276,7 +275,7 @@ def _minibatch(count: int, batch: int, generator: torch.Generator) -> Tensor:
 
 
 def _step(problem: _Problem, optimiser: _Optimiser, rows: Tensor, domain: Tensor) -> None:
-    """One step of the optimiser at the measurement set of data ``rows`` and of ``domain`` points in the inputs."""
+    """One step of the optimiser at the measurement set of data ``rows`` and ``domain`` points (indices of inputs)."""
     settings = problem.settings
     chosen = torch.cat([rows, domain])
     values, pullback = problem.network.values_and_pullback(optimiser.networks, problem.inputs[chosen])
@@ -302,9 +301,10 @@ def _step(problem: _Problem, optimiser: _Optimiser, rows: Tensor, domain: Tensor
 def _add_likelihood(
     problem: _Problem, optimiser: _Optimiser, rows: Tensor, values: Tensor, score: Tensor, precision: Tensor
 ) -> None:
-    """Add the likelihood of rows (m,) to scores (L, N, O) and precisions (O, N) in place; gradient of the noise.
+    """Add the likelihood of rows (m,) to scores (L, N, O) and precisions (O, N) in place; set the noise gradient.
 
-    The gradient by the logarithm of the noise is that of the particles' mean negative log-likelihood and of the prior.
+    The gradient with respect to the logarithm of the noise is that of the particles' mean negative log-likelihood and
+    of the prior.
     """
     settings, count = problem.settings, len(rows)
     noise = optimiser.log_noise.exp().clamp_min(MIN_NOISE)

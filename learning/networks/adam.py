@@ -1,8 +1,8 @@
-"""Adam for one tensor of numbers, in place: torch's own fused kernel, without the bookkeeping of ``torch.optim``.
+"""Adam for one tensor of parameters, in place: torch's fused kernel without the overhead of ``torch.optim``.
 
 Kingma and Ba 2015 ("Adam: A Method for Stochastic Optimization"), with decoupled weight decay as in Loshchilov and
-Hutter 2019 ("Decoupled Weight Decay Regularization"). For networks of a few thousand numbers the optimiser's own
-overhead is a good part of a step.
+Hutter 2019 ("Decoupled Weight Decay Regularization"). For networks of a few thousand parameters this overhead is a
+large part of a step.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-8
 
 @dataclass
 class Adam:
-    """Moments of a gradient, and the step that they make."""
+    """Adam's state for one tensor: parameters and moments of their gradient; ``second`` is beta_2."""
 
-    numbers: Tensor
+    parameters: Tensor
     weight_decay: float = 0.0
     second: float = BETA_2
     mean: Tensor = field(init=False)
@@ -27,19 +27,19 @@ class Adam:
     _steps: Tensor = field(init=False)
 
     def __post_init__(self) -> None:
-        self.mean, self.square = torch.zeros_like(self.numbers), torch.zeros_like(self.numbers)
-        self._steps = torch.zeros((), device=self.numbers.device)
+        self.mean, self.square = torch.zeros_like(self.parameters), torch.zeros_like(self.parameters)
+        self._steps = torch.zeros((), device=self.parameters.device)
 
     @property
     def steps(self) -> int:
-        """How many were made."""
+        """Number of steps done."""
         return int(self._steps)
 
     def step(self, gradient: Tensor, rate: float) -> None:
-        """Move the numbers against their gradient."""
+        """Move the parameters against their gradient."""
         self._steps += 1.0
         torch._fused_adamw_(
-            [self.numbers], [gradient], [self.mean], [self.square], [], [self._steps],
+            [self.parameters], [gradient], [self.mean], [self.square], [], [self._steps],
             lr=rate, beta1=BETA_1, beta2=self.second, weight_decay=self.weight_decay, eps=EPSILON,
             amsgrad=False, maximize=False,
         )  # fmt: skip
@@ -52,7 +52,7 @@ class Adam:
         """Load the moments of ``state``. Raises ValueError for another shape."""
         mean, square = torch.as_tensor(state["mean"]), torch.as_tensor(state["square"])
         if mean.shape != self.mean.shape or square.shape != mean.shape:
-            raise ValueError(f"moments of shape {tuple(mean.shape)} for numbers of shape {tuple(self.mean.shape)}")
+            raise ValueError(f"moments of shape {tuple(mean.shape)} for parameters of shape {tuple(self.mean.shape)}")
         self.mean.copy_(mean)
         self.square.copy_(square)
         self._steps.fill_(float(state["steps"]))

@@ -1,6 +1,6 @@
-"""Named arrays in one file that holds numbers only: NumPy's ``.npz``, read without pickle.
+"""Named arrays in one file of numbers: NumPy's ``.npz``, read without pickle.
 
-A file of a stranger is data. ``torch.load`` and the files of stable-baselines3 run an unpickler, which may run code.
+An untrusted file must not run code. ``torch.load`` and stable-baselines3 unpickle their files, which may run code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from carlab.core.errors import DataError
 
 MAX_BYTES = 256_000_000
-"""Size of the arrays of one file; a policy or a learned car has some hundred kilobytes."""
+"""Maximum size of the arrays of one file; a policy or a learned car has some hundred kilobytes."""
 _UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, NotImplementedError, RuntimeError),
     *(zipfile.BadZipFile, zipfile.LargeZipFile, SyntaxError, RecursionError),
@@ -26,7 +26,7 @@ _UNREADABLE = (
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Tensor | int]) -> None:
-    """Write tensors, from any device, and whole numbers. Raises OSError where the disk is full."""
+    """Write tensors of any device, and integers. Raises OSError if the disk is full."""
     content = io.BytesIO()
     np.savez(content, **{k: v.detach().cpu().numpy() if isinstance(v, Tensor) else v for k, v in arrays.items()})  # type: ignore[arg-type]
     path.write_bytes(content.getvalue())
@@ -36,8 +36,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     """Read all arrays of a file.
 
     Raises:
-        DataError: the file cannot be read, or holds more than ``MAX_BYTES`` or anything but numbers. The message is
-            a clause without a remedy.
+        DataError: the file cannot be read, or holds more than ``MAX_BYTES`` or values other than numbers. The message
+            is a clause without a remedy.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -54,7 +54,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
 
 
 def checked_tensor(arrays: Mapping[str, NDArray[np.generic]], name: str, shape: tuple[int, ...]) -> Tensor:
-    """One array as a float32 tensor. Raises DataError where it is missing, not finite or of another shape or type."""
+    """One array as a float32 tensor. Raises DataError if it is missing, not finite or of another shape or type."""
     if name not in arrays:
         raise DataError(f"{name} is missing")
     array = arrays[name]
@@ -66,10 +66,10 @@ def checked_tensor(arrays: Mapping[str, NDArray[np.generic]], name: str, shape: 
 
 
 def whole_number(arrays: Mapping[str, NDArray[np.generic]], name: str) -> int:
-    """One whole number. Raises DataError where it is missing, negative or no whole number."""
+    """One integer. Raises DataError if it is missing, negative or not an integer."""
     array = arrays.get(name)
     if array is None or array.shape != () or array.dtype.kind not in "iu" or int(array) < 0:
-        raise DataError(f"{name} is no whole number")
+        raise DataError(f"{name} is not a non-negative integer")
     return int(array)
 
 

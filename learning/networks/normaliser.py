@@ -14,8 +14,8 @@ class Normaliser:
 
     Attributes:
         input_mean, input_std, output_mean, output_std: centres and units.
-        decorrelation: matrix (O, O) that multiplies outputs in their units from the left, so that prediction errors are
-            uncorrelated; the identity where it is None.
+        decorrelation: matrix (O, O) that multiplies scaled outputs from the left, so that prediction errors are
+            uncorrelated; None is the identity.
     """
 
     input_mean: Tensor
@@ -34,35 +34,35 @@ class Normaliser:
         return scaled if self.decorrelation is None else scaled @ self.decorrelation.to(scaled).T
 
     def raw_inputs(self, normalised: Tensor) -> Tensor:
-        """Inputs in their own units."""
+        """Inputs in physical units."""
         return normalised * self.input_std + self.input_mean
 
     def raw_outputs(self, normalised: Tensor) -> Tensor:
-        """Outputs in their own units."""
+        """Outputs in physical units."""
         if self.decorrelation is not None:
             normalised = normalised @ torch.linalg.inv_ex(self.decorrelation.double()).inverse.to(normalised).T
         return normalised * self.output_std + self.output_mean
 
     @property
     def error_decorrelation(self) -> Tensor | None:
-        """Matrix (O, O) from raw errors to errors of the normalised outputs, where these are decorrelated."""
+        """Matrix (O, O) from raw errors to errors of the normalised outputs; None without a decorrelation."""
         return None if self.decorrelation is None else self.decorrelation.to(self.output_std) / self.output_std
 
     @property
     def decorrelation_log_det(self) -> float:
-        """Logarithm of the decorrelation's volume factor: log densities before it are larger by this."""
+        """Log determinant of the decorrelation: add it to a log density of decorrelated outputs."""
         return 0.0 if self.decorrelation is None else float(torch.linalg.slogdet(self.decorrelation.double()).logabsdet)
 
     def decorrelated(self, by: Tensor) -> Normaliser:
-        """With a further matrix (O, O) that multiplies the normalised outputs from the left."""
+        """Copy with a further matrix (O, O) that multiplies the normalised outputs from the left."""
         return replace(self, decorrelation=by if self.decorrelation is None else by @ self.decorrelation)
 
     def without_decorrelation(self) -> Normaliser:
-        """Without any decorrelation."""
+        """Copy without decorrelation."""
         return replace(self, decorrelation=None)
 
     def to(self, device: torch.device | str) -> Normaliser:
-        """The same on a device."""
+        """Copy on a device."""
         parts = (self.input_mean, self.input_std, self.output_mean, self.output_std)
         moved = Normaliser(*(part.to(device) for part in parts))
         return moved if self.decorrelation is None else moved.decorrelated(self.decorrelation.to(device))

@@ -1,7 +1,7 @@
 """Particles of a Bayesian neural network: many small networks of one shape as one tensor of parameters.
 
-Every particle is an MLP with a linear head. Parameters of all particles lie in one tensor (L, P), so that one batched
-product runs all of them and an optimiser sees one leaf.
+Every particle is an MLP with a linear head. One tensor (L, P) holds all parameters, so that one batched
+product evaluates all of them and an optimiser has one leaf.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Network:
         inputs: number of inputs.
         outputs: number of outputs.
         hidden: width of each hidden layer; the authors use three of 64.
-        activation: of hidden units. Smooth ones (``silu``: Elfwing, Uchibe and Doya 2018) follow a smooth
-            function more closely; the authors have leaky ReLUs.
+        activation: of hidden units. A smooth activation (``silu``: Elfwing, Uchibe and Doya 2018) approximates smooth
+            functions more closely; the authors use leaky ReLUs.
         slope: of the leaky ReLU below zero; 0 is a ReLU.
     """
 
@@ -44,7 +44,7 @@ class Network:
 
     def __post_init__(self) -> None:
         if self.activation not in get_args(Activation):
-            raise ValueError(f"no activation '{self.activation}'")
+            raise ValueError(f"unknown activation '{self.activation}'")
 
     @property
     def layers(self) -> tuple[tuple[int, int], ...]:
@@ -54,7 +54,7 @@ class Network:
 
     @property
     def parameters(self) -> int:
-        """Numbers of one particle."""
+        """Number of parameters of one particle."""
         return sum((fan_in + 1) * fan_out for fan_in, fan_out in self.layers)
 
     def initial(self, particles: int, generator: torch.Generator, device: torch.device | str = "cpu") -> Tensor:
@@ -82,23 +82,23 @@ class Network:
         return found
 
     def __call__(self, parameters: Tensor, inputs: Tensor) -> Tensor:
-        """Outputs (L, N, O) of all particles at inputs (N, D), or at inputs of their own (L, N, D)."""
+        """Outputs (L, N, O) of all particles at common inputs (N, D), or at inputs of each particle (L, N, D)."""
         *hidden, (weights, biases) = self.split(parameters)
-        given = self._by_particle(inputs, len(parameters))
+        activations = self._by_particle(inputs, len(parameters))
         inplace = not torch.is_grad_enabled()  # Autograd needs the preactivations.
         for w, b in hidden:
-            given = self._activated(torch.baddbmm(b, given, w), inplace=inplace)
-        return torch.baddbmm(biases, given, weights)
+            activations = self._activated(torch.baddbmm(b, activations, w), inplace=inplace)
+        return torch.baddbmm(biases, activations, weights)
 
     def values_and_pullback(self, parameters: Tensor, inputs: Tensor) -> tuple[Tensor, Pullback]:
         """Outputs (L, N, O) at inputs (N, D), or (L, N, D), and the pullback of directions on them to the parameters.
 
-        The chain rule is written out: at these sizes it costs a fraction of autograd's bookkeeping.
+        The chain rule is explicit: for networks of this size it is much faster than autograd.
         """
         return self.through(self.split(parameters), inputs)
 
     def through(self, layers: Layers, inputs: Tensor) -> tuple[Tensor, Pullback]:
-        """The same of layers that are split already."""
+        """``values_and_pullback`` for layers from ``split``."""
         layer_inputs, preactivations = [self._by_particle(inputs, len(layers[0][0]))], []
         *hidden, (weights, biases) = layers
         for w, b in hidden:
@@ -109,23 +109,23 @@ class Network:
 
     @staticmethod
     def _by_particle(inputs: Tensor, particles: int) -> Tensor:
-        """Inputs (L, N, D), the same for all particles unless each has its own."""
+        """Inputs (L, N, D), expanded to all particles if they are common (N, D)."""
         return inputs if inputs.ndim == 3 else inputs.expand(particles, *inputs.shape)
 
-    def _activated(self, summed: Tensor, *, inplace: bool = False) -> Tensor:
+    def _activated(self, preactivation: Tensor, *, inplace: bool = False) -> Tensor:
         """Activations of hidden units."""
         if self.activation == "silu":
-            return functional.silu(summed, inplace=inplace)
-        return functional.leaky_relu(summed, self.slope, inplace=inplace)
+            return functional.silu(preactivation, inplace=inplace)
+        return functional.leaky_relu(preactivation, self.slope, inplace=inplace)
 
-    def activation_pullback(self, direction: Tensor, summed: Tensor) -> Tensor:
-        """Direction on preactivations, from one on activations; one pass over the memory."""
-        found: Tensor
+    def activation_pullback(self, direction: Tensor, preactivation: Tensor) -> Tensor:
+        """Gradient with respect to preactivations, from one with respect to activations; one pass over the memory."""
+        gradient: Tensor
         if self.activation == "silu":
-            found = torch.ops.aten.silu_backward(direction, summed)
+            gradient = torch.ops.aten.silu_backward(direction, preactivation)
         else:
-            found = torch.ops.aten.leaky_relu_backward(direction, summed, self.slope, False)
-        return found
+            gradient = torch.ops.aten.leaky_relu_backward(direction, preactivation, self.slope, False)
+        return gradient
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ class Pullback:
     preactivations: Sequence[Tensor]
 
     def __call__(self, direction: Tensor) -> Tensor:
-        """Gradient (L, P) of ``sum(direction * outputs)`` by the parameters."""
+        """Gradient (L, P) of ``sum(direction * outputs)`` with respect to the parameters."""
         parts: list[Tensor] = []
         for k in range(len(self.layers) - 1, -1, -1):
             parts += [direction.sum(dim=1), torch.bmm(self.layer_inputs[k].transpose(1, 2), direction).flatten(1)]
@@ -154,18 +154,18 @@ class Pullback:
         return torch.cat(parts[::-1], dim=1)
 
     def on_inputs(self, direction: Tensor) -> Tensor:
-        """Gradient (L, N, D) of ``sum(direction * outputs)`` by the inputs."""
+        """Gradient (L, N, D) of ``sum(direction * outputs)`` with respect to the inputs."""
         for k in range(len(self.layers) - 1, 0, -1):
             direction = self._through(k, direction)
         return torch.bmm(direction, self.layers[0][0].transpose(1, 2))
 
     def of_first(self, count: int) -> Pullback:
-        """The derivative for the first ``count`` inputs alone."""
+        """The derivative for the first ``count`` inputs."""
         parts = ([v[:, :count] for v in each] for each in (self.layer_inputs, self.preactivations))
         return Pullback(self.network, self.layers, *parts)
 
     def _through(self, k: int, direction: Tensor) -> Tensor:
-        """Direction on the preactivations before layer k, from one on the output of layer k."""
+        """Gradient with respect to the preactivations of layer k - 1, from one with respect to those of layer k."""
         back = torch.bmm(direction, self.layers[k][0].transpose(1, 2))
         return self.network.activation_pullback(back, self.preactivations[k - 1])
 

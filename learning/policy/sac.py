@@ -1,10 +1,10 @@
-"""Soft actor-critic of stable-baselines3 with the gradient step written out: same update, a fraction of the time.
+"""Soft actor-critic of stable-baselines3 with explicit gradients: the same update in a fraction of the time.
 
-At the sizes of a small car's networks nearly all of a step of stable-baselines3 is bookkeeping: autograd's tape, one
-optimiser call for each matrix, one copy for each figure that is logged. Here both critics are one batched network,
-every network is one tensor of numbers, and the derivatives (Haarnoja et al., "Soft Actor-Critic Algorithms and
-Applications", arXiv 1812.05905, equations 6, 9 and 18) are taken by hand. Policy, replay, collecting and files are
-those of stable-baselines3, whose modules hold views of the same memory.
+For networks of this size, overhead dominates a step of stable-baselines3: autograd's tape, one optimiser call for each
+matrix, one copy for each logged figure. Here both critics are one batched network, the parameters of each network are
+one tensor, and the derivatives (Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905,
+equations 6, 9 and 18) are explicit. Policy, replay buffer and rollouts are those of stable-baselines3, whose modules
+hold views of the same memory.
 """
 
 from __future__ import annotations
@@ -28,42 +28,42 @@ from learning.networks.adam import Adam
 from learning.networks.array_file import checked_tensor, whole_number
 from learning.networks.particles import Layers, Network, Pullback
 
-_SQUASH = 1e-6
-"""Added under the logarithm of tanh's derivative, as stable-baselines3 does."""
+_LOG_OFFSET = 1e-6
+"""Offset inside the logarithm of tanh's derivative, as in stable-baselines3."""
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class _Batch(NamedTuple):
-    """Rows of a gradient step.
+    """Transitions of a gradient step.
 
     Attributes:
-        views: now, and then afterwards (2 N, F).
-        taken: views now and the actions then (N, F + A).
-        kept: discount of what is afterwards, 0 at an end (N, 1).
+        observations: before the transitions, followed by those after them (2 N, F).
+        state_actions: observations and recorded actions before the transitions (N, F + A).
+        discount: of the next value, 0 at a termination (N, 1).
         reward: (N, 1).
-        noise: of the actions at both views (2 N, A).
-        unlikely: negative logarithm of its density (2 N,).
+        noise: standard normal noise of the policy's actions at the observations (2 N, A).
+        noise_nll: negative log density of the noise (2 N,).
     """
 
-    views: Tensor
-    taken: Tensor
-    kept: Tensor
+    observations: Tensor
+    state_actions: Tensor
+    discount: Tensor
     reward: Tensor
     noise: Tensor
-    unlikely: Tensor
+    noise_nll: Tensor
 
 
 @dataclass
 class _Flat:
-    """Some networks of one shape as one tensor (L, P), which their modules see as views."""
+    """Networks of one shape as one tensor (L, P); the parameters of their modules are views of it."""
 
     network: Network
-    numbers: Tensor
+    parameters: Tensor
     layers: Layers = field(init=False)
     adam: Adam = field(init=False)
 
     def __post_init__(self) -> None:
-        self.layers, self.adam = self.network.split(self.numbers), Adam(self.numbers)
+        self.layers, self.adam = self.network.split(self.parameters), Adam(self.parameters)
 
     def __call__(self, inputs: Tensor) -> tuple[Tensor, Pullback]:
         """Outputs (L, N, O) and their derivative."""
@@ -71,14 +71,14 @@ class _Flat:
 
 
 class FastSac(SAC):
-    """``stable_baselines3.SAC`` for small perceptrons with ReLUs; ``train`` makes the same steps faster."""
+    """``stable_baselines3.SAC`` for small ReLU networks, with a faster ``train``."""
 
     def _setup_model(self) -> None:
         super()._setup_model()
         policy = self.policy
         plain = policy.features_extractor_class is FlattenExtractor and policy.activation_fn is nn.ReLU
         if not plain or self.use_sde or self.log_ent_coef is None:
-            raise ConfigError("FastSac takes ReLU perceptrons and a learned temperature; use stable_baselines3.SAC.")
+            raise ConfigError("FastSac needs ReLU networks and a learned temperature; use stable_baselines3.SAC.")
         actor = policy.actor
         heads = [[m for head in (actor.mu, actor.log_std) for m in _linear(cast(nn.Module, head))]]
         self._actor = _flattened([[[m] for m in _linear(actor.latent_pi)] + heads])
@@ -87,7 +87,7 @@ class FastSac(SAC):
         self._temperature = Adam(self.log_ent_coef.detach())
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Make so many gradient steps on batches of the replay buffer."""
+        """Do gradient steps on batches of the replay buffer."""
         assert self.replay_buffer is not None
         assert self.log_ent_coef is not None
         rate = float(self.lr_schedule(self._current_progress_remaining))
@@ -95,26 +95,25 @@ class FastSac(SAC):
         with torch.no_grad(), denormals_flushed():
             rows = self.replay_buffer.sample(gradient_steps * batch_size, env=self._vec_normalize_env)
             noise = torch.randn((gradient_steps, 2 * batch_size, rows.actions.shape[1])).to(self.device)
-            unlikely = 0.5 * noise.square().sum(dim=2) + noise.shape[2] * _HALF_LOG_TWO_PI
-            discounts = self.gamma if rows.discounts is None else rows.discounts
-            kept = (1.0 - rows.dones) * discounts
-            seen, after = (v.view(gradient_steps, batch_size, -1) for v in (rows.observations, rows.next_observations))
-            taken = torch.cat([rows.observations, rows.actions], dim=1)
-            fields = (torch.split(f, batch_size) for f in (taken, kept, rows.rewards))
-            found: dict[str, Tensor] = {}
-            views = torch.cat([seen, after], dim=1)
-            for step, batch in enumerate(zip(views, *fields, noise, unlikely, strict=True)):
+            noise_nll = 0.5 * noise.square().sum(dim=2) + noise.shape[2] * _HALF_LOG_TWO_PI
+            discount = (1.0 - rows.dones) * (self.gamma if rows.discounts is None else rows.discounts)
+            pair = (v.view(gradient_steps, batch_size, -1) for v in (rows.observations, rows.next_observations))
+            observations = torch.cat(list(pair), dim=1)
+            state_actions = torch.cat([rows.observations, rows.actions], dim=1)
+            fields = (torch.split(f, batch_size) for f in (state_actions, discount, rows.rewards))
+            figures: dict[str, Tensor] = {}
+            for step, batch in enumerate(zip(observations, *fields, noise, noise_nll, strict=True)):
                 losses = self._gradient_step(_Batch(*batch), rate, last=step + 1 == gradient_steps)
-                found = losses or found
+                figures = losses or figures
                 if step % self.target_update_interval == 0:
-                    self._targets.numbers.lerp_(self._critics.numbers, self.tau)
+                    self._targets.parameters.lerp_(self._critics.parameters, self.tau)
         self._n_updates += gradient_steps
-        for name, value in found.items():
+        for name, value in figures.items():
             self.logger.record(f"train/{name}", float(value))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
     def learned_state(self) -> dict[str, Tensor | int]:
-        """A copy of networks, temperature and optimiser state, on the CPU: what a saved policy needs to train on."""
+        """A copy of networks, temperature and optimiser state on the CPU, from which training can continue."""
         assert self.log_ent_coef is not None
         state: dict[str, Tensor | int] = {
             f"policy/{name}": value.detach().cpu().clone() for name, value in self.policy.state_dict().items()
@@ -125,7 +124,7 @@ class FastSac(SAC):
         return state
 
     def load_learned_state(self, state: Mapping[str, Tensor | int]) -> None:
-        """Take over what ``learned_state`` of an agent of the same shape returned."""
+        """Load the output of ``learned_state`` of an agent of the same shape."""
         assert self.log_ent_coef is not None
         self.policy.load_state_dict({name: state[f"policy/{name}"] for name in self.policy.state_dict()})
         self.log_ent_coef.data.copy_(torch.as_tensor(state["log_temperature"]))
@@ -133,7 +132,7 @@ class FastSac(SAC):
             adam.load({name: state[f"{adam_name}/{name}"] for name in adam.state()})
 
     def checked_state(self, arrays: Mapping[str, NDArray[np.generic]]) -> dict[str, Tensor | int]:
-        """The state in arrays of a file. Raises DataError where one is missing or does not fit this agent."""
+        """The state in arrays of a file. Raises DataError if one is missing or does not fit this agent."""
         return {
             name: checked_tensor(arrays, name, tuple(own.shape))
             if isinstance(own, Tensor)
@@ -145,44 +144,44 @@ class FastSac(SAC):
         return {"actor": self._actor.adam, "critics": self._critics.adam, "temperature": self._temperature}
 
     def _gradient_step(self, batch: _Batch, rate: float, *, last: bool) -> dict[str, Tensor]:
-        """One step of temperature, critics and actor; of the ``last`` the temperature and the losses."""
-        count, width = len(batch.taken), batch.noise.shape[1]
-        heads, through_actor = self._actor(batch.views[None])
+        """One step of temperature, critics and actor; returns temperature and losses of the ``last`` step."""
+        count, width = len(batch.state_actions), batch.noise.shape[1]
+        heads, actor_pullback = self._actor(batch.observations[None])
         mean, raw_log_std = heads[0, :, :width], heads[0, :, width:]
         log_std = raw_log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
-        swing = log_std.exp() * batch.noise
-        action = torch.tanh(mean + swing)
+        deviation = log_std.exp() * batch.noise
+        action = torch.tanh(mean + deviation)
         slope = 1.0 - action * action
-        log_density = -(log_std + torch.log(slope + _SQUASH)).sum(dim=1) - batch.unlikely
+        log_density = -(log_std + torch.log(slope + _LOG_OFFSET)).sum(dim=1) - batch.noise_nll
 
-        temperature = self._temperature.numbers.exp()
+        temperature = self._temperature.parameters.exp()
         self._temperature.step(-(log_density[:count].mean() + float(self.target_entropy)).view(1), rate)
 
-        chosen = torch.cat([batch.views, action], dim=1)
-        worth = self._targets(chosen[count:])[0].amin(dim=0)
-        worth = worth - (temperature * log_density[count:])[:, None]
-        wanted = batch.reward + batch.kept * worth
-        values, through_critics = self._critics(batch.taken)
-        off = values - wanted
-        self._critics.adam.step(through_critics(off / count), rate)
+        policy_actions = torch.cat([batch.observations, action], dim=1)
+        next_value = self._targets(policy_actions[count:])[0].amin(dim=0)
+        next_value = next_value - (temperature * log_density[count:])[:, None]
+        target = batch.reward + batch.discount * next_value
+        values, critic_pullback = self._critics(batch.state_actions)
+        error = values - target
+        self._critics.adam.step(critic_pullback(error / count), rate)
 
-        values, through_critics = self._critics(chosen[:count])
-        least, which = values.min(dim=0, keepdim=True)
-        of_least = torch.zeros_like(values).scatter_(0, which, -1.0 / count)
-        by_action = through_critics.on_inputs(of_least).sum(dim=0)[:, -width:]
-        # The logarithm of the density by what tanh is given, its noise held fixed.
-        now, bent, raw = action[:count], slope[:count], raw_log_std[:count]
+        values, critic_pullback = self._critics(policy_actions[:count])
+        min_value, min_index = values.min(dim=0, keepdim=True)
+        by_min_value = torch.zeros_like(values).scatter_(0, min_index, -1.0 / count)
+        by_action = critic_pullback.on_inputs(by_min_value).sum(dim=0)[:, -width:]
+        # Gradient of the actor's loss with respect to mean and log std before tanh, for fixed noise.
+        now, now_slope, raw = action[:count], slope[:count], raw_log_std[:count]
         scale = temperature / count
-        by_mean = bent * (by_action + scale * (2.0 * now / (bent + _SQUASH)))
-        by_log_std = (by_mean * swing[:count] - scale) * ((raw >= LOG_STD_MIN) & (raw <= LOG_STD_MAX))
-        own = torch.cat([by_mean, by_log_std], dim=1)[None]
-        self._actor.adam.step(through_actor.of_first(count)(own), rate)
+        by_mean = now_slope * (by_action + scale * (2.0 * now / (now_slope + _LOG_OFFSET)))
+        by_log_std = (by_mean * deviation[:count] - scale) * ((raw >= LOG_STD_MIN) & (raw <= LOG_STD_MAX))
+        by_heads = torch.cat([by_mean, by_log_std], dim=1)[None]
+        self._actor.adam.step(actor_pullback.of_first(count)(by_heads), rate)
         if not last:
             return {}
         return {
             "ent_coef": temperature,
-            "actor_loss": (temperature * log_density[:count]).mean() - least.mean(),
-            "critic_loss": 0.5 * (off * off).mean(dim=1).sum(),
+            "actor_loss": (temperature * log_density[:count]).mean() - min_value.mean(),
+            "critic_loss": 0.5 * (error * error).mean(dim=1).sum(),
         }
 
 
@@ -191,27 +190,28 @@ def _linear(module: nn.Module) -> list[nn.Linear]:
 
 
 def _flattened(networks: Iterable[list[list[nn.Linear]]]) -> _Flat:
-    """Move the numbers of equal networks into one tensor and let their modules see them there.
+    """Move the parameters of networks of one shape into one tensor, of which their modules become views.
 
     Args:
-        networks: of each the layers; linear maps of the same input stand in one layer, side by side.
+        networks: the layers of each network; a layer may hold several linear maps of the same input.
     """
     networks = list(networks)
     first = networks[0]
     hidden = tuple(sum(m.out_features for m in layer) for layer in first[:-1])
     shape = Network(first[0][0].in_features, sum(m.out_features for m in first[-1]), hidden, slope=0.0)
     like = first[0][0].weight
-    numbers = torch.empty((len(networks), shape.parameters), dtype=like.dtype, device=like.device)
+    flat = torch.empty((len(networks), shape.parameters), dtype=like.dtype, device=like.device)
     for k, layers in enumerate(networks):
-        for (weights, biases), layer in zip(shape.split(numbers), layers, strict=True):
+        for (weights, biases), layer in zip(shape.split(flat), layers, strict=True):
             begin = 0
             for linear in layer:
-                own = slice(begin, begin + linear.out_features)
-                for parameter, place in ((linear.weight, weights[k][:, own].T), (linear.bias, biases[k, 0, own])):
-                    place.copy_(parameter.data)
-                    parameter.data = place
-                begin = own.stop
-    return _Flat(shape, numbers)
+                columns = slice(begin, begin + linear.out_features)
+                views = ((linear.weight, weights[k][:, columns].T), (linear.bias, biases[k, 0, columns]))
+                for parameter, view in views:
+                    view.copy_(parameter.data)
+                    parameter.data = view
+                begin = columns.stop
+    return _Flat(shape, flat)
 
 
 __all__ = ["FastSac"]

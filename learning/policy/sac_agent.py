@@ -1,4 +1,4 @@
-"""SAC in a learned world: training, files, and the policy that drives the car."""
+"""SAC in the learned car: training, files, and the policy that drives the car."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action
 from learning.networks.array_file import read_arrays, whole_number, write_arrays
 from learning.policy.sac import FastSac
-from learning.world.model_env import ModelEnv, policy_spaces, policy_view
+from learning.world.model_env import ModelEnv, policy_inputs, policy_spaces
 
 AGENT_FILE = "policy.npz"
 EARLIER_AGENT_FILE = "agent.zip"
@@ -41,11 +41,11 @@ class SacSettings:
         updates: gradient steps after those ticks.
         batch: transitions of a gradient step.
         replay: size of the replay buffer [transitions].
-        warm_up: transitions before the first update; random actions where there is no policy yet.
+        warm_up: transitions before the first update; with random actions if there is no earlier policy.
         discount: discount factor.
         learning_rate: step size of the optimiser.
         target_rate: rate of the target networks' moving average.
-        temperature: entropy coefficient at the start.
+        temperature: initial entropy coefficient.
         target_entropy: target entropy of the action [nat].
         steps_ahead: number of rewards in an n-step return.
     """
@@ -66,7 +66,7 @@ class SacSettings:
 
 
 class SacAgent:
-    """A policy that learns in a ``ModelEnv``. It starts untrained; ``load`` reads an earlier one."""
+    """A policy trained in a ``ModelEnv``. A new agent is untrained; ``load`` reads a trained one."""
 
     def __init__(self, settings: SacSettings, seed: int, device: torch.device | str = "cpu") -> None:
         self._settings, self._seed, self._device = settings, seed, device
@@ -80,22 +80,22 @@ class SacAgent:
         evaluate: Callable[[SacAgent], float] | None = None,
         n_evaluations: int = 5,
     ) -> dict[str, float]:
-        """Train in a world, from the present networks and optimiser state and with an empty replay buffer.
+        """Train from the current networks and optimiser state, with an empty replay buffer.
 
         Args:
-            env: the world.
+            env: the environment.
             updates: gradient steps.
             progress: called with the number of gradient steps done.
-            evaluate: score of a policy. The best policy of ``n_evaluations`` equally spaced ones, the last one
-                included, is kept with its temperature and optimiser state.
+            evaluate: score of a policy. ``n_evaluations`` equally spaced policies, including the last one, are
+                evaluated; the best one is kept with its temperature and optimiser state.
             n_evaluations: number of evaluations.
 
         Returns:
             Figures of the last gradient step.
 
         Raises:
-            DivergedError: the policy diverged; the earlier one is kept.
-            DataError: the earlier policy has another observation.
+            DivergedError: the policy diverged; the earlier policy is kept.
+            DataError: the earlier policy has another observation space.
         """
         earlier = self._sac
         sac = self._learner(env, earlier)
@@ -125,9 +125,9 @@ class SacAgent:
         return {name: float(value) for name, value in sac.logger.name_to_value.items()}
 
     def _learner(self, env: ModelEnv, earlier: FastSac | None) -> FastSac:
-        """A learner for this world with the earlier networks, temperature and optimiser state, where there are any."""
+        """Learner for this environment, with the networks, temperature and optimiser state of ``earlier`` if given."""
         if earlier is not None and earlier.observation_space != env.observation_space:
-            raise DataError("The earlier policy has another shape; remove its folder, and it is trained anew.")
+            raise DataError("The earlier policy has another shape; remove its folder to train again.")
         s = self._settings
         sac = FastSac(
             "MlpPolicy", env, learning_rate=s.learning_rate, buffer_size=s.replay, batch_size=s.batch,
@@ -139,7 +139,7 @@ class SacAgent:
         if earlier is not None:
             sac.load_learned_state(earlier.learned_state())
         sac.set_logger(Logger(None, []))
-        env.seed_anew()
+        env.restore_seed()
         return sac
 
     def policy(self) -> SacPolicy:
@@ -147,14 +147,14 @@ class SacAgent:
         assert self._sac is not None
         return SacPolicy(self._sac)
 
-    def act(self, seen: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Mean actions (N, 2) for views (N, F)."""
+    def act(self, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mean actions (N, 2) for observations (N, F)."""
         assert self._sac is not None
-        found: NDArray[np.float32] = self._sac.predict(seen, deterministic=True)[0]
-        return found
+        actions: NDArray[np.float32] = self._sac.predict(observations, deterministic=True)[0]
+        return actions
 
     def save(self, folder: Path) -> None:
-        """Write networks, temperature and optimiser state into a folder. Raises OSError where the disk is full."""
+        """Write networks, temperature and optimiser state into a folder. Raises OSError if the disk is full."""
         assert self._sac is not None
         (width,) = self._sac.observation_space.shape or (0,)
         header = {"version": FILE_VERSION, "observation_size": width}
@@ -164,15 +164,15 @@ class SacAgent:
     def load(cls, folder: Path, settings: SacSettings, seed: int, device: torch.device | str = "cpu") -> SacAgent:
         """Read an agent that was saved with the same layer widths.
 
-        Until it is trained again, on ``device``, it acts on the CPU: a car's policy waits for no other device.
+        The agent acts on the CPU until it is trained again on ``device``, so that a car's policy has low latency.
 
         Raises:
-            DataError: the file is missing, broken, of an earlier version or of another shape. Nothing in it is run.
+            DataError: the file is missing, broken, of an earlier version or of another shape. Its content is not run.
         """
         if (folder / EARLIER_AGENT_FILE).exists() and not (folder / AGENT_FILE).exists():
             raise DataError(
                 f"{folder / EARLIER_AGENT_FILE} is a policy of an earlier version of carlab, whose format may run code "
-                f"and is not read; remove the folders in {folder.parent}, and the policy is trained anew."
+                f"and is not read; remove the folders in {folder.parent} to train again."
             )
         try:
             arrays = read_arrays(folder / AGENT_FILE)
@@ -180,17 +180,17 @@ class SacAgent:
             if version != FILE_VERSION or not 0 < width <= MAX_OBSERVATION_SIZE:
                 raise DataError(f"it has version {version} and {width} features")
             agent = cls(settings, seed, device)
-            agent._sac = _without_world(width, settings, seed)
+            agent._sac = _without_environment(width, settings, seed)
             agent._sac.load_learned_state(agent._sac.checked_state(arrays))
         except DataError as error:
             raise DataError(
-                f"The policy in {folder} cannot be read ({error}); remove the folder, and it is trained anew."
+                f"The policy in {folder} cannot be read ({error}); remove the folder to train again."
             ) from error
         return agent
 
 
-def _without_world(observation_size: int, settings: SacSettings, seed: int) -> FastSac:
-    """An untrained agent on the CPU that drives, or gives its networks to a learner."""
+def _without_environment(observation_size: int, settings: SacSettings, seed: int) -> FastSac:
+    """An untrained agent on the CPU without an environment."""
     hidden = {"net_arch": list(settings.hidden)}
     sac = FastSac(
         "MlpPolicy", cast(Any, None), buffer_size=1, target_entropy=settings.target_entropy, policy_kwargs=hidden,
@@ -210,7 +210,7 @@ class _Best:
     state: dict[str, Tensor | int] | None = None
 
     def offer(self, score: float, sac: FastSac) -> None:
-        """Keep a copy of the state of ``sac`` where its score is the highest."""
+        """Keep a copy of the state of ``sac`` if its score is the highest."""
         if score > self.score:
             self.score, self.state = score, sac.learned_state()
 
@@ -223,19 +223,19 @@ class SacPolicy:
     name: str = "sac"
 
     def reset(self) -> None:
-        """Nothing to reset: the policy has no memory, and past commands are in its observation."""
+        """Do nothing: the policy has no state, and its observation holds the past commands."""
 
     def act(self, view: PolicyInput) -> Action | None:
         """The mean action."""
-        action: Any = self.sac.predict(policy_view(view.features)[None], deterministic=True)[0][0]
+        action: Any = self.sac.predict(policy_inputs(view.features)[None], deterministic=True)[0][0]
         return Action.from_array(action.astype(np.float64))
 
 
 class _Milestones(BaseCallback):
     """Checks the policy after given numbers of gradient steps, and ends training after the last check.
 
-    It checks between two ticks of the world. stable-baselines3 drops the tick in which a callback ends training, and a
-    replay buffer that goes on after that would hold two ticks as one.
+    Checks take place between two ticks. stable-baselines3 drops the tick in which a callback ends training; the replay
+    buffer would join the ticks before and after it.
     """
 
     def __init__(self, milestones: list[int], progress: Callable[[int], None], check: Callable[[], None]) -> None:

@@ -1,9 +1,9 @@
 """Model discrepancy (simulator against reality) as a Gaussian process whose covariance is fitted to data.
 
-Each output has a process of its own: a plane with unknown slopes, and a smooth function with one lengthscale per input
+Each output has its process: a plane with unknown slopes, and a smooth function with one lengthscale per input
 (automatic relevance determination). Hyperparameters and noise maximise the evidence times a log-normal prior (maximum a
 posteriori; Rasmussen and Williams 2006, equations 2.30 and 5.8), given the simulator's mean and the covariance of its
-parameters. All in normalised inputs and outputs.
+parameters. Inputs and outputs are normalised.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from learning.networks.adam import Adam
 
 STEPS = 120
 LEARNING_RATE, FINAL_RATE_SHARE = 0.08, 0.05
-"""Of Adam; the share of it that is left at the end of a half cosine."""
+"""Initial rate of Adam; final share of it after a half cosine."""
 BATCH_ROWS = 300
 """Rows of one evidence gradient; a random subset of more."""
 STEPS_PER_BATCH = 30
@@ -27,17 +27,17 @@ STEPS_PER_BATCH = 30
 CHOLESKY_JITTER = 1e-6
 """Variance added before a Cholesky factorisation."""
 PRIOR_DISCREPANCY_STD = 0.3
-"""Prior size of the discrepancy in normalised outputs, unless something better is known."""
+"""Default prior size of the discrepancy in normalised outputs."""
 PRIOR_LENGTHSCALE = 3.0
 LOG_STD_SCALE, LOG_STD_SHAPE, LOG_STD_NOISE = 1.0, 0.3, 0.5
-"""Prior standard deviations of logarithms: of sizes, of an output's own lengthscales and slopes, of the noise."""
+"""Prior standard deviations of logarithms: of sizes, of lengthscales and slopes of each output, of the noise."""
 LOG_STD_OUTPUT_FACTOR, LOG_STD_INPUT_FACTOR = 1.0, 1.0
 """The same of a common factor on all sizes of an output, and on the lengthscales of all outputs along an input."""
 LOG_STDS = (
     *(LOG_STD_SCALE, LOG_STD_SHAPE, LOG_STD_SHAPE, LOG_STD_SCALE, LOG_STD_SCALE, LOG_STD_SHAPE),
     *(LOG_STD_NOISE, LOG_STD_OUTPUT_FACTOR, LOG_STD_INPUT_FACTOR),
 )
-"""Of a covariance's six parts in their order, the noise, and the two factors."""
+"""The same for a covariance's six parts in their order, the noise, and the two factors."""
 
 Evaluated = tuple[Tensor, Callable[[Tensor], list[Tensor]]]
 """A covariance, and the map from a gradient with respect to it to gradients with respect to its hyperparameters."""
@@ -73,8 +73,8 @@ class DiscrepancyCovariance:
 
         Args:
             inputs: D.
-            prior_std: prior size of the discrepancy (O,). Every part has this size at inputs one unit from the middle,
-                the plane over all of its slopes.
+            prior_std: prior size of the discrepancy (O,). Every part has this size at inputs one unit from the centre,
+                the plane with all slopes together.
             multiplier_share: size of the multiplicative part relative to the others.
         """
         size = prior_std.double()
@@ -102,7 +102,7 @@ class DiscrepancyCovariance:
         return covariance.add_(multiplicative)
 
     def with_pullback(self, inputs: Tensor) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
-        """The covariance of inputs with themselves, and its derivative in closed form.
+        """The covariance matrix of inputs, and its derivative in closed form.
 
         Args:
             inputs: (n, D) or (n, D + O).
@@ -123,7 +123,7 @@ class DiscrepancyCovariance:
             covariance.add_(multiplicative)
 
         def lengthscale_gradient(weighted: Tensor, lengthscales: Tensor) -> Tensor:
-            """By the logarithms of lengthscales (O, D), of a gradient times the covariance that has them."""
+            """Gradient with respect to the log lengthscales (O, D), from a gradient times their covariance term."""
             return 2.0 * (weighted.sum(dim=2) @ x**2 - ((weighted @ x) * x).sum(dim=1)) / lengthscales**2
 
         def pullback(gradient: Tensor) -> list[Tensor]:
@@ -181,7 +181,7 @@ def fit_discrepancy(
         noise_std: prior median of the noise (O,).
         prior_std: prior size of the discrepancy (O,).
         row_weights: Student-t weights (n,); a row's noise variance is divided by its weight.
-        simulated_mean: normalised outputs of the simulator (n, O), where there is one.
+        simulated_mean: normalised outputs of the simulator (n, O), if any.
         seed: of the subsets of rows.
         multiplier_share: prior size of the multiplicative part relative to the others.
 
@@ -206,11 +206,11 @@ def fit_discrepancy(
             covariance += _of_rows(parameter_covariance, rows)
 
         def pullback(gradient: Tensor) -> list[Tensor]:
-            own = part_gradients(gradient)
-            scales, lengthscales, slopes, offsets, multiplier_stds, multiplier_lengthscales = own
+            by_parts = part_gradients(gradient)
+            scales, lengthscales, slopes, offsets, multiplier_stds, multiplier_lengthscales = by_parts
             by_output = scales + slopes.sum(dim=1) + offsets + multiplier_stds
             by_input = (lengthscales + multiplier_lengthscales).sum(dim=0)
-            return [*own, _noise_gradient(gradient, noise_variance), by_output, by_input]
+            return [*by_parts, _noise_gradient(gradient, noise_variance), by_output, by_input]
 
         return covariance, pullback
 
@@ -244,10 +244,10 @@ def _maximise_posterior(
     """Logarithms of hyperparameters at the maximum of evidence times Gaussian priors, by Adam.
 
     Args:
-        medians: prior means of the logarithms, where the search starts.
+        medians: prior means of the logarithms, the initial values.
         log_stds: their prior standard deviations.
         residual: (n, O), zero-mean Gaussian.
-        evaluate: covariance (O, m, m) of some rows (m,) for given logarithms, and its pullback.
+        evaluate: covariance (O, m, m) of the rows with indices (m,) for given logarithms, and its pullback.
         seed: of the subsets of rows.
     """
     generator, count = torch.Generator().manual_seed(seed), len(residual)
@@ -268,7 +268,7 @@ def _maximise_posterior(
 
 
 def _of_rows(covariance: Tensor, rows: Tensor) -> Tensor:
-    """Covariances (O, m, m) of some rows (m,), from those of all (O, n, n)."""
+    """Covariances (O, m, m) of the rows with indices (m,), from those of all (O, n, n)."""
     return covariance if len(rows) == covariance.shape[1] else covariance[:, rows][:, :, rows]
 
 
@@ -278,12 +278,12 @@ def _noise_variance(log_noise: Tensor, row_weights: Tensor) -> Tensor:
 
 
 def _noise_gradient(gradient: Tensor, variance: Tensor) -> Tensor:
-    """Gradient (O,) by the logarithms of the noise, from one by the covariance (O, n, n)."""
+    """Gradient (O,) with respect to the log noise, from one with respect to the covariance (O, n, n)."""
     return 2.0 * (gradient.diagonal(dim1=1, dim2=2) * variance).sum(dim=1)
 
 
 def _covariance_of(logs: list[Tensor]) -> DiscrepancyCovariance:
-    """The covariance of logarithms: of its six parts, of the noise, of an output's factor and of an input's."""
+    """The covariance, from logarithms of its six parts, of the noise, and of the factors by output and by input."""
     scales, lengthscales, slopes, offsets, multiplier_stds, multiplier_lengthscales, _, by_output, by_input = logs
     return DiscrepancyCovariance(
         (scales + by_output).exp(), (lengthscales + by_input).exp(), (slopes + by_output[:, None]).exp(),
@@ -292,7 +292,7 @@ def _covariance_of(logs: list[Tensor]) -> DiscrepancyCovariance:
 
 
 def evidence_gradient(residual: Tensor, covariance: Tensor) -> Tensor:
-    """Gradient (O, n, n) of the negative log evidence by the covariance.
+    """Gradient (O, n, n) of the negative log evidence with respect to the covariance.
 
     ``(K^-1 - K^-1 r r^T K^-1) / 2`` (Rasmussen and Williams 2006, equation 5.9).
 

@@ -1,6 +1,6 @@
 """Distillation of a posterior over functions into particles of a network: what carlab calls Sim-FSVGD.
 
-This is carlab's own method, not the algorithm of Rothfuss et al. (arXiv 2403.16644); theirs is
+This method is carlab's, not the algorithm of Rothfuss et al. (arXiv 2403.16644); theirs is
 ``learning.functional_svgd.fsvgd`` with a ``SimulatorPrior``. Here the posterior's moments are in closed form
 (``function_posterior``: a Gaussian process around a simulator whose parameters are drawn by sequential Monte Carlo).
 Particles are moved until they have these moments at many small measurement sets: Stein's direction with a linear kernel
@@ -32,9 +32,9 @@ FINAL_RATE_SHARE = 0.001
 SQUARE_DECAY = 0.99
 """Adam's decay of the mean square of a gradient."""
 MIN_ROWS_FOR_NEIGHBOURS = 20
-"""Rows from which on half of the measurement points are neighbours of rows."""
+"""Minimum number of rows for half of the measurement points to be neighbours of rows."""
 MIN_ROWS_FOR_NOISE = 40
-"""Rows from which on the particles' misfit is measured at the rows, and not at the measurement points."""
+"""Minimum number of rows for the particles' misfit to be measured at the rows instead of the measurement points."""
 MIN_NOISE_SHARE = 0.5
 """Lower bound of the particles' noise, relative to the measurement noise."""
 MAX_MISFIT_STD = 3.0
@@ -42,7 +42,7 @@ MAX_MISFIT_STD = 3.0
 SLOPE_PENALTY_SHARE = 1e-6
 """Ridge penalty of the linear trend, as a share of the total weight."""
 MAX_NEIGHBOUR_DISTANCE = 0.5
-"""Largest standard deviation of a neighbour's distance from its row, in units of the inputs."""
+"""Maximum standard deviation of a neighbour's distance from its row, in units of the inputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class DistillationSettings:
         steps: of Adam.
         sets: measurement sets of a step.
         points: of a set; fewer than particles, because L particles have a covariance of rank L - 1.
-        learning_rate: at the start; it falls to ``FINAL_RATE_SHARE`` of it along a half cosine.
+        learning_rate: initial rate; it falls to ``FINAL_RATE_SHARE`` of it along a half cosine.
         activation: of the hidden units.
         seed: of all draws.
     """
@@ -98,20 +98,20 @@ def distil(
 
     Args:
         target: the posterior.
-        points: raw inputs of the domain (M, D), from which measurement sets are made.
+        points: raw inputs of the domain (M, D), which are split into measurement sets.
         settings: of the fit.
         progress: called with the number of steps done, every ``PROGRESS_PERIOD_STEPS``.
-        start: parameters of earlier particles (L, P) to start from.
+        start: initial parameters (L, P), of earlier particles.
 
     Returns:
-        The particles. Their noise is the measurements' and the particles' misfit to the target's mean.
+        The particles. Their noise includes the measurement noise and the particles' misfit to the target's mean.
 
     Raises:
-        DataError: there are fewer points than a measurement set has.
+        DataError: fewer points than a measurement set needs.
         DivergedError: the particles diverged.
     """
     if len(points) < settings.points:
-        raise DataError(f"{len(points)} points of the domain make no measurement set of {settings.points}; give more.")
+        raise DataError(f"A measurement set needs {settings.points} points of the domain, not {len(points)}; add some.")
     normaliser = target.normaliser
     generator = torch.Generator().manual_seed(settings.seed)
     network = Network(points.shape[1], len(target.noise_std), settings.hidden, settings.activation)
@@ -161,7 +161,7 @@ def _train(
     for step, sets in enumerate(order.to(parameters.device)):
         values, pullback = network.through(layers, targets.inputs[sets].flatten(0, 1))
         by_set = values.view(particles, settings.sets, settings.points, outputs)
-        # One set and output a row: (L, sets * outputs, points).
+        # Rows are pairs of set and output: (L, sets * outputs, points).
         rows = by_set.transpose(2, 3).flatten(1, 2)
         direction = moment_direction(rows, targets.mean[sets].flatten(0, 1), targets.cholesky[sets].flatten(0, 1))
         direction = direction * targets.weight[sets].flatten(0, 1)
@@ -183,19 +183,19 @@ def measurement_points(
 ) -> Tensor:
     """Raw inputs (count, D) at which particles are fitted to a posterior.
 
-    Half are neighbours of rows, if there are ``MIN_ROWS_FOR_NEIGHBOURS``; the rest is drawn from the simulator's
-    domain, or from ``domain`` where there is no simulator.
+    From ``MIN_ROWS_FOR_NEIGHBOURS`` rows on, half are neighbours of rows; the others are drawn from the simulator's
+    domain, or from ``domain`` without a simulator.
 
     Args:
         model: the simulator.
         inputs: raw inputs of the rows (n, D).
         normaliser: its units.
         generator: of the draws.
-        count: how many.
+        count: number of inputs.
         domain: raw inputs (M, D).
 
     Raises:
-        DataError: there are neither rows nor a domain.
+        DataError: neither rows nor a domain are given.
     """
     if model is None and domain is None and not len(inputs):
         raise DataError("There is neither data nor a domain to learn in; name a car file as the prior.")
@@ -217,9 +217,9 @@ def measurement_points(
 def _noise(
     values: Tensor, mean: Tensor, variance: Tensor, weight: Tensor, noise_std: Tensor, max_misfit: float
 ) -> Tensor:
-    """Noise (O,) of particles: the target's, and the particles' squared misfit beyond the target's variance.
+    """Noise (O,) of particles: that of the target, and the squared misfit in excess of its variance.
 
-    The expected squared error of a particle is that of the particles' mean plus their spread.
+    The expected squared error of a particle is that of the particles' mean plus their variance.
 
     Args:
         values: of the particles (L, B, O, N).
@@ -237,7 +237,7 @@ def _noise(
 
 
 def _trend(inputs: Tensor, mean: Tensor, weight: Tensor) -> Tensor:
-    """Constant and slopes (1 + D, O) of the weighted least squares line through means (B, O, N) at inputs (B, N, D)."""
+    """Constant and slopes (1 + D, O) of the weighted linear regression of means (B, O, N) on inputs (B, N, D)."""
     one = torch.ones_like(inputs[..., :1])
     design = torch.cat([one, inputs], dim=2).flatten(0, 1).double()
     means, weight = (v.transpose(1, 2).flatten(0, 1).double().T for v in (mean, weight))

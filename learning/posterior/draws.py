@@ -1,4 +1,4 @@
-"""Samples of a particle posterior, one for each row of inputs: the step of a learned world."""
+"""Samples of a particle posterior, one for each row of inputs: the step of a learned car."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from learning.posterior.particle_posterior import ParticlePosterior
 
 @dataclass(frozen=True, slots=True)
 class Draws:
-    """A posterior to sample from; units, decorrelation and correlation are folded into its matrices once.
+    """Sampler of a posterior; units, decorrelation and correlation are precomputed in its matrices.
 
     Attributes:
         posterior: the mixture.
-        parameters: of networks whose outputs are raw (L, P).
+        parameters: of networks with raw outputs (L, P).
         slopes: of the trend in raw outputs, for each normalised input (D, O).
-        noise: matrix from independent unit noise to raw noise, from the right (O, O).
+        noise: matrix (O, O) that multiplies independent unit noise from the right and gives raw noise.
         scales: of each particle's noise (L, 1, 1).
     """
 
@@ -30,7 +30,7 @@ class Draws:
 
     @classmethod
     def of(cls, posterior: ParticlePosterior) -> Draws:
-        """Samples of a posterior, on its device."""
+        """Create the sampler of a posterior, on its device."""
         units, noise = posterior.normaliser, posterior.noise_std.double().diag()
         to_raw = units.output_std.double().diag()
         if units.decorrelation is not None:
@@ -49,7 +49,7 @@ class Draws:
     def __call__(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """One sample (N, O) of the mixture at each of the raw inputs (N, D).
 
-        Rows are assigned to particles at random and evenly, so that each particle runs on its own rows alone.
+        Rows are assigned to particles at random and evenly; each particle is evaluated only at its rows.
         """
         count, particles = len(inputs), len(self.parameters)
         share = -(-count // particles)

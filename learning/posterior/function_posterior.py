@@ -2,8 +2,8 @@
 
 Model: ``y = f(x, theta) + discrepancy(x) + noise``, with a prior on the parameters ``theta``, a Gaussian process for
 the model discrepancy (the sim-to-real gap process of Rothfuss et al., arXiv 2403.16644, section 4.2) and Student-t
-noise. Given ``theta`` everything is Gaussian in closed form (Rasmussen and Williams 2006, equations 2.23 and 2.24);
-moments are averaged over draws of ``theta`` (law of total covariance). The paper has no such posterior; this is ours.
+noise. Given ``theta`` the posterior is Gaussian in closed form (Rasmussen and Williams 2006, equations 2.23 and 2.24);
+moments are averaged over draws of ``theta`` (law of total covariance). The method is carlab's, not the paper's.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class FunctionPosterior:
         noise_std: of the measurements (O,).
         dof: degrees of freedom of the noise's multivariate Student-t distribution; infinite for a Gaussian.
         correlation: of prediction errors in normalised outputs (O, O).
-        model: the simulator; a zero mean where it is None.
+        model: the simulator; None: a zero mean.
         parameters: draws of its parameters given the rows (P, K).
-        discrepancy: covariance of the model discrepancy; None for a simulator that is taken as exact.
-        inputs: normalised inputs of the rows and the simulator's mean output there (n, D + O); (n, D) without one.
+        discrepancy: covariance of the model discrepancy; None: the simulator is exact.
+        inputs: normalised inputs of the rows and the simulator's mean output (n, D + O); (n, D) without a simulator.
         cholesky: Cholesky factors of the rows' covariance (O, n, n).
-        whitened_residuals: residuals of each draw, whitened by them (O, n, P).
+        whitened_residuals: residuals of each draw, whitened by the Cholesky factors (O, n, P).
     """
 
     normaliser: Normaliser
@@ -74,7 +74,7 @@ class FunctionPosterior:
     def predict(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and scale (N, O) of a measurement at raw inputs (N, D), in raw units.
 
-        The scale is that of the Student-t distribution, the standard deviation where ``dof`` is infinite.
+        The scale is that of the Student-t distribution; it is the standard deviation if ``dof`` is infinite.
         """
         prediction = self.prediction(inputs)
         return prediction.means[0], prediction.marginal_scales[0]

@@ -36,28 +36,28 @@ PARAMETER_DRAWS = 128
 """Draws of the parameters given data."""
 PRIOR_DRAWS = 1024
 PARAMETER_ROWS = 800
-"""Largest number of rows that the parameters are inferred from."""
+"""Maximum number of rows from which the parameters are inferred."""
 EARLY_PARAMETER_ROWS = 200
 """The same in all iterations but the last."""
 MAX_ROWS = 2000
-"""Largest number of rows that the process is conditioned on; a random subset of more."""
+"""Maximum number of rows on which the process is conditioned; a random subset of more."""
 DOMAIN_ROWS = 64
-"""Inputs of the domain at which draws of the prior are checked when there is no data."""
+"""Inputs of the domain at which draws of the prior are checked without data."""
 ITERATIONS = 3
 """Alternations between covariance, parameters, row weights and output decorrelation (docs/decisions/0013)."""
 MIN_NOISE_SHARE = 0.01
 """Lower bound of the noise, relative to the prior noise."""
 MIN_ROWS_STUDENT = 40
-"""Rows from which on Student-t noise, output correlation and restarts are used."""
+"""Minimum number of rows for Student-t noise, output correlation and restarts."""
 MULTIPLIER_SHARE = 0.1
 """Prior size of the discrepancy's multiplicative part relative to its other parts, from ``MIN_ROWS_STUDENT`` rows on
 (docs/decisions/0012)."""
 RESTART_SCALES = (1.0, 0.3, 3.0, 10.0)
-"""Factors on the prior discrepancy from which fits start; the first is the default (docs/decisions/0011)."""
+"""Factors on the prior discrepancy of the restarts; the first is the default (docs/decisions/0011)."""
 MIN_RESTART_GAIN_SE = 2.0
 """Standard errors by which a restart's leave-one-out density must exceed the default's."""
 ROWS_PER_DOF, MIN_DOF = 8.0, 6.0
-"""A fitted covariance allows one degree of freedom per so many rows, and never fewer than the second number."""
+"""Rows per allowed degree of freedom of a fitted covariance, and the lower bound of the maximum."""
 
 
 def infer(
@@ -76,22 +76,22 @@ def infer(
     """Condition simulator, discrepancy and noise on rows.
 
     Args:
-        model: the simulator; a zero mean where it is None.
+        model: the simulator; None: a zero mean.
         inputs: raw (n, D); may be empty.
         outputs: raw (n, O).
         normaliser: of inputs and outputs.
         noise_std: prior median of the noise, raw (O,).
-        discrepancy_std: prior size of the model discrepancy, raw (O,); ``PRIOR_DISCREPANCY_STD`` of the outputs' units
-            unless given.
-        with_discrepancy: whether the simulator may be wrong.
-        noise_known: whether the noise stays at ``noise_std`` where there is no discrepancy; with one it is fitted.
-            Student-t tails and the noise's scale are fitted from ``MIN_ROWS_STUDENT`` rows on in any case.
-        restart_scales: factors on ``discrepancy_std`` from which the covariance is fitted; all but the first are used
-            from ``MIN_ROWS_STUDENT`` rows on.
+        discrepancy_std: prior size of the model discrepancy, raw (O,); by default ``PRIOR_DISCREPANCY_STD`` in the
+            outputs' units.
+        with_discrepancy: whether the model has a discrepancy.
+        noise_known: whether the noise is fixed at ``noise_std``; ignored with a discrepancy, which needs fitted noise.
+            Student-t tails and the noise's scale are always fitted from ``MIN_ROWS_STUDENT`` rows on.
+        restart_scales: factors on ``discrepancy_std``, one for each fit; all but the first are used from
+            ``MIN_ROWS_STUDENT`` rows on.
         seed: of all draws.
 
     Raises:
-        DataError: numbers are missing or infinite, a unit is zero, or the simulator gives no finite numbers.
+        DataError: missing or infinite numbers, a unit of zero, or a simulator without finite outputs.
     """
     _check(inputs, outputs, normaliser, noise_std)
     if len(inputs) > MAX_ROWS:
@@ -117,7 +117,7 @@ def _check(inputs: Tensor, outputs: Tensor, normaliser: Normaliser, noise_std: T
     if len(inputs) != len(outputs):
         raise DataError(f"There are {len(inputs)} rows of inputs and {len(outputs)} of outputs; each row needs both.")
     if not all(bool((size > 0.0).all()) for size in (normaliser.input_std, normaliser.output_std, noise_std)):
-        raise DataError("A unit or an expected noise is zero; each input and output needs one that is larger.")
+        raise DataError("The unit or noise of an input or output is not positive; give positive values.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +136,7 @@ class _Problem:
 
     @property
     def has_student_noise(self) -> bool:
-        """Whether there are rows enough for Student-t noise."""
+        """Whether there are enough rows for Student-t noise."""
         return len(self.inputs) >= MIN_ROWS_STUDENT
 
     @property
@@ -146,7 +146,7 @@ class _Problem:
 
     @property
     def max_dof(self) -> float:
-        """Degrees of freedom that a covariance fitted to these rows allows."""
+        """Maximum degrees of freedom for a covariance fitted to these rows."""
         fitted = len(self.inputs) and (self.with_discrepancy or not self.noise_known)
         return max(len(self.inputs) / ROWS_PER_DOF, MIN_DOF) if fitted else math.inf
 
@@ -168,12 +168,12 @@ class _Residual:
 
 @dataclass(slots=True)
 class _Estimate:
-    """Current estimate of everything that is alternated over.
+    """Current estimate of all quantities in the alternation.
 
     Attributes:
-        normaliser: with the present decorrelation of the outputs.
+        normaliser: with the current decorrelation of the outputs.
         parameters: draws (P, K).
-        residual: of the simulator with these.
+        residual: of the simulator with these parameters.
         discrepancy: its covariance.
         noise_std: (O,).
         noise_prior_std: prior median of the noise in the next fit (O,).
@@ -197,7 +197,7 @@ class _Estimate:
     log_density: Tensor
 
     def covariance(self, rows: Tensor | None = None) -> Tensor:
-        """Covariances (O, m, m) of discrepancy and noise of some rows (m,), or of all."""
+        """Covariances (O, m, m) of discrepancy and noise of the rows with indices (m,), or of all rows."""
         inputs, weights = self.residual.inputs, self.row_weights
         if rows is not None:
             inputs, weights = inputs[rows], weights[rows]
@@ -205,7 +205,7 @@ class _Estimate:
 
 
 def _best_of_restarts(problem: _Problem, scales: Sequence[float]) -> FunctionPosterior:
-    """Fit from several prior sizes of the discrepancy; the leave-one-out density of the rows chooses.
+    """Fit with several prior sizes of the discrepancy, and select by the leave-one-out density of the rows.
 
     A restart replaces the first fit only if its density is higher by ``MIN_RESTART_GAIN_SE`` standard errors. Restarts
     use the parameters of the first fit; the parameters depend little on the scale and cost most of the time.
@@ -217,7 +217,7 @@ def _best_of_restarts(problem: _Problem, scales: Sequence[float]) -> FunctionPos
         try:
             posterior, density = _fit(restart, parameters)
         except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
-            continue  # This scale has no computable covariance; the first fit stands.
+            continue  # The covariance of this scale is not positive definite; the first fit remains.
         difference = density - first_density
         gain = float(difference.mean())
         if gain > max(best_gain, MIN_RESTART_GAIN_SE * float(difference.std()) / math.sqrt(len(difference))):
@@ -228,11 +228,11 @@ def _best_of_restarts(problem: _Problem, scales: Sequence[float]) -> FunctionPos
 def _fit(problem: _Problem, known_parameters: Tensor | None = None) -> tuple[FunctionPosterior, Tensor]:
     """Alternate between covariance, parameters, row weights and output decorrelation, then condition on the rows.
 
-    Outputs are decorrelated because each output has a discrepancy process of its own.
+    Outputs are decorrelated because their discrepancy processes are independent.
 
     Args:
         problem: rows and priors.
-        known_parameters: draws of the parameters given the rows; inferred unless given.
+        known_parameters: draws of the parameters given the rows; None: they are inferred.
 
     Returns:
         The posterior, and the leave-one-out log density of each row (n,) from ``MIN_ROWS_STUDENT`` rows on.
@@ -254,7 +254,7 @@ def _fit(problem: _Problem, known_parameters: Tensor | None = None) -> tuple[Fun
 
 
 def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, generator: torch.Generator) -> _Estimate:
-    """Prior medians, draws of the prior parameters, and row weights by them."""
+    """Prior medians, draws of the prior parameters, and the row weights that follow from them."""
     count, noise = len(problem.inputs), problem.noise_std
     parameters = known_parameters
     if problem.model is not None and parameters is None:
@@ -274,15 +274,15 @@ def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, genera
     if problem.has_student_noise:
 
         def covariance(row_weights: Tensor) -> Tensor:
-            own = _covariance(discrepancy, residual.inputs, noise, row_weights)
-            return own if residual.parameter_covariance is None else own + residual.parameter_covariance
+            prior = _covariance(discrepancy, residual.inputs, noise, row_weights)
+            return prior if residual.parameter_covariance is None else prior + residual.parameter_covariance
 
         estimate.row_weights = initial_row_weights(residual.mean, covariance, noise)
     return estimate
 
 
 def _prior_parameters(problem: _Problem, model: DomainModel, generator: torch.Generator) -> Tensor:
-    """Draws (P, K) of the prior; where there is no data, only those for which the simulator works in its domain."""
+    """Draws (P, K) of the prior; without data, only those with plausible outputs in the simulator's domain."""
     if len(problem.inputs):
         return draw_parameters(model, PRIOR_DRAWS, generator).to(problem.inputs)
     drawn = draw_parameters(model, PARAMETER_DRAWS, generator).to(problem.inputs)
@@ -307,7 +307,7 @@ def _fit_covariance(problem: _Problem, estimate: _Estimate) -> None:
 
 
 def _infer_parameters(problem: _Problem, estimate: _Estimate, rows: Tensor, generator: torch.Generator) -> None:
-    """Draw the simulator's parameters given some of the rows (m,), and update the residual."""
+    """Draw the simulator's parameters given the rows with indices (m,), and update the residual."""
     assert problem.model is not None
     cholesky = torch.linalg.cholesky(estimate.covariance(rows))
     estimate.parameters = posterior_parameters(
@@ -339,7 +339,7 @@ def _fit_student_noise(problem: _Problem, estimate: _Estimate) -> tuple[Tensor, 
 
 def _decorrelate_outputs(problem: _Problem, estimate: _Estimate, width: Tensor, variance: Tensor) -> None:
     """Transform the outputs so that leave-one-out errors are uncorrelated, and update the residual."""
-    # An output that never changes says nothing about its noise.
+    # A constant output does not determine its noise; the lower bound holds.
     estimate.noise_prior_std = torch.maximum(width * estimate.noise_std, MIN_NOISE_SHARE * problem.noise_std)
     error_std = width * variance.median(dim=0).values.sqrt()
     estimate.normaliser = estimate.normaliser.decorrelated(decorrelation_of(estimate.correlation, error_std))
@@ -381,12 +381,12 @@ def _plausible(simulated: Tensor) -> Tensor:
     """Mask (P,) of the draws whose outputs (P, N, O) are finite and of plausible size.
 
     Raises:
-        DataError: no draw is.
+        DataError: no draw is plausible.
     """
-    found = (simulated.abs() < MAX_PLAUSIBLE_OUTPUT).flatten(1).all(dim=1)
-    if not bool(found.any()):
+    plausible = (simulated.abs() < MAX_PLAUSIBLE_OUTPUT).flatten(1).all(dim=1)
+    if not bool(plausible.any()):
         raise DataError(NO_FINITE_OUTPUT)
-    return found
+    return plausible
 
 
 def _covariance(

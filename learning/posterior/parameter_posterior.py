@@ -1,8 +1,8 @@
 """Posterior of a simulator's parameters by sequential Monte Carlo, without gradients.
 
 Draws of the prior are moved to the posterior through tempered likelihoods, with random-walk Metropolis steps in between
-(Del Moral, Doucet and Jasra 2006, "Sequential Monte Carlo samplers"). The walk is in the standard normal numbers behind
-the parameters, so that any prior distribution can be used.
+(Del Moral, Doucet and Jasra 2006, "Sequential Monte Carlo samplers"). The walk is in standard normal variables, which
+``DomainModel.parameters`` maps to parameters, so that any prior distribution can be used.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from learning.priors.domain_models import NO_FINITE_OUTPUT, DomainModel
 RANDOM_WALK_STEPS = 4
 """Metropolis steps after each tempering step; three times as many at the end."""
 MIN_EFFECTIVE_SHARE = 0.5
-"""Effective sample size that a tempering step leaves, as a share of the draws."""
+"""Effective sample size after a tempering step, as a share of the draws."""
 MAX_TEMPERING_STEPS = 60
 TARGET_ACCEPTANCE = 0.25
-"""Of Metropolis steps (Roberts and Rosenthal 2001)."""
+"""Acceptance rate of Metropolis steps (Roberts and Rosenthal 2001)."""
 
 
 @dataclass(slots=True)
 class _Walkers:
-    """Draws behind the parameters (P, K) and their log likelihoods (P,)."""
+    """Standard normal variables of the draws (P, K) and log likelihoods (P,)."""
 
     normal: Tensor
     log_likelihood: Tensor
@@ -89,7 +89,7 @@ def posterior_parameters(
 
 
 def _reweight(walkers: _Walkers, step: float, generator: torch.Generator) -> Tensor:
-    """Resample by the likelihood to the power ``step``; Cholesky factor (K, K) of the weighted draws' covariance."""
+    """Resample by the likelihood to the power ``step``; returns the Cholesky factor (K, K) of the draws' covariance."""
     normal, size = walkers.normal, walkers.normal.shape[1]
     weight = torch.softmax(step * walkers.log_likelihood, dim=0)
     chosen = _resample(weight, generator)
@@ -108,14 +108,14 @@ def _random_walk(
     moves: int,
     generator: torch.Generator,
 ) -> None:
-    """Metropolis steps in place, with a step size that is led to ``TARGET_ACCEPTANCE``.
+    """Metropolis steps in place; the step size is adapted to ``TARGET_ACCEPTANCE``.
 
     Args:
         walkers: the draws.
         log_likelihood: of draws (P, K): (P,).
         exponent: of the likelihood.
         proposal: Cholesky factor of the proposal's covariance (K, K).
-        moves: how many steps.
+        moves: number of steps.
         generator: of all randomness.
     """
     count, size = walkers.normal.shape
@@ -134,7 +134,7 @@ def _random_walk(
 
 
 def _tempering_step(log_likelihood: Tensor, max_step: float) -> float:
-    """Largest increase of the likelihood's exponent, at most ``max_step``, that keeps enough draws effective."""
+    """Largest increase of the likelihood's exponent, at most ``max_step``, by ``MIN_EFFECTIVE_SHARE``."""
     relative = (log_likelihood - log_likelihood.max()).cpu()  # The bisection is scalar; it is fastest on the CPU.
 
     def effective_share(step: float) -> float:

@@ -14,7 +14,7 @@ from learning.networks.particles import Network
 from learning.outliers import tail_scales
 
 MIN_INPUT_CLIP = 6.0
-"""Smallest bound at which normalised inputs are clipped; a network extrapolates without bound."""
+"""Minimum clip of normalised inputs; a network's extrapolation is unbounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +28,9 @@ class ParticlePosterior:
         normaliser: between raw and normalised units.
         dof: degrees of freedom of the noise's multivariate Student-t distribution; infinite for a Gaussian.
         trend: linear function of the normalised inputs that is added to all particles: a constant and slopes
-            (1 + D, O); zero where it is None.
-        correlation: of the noise of the normalised outputs (O, O); none where it is None.
-        input_clip: bounds of the normalised inputs (D,); ``MIN_INPUT_CLIP`` where it is None.
+            (1 + D, O); None: zero.
+        correlation: of the noise of the normalised outputs (O, O); None: uncorrelated.
+        input_clip: bounds of the normalised inputs (D,); None: ``MIN_INPUT_CLIP``.
     """
 
     network: Network
@@ -44,7 +44,7 @@ class ParticlePosterior:
 
     @property
     def noise_scales(self) -> Tensor:
-        """Scales of each particle's noise when drawing (L, 1, 1); together they have the Student-t tails."""
+        """Scale of each particle's noise in draws (L, 1, 1); their mixture has the Student-t tails."""
         return tail_scales(self.dof, len(self.parameters)).to(self.noise_std)[:, None, None]
 
     def predict(self, inputs: Tensor) -> Mixture:
@@ -83,7 +83,7 @@ class ParticlePosterior:
         return normalised.clamp(-self.input_clip, self.input_clip)
 
     def to(self, device: torch.device | str) -> ParticlePosterior:
-        """The same on a device."""
+        """Copy on a device."""
         required = (self.parameters.to(device), self.noise_std.to(device), self.normaliser.to(device))
         optional = (None if v is None else v.to(device) for v in (self.trend, self.correlation, self.input_clip))
         return ParticlePosterior(self.network, *required, self.dof, *optional)

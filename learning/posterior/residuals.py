@@ -1,7 +1,7 @@
 """Distribution of the errors of a model that predicts only a mean: a multivariate Student-t fitted to its residuals.
 
-For an identified simulator, a regression or the networks of an ensemble, so that their likelihood is not that of badly
-chosen independent Gaussians: errors of the particles of ``function_posterior`` are correlated and heavy-tailed, too.
+It applies to an identified simulator, a regression or the networks of an ensemble. Their likelihood is then comparable
+with that of ``function_posterior``, whose errors are correlated and heavy-tailed.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from learning.outliers import (
 )
 
 SCALE_ITERATIONS = 60
-"""Of expectation maximisation of the common scale."""
+"""Iterations of the expectation maximisation of the common scale."""
 MIN_DOF = DOF_CANDIDATES[0]
 MIN_SCALE, MIN_SHARE = 1e-9, 1e-3
-"""Lower bounds of an output's error, in its units and relative to its root mean square: it may be constant."""
+"""Lower bounds of an output's error (absolute, and relative to its root mean square), for constant outputs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class ResidualDistribution:
         return Mixture(means, one, self.dof, self.whitening.to(means))
 
     def to(self, like: Tensor) -> ResidualDistribution:
-        """The same with the type and device of another tensor."""
+        """Copy with the type and device of another tensor."""
         return ResidualDistribution(self.factor.to(like), self.dof)
 
 
@@ -80,16 +80,16 @@ def fit_residuals(
 
     Args:
         errors: (n, O).
-        prior_std: prior standard deviation (O,), positive; none unless given.
+        prior_std: prior standard deviation (O,), positive; None: no prior.
         prior_rows: its weight in rows.
-        fitted_rows: rows used up by the fit of the mean: its parameters divided by the outputs.
+        fitted_rows: degrees of freedom used by the fit of the mean, in rows: its parameters divided by the outputs.
 
     Raises:
-        DataError: there are no errors, or they are not finite.
+        DataError: no row, or errors that are not finite.
     """
     count, outputs = errors.shape
     if not count or not torch.isfinite(errors).all():
-        raise DataError("What a model leaves must be finite and of one row at least; check its inputs.")
+        raise DataError("The residuals are empty or not finite; check the inputs of the model.")
     errors = errors.double()
     weight = 0.0 if prior_std is None else prior_rows
     unit = errors.square().mean(dim=0).sqrt() if prior_std is None else prior_std.double()
@@ -101,12 +101,12 @@ def fit_residuals(
     free_rows = max(count - fitted_rows, 0.0)
     best, dof, scale = -math.inf, math.inf, 1.0
     for candidate in DOF_CANDIDATES:
-        own = _common_scale(square, outputs, candidate, weight, prior_square)
-        log_likelihood = float(log_student(square / own**2, outputs, candidate).sum()) - count * outputs * math.log(own)
+        s = _common_scale(square, outputs, candidate, weight, prior_square)
+        log_likelihood = float(log_student(square / s**2, outputs, candidate).sum()) - count * outputs * math.log(s)
         if log_likelihood > best + DOF_MIN_GAIN_NATS:
-            best, dof, scale = log_likelihood, candidate, own
+            best, dof, scale = log_likelihood, candidate, s
     max_dof = max(free_rows + weight, MIN_DOF)
-    # A residual of a fitted row is smaller than the error of a new one.
+    # Residuals of fitted rows are smaller than errors at new rows.
     variance_factor = (count + weight) / max(free_rows + weight, 1.0)
     factor = torch.linalg.cholesky(correlation) * scales[:, None] * scale * math.sqrt(variance_factor)
     return ResidualDistribution(factor, min(dof, max_dof))

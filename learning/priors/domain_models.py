@@ -1,7 +1,7 @@
 """Simulators with unknown parameters, as priors over functions: the studies of the Sim-FSVGD paper.
 
-Each maps inputs (N, D) and P parameter draws to outputs (P, N, O). Ranges, domains and step sizes are those of the
-authors' public code (lasgroup/simulation_transfer, commit 547fa14, MIT), restated from its facts.
+Each maps inputs (N, D) and P parameter draws to outputs (P, N, O). Ranges, domains and step sizes are those of
+the authors' public code (lasgroup/simulation_transfer, commit 547fa14, MIT).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch import Tensor
 
 Range = tuple[float, float]
 MAX_PLAUSIBLE_OUTPUT = 1e6
-"""Bound of plausible outputs, in normalised units or in SI units of a car; larger ones are a numerical failure."""
+"""Bound of plausible outputs, in normalised units or in SI units of a car; larger outputs are numerical failures."""
 NO_FINITE_OUTPUT = (
-    "The simulator gives no finite numbers for this data; narrow the ranges of its parameters, or name another."
+    "The simulator gives no finite outputs for this data; narrow the ranges of its parameters or use another simulator."
 )
 
 
 class DomainModel(Protocol):
-    """A simulator whose parameters are only known as a distribution."""
+    """A simulator with a distribution of its parameters."""
 
     @property
     def size(self) -> int:
@@ -35,7 +35,7 @@ class DomainModel(Protocol):
         ...
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """Parameters (P, K) for standard normal numbers (P, K): a map from a normal draw to a draw of the prior."""
+        """Map of standard normal draws (P, K) to draws of the prior parameters (P, K)."""
         ...
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ def draw_parameters(model: DomainModel, count: int, generator: torch.Generator) 
 
 
 def within(ranges: Sequence[Range], shares: Tensor) -> Tensor:
-    """Values (..., K) at shares (..., K) of ranges, 0 being the low end and 1 the high one."""
+    """Values (..., K) at shares (..., K) of ranges: 0 is the lower end, 1 the upper end."""
     low = torch.tensor([r[0] for r in ranges]).to(shares)
     high = torch.tensor([r[1] for r in ranges]).to(shares)
     return low + (high - low) * shares
@@ -65,7 +65,7 @@ class Sinusoids:
     """``a sin(w x) + b x`` with a ~ N(2, 0.4^2), w ~ U(1.7, 2.3), b ~ N(2, 1), for x in [-5, 5]."""
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Places x (N, 1)."""
+        """X (N, 1)."""
         return uniform(((-5.0, 5.0),), count, generator)
 
     @property
@@ -89,13 +89,13 @@ class Sinusoids:
 class Pendulum:
     """Change of (sin, cos, rate) of a pendulum over 50 ms: ``theta'' = (g/l) sin theta + u / (m l^2) - friction``.
 
-    Explicit Euler in ten substeps, as the authors integrate it. Friction is ``nu rate / (m l) + drag / m rate^2`` as in
+    Explicit Euler in ten substeps, as in the authors' code. Friction is ``nu rate / (m l) + drag / m rate^2`` as in
     their code (its square does not change sign with the rate) or, with ``dissipative``, ``rate |rate|``.
 
     Attributes:
         masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu and drag.
-        rate_gap: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] in a missing angular
-            acceleration: a discrepancy process inside the dynamics, with a polynomial kernel.
+        rate_discrepancy: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] in a missing
+            angular acceleration: a discrepancy process inside the dynamics, with a polynomial kernel.
     """
 
     masses: Range = (0.5, 1.5)
@@ -109,7 +109,7 @@ class Pendulum:
     substeps: int = 10
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Sine and cosine of angles all around, rates within 5 rad/s, torques within 2.5 N m: (N, 4)."""
+        """Sine and cosine of angles in [-pi, pi], rates within 5 rad/s, torques within 2.5 N m: (N, 4)."""
         drawn = uniform(((-math.pi, math.pi), (-5.0, 5.0), (-2.5, 2.5)), count, generator)
         return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
 
@@ -145,8 +145,8 @@ class Pendulum:
 class KinematicCar:
     """Change over 1/30 s of (x, y, sin yaw, cos yaw, vx, vy in the world, yaw rate) of a car whose wheels do not slip.
 
-    ``beta = atan(l_r tan(d) / L)`` at the centre of mass; side velocity and yaw rate settle within a step. The body
-    is rotated by an unknown angle relative to the measured heading.
+    ``beta = atan(l_r tan(d) / L)`` at the centre of mass; lateral velocity and yaw rate converge within a step. The
+    body is rotated by an unknown angle relative to the measured heading.
     """
 
     masses: Range = (1.6, 1.7)
@@ -191,23 +191,24 @@ class KinematicCar:
         rate = inputs[None, :, 6].expand_as(ahead)
         x, y = (inputs[None, :, k].expand_as(ahead) for k in (0, 1))
         step = self.period_s / self.substeps
-        decay = math.exp(-1.0)  # of a deviation from rolling in one substep
+        decay = math.exp(-1.0)  # of a deviation from rolling without slip, in one substep
         for _ in range(self.substeps):
-            faster = ahead + step * (drive * throttle - damping**2 * ahead) / mass
-            mean = 0.5 * (ahead + faster)
-            rolling_rate = faster * tangent / (front + rear)
+            next_ahead = ahead + step * (drive * throttle - damping**2 * ahead) / mass
+            mean_ahead = 0.5 * (ahead + next_ahead)
+            rolling_rate = next_ahead * tangent / (front + rear)
             new_rate = rolling_rate + decay * (rate - rolling_rate)
             new_left = rear * rolling_rate + decay * (left - rear * rolling_rate)
-            half = yaw + 0.25 * step * (rate + new_rate)
-            across = 0.5 * (left + new_left)
-            x = x + step * (mean * torch.cos(half) - across * torch.sin(half))
-            y = y + step * (mean * torch.sin(half) + across * torch.cos(half))
+            mid_yaw = yaw + 0.25 * step * (rate + new_rate)
+            mean_left = 0.5 * (left + new_left)
+            x = x + step * (mean_ahead * torch.cos(mid_yaw) - mean_left * torch.sin(mid_yaw))
+            y = y + step * (mean_ahead * torch.sin(mid_yaw) + mean_left * torch.cos(mid_yaw))
             yaw = yaw + 0.5 * step * (rate + new_rate)
-            ahead, left, rate = faster, new_left, new_rate
-        seen = yaw - offset
+            ahead, left, rate = next_ahead, new_left, new_rate
+        measured_yaw = yaw - offset
         velocity_x = ahead * torch.cos(yaw) - left * torch.sin(yaw)
         velocity_y = ahead * torch.sin(yaw) + left * torch.cos(yaw)
-        after = torch.stack([x, y, torch.sin(seen), torch.cos(seen), velocity_x, velocity_y, rate], dim=-1)
+        heading = torch.sin(measured_yaw), torch.cos(measured_yaw)
+        after = torch.stack([x, y, *heading, velocity_x, velocity_y, rate], dim=-1)
         return after - inputs[None, :, :7]
 
 

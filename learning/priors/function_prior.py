@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 JITTER = 1e-4
-"""Variance that is added to each normalised value; the authors' figure."""
+"""Variance added to each normalised value, as in the authors' code."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def simulator_marginal(
     Args:
         draws: simulator outputs for P parameter draws at the measurement set (P, N, O), normalised.
         inputs: of the discrepancy at the measurement set (N, D).
-        discrepancy: its covariance; none unless given.
+        discrepancy: its covariance; None: no discrepancy.
         jitter: variance added to each value.
     """
     mean = draws.mean(dim=0)

@@ -1,4 +1,4 @@
-"""Measured states of a simulator with many draws of its numbers: the measurement model on batches of tensors."""
+"""Measurement model of a simulator on batches of tensors, with one parameter draw for each row."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from sim_backends.measurement import MeasurementModel, delay_as_recorded_s, filt
 
 
 class DrawnMeasurement:
-    """The measurement model of a simulator, with one set of numbers for each row of a batch.
+    """The measurement model of a simulator, with one set of parameters for each row of a batch.
 
     Args:
-        config: The simulator.
-        drawn: Numbers that replace its own, by dotted name, each (rows,).
-        like: A tensor (rows, ...) whose dtype and device all others take.
-        velocity_delay_s: Delay of the velocities [s]; counts as so much more of the filter's time constant.
+        config: the simulator.
+        drawn: parameters that replace those of ``config``, by dotted name, each (rows,).
+        like: a tensor (rows, ...) that determines dtype and device.
+        velocity_delay_s: delay of the velocities [s]; added to the time constant of the filter.
     """
 
     def __init__(
@@ -32,8 +32,8 @@ class DrawnMeasurement:
         self._model = MeasurementModel(self._ops, rows, self._effects)
         if velocity_delay_s > 0.0:
             lag_s = self._model.velocity_time_constant_s
-            own_s = torch.zeros_like(first) if lag_s is None else lag_s
-            self._model.velocity_time_constant_s = velocity_delay_s + own_s
+            filter_s = torch.zeros_like(first) if lag_s is None else lag_s
+            self._model.velocity_time_constant_s = velocity_delay_s + filter_s
 
     @property
     def has_filter(self) -> bool:
@@ -42,24 +42,24 @@ class DrawnMeasurement:
 
     @property
     def command_delay_s(self) -> Tensor:
-        """Delay of commands [s] as the recording shows it: later by the latency of what is measured; () or (rows,)."""
+        """Delay of commands in recorded time [s]: the true delay plus the measurement latency; () or (rows,)."""
         latency_s = MeasurementModel(self._ops, self._numbers, self._effects).latency_s
         delay_s = delay_as_recorded_s(self._ops, self._numbers, self._effects, latency_s)
         return torch.as_tensor(delay_s).to(self._like)
 
     def inverse(self, measured: Tensor) -> Tensor:
-        """True states (rows, 6) that are measured as ``measured``, filtered velocities taken for unfiltered."""
+        """True states (rows, 6) of measured ones, without inversion of the velocity filter."""
         return torch.stack(self._model.invert(tuple(measured.unbind(dim=1))), dim=1)
 
     def measured(self, states: Tensor, period_s: float, filtered: Tensor) -> Tensor:
-        """Measured states (rows, T + 1, 6) of true ones; the filter begins at the velocities ``filtered`` (rows, 3)."""
-        shown = self._model.measure(_ticks(states), period_s, filtered=tuple(filtered.unbind(dim=1)))
-        return torch.stack([torch.stack(tick, dim=1) for tick in shown], dim=1)
+        """Measured states (rows, T + 1, 6) of true ones; ``filtered`` is the initial filter output (rows, 3)."""
+        measured = self._model.measure(_ticks(states), period_s, filtered=tuple(filtered.unbind(dim=1)))
+        return torch.stack([torch.stack(tick, dim=1) for tick in measured], dim=1)
 
     def filter_lag(self, states: Tensor, period_s: float) -> Tensor:
-        """By how much filtered velocities (rows, 3) lag behind at the last of true states (rows, T + 1, 6).
+        """True minus filtered velocities (rows, 3) at the last of true states (rows, T + 1, 6).
 
-        The filter is taken to have followed a steady change before.
+        The initial filter output assumes a constant rate of change.
         """
         lag_s = self._model.velocity_time_constant_s
         inputs = [self._model.observe(tick)[3:6] for tick in _ticks(states)]

@@ -1,7 +1,7 @@
-"""Pendulum with drag, dry friction and motor lag, as the Sim-FSVGD paper describes its own.
+"""Pendulum with drag, dry friction and motor lag, as described in the Sim-FSVGD paper.
 
-Rothfuss et al. (arXiv 2403.16644, section 6.1) hide drag, friction and motor dynamics from the prior. Their public code
-has neither dry friction nor a motor, and its drag accelerates a pendulum that turns backwards.
+Rothfuss et al. (arXiv 2403.16644, section 6.1) exclude drag, friction and motor dynamics from the prior. Their public
+code has neither dry friction nor a motor, and its drag accelerates a pendulum with a negative rate.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 from learning.priors.domain_models import Range, uniform, within
 
 SLIDING_RADPS = 0.1
-"""Rate at which dry friction has three quarters of its size: ``tanh(rate / 0.1)`` in place of the sign."""
+"""Rate scale of dry friction, in which ``tanh(rate / 0.1)`` replaces the sign."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,19 +24,20 @@ class MotorPendulum:
 
     ``theta'' = (g/l) sin theta + (torque - dry sign(rate)) / (m l^2) - nu rate / (m l) - drag / m rate |rate|`` with
     ``torque' = (command - torque) / lag``; without lag the torque is the command. Drag, friction and their units are
-    those of ``Pendulum``, except that drag always brakes. Runge-Kutta steps of 5 ms, the torque in closed form.
+    those of ``Pendulum``, except that drag always brakes. Integration by Runge-Kutta steps of 5 ms, with the torque in
+    closed form.
 
-    The torque is a hidden state. A row holds the past command in its place, which the torque has reached when the step
-    begins; with it the true system is a function of the row.
+    The torque is a hidden state. A row holds the past command instead, which equals the torque at the start of the
+    step; the true system is then a function of the row.
 
     Attributes:
         masses, lengths, gravities: ranges of m [kg], l [m], g [m/s2].
         frictions, drags, dry: ranges of nu, drag and the dry friction's torque [N m].
         lags: range of the motor's time constant [s].
-        rate_gap: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] and sign(rate)
-            [rad/s2] in a missing angular acceleration.
-        command_gap: standard deviation of the shares of command and past command [1] in a missing torque. Both make a
-            discrepancy process inside the dynamics.
+        rate_discrepancy: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] and
+            sign(rate) [rad/s2] in a missing angular acceleration.
+        command_discrepancy: standard deviation of the shares of command and past command [1] in a missing torque. Both
+            are discrepancy processes inside the dynamics.
     """
 
     masses: Range = (0.5, 1.5)
@@ -52,7 +53,7 @@ class MotorPendulum:
     substeps: int = 10
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Sine, cosine of angles all around, rates within 5 rad/s, past and present command within 2.5 N m: (N, 5)."""
+        """Sine, cosine of angles in [-pi, pi], rates within 5 rad/s, past and new command within 2.5 N m: (N, 5)."""
         spans = (math.pi, 5.0, 2.5, 2.5)
         drawn = uniform(tuple((-v, v) for v in spans), count, generator)
         return torch.cat([torch.sin(drawn[:, :1]), torch.cos(drawn[:, :1]), drawn[:, 1:]], dim=1)
@@ -78,15 +79,15 @@ class MotorPendulum:
         past, command = inputs[None, :, 3], inputs[None, :, 4]
         inertia = mass * length**2
         constant = (command + of_command * command + of_past * past) / inertia
-        late = (past - command) / inertia
+        initial_lag = (past - command) / inertia
         viscous, quadratic = linear - friction / (mass * length), odd - drag / mass
-        pull, rubbing = gravity / length, sliding - dry / inertia
+        gravity_rate, dry_friction = gravity / length, sliding - dry / inertia
 
         def rates(time_s: float, theta: Tensor, omega: Tensor) -> tuple[Tensor, Tensor]:
-            behind = torch.where(lag > 0.0, torch.exp(-time_s / lag.clamp_min(1e-9)), 0.0)
+            decay = torch.where(lag > 0.0, torch.exp(-time_s / lag.clamp_min(1e-9)), 0.0)
             of_rate = (viscous + quadratic * omega.abs() + even * omega) * omega
-            of_rate = of_rate + rubbing * torch.tanh(omega / SLIDING_RADPS)
-            return omega, pull * torch.sin(theta) + constant + late * behind + of_rate
+            of_rate = of_rate + dry_friction * torch.tanh(omega / SLIDING_RADPS)
+            return omega, gravity_rate * torch.sin(theta) + constant + initial_lag * decay + of_rate
 
         step = self.period_s / self.substeps
         theta = torch.atan2(inputs[:, 0], inputs[:, 1])[None].expand(len(parameters), -1)

@@ -1,1 +1,1 @@
-"""The learned car: transitions, dynamics, fit, and the vectorised environment that SAC trains in."""
+"""The learned car: dynamics, fit, and the vectorised environment for the training by SAC."""

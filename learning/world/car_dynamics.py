@@ -1,8 +1,8 @@
 """A learned car: particles predict one step in the body frame, and exact kinematics integrate the pose.
 
-A step is ``pose + R(yaw) change``; the networks see velocities and the last commands, not the pose. Each step of each
-car samples a particle (epistemic uncertainty; Rothfuss et al., arXiv 2403.16644, section 5.3) and the likelihood's
-noise (aleatoric uncertainty).
+A step is ``pose + R(yaw) change``; inputs of the networks are velocities and the last commands, without the pose. Each
+step of each car samples a particle (epistemic uncertainty; Rothfuss et al., arXiv 2403.16644, section 5.3) and the
+noise of the likelihood (aleatoric uncertainty).
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from learning.transitions import transitions_of
 
 
 class OneStep(Protocol):
-    """One-step dynamics of a learned world."""
+    """One-step dynamics of a learned car."""
 
     @property
     def history(self) -> int:
-        """H, commands before the last one that a row of inputs holds."""
+        """H, number of commands before the last one in a row of inputs."""
         ...
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) a step after ``action`` (N, 2) is sent, sampled from the predictive distribution."""
+        """Features (N, 7 + 2 H) one step after ``action`` (N, 2), sampled from the predictive distribution."""
         ...
 
 
 class StepInBody(ABC):
-    """A step from changes sampled in the body frame of its start, by exact kinematics."""
+    """A step by exact kinematics, from changes sampled in the body frame at its start."""
 
     __slots__ = ()
 
@@ -46,7 +46,7 @@ class StepInBody(ABC):
         """Changes (N, 6) over one step at inputs (N, 3 + 2 (H + 1)), in the order of ``transitions.OUTPUTS``."""
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
-        """Features (N, 7 + 2 H) a step later."""
+        """Features (N, 7 + 2 H) one step later."""
         return advance(features, action, self.sample(inputs_of(features, action), generator))
 
 
@@ -56,7 +56,7 @@ class CarDynamics(StepInBody):
 
     Attributes:
         posterior: particles and noise.
-        history: H, commands before the last one that a row of inputs holds.
+        history: H, number of commands before the last one in a row of inputs.
     """
 
     posterior: ParticlePosterior
@@ -83,12 +83,12 @@ class CarDynamics(StepInBody):
 
 
 def inputs_of(features: Tensor, action: Tensor) -> Tensor:
-    """Rows of inputs (N, 3 + 2 (H + 1)) of features (N, 7 + 2 H) and the action (N, 2) that is sent now."""
+    """Rows of inputs (N, 3 + 2 (H + 1)) from features (N, 7 + 2 H) and the next action (N, 2)."""
     return torch.cat([features[:, STATE_FEATURES - 3 :], action], dim=1)
 
 
 def advance(features: Tensor, action: Tensor, change: Tensor) -> Tensor:
-    """Features (N, 7 + 2 H) after a step that sent ``action`` (N, 2) and changed the body by ``change`` (N, 6)."""
+    """Features (N, 7 + 2 H) after a step with ``action`` (N, 2) and the body-frame ``change`` (N, 6)."""
     sin, cos = features[:, 2], features[:, 3]
     ahead, left = change[:, 0], change[:, 1]
     state = decode_state(features)

@@ -1,4 +1,4 @@
-"""Learn a car from recorded rows and a simulator; save and load it."""
+"""Fit a learned car to recorded rows and a simulator prior; save and load it."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
 LearnedCar = CarDynamics | WorldDynamics
 FILE_VERSION = 6
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
-"""Prior noise of a step's changes, in the order of ``OUTPUTS``: motion capture at 100 Hz, differentiated."""
+"""Prior noise of a step's changes, in the order of ``OUTPUTS``: differences of motion capture at 100 Hz."""
 PRIOR_DISCREPANCY = 0.3
 PRIOR_FUNCTION = 1.0
 """Prior sizes of a simulator's discrepancy, and of a step without a simulator, in units of the outputs."""
 MAX_ROWS = 800
-"""Largest number of rows that are conditioned on; a random subset of more."""
+"""Maximum number of rows of the fit; a random subset of more."""
 _UNIT_SAMPLES = 2000
 
 
 @dataclass(frozen=True, slots=True)
 class CarFitSettings:
-    """How a car is learned.
+    """Settings of the fit.
 
     Attributes:
-        method: ``sim-fsvgd`` has the simulator as prior, ``fsvgd`` a zero mean; both are distilled posteriors
+        method: ``sim-fsvgd`` has a simulator prior, ``fsvgd`` a zero-mean prior; both are distilled posteriors
             (``learning.posterior``). ``fsvgd-authors`` is FSVGD as published (``functional_svgd.authors_fsvgd``).
         steps: of the particles' optimiser.
         particles: their number.
@@ -62,7 +62,7 @@ def car_units(model: CarModel, generator: torch.Generator) -> Normaliser:
     """Units of inputs and outputs from random drives of the simulator, independent of the data.
 
     Raises:
-        DataError: most drives give implausible numbers.
+        DataError: most drives have implausible outputs.
     """
     inputs = model.inputs(_UNIT_SAMPLES, generator)
     with torch.no_grad():
@@ -84,25 +84,25 @@ def fit_car(
     device: torch.device | str = "cpu",
     progress: Callable[[int], None] = lambda step: None,
 ) -> CarDynamics:
-    """Learn a car.
+    """Fit a car.
 
     Args:
-        rows: recorded transitions; None: the simulator alone is learned.
+        rows: recorded transitions; None: the prior alone is distilled.
         model: the simulator: the prior, or (``fsvgd``) only the source of units and domain.
         settings: of the fit.
-        before: an earlier fit of the same car, on any device; its units and particles are the starting point.
+        before: an earlier fit of the same car, on any device, with the units and initial particles.
         device: of the fit; random numbers are drawn on the CPU.
         progress: called with the number of optimiser steps done.
 
     Raises:
-        DataError: the history of the rows or of the earlier fit is not the model's, or the fit diverged.
+        DataError: the rows or the earlier fit have another history than the model, or the fit diverged.
     """
     if rows is not None and rows.history != model.history:
-        raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; make them alike.")
+        raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; use the same number.")
     if before is not None and before.history != model.history:
         raise DataError(
-            f"The earlier car has {before.history} past commands, the model {model.history}; remove its folder, and it "
-            "is learned anew."
+            f"The earlier car has {before.history} past commands, the model {model.history}; remove its folder to "
+            "train again."
         )
     generator = torch.Generator().manual_seed(settings.seed)
     earlier_units = None if before is None else before.posterior.normaliser.without_decorrelation()
@@ -130,7 +130,7 @@ def fit_car(
 
 
 def save_car(dynamics: LearnedCar, path: Path) -> None:
-    """Write a learned car into a file.
+    """Write a learned car to a file.
 
     Args:
         dynamics: the car, on any device.
@@ -156,7 +156,7 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
         "correlation": posterior.correlation,
         "reach": posterior.input_clip,
     }
-    buffer = io.BytesIO()  # torch.save raises an error of its own where the disk is full.
+    buffer = io.BytesIO()  # torch.save to a full disk would not raise OSError.
     torch.save(content, buffer)
     path.write_bytes(buffer.getvalue())
 
@@ -164,19 +164,18 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
 def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
     """Read a learned car onto a device.
 
-    Keys of the file that differ from the attributes: ``freedom`` is ``dof``, ``turn`` is ``decorrelation``, ``reach``
-        is
-    ``input_clip``.
+    Some keys of the file differ from the attributes: ``freedom`` is ``dof``, ``turn`` is ``decorrelation``, ``reach``
+    is ``input_clip``.
 
     Raises:
         DataError: the file cannot be read, or has another version or shape.
     """
-    remedy = "remove its folder, and it is learned anew"
+    remedy = "remove its folder to train again"
     try:
         content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
         version = content["version"]
         if version != FILE_VERSION:
-            raise DataError(f"{path} is of version {version}, this program reads {FILE_VERSION}; {remedy}.")
+            raise DataError(f"{path} has version {version}, this program reads version {FILE_VERSION}; {remedy}.")
         inputs, outputs, *hidden = content["network"]
         network = Network(inputs, outputs, tuple(hidden), content["activation"])
         parameters: Tensor = content["parameters"]
@@ -197,12 +196,12 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
     except _READ_ERRORS as error:
         raise DataError(f"The learned car in {path} cannot be read ({_first_line(error)}); {remedy}.") from error
     if count != network.parameters:
-        raise DataError(f"{path} holds {count} numbers a particle for {network.parameters}; {remedy}.")
+        raise DataError(f"{path} holds {count} parameters per particle, not {network.parameters}; {remedy}.")
     return car
 
 
 def _check_shapes(car: LearnedCar) -> None:
-    """Raise ValueError where a part of a file does not fit the others: a file of a stranger may hold anything."""
+    """Raise ValueError if the parts of a file have inconsistent shapes; the file may be untrusted."""
     posterior, units = car.posterior, car.posterior.normaliser
     d, o = posterior.network.inputs, posterior.network.outputs
     state_inputs = 3 if isinstance(car, CarDynamics) else STATE_FEATURES
@@ -222,7 +221,7 @@ def _check_shapes(car: LearnedCar) -> None:
         if part is None and name in ("turn", "trend", "correlation", "reach"):
             continue
         if not isinstance(part, Tensor) or part.layout != torch.strided or not part.is_floating_point():
-            raise ValueError(f"{name} is no array of numbers")
+            raise ValueError(f"{name} is not an array of numbers")
         if tuple(part.shape) != shape or not torch.isfinite(part).all():
             raise ValueError(f"{name} has shape {tuple(part.shape)}, not {shape}, or is not finite")
 

@@ -1,4 +1,4 @@
-"""Choice of the number of past commands that a model sees."""
+"""Choice of the number of past commands in the inputs of a model."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from learning.transitions import transitions_of
 
 CANDIDATE_LENGTHS = (0, 1, 2, 3, 4, 6, 8)
 MIN_GAIN_NATS = 0.1
-"""Leave-one-out log-likelihood per row that a history of one more command must gain."""
+"""Minimum gain in leave-one-out log-likelihood per row for one more command."""
 MIN_ROWS, MAX_ROWS = 60, 240
 STUDENT_DOF = 4.0
 
@@ -26,16 +26,16 @@ class HistoryChoice:
     """A chosen history.
 
     Attributes:
-        history: commands before the last one.
-        nll: mean leave-one-out negative log-likelihood of a row by length [nat, outputs in units of their standard
-            deviation].
+        history: number of commands before the last one.
+        nll: mean leave-one-out negative log-likelihood per row for each length [nat, outputs in units of their
+            standard deviation].
     """
 
     history: int
     nll: dict[int, float]
 
     def message(self) -> str:
-        """The choice in a sentence."""
+        """One sentence about the choice."""
         shown = ", ".join(f"{h}: {value:.2f}" for h, value in self.nll.items())
         return (
             f"The data supports {self.history} past commands (leave-one-out negative log-likelihood by their number: "
@@ -44,14 +44,14 @@ class HistoryChoice:
 
 
 def find_history(episodes: Sequence[EpisodeData], seed: int = 0) -> HistoryChoice | None:
-    """The shortest history that no longer one beats, by the leave-one-out likelihood of a Gaussian process.
+    """Choose the shortest history by the leave-one-out likelihood of a Gaussian process (``MIN_GAIN_NATS``).
 
     The process has a lengthscale for each input and is fitted by its evidence to the same rows for every length. The
     density is Student-t, so that collisions have little influence.
 
     Args:
         episodes: recordings.
-        seed: of the rows that are drawn.
+        seed: of the random subset of rows.
 
     Returns:
         The choice; None with fewer than ``MIN_ROWS`` rows.

@@ -1,7 +1,7 @@
-"""A learned car as a vectorised environment of stable-baselines3, with the task of the real one.
+"""A learned car as a vectorised environment of stable-baselines3, with the task of the real car.
 
-Start states are drawn from the task and from recorded states with the commands before them. An episode ends after the
-task's ticks, where the task ends, or where the safety gate would stop a real car, with no reward afterwards.
+Start states are drawn from the task and from recorded states with their past commands. An episode ends after the task's
+ticks, at the task's termination, or when the safety gate would stop a real car; no reward follows.
 """
 
 from __future__ import annotations
@@ -30,37 +30,37 @@ MAX_POLICY_INPUT = 10.0
 """Clip of a policy's inputs, in these units."""
 
 
-def policy_view(features: Any) -> NDArray[np.float32]:
+def policy_inputs(features: Any) -> NDArray[np.float32]:
     """A policy's inputs for features (..., 7 + 2 H): scaled by ``FEATURE_UNITS`` and clipped."""
-    found = np.array(features, dtype=np.float32)
-    found[..., : len(FEATURE_UNITS)] /= np.array(FEATURE_UNITS, dtype=np.float32)
-    return np.clip(found, -MAX_POLICY_INPUT, MAX_POLICY_INPUT)
+    inputs = np.array(features, dtype=np.float32)
+    inputs[..., : len(FEATURE_UNITS)] /= np.array(FEATURE_UNITS, dtype=np.float32)
+    return np.clip(inputs, -MAX_POLICY_INPUT, MAX_POLICY_INPUT)
 
 
 def policy_spaces(width: int) -> tuple[gym.spaces.Box, gym.spaces.Box]:
-    """Spaces of what a policy sees (width,) and of its actions (2,)."""
+    """Spaces of a policy's inputs (width,) and of its actions (2,)."""
     high = np.full(width, MAX_POLICY_INPUT, dtype=np.float32)
     return gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
 class ModelEnv(VecEnv):
-    """Many copies of a learned car at once.
+    """Parallel copies of a learned car.
 
     Args:
-        model: one step of the car.
-        task: reward, end and starts; its history is the model's.
-        cars: how many copies.
+        model: one-step dynamics of the car.
+        task: reward, termination and start states, with the history of the model.
+        cars: number of copies.
         recorded: features (R, 7 + 2 H) of recorded states; may be empty.
-        from_recorded: share of starts among them, where there are any.
+        from_recorded: share of start states from ``recorded``, unless it is empty.
         envelope: limits of the safety gate, which slews commands and stops a car that could not stop inside the arena.
         period_s: control period, for the slew limits [s].
         bonus: additional reward (cars,) for features (cars, 7 + 2 H) after a step; not part of the returns of
             ``roll_out``.
-        seed: of starts, particles and noise.
-        device: where the model's tensors are.
+        seed: of start states, particles and noise.
+        device: of the model's tensors.
 
     Raises:
-        ConfigError: task and model have other histories.
+        ConfigError: task and model have different histories.
         DataError: recorded states have another number of features.
     """
 
@@ -81,11 +81,11 @@ class ModelEnv(VecEnv):
         width = feature_size(model.history)
         if task.history_length != model.history:
             raise ConfigError(
-                f"The task shows {task.history_length} past commands, the learned car takes {model.history}; make them "
-                "alike."
+                f"The task has {task.history_length} past commands, the learned car {model.history}; use the same "
+                "number."
             )
         if recorded is not None and recorded.shape[1:] != (width,):
-            raise DataError(f"Recorded starts have {recorded.shape[1:]} features, this car {width}; encode them anew.")
+            raise DataError(f"Recorded states have {recorded.shape[1:]} features, this car {width}; encode them again.")
         super().__init__(cars, *policy_spaces(width))
         self._model, self._task, self._device = model, task, torch.device(device)
         self._envelope = SafetyEnvelope() if envelope is None else envelope
@@ -105,18 +105,17 @@ class ModelEnv(VecEnv):
         self._arena_m = self._envelope.arena_m or task.arena_m
 
     def reset(self) -> NDArray[np.float32]:
-        """Start all cars; their episodes end at different ticks, so that no batch is all starts."""
-        everyone = np.arange(self.num_envs)
-        self._start(everyone)
+        """Start all cars. Their episodes end at different ticks, so that no batch consists of start states."""
+        self._start(np.arange(self.num_envs))
         self._ticks = self._rng.integers(self._task.max_ticks, size=self.num_envs)
         return self._seen()
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Take the commands (cars, 2)."""
+        """Store the commands (cars, 2)."""
         self._actions = torch.as_tensor(actions, dtype=torch.float32).to(self._device)
 
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """One step of every car; those that end start anew."""
+        """One step of every car; a car whose episode ends starts again."""
         before = self._features
         with torch.no_grad():
             action = self._gate(before, self._actions)
@@ -129,7 +128,7 @@ class ModelEnv(VecEnv):
         terminated = self._task.terminated(here).numpy() | self._stopped(here)
         self._features = after
         self._ticks += 1
-        seen = policy_view(here.numpy())
+        seen = policy_inputs(here.numpy())
         truncated = (self._ticks >= self._task.max_ticks) & ~terminated
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -137,18 +136,17 @@ class ModelEnv(VecEnv):
         for k in ended:
             infos[k] = {"terminal_observation": seen[k].copy(), "TimeLimit.truncated": bool(truncated[k])}
         if len(ended):
-            seen[ended] = policy_view(self._start(ended))
+            seen[ended] = policy_inputs(self._start(ended))
         return seen, reward.cpu().numpy().astype(np.float32), done, infos
 
     def roll_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
-        """Drive every car once from a start of the task by a policy, to the end.
+        """Drive one complete episode of every car by a policy, from start states of the task.
 
         Args:
-            act: actions (cars, 2) for views (cars, F).
+            act: actions (cars, 2) for policy inputs (cars, F).
 
         Returns:
-            Returns (cars,), unscaled and counted until a car ends, and the features at its end (cars, 7 + 2 H); both on
-            the CPU.
+            Unscaled return of each episode (cars,) and its final features (cars, 7 + 2 H); both on the CPU.
         """
         share, self._from_recorded = self._from_recorded, 0.0
         self._start(np.arange(self.num_envs))
@@ -164,17 +162,17 @@ class ModelEnv(VecEnv):
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
-                self._features, seen = after, policy_view(here.numpy())
+                self._features, seen = after, policy_inputs(here.numpy())
         self._from_recorded = share
         return total, last
 
     @property
     def features(self) -> Tensor:
-        """Present features (cars, 7 + 2 H)."""
+        """Current features (cars, 7 + 2 H)."""
         return self._features
 
     def _gate(self, features: Tensor, requested: Tensor) -> Tensor:
-        """Commands (cars, 2) as the safety gate would send them after those before (``carlab.core.safety.slew``)."""
+        """Commands (cars, 2) that the safety gate would send after the previous ones (``carlab.core.safety.slew``)."""
         requested = torch.minimum(torch.maximum(requested, -self._limits), self._limits)
         if not self._model.history:
             return requested
@@ -184,50 +182,50 @@ class ModelEnv(VecEnv):
         return torch.where(requested.abs() <= previous.abs(), requested, slewed)
 
     def _stopped(self, features: Tensor) -> NDArray[np.bool_]:
-        """Whether the gate stops a car: too fast, or not able to stop inside the arena. On the CPU."""
+        """Mask (cars,) of the cars that the gate stops: too fast, or unable to stop inside the arena; on the CPU."""
         state = decode_state(features).numpy()
         speed = np.hypot(state[:, 3], state[:, 4])
         course = state[:, 2] + np.arctan2(state[:, 4], state[:, 3])
         needed = stopping_distance_m(speed, self._envelope.reaction_s, self._envelope.deceleration_mps2)
-        found: NDArray[np.bool_] = ~(speed <= self._envelope.max_speed_mps)
+        stopped: NDArray[np.bool_] = ~(speed <= self._envelope.max_speed_mps)
         if self._arena_m:
-            found |= ~can_stop_inside_batch(self._arena_m, state[:, :2], course, needed)
-        return found
+            stopped |= ~can_stop_inside_batch(self._arena_m, state[:, :2], course, needed)
+        return stopped
 
     def _start(self, cars: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Start some of the cars anew; their features."""
-        fresh = np.array([self._task.sample_start(self._rng).to_array() for _ in cars])
-        rows = encode(fresh, np.zeros((len(cars), self._model.history, ACTION_SIZE)))
-        again = self._rng.random(len(cars)) < self._from_recorded
-        if again.any():
-            rows[again] = self._recorded[self._rng.integers(len(self._recorded), size=int(again.sum()))]
-        fresh_rows = torch.from_numpy(rows).float()
+        """Start new episodes of cars (indices); returns their features."""
+        starts = np.array([self._task.sample_start(self._rng).to_array() for _ in cars])
+        rows = encode(starts, np.zeros((len(cars), self._model.history, ACTION_SIZE)))
+        use_recorded = self._rng.random(len(cars)) < self._from_recorded
+        if use_recorded.any():
+            rows[use_recorded] = self._recorded[self._rng.integers(len(self._recorded), size=int(use_recorded.sum()))]
+        start_features = torch.from_numpy(rows).float()
         features = self._features.clone()
-        features[torch.from_numpy(cars).to(self._device)] = fresh_rows.to(self._device)
+        features[torch.from_numpy(cars).to(self._device)] = start_features.to(self._device)
         self._features = features
         self._ticks[cars] = 0
-        found: NDArray[np.float32] = fresh_rows.numpy()
-        return found
+        array: NDArray[np.float32] = start_features.numpy()
+        return array
 
     def _seen(self) -> NDArray[np.float32]:
-        return policy_view(self._features.cpu().numpy())
+        return policy_inputs(self._features.cpu().numpy())
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: the environment holds no resources."""
 
-    def seed_anew(self) -> None:
-        """Seed with the number given at construction; an agent of stable-baselines3 seeds with its own."""
+    def restore_seed(self) -> None:
+        """Seed with the number given at construction, after an agent of stable-baselines3 has set its seed."""
         self.seed(self._own_seed)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed starts, particles and noise."""
+        """Seed start states, particles and noise."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)
             self._generator.manual_seed(seed)
         return [seed] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the environment, once for each requested car."""
+        """An attribute of the environment, repeated for each requested car."""
         return [getattr(self, attr_name, None)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -235,13 +233,13 @@ class ModelEnv(VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the environment once, its answer repeated for each requested car."""
-        answer = getattr(self, method_name)(*method_args, **method_kwargs)
-        return [answer] * len(list(self._get_indices(indices)))
+        """Call a method of the environment once; its result is repeated for each requested car."""
+        result = getattr(self, method_name)(*method_args, **method_kwargs)
+        return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Any = None) -> list[bool]:
-        """Never."""
+        """False for each requested car."""
         return [False] * len(list(self._get_indices(indices)))
 
 
-__all__ = ["FEATURE_UNITS", "ModelEnv", "policy_spaces", "policy_view"]
+__all__ = ["FEATURE_UNITS", "ModelEnv", "policy_inputs", "policy_spaces"]

@@ -138,7 +138,7 @@ def test_a_learned_car_of_another_version_is_learned_anew_once_its_folder_is_rem
     options = ("learn", "--resume", folder, "--episodes", len(done) + 1)
     code, text = carlab(*options)
     assert code == 1
-    assert "is of version 1" in text
+    assert "has version 1" in text
     assert "remove its folder to train again." in text
     shutil.rmtree(folder / "models" / done[-1])
     code, text = carlab(*options)

@@ -48,14 +48,14 @@ def test_with_the_state_of_another_it_goes_on_as_torch_without_a_break():
     second = None
     for step, gradient in enumerate(gradients(30)):
         if step == 10:
-            second = Adam(first.numbers.clone())
+            second = Adam(first.parameters.clone())
             state = first.state()
             first.step(gradient, 1.0)  # What a state has given is not moved any more.
             second.load(state)
         (second or first).step(gradient, 0.01)
         theirs.grad = gradient.clone()
         stock.step()
-    torch.testing.assert_close(second.numbers, theirs.detach(), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(second.parameters, theirs.detach(), rtol=1e-12, atol=1e-12)
 
 
 def test_loaded_moments_are_a_copy():

@@ -87,7 +87,7 @@ def test_a_fit_learns_and_before_any_episode_there_is_none() -> None:
 
 
 def test_a_handful_of_rows_is_too_few() -> None:
-    with pytest.raises(DataError, match="too few to hold some out"):
+    with pytest.raises(DataError, match="too few for a validation split"):
         fit_authors_fsvgd([circling(ticks=HISTORY + 3)], HISTORY, 10)
 
 

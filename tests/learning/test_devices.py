@@ -23,7 +23,7 @@ from carlab.studies.regression.methods import METHODS, Way
 from carlab.studies.regression.study import run_study
 from learning.baselines import system_identification
 from learning.baselines.system_identification import grey_box, identify
-from learning.devices import settle
+from learning.devices import synchronise
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.functional_svgd.authors_fsvgd import fit_authors_fsvgd
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
@@ -371,7 +371,7 @@ def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(speed, "STEPS", 400)
     monkeypatch.setattr(speed, "SIZES", {"small": (4, 2, 9)})
     monkeypatch.setattr(speed, "CAR_FIT", CarFitSettings(steps=20))
-    settle(device)
+    synchronise(device)
     training = speed.training_speed(device)
     assert training["small"]["steps_per_s"] > 0.0
     assert training["a car from 100 rows, as carlab learn"]["whole_fit_s"] > 0.0

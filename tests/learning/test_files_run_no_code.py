@@ -66,7 +66,7 @@ def test_a_payload_in_a_model_folder_does_not_run(
     folder = tmp_path / "models" / "0001"
     folder.mkdir(parents=True)
     write(folder / name, Payload(made))
-    with pytest.raises(DataError, match=r"; remove .* anew\.$") as error:
+    with pytest.raises(DataError, match=r"; remove .* to train again\.$") as error:
         load_car(folder / name) if name == "dynamics.pt" else SacAgent.load(folder, SacSettings(), 0)
     assert not made.exists()
     assert "\n" not in str(error.value)
@@ -132,7 +132,7 @@ def test_parts_of_a_learned_car_that_do_not_fit_are_refused_in_a_sentence(
     save_car(CarDynamics(ParticlePosterior(network, parameters, torch.ones(6), units), 1), path)
     load_car(path)
     torch.save(torch.load(path, weights_only=True) | changed, path)
-    with pytest.raises(DataError, match=r"; remove its folder, and it is learned anew\.$") as error:
+    with pytest.raises(DataError, match=r"; remove its folder to train again\.$") as error:
         load_car(path)
     assert "\n" not in str(error.value)
 

@@ -16,7 +16,7 @@ from carlab.core.safety import SafetyEnvelope, limit
 from carlab.core.task import ParkingTask
 from learning.policy.sac import FastSac
 from learning.world.car_dynamics import StepInBody
-from learning.world.model_env import REWARD_SCALE, ModelEnv, policy_view
+from learning.world.model_env import REWARD_SCALE, ModelEnv, policy_inputs
 
 HISTORY = 2
 WIDTH = 7 + 2 * HISTORY
@@ -172,7 +172,7 @@ def test_an_episode_is_cut_off_after_the_ticks_of_the_task() -> None:
             assert 10 < done.sum() < 60, "episodes end at different ticks from the first"
         if tick == 6:
             assert (ended == 1).all()
-        final = policy_view(rows_of(np.array(driven), past))
+        final = policy_inputs(rows_of(np.array(driven), past))
         for k in np.flatnonzero(done):
             assert infos[k]["TimeLimit.truncated"] is True
             np.testing.assert_allclose(infos[k]["terminal_observation"], final[k], atol=1e-5)
@@ -305,9 +305,9 @@ def test_soft_actor_critic_of_stable_baselines_can_be_trained_in_it() -> None:
 def test_a_policy_sees_numbers_of_size_one_and_nothing_far_outside() -> None:
     features = np.array([[1.0, -3.0, 0.6, -0.8, 2.0, 0.5, 8.0, 0.1, -1.0], [500.0, -500.0, 0, 1, 100.0, 0, 0, 0, 0]])
     kept = features.copy()
-    seen = policy_view(features)
+    seen = policy_inputs(features)
     assert seen.dtype == np.float32
     assert seen[0].tolist() == pytest.approx([0.5, -1.5, 0.6, -0.8, 1.0, 0.5, 2.0, 0.1, -1.0])
     assert seen[1].tolist() == [10.0, -10.0, 0.0, 1.0, 10.0, 0.0, 0.0, 0.0, 0.0]
     assert np.array_equal(features, kept), "the features themselves stay"
-    assert np.array_equal(policy_view(features[0]), seen[0])
+    assert np.array_equal(policy_inputs(features[0]), seen[0])

@@ -225,5 +225,5 @@ def test_a_diagnosed_number_is_cauchys_within_what_is_possible():
 
 def test_a_choice_has_no_range():
     config = SimulatorConfig(effects={"traction_limit": {}})
-    with pytest.raises(ConfigError, match=r"'effects\.traction_limit\.axle' is one of rear, .*; it has no range"):
+    with pytest.raises(ConfigError, match=r"'effects\.traction_limit\.axle' is one of rear, .*; remove its range"):
         CarModel(config, 3, {"effects.traction_limit.axle": (0.0, 1.0)})

@@ -18,7 +18,7 @@ from carlab.core.quantities import CarState, Observation
 from carlab.core.task import ParkingTask
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacPolicy, SacSettings
 from learning.world.car_dynamics import StepInBody
-from learning.world.model_env import ModelEnv, policy_view
+from learning.world.model_env import ModelEnv, policy_inputs
 
 HISTORY = 1
 SETTINGS = SacSettings(hidden=(32,), cars=32, warm_up=512, batch=128, discount=0.5, learning_rate=3e-3, temperature=0.3)
@@ -61,7 +61,7 @@ def features(x_m: np.ndarray) -> np.ndarray:
 
 
 def answers(agent: SacAgent) -> np.ndarray:
-    return agent.act(policy_view(features(X_M)))
+    return agent.act(policy_inputs(features(X_M)))
 
 
 @pytest.fixture(scope="module")
@@ -223,7 +223,7 @@ def test_broken_files_are_refused_with_what_to_do(saved: Path, tmp_path: Path, k
         path.mkdir()
     elif kind != "not there":
         path.write_bytes({"empty": b"", "cut short": whole[: len(whole) // 2], "text": b"rubbish\n"}[kind])
-    with pytest.raises(DataError, match=r"remove the folder, and it is trained anew\.$") as error:
+    with pytest.raises(DataError, match=r"remove the folder to train again\.$") as error:
         SacAgent.load(tmp_path, SMALL, 0)
     assert "\n" not in str(error.value)
 
@@ -240,12 +240,12 @@ WEIGHT = "policy/actor.mu.weight"
         ({WEIGHT: np.full((2, 8), np.nan, np.float32)}, "not finite"),
         ({WEIGHT: np.array("text")}, "no numbers"),
         ({"actor/mean": np.zeros((1, 3), np.float32)}, "actor/mean is float32 of shape"),
-        ({"critics/steps": np.array(-1)}, "critics/steps is no whole number"),
-        ({"critics/steps": np.array(1.5)}, "critics/steps is no whole number"),
+        ({"critics/steps": np.array(-1)}, "critics/steps is not a non-negative integer"),
+        ({"critics/steps": np.array(1.5)}, "critics/steps is not a non-negative integer"),
         ({"log_temperature": np.array(["a"])}, "no numbers"),
         ({"version": np.array(7)}, "it has version 7"),
         ({"observation_size": np.array(10**12)}, "1000000000000 features"),
-        ({"observation_size": None}, "observation_size is no whole number"),
+        ({"observation_size": None}, "observation_size is not a non-negative integer"),
         ({"extra": np.zeros(70_000_000, np.float32)}, "more than 256 MB"),
     ],
     ids=lambda v: None if isinstance(v, str) else next(iter(v)),
@@ -255,7 +255,7 @@ def test_arrays_that_do_not_fit_are_refused_in_a_sentence(
 ) -> None:
     content = dict(np.load(saved / AGENT_FILE)) | changed
     np.savez_compressed(tmp_path / AGENT_FILE, **{k: v for k, v in content.items() if v is not None})
-    with pytest.raises(DataError, match=rf"{words}.*trained anew\.$") as error:
+    with pytest.raises(DataError, match=rf"{words}.*to train again\.$") as error:
         SacAgent.load(tmp_path, SMALL, 0)
     assert "\n" not in str(error.value)
 
@@ -265,5 +265,5 @@ def test_an_agent_of_another_shape_is_refused(saved: Path, kind: str) -> None:
     """Where it is read, or at the latest where it is to go on learning."""
     settings, history = (replace(SMALL, hidden=(12,)), HISTORY) if kind == "other layers" else (SMALL, HISTORY + 2)
     env = ModelEnv(Still(history), Sides(history_length=history), 16)
-    with pytest.raises(DataError, match="trained anew"):
+    with pytest.raises(DataError, match="to train again"):
         SacAgent.load(saved, settings, 0).train(env, 32)

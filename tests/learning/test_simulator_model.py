@@ -80,5 +80,5 @@ def test_identification_finds_the_car_that_drove():
 
 
 def test_a_range_for_nothing_is_refused():
-    with pytest.raises(ConfigError, match=r"'motor\.gain' is no number"):
+    with pytest.raises(ConfigError, match=r"'motor\.gain' is not a parameter"):
         CarModel(SimulatorConfig(), 3, {"motor.gain": (1.0, 2.0)})

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import torch
 
-from learning.devices import described
+from learning.devices import device_name
 
 FIGURES = ("nll", "rmse", "calibration", "seconds")
 
@@ -93,7 +93,7 @@ def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[
     return {
         "schema": "carlab.regression/1",
         "command": command,
-        "device": described(device),
+        "device": device_name(device),
         "torch_threads": torch.get_num_threads(),
         "rows": [plain(row) for row in summarised(scores)],
         "scores": [plain(score) for score in scores],
