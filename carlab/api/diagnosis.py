@@ -219,7 +219,7 @@ def _diagnosed(
         why = str(error)
         if error.verdict == "data":
             causes = ", ".join(sorted({f.id.replace("_", " ") for f in known}))
-            why = f"The recording is at fault ({causes}), so no physics can be identified: {why}"
+            why = f"The recording is faulty ({causes}), so no physics can be identified: {why}"
         undecided = Diagnosis(error.verdict, why, (), {}, 1.0, {}, None, tuple(known), uses, seed, 0.0, why)
         return DiagnosisReport(undecided, Exhibits(), _as_car_file(undecided, file.simulator, file.name), False)
     model = _as_car_file(outcome.diagnosis, outcome.model, file.name)
@@ -292,13 +292,13 @@ def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Ma
     """Episodes as a diagnosis expects them: CSV repaired on reading, own recordings as captured by the cameras."""
     from carlab.api.recordings import load
     from carlab.diagnosis.findings import RecordingUse
-    from carlab.diagnosis.own_recordings import as_captured
+    from carlab.diagnosis.state_alignment import align_states
 
     material = Material()
     for item in items:
         path = _path_of(item)
         if path is None:
-            material.episodes.append(as_captured(item, latency_s))
+            material.episodes.append(align_states(item, latency_s))
             digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
             material.uses.append(RecordingUse(str(item.metadata.get("source", "episode")), digest, role))
             continue
@@ -306,7 +306,7 @@ def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Ma
             _read_csv(path, item.mapping if isinstance(item, Recording) else None, material)
         else:
             read = item if isinstance(item, Recording) else load(path)
-            material.episodes += [as_captured(episode, latency_s) for episode in read.episodes]
+            material.episodes += [align_states(episode, latency_s) for episode in read.episodes]
             if read.is_recovered:
                 ticks = read.episode.ticks
                 material.notes.append(f"{path} was never finished; {ticks} complete ticks were recovered.")

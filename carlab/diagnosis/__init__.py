@@ -1,1 +1,1 @@
-"""Locate, name, model and prove what a simulator leaves out."""
+"""Find physics that a simulator lacks: locate it, name it, model it and test it on held-out recordings."""

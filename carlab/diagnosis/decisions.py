@@ -1,4 +1,4 @@
-"""Decisions about names, with the statistics that were compared with thresholds: the content of ``decisions.json``."""
+"""Accepted and rejected effects with their statistics and thresholds: the content of ``decisions.json``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SCHEMA = "carlab.decisions/1"
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A comparison: it holds where ``statistic`` is above the threshold, or below it where ``above`` is false.
+    """A comparison: ``statistic`` must be above the threshold, or below it if ``above`` is false.
 
     ``setting`` is the threshold's dotted name in DiagnosisSettings.
     """
@@ -25,13 +25,13 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Whether a name passed a stage: all conditions of one of the alternatives must hold.
+    """Whether an effect passed a stage: all conditions of one of the alternatives must hold.
 
-    stage          accept (the first that passes is taken), keep or stand (each name by itself)
-    effect         the name
-    alternatives   conditions
-    passed         what the diagnosis decided
-    step           number of effects that were accepted before
+    stage          accept (the first effect that passes is added), keep or stand (each effect alone)
+    effect         id of the effect
+    alternatives   sets of conditions
+    passed         decision
+    step           number of effects accepted before
     """
 
     stage: str

@@ -1,4 +1,4 @@
-"""Evidence for the accepted effects on held-out windows: strength, place, intervals, confidence, and the verdict."""
+"""Evidence for the accepted effects on held-out windows: strength, location, intervals, confidence, and the verdict."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sim_backends.registry import REGISTRY
 
 @dataclass(frozen=True, slots=True)
 class Texts:
-    """Functions that phrase the report.
+    """Functions that return texts of the report.
 
     effect             sentence of an effect with its numbers
     separating_drive   manoeuvre that separates an effect from its confusable ones
@@ -39,7 +39,7 @@ class Texts:
 class ScoredSearch:
     """A search with the held-out errors of its models.
 
-    fit      with the accepted effects and its covariance
+    fit      fit with the accepted effects, with covariance
     errors   held-out errors (S, 6) of the models nominal, refit and with_effects
     """
 
@@ -123,7 +123,7 @@ def _confidence(scored: ScoredSearch, name: str) -> float:
 def _where(
     scored: ScoredSearch, name: str, parameters: Mapping[str, Estimate], error: FloatArray, without: Fit
 ) -> Where:
-    """Channels by how much of the squared score the effect removes; regime, lag, time and place."""
+    """Channels sorted by the fall of their squared score, and regime, lag, time and place of the effect."""
     floor, windows = scored.held_out.floor, scored.problem.windows
     removed = np.mean((error / floor) ** 2, axis=0) - np.mean((scored.errors["with_effects"] / floor) ** 2, axis=0)
     main = removed >= min(0.5 * removed.max(), removed.max())
@@ -161,7 +161,7 @@ def base_estimates(scored: ScoredSearch) -> dict[str, Estimate]:
 
 
 def visibility(scored: ScoredSearch, effect: str) -> float:
-    """Share of an effect's influence on the errors that other parameters cannot imitate, in [0, 1]."""
+    """Share of an effect's influence on the errors that other parameters cannot reproduce, in [0, 1]."""
     free = scored.fit.free
     fitter = scored.problem.fitter(scored.found.scale)
     jacobian = fitter.linearised(scored.fit)[0].reshape(len(free), -1)
@@ -174,7 +174,7 @@ def visibility(scored: ScoredSearch, effect: str) -> float:
 
 
 def verdict_of(scored: ScoredSearch, has_unnamed: bool, data_faults: Sequence[DataFault]) -> Verdict:
-    """The verdict; ``has_unnamed``: whether anything is missing that has no name."""
+    """The verdict; ``has_unnamed``: whether physics outside the catalogue is missing."""
     if any(f.action.startswith("unusable") for f in data_faults):
         return "data"
     if scored.found.effects:
@@ -193,7 +193,7 @@ def verdict_of(scored: ScoredSearch, has_unnamed: bool, data_faults: Sequence[Da
 
 
 def unexplained_share(scored: ScoredSearch) -> float:
-    """Share of the refit's squared excess that stays with the accepted effects."""
+    """Share of the refit's squared excess that remains with the accepted effects."""
     score = scored.scores()
     excess = score["refit"] ** 2 - 1.0
     if excess <= scored.problem.settings.evidence.min_explained_excess:

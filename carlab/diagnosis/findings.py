@@ -1,4 +1,4 @@
-"""Results of a diagnosis as data: the schema ``carlab.diagnosis/1``, and the material of its pictures."""
+"""Results of a diagnosis as data: the schema ``carlab.diagnosis/1``, and the data of its figures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """Where an effect shows. ``time`` is (start, end) [s] and ``place`` (x, y, radius) [m] where it has one."""
+    """Location of an effect's error; ``time`` is (start, end) [s], ``place`` is (x, y, radius) [m]."""
 
     channels: tuple[str, ...]
     regime: str
@@ -39,11 +39,11 @@ class Where:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Why an effect is accepted.
+    """Evidence for an effect on held-out recordings.
 
     held_out_error_reduction   relative fall of the held-out score when it is added last
     standard_errors            held-out log-likelihood gain over its clustered standard error
-    visibility                 share of its influence that base parameters cannot imitate
+    visibility                 share of its influence that base parameters cannot reproduce
     deletion_fingerprint       relative rise of each channel's error when it is removed
     """
 
@@ -55,7 +55,7 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class EffectFinding:
-    """One named effect. ``separating_drive`` names a manoeuvre that would separate its set."""
+    """An accepted effect; ``separating_drive`` is the manoeuvre that separates its set of indistinguishable effects."""
 
     id: str
     confidence: float
@@ -81,7 +81,7 @@ class FitErrors:
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """Residual with every named effect: share of the squared excess, where it shows, and its class."""
+    """Residual with all accepted effects: share of the squared excess, channels, regime, class and formula."""
 
     share: float
     channels: tuple[str, ...]
@@ -92,7 +92,7 @@ class Unexplained:
 
 @dataclass(frozen=True, slots=True)
 class DataFault:
-    """A fault of the recording rather than of the simulator."""
+    """A fault of a recording."""
 
     id: str
     channel: str
@@ -102,7 +102,7 @@ class DataFault:
 
 @dataclass(frozen=True, slots=True)
 class RecordingUse:
-    """A recording and what it was used for: ``fit`` or ``held out``."""
+    """A recording and its role: ``fit`` or ``held out``."""
 
     path: str
     sha256: str
@@ -111,7 +111,7 @@ class RecordingUse:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The whole result. ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor."""
+    """Result of a diagnosis. ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor."""
 
     verdict: Verdict
     sentence: str
@@ -172,8 +172,8 @@ def _plain(value: Any) -> Any:
 class Trace:
     """One held-out recording and its predictions, each restarted every horizon.
 
-    times_s (T + 1,); recorded (T + 1, 6); predicted by name (nominal, refit, with_effects), each (T + 1, 6) with NaN
-    where there is none; marked are the stretches (start, end) [s] where the refit is worst.
+    times_s (T + 1,); recorded (T + 1, 6); predicted by model (nominal, refit, with_effects), each (T + 1, 6), NaN
+    without a prediction; marked: stretches (start, end) [s] with the largest errors of the refit.
     """
 
     name: str
@@ -185,14 +185,14 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class Exhibits:
-    """Material for the report's pictures.
+    """Data of the report's figures.
 
     ladder: scores from nominal over refit and each added effect to the noise floor, with labels
     regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
     correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
                  and the 99 % bound
     candidates: candidates for the first effect: id, gain on unseen blocks in standard errors, loss with it
-    decisions: about names, with the statistics that were compared with thresholds
+    decisions: accepted and rejected effects with statistics and thresholds
     """
 
     traces: tuple[Trace, ...] = ()

@@ -1,4 +1,4 @@
-"""Recordings as a diagnosis uses them: split into a part to fit and a held-out part, checked, and cut into windows."""
+"""Split recordings into a part to fit and a held-out part, check them, and cut them into prediction windows."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from carlab.prediction.windows import PredictionWindows, Track, cut_windows, spl
 
 
 class Inconclusive(DataError):
-    """The recordings do not allow a verdict about the simulator; the message says why and what to record.
+    """The recordings do not allow a verdict about the simulator; the message states why and what to record.
 
     Attributes:
-        data_faults: found until then.
-        verdict: "data" where the faults, and not the drive, leave too little.
+        data_faults: faults found so far.
+        verdict: "data" if faults make most of the recordings unusable.
     """
 
     data_faults: tuple[DataFault, ...] = ()
@@ -37,10 +37,10 @@ class SplitRecordings:
 
 
 def check_held_out_share(share: float, settings: WindowSettings) -> None:
-    """Raise ConfigError for a share that leaves too little to fit or to hold out."""
+    """Raise ConfigError if the held-out share is out of range."""
     if not 0.0 < share <= settings.max_held_out_share:
         raise ConfigError(
-            f"--holdout-share {share:g} leaves too little to fit or to hold out; give one above 0 and at most "
+            f"--holdout-share {share:g} is out of range; give a share above 0 and at most "
             f"{settings.max_held_out_share:g}."
         )
 
@@ -51,7 +51,7 @@ def split_recordings(
     """Split recordings and cut them into windows.
 
     Raises:
-        Inconclusive: too little is left, or nothing is excited.
+        Inconclusive: too little driving, speed or variation of the commands.
     """
     fit_tracks, held_out_tracks = _split(fit, held_out, held_out_share, settings)
     _check_excitation(fit_tracks, settings)
@@ -64,7 +64,7 @@ def split_recordings(
 def _split(
     fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], share: float, settings: WindowSettings
 ) -> tuple[list[Track], list[Track]]:
-    """Tracks to fit and held-out tracks: the end of each recording where no recording is held out."""
+    """Tracks to fit and held-out tracks; without held-out recordings, the end of each recording is held out."""
     fit_tracks = tracks_of(fit)
     if not fit_tracks:
         raise Inconclusive("No recording has an unbroken stretch of half a second; record without gaps.")
@@ -72,15 +72,17 @@ def _split(
     if held_out:
         held_out_tracks = tracks_of(held_out, period_s)
         if not held_out_tracks:
-            raise Inconclusive("The held-out recordings have no unbroken stretch; hold out another one.")
+            raise Inconclusive(
+                "The held-out recordings have no unbroken stretch of half a second; hold out other recordings."
+            )
         return fit_tracks, held_out_tracks
     return split_tracks(fit_tracks, share, settings.held_out_window_s + settings.split_guard_s)
 
 
 def _cut(tracks: Sequence[Track], horizon_s: float, stride_s: float) -> PredictionWindows:
-    """Prediction windows; Inconclusive where there are none."""
+    """Prediction windows. Raises Inconclusive without windows."""
     if not tracks:
-        raise Inconclusive("Too little driving is left when part of it is held out; record a longer drive (100 s).")
+        raise Inconclusive("The recording is too short to hold out a part of it; record a longer drive (100 s).")
     try:
         return cut_windows(tracks, horizon_s, stride_s)
     except DataError as error:
@@ -88,17 +90,17 @@ def _cut(tracks: Sequence[Track], horizon_s: float, stride_s: float) -> Predicti
 
 
 def _check_excitation(tracks: Sequence[Track], settings: WindowSettings) -> None:
-    """Raise Inconclusive where nothing can be identified, with what to record."""
+    """Raise Inconclusive if the excitation is not sufficient; the message states what to record."""
     seconds = sum(track.duration_s for track in tracks)
     if seconds < settings.min_fit_s:
         raise Inconclusive(
-            f"The recordings to fit hold {seconds:.1f} s of driving. A diagnosis needs at least "
+            f"The recordings to fit contain {seconds:.1f} s of driving. A diagnosis needs at least "
             f"{settings.min_fit_s:.0f} s, better 100 s, with changing speed and steering "
             "(carlab drive --policy steering_steps)."
         )
     speed = np.concatenate([np.hypot(t.smooth[:, 3], t.smooth[:, 4]) for t in tracks])
     if np.quantile(speed, 0.9) < settings.min_speed_mps:
-        raise Inconclusive("The car hardly moves in the recordings to fit; record it driving.")
+        raise Inconclusive("The car hardly moves in the recordings to fit; record a drive.")
     commands = np.concatenate([t.commands for t in tracks])
     for k, name in enumerate(("steering", "throttle")):
         if commands[:, k].std() < settings.min_command_std:

@@ -1,7 +1,7 @@
-"""Prediction errors of a simulator on a recording, by the same steps as the held-out errors of a diagnosis.
+"""Prediction errors of a simulator on a recording, computed like the held-out errors of a diagnosis.
 
-Faults of the recording are repaired, the window of its velocities is estimated, and so are the initial states. So a
-``model.toml`` has here the error that its report states.
+Faults of the recording are repaired; the velocity window and the initial states are estimated. A ``model.toml``
+therefore has the error that its report states.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PartScore:
 
     Attributes:
         part: "whole recording" or "last 30 %".
-        held_out: its S windows and their noise floor.
+        held_out: S windows and their noise floor.
         errors: (S, 6) of the model and of the baselines, by name.
     """
 
@@ -49,13 +49,13 @@ class RecordingScore:
     """Errors of a simulator on a recording.
 
     Attributes:
-        horizon_s: that was predicted: a whole number of steps.
+        horizon_s: prediction horizon, a whole number of steps.
         whole: errors in the whole recording.
-        last: errors in the part that a diagnosis of this recording alone holds out; None where that is too short.
+        last: errors in the part that a diagnosis of this recording alone holds out; None if it is too short.
         episodes: the recording, repaired.
-        overlays: predictions (T + 1, 6) at the stamps of each episode, restarted every horizon; NaN where there is
-            none.
-        faults: what was found and repaired.
+        overlays: predictions (T + 1, 6) at the stamps of each episode, restarted every horizon; NaN without a
+            prediction.
+        faults: faults of the recording.
     """
 
     horizon_s: float
@@ -77,21 +77,21 @@ def score_recording(
     """Predict a recording from many initial states along it.
 
     Args:
-        episodes: the recording, as a diagnosis reads it.
+        episodes: the recording as read.
         config: the simulator, observation effects included.
-        horizon_s: how far to predict.
-        stride_s: from one start to the next.
-        holdout_share: the last part that is scored by itself, above 0 and at most 0.5.
+        horizon_s: prediction horizon.
+        stride_s: time between initial states.
+        holdout_share: share of the last part, which is scored separately, above 0 and at most 0.5.
 
     Raises:
-        DataError: the recording holds no window of that length in which the car moves.
-        ConfigError: the share is impossible.
+        DataError: the recording contains no window of that length in which the car moves.
+        ConfigError: the share is out of range.
     """
     check_held_out_share(holdout_share, DEFAULT.windows)
     if not (horizon_s > 0 and stride_s > 0):
         raise DataError(f"Horizon {horizon_s:g} s and stride {stride_s:g} s must be positive.")
     if not any(episode.ticks for episode in episodes):
-        raise DataError("The recording holds no command; there is nothing to predict.")
+        raise DataError("The recording contains no command; give a recording of a drive.")
     repaired, _, faults = recording_faults.check(episodes, [], config)
     tracks = tracks_of(repaired)
     if not tracks:
@@ -115,9 +115,9 @@ def score_recording(
 def _score(
     part: str, fit_tracks: list[Track], tracks: list[Track], config: SimulatorConfig, horizon_s: float, stride_s: float
 ) -> PartScore:
-    """Errors on ``tracks``, with the velocity window and the noise of ``fit_tracks``. DataError without windows."""
+    """Errors on ``tracks``, with velocity window and noise of ``fit_tracks``. Raises DataError without windows."""
     if not fit_tracks or not tracks:
-        raise DataError("Too little is left.")
+        raise DataError("The part is too short.")
     settings = DEFAULT.windows
     fit_windows = cut_windows(fit_tracks, min(settings.fit_window_s, horizon_s), settings.fit_stride_s)
     fit_windows = fit_windows.thinned(settings.max_fit_windows)
@@ -147,7 +147,7 @@ def _overlays(
 
 
 def describe_windows(score: PartScore) -> str:
-    """The part with its number of windows and where they lie."""
+    """Name of a part with number and time span of its windows."""
     windows = score.held_out.windows
     first_s, last_s = float(np.min(windows.t0_s)), float(np.max(windows.t0_s)) + windows.horizon_s
     return f"{score.part} ({len(windows)} windows from {first_s:.1f} to {last_s:.1f} s)"

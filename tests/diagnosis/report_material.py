@@ -155,7 +155,7 @@ def nameless() -> Diagnosis:
 
 
 def no_verdict() -> Diagnosis:
-    why = "The car hardly moves in the recordings to fit; record it driving (carlab drive --policy figure_eight)."
+    why = "The car hardly moves in the recordings to fit; record a drive (carlab drive --policy figure_eight)."
     return Diagnosis("inconclusive", why, (), {}, 1.0, {}, None, (), USES[:1], 0, 0.0, why)
 
 

@@ -114,7 +114,7 @@ def test_a_parked_car_is_inconclusive_and_says_what_to_record(
     path = tmp_path / "parked.csv"
     path.write_text("\n".join(parked) + "\n")
     assert run(["diagnose", str(path), "--out", str(tmp_path / "out")]) == 5
-    assert "record it driving" in " ".join(capfd.readouterr().err.split())
+    assert "record a drive" in " ".join(capfd.readouterr().err.split())
     assert json.loads((tmp_path / "out" / "report.json").read_text())["verdict"] == "inconclusive"
 
 
@@ -148,7 +148,7 @@ def test_a_recording_whose_tracking_is_lost_all_the_time_is_itself_at_fault(
     assert report["verdict"] == "data"
     assert report["effects"] == []
     assert "outliers" in {fault["id"] for fault in report["data_faults"]}
-    assert "The recording is at fault" in " ".join(capfd.readouterr().err.split())
+    assert "The recording is faulty" in " ".join(capfd.readouterr().err.split())
 
 
 def test_a_constant_command_is_inconclusive_and_names_the_drive_that_varies_it(

@@ -203,5 +203,5 @@ def test_leaving_a_fold_out_by_one_step_is_as_good_as_a_refit(
     for fold in range(3):
         own = folds == fold
         apart = Fitter(windows.take(~own), fitter.scale).fit(fit.config, free, fit.z, iterations=30)
-        exact = Fitter(windows.take(own), fitter.scale).loss(car, free, apart.z, most=12.0).sum()
+        exact = Fitter(windows.take(own), fitter.scale).loss(car, free, apart.z, max_error=12.0).sum()
         assert quick[own].sum() == pytest.approx(exact, rel=0.1)

@@ -22,9 +22,9 @@ from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.report.sentences import (
     effect_noun,
     effect_sentence,
+    refutation_sentence,
     separating_drive,
     separating_reason,
-    wrong_sentence,
 )
 from carlab.diagnosis.report.write import write_report
 from carlab.prediction.initial_states import as_recorded
@@ -234,7 +234,7 @@ def test_the_report_has_its_texts(found: Outcome, report: Path) -> None:
         assert escape(effect["sentence"]) in page
         assert escape(own.refuted_if) in page
     assert effect_noun("spin_moment") == SpinMoment.name
-    assert wrong_sentence("spin_moment") == "This would be wrong if the car drives straight at high speed."
+    assert refutation_sentence("spin_moment") == "This would be wrong if the car drives straight at high speed."
 
 
 def test_confusable_effects_and_the_drive_that_separates_them_go_both_ways() -> None:

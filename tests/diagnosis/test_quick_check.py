@@ -1,4 +1,4 @@
-"""The quick check: whether, where and why a simulator disagrees with drives whose truth is known."""
+"""The quick check on drives with known physics: verdict, location and causes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.state_estimator import fit_velocity
-from carlab.diagnosis.own_recordings import as_captured, window_variance_s2
 from carlab.diagnosis.quick.conditions import find_conditions
 from carlab.diagnosis.quick.quick_check import quick_check
 from carlab.diagnosis.quick.sentences import sentences, short
 from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.state_alignment import align_states, window_variance_s2
 from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
 from carlab.recording.mcap.source import read_episode
 from sim_backends.car_parameters import SimulatorConfig
@@ -30,7 +30,7 @@ def recorded(folder: Path, true: SimulatorConfig, seed: int, episodes: int = 5) 
 
 
 @pytest.mark.parametrize("seed", [20, 21, 22])
-def test_the_simulator_explains_its_own_recordings_from_the_first_on(tmp_path: Path, seed: int) -> None:
+def test_the_true_simulator_explains_its_recordings(tmp_path: Path, seed: int) -> None:
     episodes = recorded(tmp_path, SIMULATOR, seed)
     for count in (1, 3, 5):
         check = quick_check(episodes[:count], SIMULATOR)
@@ -43,7 +43,7 @@ def test_the_simulator_explains_its_own_recordings_from_the_first_on(tmp_path: P
 @pytest.mark.parametrize(
     ("effect", "size"), [("motor_lag", 1.0), ("marker_offset", 1.0), ("road_slope", 2.0)]
 )  # fmt: skip
-def test_what_an_independent_generator_conceals_is_found_where_it_shows_and_named(effect: str, size: float) -> None:
+def test_a_concealed_effect_of_an_independent_generator_is_located_and_named(effect: str, size: float) -> None:
     case = drives.concealed_drives(effect, size, seed=23)
     check = quick_check(case.episodes, case.simulator)
     assert check.verdict == "left"
@@ -59,7 +59,7 @@ def test_what_an_independent_generator_conceals_is_found_where_it_shows_and_name
     assert effect in short(check)
 
 
-def test_with_refit_that_are_off_an_effect_is_named_too() -> None:
+def test_an_effect_is_named_with_wrong_base_parameters() -> None:
     case = drives.concealed_drives("motor_lag", 3.0, seed=24, share=0.1)
     check = quick_check(case.episodes, case.simulator)
     assert check.verdict == "left"
@@ -69,7 +69,7 @@ def test_with_refit_that_are_off_an_effect_is_named_too() -> None:
     assert found.parameters["effects.motor_lag.time_constant"].value == pytest.approx(truth, rel=0.15)
 
 
-def test_a_wrong_number_is_distinguished_from_an_effect_and_so_is_an_effect_that_changed(tmp_path: Path) -> None:
+def test_a_wrong_parameter_and_a_changed_effect_are_distinguished_from_new_effects(tmp_path: Path) -> None:
     weaker = SIMULATOR.with_values({"motor.drive_gain": 7.4})
     check = quick_check(recorded(tmp_path, weaker, 25), SIMULATOR)
     assert (check.verdict, check.causes[0].id) == ("left", "motor.drive_gain")
@@ -84,14 +84,14 @@ def test_a_wrong_number_is_distinguished_from_an_effect_and_so_is_an_effect_that
     assert check.causes[0].parameters["effects.steering_lag.time_constant"].value == pytest.approx(0.09, rel=0.1)
 
 
-def test_the_same_recordings_give_the_same_answer() -> None:
+def test_the_check_is_deterministic() -> None:
     case = drives.concealed_drives("rolling_resistance", 3.0, seed=27, episodes=2)
     first, again = (quick_check(case.episodes, case.simulator).to_dict() for _ in range(2))
     assert first == again
     assert first["verdict"] == "left"
 
 
-def test_recordings_that_are_not_sufficient_are_undecided_with_a_reason() -> None:
+def test_insufficient_recordings_are_undecided_with_a_reason() -> None:
     case = drives.concealed_drives(None, 0.0, seed=28, episodes=1)
     (episode,) = case.episodes
     standing = np.zeros_like(episode.states)
@@ -109,8 +109,8 @@ def test_recordings_that_are_not_sufficient_are_undecided_with_a_reason() -> Non
         assert check.why in sentence
 
 
-def test_one_accident_is_undecided(tmp_path: Path) -> None:
-    """Somebody pushes the car aside in one episode."""
+def test_an_outlier_in_one_episode_is_undecided(tmp_path: Path) -> None:
+    """A person pushes the car aside in one episode."""
     episodes = recorded(tmp_path, SIMULATOR, 21)
     index = next(k for k, e in enumerate(episodes) if e.ticks > 80)
     pushed = episodes[index]
@@ -122,10 +122,10 @@ def test_one_accident_is_undecided(tmp_path: Path) -> None:
     check = quick_check(episodes, SIMULATOR)
     assert check.score > DEFAULT.quick.score_max
     assert check.verdict == "undecided"
-    assert "accident" in check.why
+    assert "outlier" in check.why
 
 
-# -- where ------------------------------------------------------------------------------------------------------------
+# -- conditions -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -148,21 +148,21 @@ def test_errors_on_one_side_at_one_place_or_while_braking_are_located(windows: P
     assert any(text.startswith("within 0.5 m of") for text in texts)
 
 
-# -- recordings as carlab makes them ----------------------------------------------------------------------------------
+# -- alignment of states ----------------------------------------------------------------------------------------------
 
 RADIUS_M, RATE = 0.8, 1.5
 
 
 def circle(t_s: np.ndarray) -> np.ndarray:
-    """States on a circle, its speed growing: pose and body velocities in closed form."""
+    """States on a circle with growing speed: pose and body velocities in closed form."""
     angle, rate = RATE * t_s + 0.3 * t_s**2, RATE + 0.6 * t_s
     x, y = RADIUS_M * np.sin(angle), RADIUS_M * (1.0 - np.cos(angle))
     yaw = (angle + math.pi) % (2.0 * math.pi) - math.pi
     return np.stack([x, y, yaw, RADIUS_M * rate, np.zeros_like(t_s), rate], axis=1)
 
 
-def circled(filter_left: float = 0.0) -> EpisodeData:
-    """Forty ticks as a control loop sees them: the newest pose of 120 Hz, velocities of a line through six."""
+def circle_episode(velocity_offset: float = 0.0) -> EpisodeData:
+    """Forty ticks of a control loop: the newest pose of 120 Hz, velocities of a line through six poses."""
     captures = np.arange(-30, 180) / 120.0 + 0.0021
     poses = np.column_stack([captures, circle(captures)[:, :3]])
     unwrapped = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
@@ -171,7 +171,7 @@ def circled(filter_left: float = 0.0) -> EpisodeData:
     for t in times:
         newest = int(np.searchsorted(captures, t - 0.009)) - 1
         line = fit_velocity(unwrapped[newest - 5 : newest + 1])
-        states.append([*poses[newest, 1:], line.vx_mps - filter_left, line.vy_mps, line.yaw_rate_radps])
+        states.append([*poses[newest, 1:], line.vx_mps - velocity_offset, line.vy_mps, line.yaw_rate_radps])
         age.append(t - captures[newest])
         delay.append(captures[newest] - line.t_s)
     nothing = np.zeros((40, 2))
@@ -179,39 +179,39 @@ def circled(filter_left: float = 0.0) -> EpisodeData:
     return EpisodeData(times, np.array(states), nothing, nothing, np.zeros(40), poses, extra=extra)
 
 
-def test_states_are_those_of_the_stated_latency() -> None:
-    episode, latency_s = circled(), 0.008
+def test_aligned_states_have_the_stated_latency() -> None:
+    episode, latency_s = circle_episode(), 0.008
     truth = circle(episode.times_s - latency_s)
-    assert np.abs(episode.states - truth)[:, 3:].max() > 0.01, "as recorded they are too old"
-    seen = as_captured(episode, latency_s)
-    rows = np.searchsorted(episode.times_s, seen.times_s)
-    assert seen.ticks >= 38
-    error = seen.states - truth[rows]
+    assert np.abs(episode.states - truth)[:, 3:].max() > 0.01, "recorded velocities are too old"
+    aligned = align_states(episode, latency_s)
+    rows = np.searchsorted(episode.times_s, aligned.times_s)
+    assert aligned.ticks >= 38
+    error = aligned.states - truth[rows]
     error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
     assert np.abs(error[:, :3]).max() < 1e-4
     assert np.abs(error[:, 3:]).max() < 2e-3
-    np.testing.assert_array_equal(seen.sent, episode.sent[rows[:-1]])
+    np.testing.assert_array_equal(aligned.sent, episode.sent[rows[:-1]])
 
 
-def test_a_filter_behind_the_estimator_is_kept() -> None:
-    seen, filtered = (as_captured(circled(left), 0.008) for left in (0.0, 0.07))
-    np.testing.assert_allclose(seen.states[:, 3] - filtered.states[:, 3], 0.07, atol=1e-9)
+def test_the_influence_of_a_velocity_filter_is_kept() -> None:
+    aligned, filtered = (align_states(circle_episode(offset), 0.008) for offset in (0.0, 0.07))
+    np.testing.assert_allclose(aligned.states[:, 3] - filtered.states[:, 3], 0.07, atol=1e-9)
 
 
-def test_where_poses_are_missing_nothing_is_made_up_and_foreign_recordings_are_left_alone() -> None:
-    episode = circled()
-    gone = (episode.poses[:, 0] > 0.6) & (episode.poses[:, 0] < 0.75)
-    broken = as_captured(replace(episode, poses=episode.poses[~gone]), 0.008)
+def test_missing_poses_give_missing_states_and_foreign_recordings_are_unchanged() -> None:
+    episode = circle_episode()
+    missing_poses = (episode.poses[:, 0] > 0.6) & (episode.poses[:, 0] < 0.75)
+    broken = align_states(replace(episode, poses=episode.poses[~missing_poses]), 0.008)
     missing = np.isnan(broken.states).any(axis=1)
     assert missing[np.argmin(np.abs(broken.times_s - 0.68))]
     assert not missing[broken.times_s < 0.55].any()
     assert not missing[broken.times_s > 0.82].any()
     foreign = replace(episode, extra={})
-    assert as_captured(foreign, 0.008) is foreign
+    assert align_states(foreign, 0.008) is foreign
     assert window_variance_s2([foreign]) is None
 
 
-def test_the_window_smears_velocities_by_its_variance() -> None:
+def test_the_velocity_error_equals_the_window_variance() -> None:
     """x = t^3: velocities of a symmetric window of variance s2 are 3 t^2 + 3 s2."""
     t = np.arange(-60, 61) / 120.0
     poses = np.column_stack([t, t**3, np.zeros_like(t), np.zeros_like(t)])
@@ -219,7 +219,7 @@ def test_the_window_smears_velocities_by_its_variance() -> None:
     ages = {"pose_age_s": np.full(3, 0.01), "velocity_delay_s": np.full(3, np.nan)}
     nothing = np.zeros((2, 2))
     episode = EpisodeData(times, np.zeros((3, 6)), nothing, nothing, np.zeros(2), poses, extra=ages)
-    smear = as_captured(episode, 0.0).states[:, 3] - 3.0 * times**2
+    error = align_states(episode, 0.0).states[:, 3] - 3.0 * times**2
     variance = window_variance_s2([episode])
     assert variance is not None
-    np.testing.assert_allclose(smear, 3.0 * variance, rtol=1e-6)
+    np.testing.assert_allclose(error, 3.0 * variance, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""The written report, read back: JSON by its schema, HTML by a parser, TOML as a car file, rerun by its own tool."""
+"""The written report, read again: JSON by its schema, HTML by a parser, TOML as a car file, rerun by its tool."""
 
 import importlib.util
 import json
@@ -48,7 +48,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Page(HTMLParser):
-    """Checks nesting, and gathers the words outside of drawings and style sheets, and all attributes."""
+    """Check nesting, and collect all attributes and the text outside of drawings and style sheets."""
 
     def __init__(self, text: str) -> None:
         super().__init__(convert_charrefs=True)
@@ -112,12 +112,12 @@ def test_json_has_the_keys_of_the_schema_for_each_verdict(case: Diagnosis, tmp_p
     assert all(set(r) == {"path", "sha256", "role"} for r in report["recordings"])
 
 
-def test_json_holds_the_numbers_and_fills_in_the_sentences(written: Path) -> None:
+def test_json_contains_the_numbers_and_default_sentences(written: Path) -> None:
     report = json.loads((written / "report.json").read_text(encoding="utf-8"))
     assert report["effects"][0]["parameters"]["time_constant"]["value"] == 0.11
     assert report["effects"][1]["where"]["place"] == {"x": 1.31, "y": -0.42, "radius": 0.62}
     assert report["fit"]["held_out"]["refit"]["score"] == 3.86
-    assert report["sentence"].startswith("The simulator leaves out two things")
+    assert report["sentence"].startswith("The simulator leaves out two effects")
     assert report["effects"][0]["sentence"] == "Left out: the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)."
     assert "carlab drive --policy steering_steps" in report["advice"]
 
@@ -140,7 +140,7 @@ def test_page_is_one_file_without_scripts_or_references_to_elsewhere(case: Diagn
 
 
 def _numbers_of(value: object) -> set[str]:
-    """Every number in plain data, as the page may write it: itself, its size, in per cent, each minute."""
+    """All numbers in plain data in the formats of the page: value, magnitude, per cent, per minute."""
     if isinstance(value, Mapping):
         return {n for v in value.values() for n in _numbers_of(v)}
     if isinstance(value, list | tuple):
@@ -164,19 +164,19 @@ def test_every_number_in_the_text_comes_from_the_data(case: Diagnosis, tmp_path:
     known |= _numbers_of(pictures.candidates)
     lags, curve, bound = pictures.correlation["steering_lag"]
     known |= _numbers_of([float(lags[curve.argmax()]), float(curve.max()), int((curve > bound).sum()), len(lags)])
-    reached = (material.REFIT.score - material.WITH.score) / (material.REFIT.score - 1.0)
-    known |= {"90", "1", "99", "3", f"{100 * reached:.0f}", "256", str(len(pictures.candidates))}
+    attained = (material.REFIT.score - material.WITH.score) / (material.REFIT.score - 1.0)
+    known |= {"90", "1", "99", "3", f"{100 * attained:.0f}", "256", str(len(pictures.candidates))}
     known |= {"2", "0.15"}  # units such as m/s2, and the throttle of a second drive
-    said = {n for word in page.words for n in re.findall(r"\d+(?:\.\d+)?", word)}
-    assert said - known == set()
-    assert len(said) > 8
+    shown = {n for word in page.words for n in re.findall(r"\d+(?:\.\d+)?", word)}
+    assert shown - known == set()
+    assert len(shown) > 8
 
 
-def test_page_tells_effect_interval_set_and_next_drive(written: Path) -> None:
+def test_page_contains_effect_interval_set_and_next_drive(written: Path) -> None:
     text, page = read_page(written)
     words = re.sub(r"\s+", " ", " ".join(page.words))
     assert "the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)" in words
-    assert "These recordings cannot tell it from a delay of the steering." in words
+    assert "These recordings do not distinguish it from a delay of the steering." in words
     assert "carlab drive --policy steering_steps" in words
     assert "within 0.62 m of x = 1.31 m, y = −0.42 m" in words
     assert "This would be wrong if" in words
@@ -185,14 +185,14 @@ def test_page_tells_effect_interval_set_and_next_drive(written: Path) -> None:
     assert text.count("<svg") >= 12
 
 
-def test_a_report_without_a_verdict_says_why_and_what_to_record(tmp_path: Path) -> None:
+def test_a_report_without_a_verdict_states_why_and_what_to_record(tmp_path: Path) -> None:
     write_report(material.no_verdict(), Exhibits(), tmp_path, material.model())
     words = " ".join(read_page(tmp_path)[1].words)
     assert "No verdict. The car hardly moves in the recordings to fit" in words
     assert "carlab drive --policy figure_eight" in words
 
 
-def test_names_from_outside_cannot_become_markup(tmp_path: Path) -> None:
+def test_names_from_outside_are_escaped(tmp_path: Path) -> None:
     case = replace(
         material.mismatch(),
         recordings=(RecordingUse(HOSTILE, HOSTILE, "fit"),),
@@ -212,7 +212,7 @@ def test_names_from_outside_cannot_become_markup(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["recordings"][0]["path"] == HOSTILE
 
 
-def test_model_is_a_car_file_that_says_where_it_comes_from(written: Path) -> None:
+def test_model_is_a_car_file_that_states_its_origin(written: Path) -> None:
     loaded = load_car_file(written / "model.toml")
     assert replace(loaded.simulator, parameter_std={}) == material.model()
     known = {"effects.steering_lag.time_constant": material.lag_finding().parameters["time_constant"]}
@@ -220,11 +220,11 @@ def test_model_is_a_car_file_that_says_where_it_comes_from(written: Path) -> Non
     assert loaded.simulator.effects["steering_lag"]["time_constant"] == 0.11
     comments = [line for line in loaded.text.splitlines() if line.startswith("#")]
     assert any("drives/2024-06-07 morning.csv" in line for line in comments)
-    assert any("cannot tell steering_lag from steering_delay" in line for line in comments)
+    assert any("do not distinguish steering_lag from steering_delay" in line for line in comments)
     assert not any("noon" in line for line in comments)
 
 
-def test_rerun_reads_the_recording_and_finds_its_entities(written: Path) -> None:
+def test_rerun_reads_the_recording_and_prints_its_entities(written: Path) -> None:
     rerun = Path(sys.executable).with_name("rerun")
     path = str(written / "report.rrd")
     checked = subprocess.run([str(rerun), "rrd", "verify", path], capture_output=True, text=True, check=False)
@@ -243,7 +243,7 @@ def test_rerun_reads_the_recording_and_finds_its_entities(written: Path) -> None
     assert "/verdict" in printed
 
 
-def test_recordings_of_the_same_name_stay_apart(tmp_path: Path) -> None:
+def test_recordings_of_equal_names_have_different_entities(tmp_path: Path) -> None:
     write_report(
         material.mismatch(),
         Exhibits(traces=(material.trace("a b"), material.trace("a b"), material.trace("verdict"))),
@@ -256,14 +256,14 @@ def test_recordings_of_the_same_name_stay_apart(tmp_path: Path) -> None:
     assert all(f"/{name}/map/recorded/trail" in printed for name in ("a_b", "a_b_2", "verdict_2"))
 
 
-def test_a_report_replaces_an_older_one_and_leaves_nothing_unfinished(tmp_path: Path) -> None:
+def test_a_report_replaces_an_older_one_without_leftover_files(tmp_path: Path) -> None:
     write_report(material.mismatch(), material.exhibits(), tmp_path, material.model())
     write_report(material.nothing(), Exhibits(), tmp_path, material.model())
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["verdict"] == "none"
     assert {p.name for p in tmp_path.iterdir()} == {"report.json", "report.html", "report.rrd", "model.toml"}
 
 
-def test_a_file_in_place_of_the_folder_is_told_in_a_sentence(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine", encoding="utf-8")
     with pytest.raises(DataError, match="a file has the path of its folder; choose another folder"):
         write_report(material.nothing(), Exhibits(), tmp_path / "taken", material.model())

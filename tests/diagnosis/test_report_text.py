@@ -1,4 +1,4 @@
-"""Every effect, look-alike and verdict has words, and they never say more than the numbers."""
+"""Texts of effects, confusable effects and verdicts state the numbers with their uncertainty."""
 
 import math
 import re
@@ -25,19 +25,19 @@ from carlab.diagnosis.report.sentences import (
     next_drive,
     number,
     percent,
+    refutation_sentence,
     separating_drive,
     separating_reason,
     unit_text,
     verdict_sentence,
     verdict_title,
-    wrong_sentence,
 )
 from sim_backends.effects import CATALOGUE, confusable_effects
 
-LOOK_ALIKES = confusable_effects()
+CONFUSABLE = confusable_effects()
 
-PAIRS = [(a, b) for a in LOOK_ALIKES for b in LOOK_ALIKES[a]]
-INSEPARABLE = {"command_delay", "mocap_latency"}
+PAIRS = [(a, b) for a in CONFUSABLE for b in CONFUSABLE[a]]
+INSEPARABLE_PAIR = {"command_delay", "mocap_latency"}
 
 
 def around(value: float, unit: str) -> Estimate:
@@ -57,14 +57,14 @@ def diagnosis(verdict: str, *effects: EffectFinding, refit: float = 4.0, with_ef
 
 
 @pytest.mark.parametrize("effect_id", CATALOGUE)
-def test_every_effect_says_each_of_its_numbers_with_its_unit(effect_id: str) -> None:
+def test_the_sentence_of_an_effect_contains_each_parameter_with_its_unit(effect_id: str) -> None:
     parameters = {p.name: around(p.typical, p.unit) for p in CATALOGUE[effect_id].parameters}
     sentence = effect_sentence(effect_id, parameters)
     assert sentence.startswith("Left out: ")
     assert sentence.endswith(".")
     assert sentence.count(" at 90 %") == 1
     assert not re.search(r"[{}_]|nan|unknown|  ", sentence)
-    hidden = {"B_front", "C_front", "B_rear", "C_rear", "axle"}  # shape factors say nothing to most readers
+    hidden = {"B_front", "C_front", "B_rear", "C_rear", "axle"}  # shape factors are not in the sentence
     for p in CATALOGUE[effect_id].parameters:
         if p.name in hidden:
             continue
@@ -75,62 +75,62 @@ def test_every_effect_says_each_of_its_numbers_with_its_unit(effect_id: str) -> 
 
 
 @pytest.mark.parametrize("effect_id", CATALOGUE)
-def test_every_effect_says_what_would_prove_it_wrong(effect_id: str) -> None:
-    assert re.fullmatch(r"This would be wrong if .{20,}\.", wrong_sentence(effect_id))
+def test_every_effect_has_a_refutation(effect_id: str) -> None:
+    assert re.fullmatch(r"This would be wrong if .{20,}\.", refutation_sentence(effect_id))
 
 
 @pytest.mark.parametrize("effect_id", CATALOGUE)
-def test_a_sentence_survives_missing_and_infinite_numbers(effect_id: str) -> None:
+def test_a_sentence_allows_missing_and_infinite_numbers(effect_id: str) -> None:
     assert effect_sentence(effect_id, {}).startswith("Left out: ")
     odd = {p.name: Estimate(math.inf, math.nan, math.nan, math.inf, p.unit) for p in CATALOGUE[effect_id].parameters}
     assert "inf" not in effect_sentence(effect_id, odd).replace("infl", "")
 
 
-def test_the_servo_lag_reads_as_a_person_would_say_it() -> None:
+def test_sentence_of_the_servo_lag() -> None:
     lag = Estimate(0.11, 0.0091, 0.095, 0.125, "s")
     wanted = "Left out: the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)."
     assert effect_sentence("steering_lag", {"time_constant": lag}) == wanted
 
 
 @pytest.mark.parametrize(("angle", "side"), [(0.05, "left"), (-0.05, "right")])
-def test_a_sign_becomes_a_side_and_the_interval_turns_with_it(angle: float, side: str) -> None:
+def test_a_sign_becomes_a_side_and_the_interval_is_mirrored(angle: float, side: str) -> None:
     sentence = effect_sentence("steering_offset", {"angle": around(angle, "rad")})
     assert f"0.05 rad (0.04 to 0.06 at 90 %) to the {side}" in sentence
 
 
-def test_an_interval_across_zero_says_that_the_sign_is_not_certain() -> None:
+def test_an_interval_across_zero_states_that_the_sign_is_not_certain() -> None:
     sentence = effect_sentence("lateral_bias", {"force": Estimate(-0.2, 0.3, -0.7, 0.3, "N")})
     assert "0.2 N (−0.3 to 0.7 at 90 %; its sign is not certain) pushes the car to the right." in sentence
 
 
-def test_an_effect_beyond_the_catalogue_stands_for_itself() -> None:
+def test_an_effect_outside_the_catalogue_is_named_by_its_id() -> None:
     assert "wind gust" in effect_sentence("wind_gust", {"force": around(1.0, "N")})
-    assert wrong_sentence("wind_gust").startswith("This would be wrong if")
+    assert refutation_sentence("wind_gust").startswith("This would be wrong if")
 
 
-def test_look_alikes_hold_the_catalogue_both_ways() -> None:
-    assert set(LOOK_ALIKES) == set(CATALOGUE)
-    assert all(a in LOOK_ALIKES[b] for a, b in PAIRS)
-    assert set(LOOK_ALIKES["steering_lag"]) == {
+def test_confusable_effects_are_symmetric() -> None:
+    assert set(CONFUSABLE) == set(CATALOGUE)
+    assert all(a in CONFUSABLE[b] for a, b in PAIRS)
+    assert set(CONFUSABLE["steering_lag"]) == {
         *("steering_delay", "steering_rate_limit", "tyre_relaxation", "velocity_filter_lag"),
     }
-    assert set(LOOK_ALIKES["rolling_resistance"]) == {"throttle_deadband"}
-    assert LOOK_ALIKES["low_friction_patch"] == ()
+    assert set(CONFUSABLE["rolling_resistance"]) == {"throttle_deadband"}
+    assert CONFUSABLE["low_friction_patch"] == ()
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_every_pair_of_look_alikes_has_a_drive_that_can_be_driven_or_says_that_none_can(one: str, other: str) -> None:
+def test_every_confusable_pair_has_a_separating_drive_or_states_that_none_exists(one: str, other: str) -> None:
     drive = separating_drive(one, (other,))
     assert drive == separating_drive(other, (one,))
     assert len(separating_reason(one, (other,))) > 20
-    if {one, other} == INSEPARABLE:
+    if {one, other} == INSEPARABLE_PAIR:
         assert drive == ""
         assert "No manoeuvre separates" in separating_reason(one, (other,))
     else:
         assert drive in MANOEUVRES
 
 
-def test_of_three_the_drive_that_separates_most_pairs_is_chosen() -> None:
+def test_the_drive_that_separates_most_pairs_of_a_set_is_chosen() -> None:
     assert separating_drive("throttle_nonlinearity", ("motor_saturation", "throttle_deadband")) == "throttle_ramp"
     assert separating_drive("motor_saturation", ("aerodynamic_drag", "throttle_nonlinearity")) in MANOEUVRES
     assert separating_drive("yaw_damping", ()) == ""
@@ -139,31 +139,32 @@ def test_of_three_the_drive_that_separates_most_pairs_is_chosen() -> None:
 def test_a_mismatch_names_its_effects_and_its_sets() -> None:
     text = verdict_sentence(diagnosis("mismatch", finding("motor_lag", ("throttle_delay",)), finding("yaw_damping")))
     assert (
-        "leaves out two things: a lag of the motor (or a delay of the throttle: these recordings cannot tell)" in text
+        "leaves out two effects: a lag of the motor "
+        "(or a delay of the throttle; these recordings do not distinguish them)" in text
     )
     assert "and a yaw damping moment" in text
     assert "from 4 to 2.5 noise floors, which removes 50 % of the error above the noise" in text
-    assert "cannot tell" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
+    assert "distinguish" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
 
 
-def test_the_share_of_what_was_attainable() -> None:
+def test_the_attained_share_of_the_error_above_the_noise() -> None:
     assert attained(diagnosis("mismatch", refit=4.0, with_effects=1.0)) == pytest.approx(1.0)
     assert math.isnan(attained(diagnosis("none", refit=1.0, with_effects=1.0)))
     text = verdict_sentence(diagnosis("mismatch", finding("motor_lag"), refit=4.0, with_effects=0.97))
     assert "removes 100 % of the error above the noise" in text
 
 
-def test_a_simulator_that_is_worse_than_constant_velocity_is_warned_of() -> None:
+def test_a_simulator_that_is_worse_than_constant_velocity_has_a_warning() -> None:
     fitted = diagnosis("mismatch", finding("motor_lag"), refit=60.0, with_effects=47.8)
     held = fitted.held_out | {"nominal": replace(fitted.held_out["refit"], score=409.0)}
     for score, warns in ((35.8, True), (50.0, False)):
         known = replace(fitted, held_out=held | {"constant_velocity": replace(held["refit"], score=score)})
-        assert ("Constant velocity predicts these recordings better" in verdict_sentence(known)) == warns
-        assert ("(35.8 noise floors for 47.8)" in verdict_sentence(known)) == warns
+        assert ("constant-velocity model predicts these recordings better" in verdict_sentence(known)) == warns
+        assert ("(35.8 against 47.8 noise floors)" in verdict_sentence(known)) == warns
 
 
 @pytest.mark.parametrize("verdict", ["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"])
-def test_every_verdict_has_a_sentence_even_with_no_figures(verdict: str) -> None:
+def test_every_verdict_has_a_sentence_without_scores(verdict: str) -> None:
     bare = replace(diagnosis(verdict), held_out={})
     assert verdict_sentence(bare)[0].isupper()
     assert verdict_sentence(bare).endswith(".")
@@ -179,7 +180,7 @@ def test_verdicts_state_faults_residuals_and_reasons() -> None:
     assert "(wrong unit)" in verdict_sentence(replace(diagnosis("data"), data_faults=(fault,)))
     rest = Unexplained(0.7, ("vx",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
     nameless = replace(diagnosis("unexplained"), unexplained=rest)
-    assert "speed ahead, mostly where speed > 1 m/s; its kind: even in steering" in verdict_sentence(nameless)
+    assert "longitudinal velocity, mostly where speed > 1 m/s. Class: even in steering." in verdict_sentence(nameless)
     assert next_drive(nameless)[0] == "coast_down"
     why = "Too short; drive throttle_ramp."
     unsure = replace(diagnosis("inconclusive"), sentence=why, advice=why)
@@ -192,25 +193,25 @@ def test_an_error_above_the_noise_is_stated(verdict: str, which: str) -> None:
     far, near = diagnosis(verdict), diagnosis(verdict)
     near = replace(near, held_out={k: replace(v, score=1.02) for k, v in near.held_out.items()})
     assert far.held_out[which].score > 3.0
-    assert "something is missing that the diagnosis does not find" in verdict_sentence(far)
-    assert "something is missing" not in verdict_sentence(near)
+    assert "the simulator lacks physics that the diagnosis does not find" in verdict_sentence(far)
+    assert "lacks physics" not in verdict_sentence(near)
 
 
 def test_the_next_drive_separates_the_strongest_set() -> None:
     drive, why = next_drive(diagnosis("mismatch", finding("yaw_damping"), finding("motor_lag", ("throttle_delay",))))
     assert drive == "throttle_steps"
-    assert "a lag of the motor or a delay of the throttle" in why
+    assert "a lag of the motor from a delay of the throttle" in why
     assert drive_command(drive) == "carlab drive --policy throttle_steps"
     drive, why = next_drive(diagnosis("mismatch", finding("command_delay", ("mocap_latency",))))
     assert drive == ""
     assert "No manoeuvre separates" in why
 
 
-def test_confidence_words_are_no_stronger_than_the_number() -> None:
+def test_confidence_words_match_the_probability() -> None:
     assert confidence_words(0.99) == "almost certain"
     assert confidence_words(0.6) == "more likely than not"
-    assert confidence_words(0.4).startswith("a guess")
-    assert confidence_words(0.49, 1) == "one of 2 that look alike"
+    assert confidence_words(0.4).startswith("uncertain")
+    assert confidence_words(0.49, 1) == "one of 2 indistinguishable effects"
 
 
 @pytest.mark.parametrize(
@@ -227,7 +228,7 @@ def test_confidence_words_are_no_stronger_than_the_number() -> None:
         (math.nan, "unknown"),
     ],
 )
-def test_numbers_are_short(value: float, wanted: str) -> None:
+def test_numbers_have_three_significant_digits(value: float, wanted: str) -> None:
     assert number(value) == wanted
 
 
@@ -235,5 +236,5 @@ def test_numbers_are_short(value: float, wanted: str) -> None:
     ("share", "wanted"),
     [(0.31, "31 %"), (0.021, "2.1 %"), (0.0, "0 %"), (0.0002, "0.02 %"), (0.998, "more than 99 %"), (1.0, "100 %")],
 )
-def test_shares_are_not_rounded_into_certainty(share: float, wanted: str) -> None:
+def test_shares_are_not_rounded_to_0_or_100_per_cent(share: float, wanted: str) -> None:
     assert percent(share) == wanted

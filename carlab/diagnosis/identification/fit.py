@@ -1,7 +1,7 @@
 """Fit of a simulator to prediction windows: robust Levenberg-Marquardt, all perturbations in one batch.
 
 Errors are whitened by channel and step. Huber's loss (Huber 1964) at four standard deviations bounds the influence of
-outliers. Base parameters have weak priors; parameters of effects have bounds only.
+outliers. Base parameters have weak priors; parameters of effects have only bounds.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ TYRES = tuple(name for name in BASE if name.startswith("tyre."))
 
 @dataclass(frozen=True, slots=True)
 class FitParameter:
-    """A parameter that a fit estimates, by its coordinate z.
+    """A free parameter of a fit with coordinate z.
 
     Attributes:
         name: dotted name.
@@ -47,7 +47,7 @@ class FitParameter:
         low, high: bounds of the value.
         logarithmic: whether the value is ``origin * exp(size * z)``.
         prior_z: prior standard deviation of z about 0.
-        choice: whether the value is the position of a word.
+        choice: whether the value is the index of a discrete option.
     """
 
     name: str
@@ -77,7 +77,7 @@ class FitParameter:
 def base_parameters(
     config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
 ) -> tuple[FitParameter, ...]:
-    """Base parameters that a refit of this simulator estimates: the usual ones, all with a range, and the unknown."""
+    """Free base parameters of a refit: ``BASE``, parameters with a range in the car file, and an unknown latency."""
     values = config.values()
     names = [name for name in BASE if config.kind != "kinematic" or name not in (*TYRES, "vehicle.yaw_inertia")]
     names += [n for n in config.priors if n not in names and not n.startswith(("effects.", "timing.", "mocap."))]
@@ -157,13 +157,13 @@ class Fit:
     """A fitted simulator.
 
     Attributes:
-        config: with the fitted parameters.
-        free: the n parameters that were fitted.
-        z: (n,) their coordinates.
+        config: simulator with the fitted parameters.
+        free: n fitted parameters.
+        z: (n,) coordinates of the parameters.
         cost: Huber loss plus prior.
         loss: (S,) Huber loss of each window.
         covariance: (n, n) sandwich estimate of the covariance of z, clustered by block.
-        design_effects: (n,) its diagonal over that of independent errors.
+        design_effects: (n,) diagonal of ``covariance`` over that for independent errors.
     """
 
     config: SimulatorConfig
@@ -176,7 +176,7 @@ class Fit:
 
     @property
     def design_effect(self) -> float:
-        """Median design effect, at least one: by how much dependent errors overstate a gain."""
+        """Median design effect, at least 1: factor by which dependent errors overstate a gain."""
         if self.design_effects is None or not len(self.free):
             return 1.0
         return max(1.0, float(np.median(self.design_effects)))
@@ -219,11 +219,11 @@ class Fitter:
         free: Sequence[FitParameter] = (),
         z: FloatArray | None = None,
         *,
-        most: float = math.inf,
+        max_error: float = math.inf,
     ) -> FloatArray:
-        """Huber loss of each window (S,), with whitened errors no larger than ``most``."""
+        """Huber loss of each window (S,), with whitened errors clipped at ``max_error``."""
         at = np.zeros((1, len(free))) if z is None else z[None]
-        return np.asarray(self.huber(self.white(config, free, at).clip(-most, most))[0].sum(axis=(1, 2)))
+        return np.asarray(self.huber(self.white(config, free, at).clip(-max_error, max_error))[0].sum(axis=(1, 2)))
 
     def best_point(self, config: SimulatorConfig, free: Sequence[FitParameter], starts: FloatArray) -> FloatArray:
         """The point (n,) of (P, n) with the smallest cost."""
@@ -300,19 +300,19 @@ class Fitter:
         design_effects = np.diag(sandwich) / np.maximum(np.diag(bread), 1e-30)
         return replace(fit, covariance=sandwich, design_effects=design_effects)
 
-    def leave_fold_out_loss(self, fit: Fit, folds: IndexArray, most: float) -> FloatArray:
-        """Loss of every window (S,) by a fit without its fold, whitened errors no larger than ``most``.
+    def leave_fold_out_loss(self, fit: Fit, folds: IndexArray, max_error: float) -> FloatArray:
+        """Loss of every window (S,) by a fit without its fold, whitened errors clipped at ``max_error``.
 
         Each fold is removed from ``fit`` by one Gauss-Newton step (Beirami et al. 2017, approximate leave-k-out), at
         the cost of a few predictions; a refit costs a hundred.
 
         Args:
-            fit: of all windows.
-            folds: number of each window's fold (S,).
-            most: bound of the whitened errors.
+            fit: fit to all windows.
+            folds: index of each window's fold (S,).
+            max_error: bound of the whitened errors.
         """
         if not fit.free:
-            return self.loss(fit.config, most=most)
+            return self.loss(fit.config, max_error=max_error)
         jacobian, white = self.linearised(fit)
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
         normal, score = self._normal(fit, jacobian, white)
@@ -320,14 +320,14 @@ class Fitter:
         for name in np.unique(folds):
             own = folds == name
             part = jacobian[:, own].reshape(len(fit.free), -1)
-            left = normal - (part * weight[own].reshape(-1)) @ part.T
-            left = left + 1e-3 * np.diag(np.diag(normal) + 1e-9)
-            step = np.linalg.solve(left, score[:, own].sum(axis=1))
+            reduced = normal - (part * weight[own].reshape(-1)) @ part.T
+            reduced = reduced + 1e-3 * np.diag(np.diag(normal) + 1e-9)
+            step = np.linalg.solve(reduced, score[:, own].sum(axis=1))
             step *= min(1.0, self.settings.max_fold_step / max(float(np.abs(step).max()), 1e-12))
             trials = fit.z + np.array(self.settings.fold_step_shares)[:, None] * step
             whites = self.white(fit.config, fit.free, trials)
             seen = self.huber(whites[:, ~own]).sum(axis=(1, 2, 3)) + self.prior(fit.free, trials)
-            loss[own] = self.huber(whites[int(np.argmin(seen)), own].clip(-most, most)).sum(axis=(1, 2))
+            loss[own] = self.huber(whites[int(np.argmin(seen)), own].clip(-max_error, max_error)).sum(axis=(1, 2))
         return loss
 
     def linearised(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
@@ -345,7 +345,7 @@ class Fitter:
 
 
 def clustered_gain(before: FloatArray, after: FloatArray, windows: PredictionWindows) -> tuple[float, float]:
-    """Fall of the loss from ``before`` to ``after`` (S,) and its standard error, windows of a block taken together."""
+    """Fall of the loss from ``before`` to ``after`` (S,) and its standard error, clustered by block."""
     gain = before - after
     blocks, index = np.unique(windows.block, return_inverse=True)
     sums = np.bincount(index, weights=gain, minlength=len(blocks))
@@ -357,7 +357,7 @@ def design_effect_of(fit: Fit, effect: str) -> float:
     """Design effect of an effect's parameters: sandwich over naive variance, at least one.
 
     Twice the gain of several parameters is a sum of chi-squares weighted by such ratios, so their mean divides it
-    (Kent 1982). The median of all parameters replaces it where the effect's own is undefined (a clip that never acts).
+    (Kent 1982). The median of all parameters replaces it if that of the effect is undefined (a limit never reached).
     """
     assert fit.design_effects is not None
     own = [
@@ -368,7 +368,7 @@ def design_effect_of(fit: Fit, effect: str) -> float:
 
 
 def with_effect(config: SimulatorConfig, effect_id: str) -> SimulatorConfig:
-    """The simulator with one more effect, switched on at its identity or, where that is infinite, far from acting."""
+    """Add an effect at its identity value or, if that is infinite, at a value with no influence."""
     effect = EFFECTS[effect_id]
     given = {}
     for p in effect.parameters:
@@ -378,5 +378,5 @@ def with_effect(config: SimulatorConfig, effect_id: str) -> SimulatorConfig:
 
 
 def describe(values: Mapping[str, float]) -> str:
-    """Values in one line, for the log."""
+    """Format values in one line for the log."""
     return ", ".join(f"{name} {value:.4g}" for name, value in values.items())

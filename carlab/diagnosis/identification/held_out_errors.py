@@ -1,4 +1,4 @@
-"""Held-out errors after a horizon, in units and in noise floors, and the gains of effects by them."""
+"""Held-out errors after a horizon, in units and in noise floors, and gains of effects."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class HeldOut:
 
     Attributes:
         windows: S held-out prediction windows.
-        floor: (6,) error that a perfect simulator would leave after the horizon, estimated from the recording: noise
-            of the measurement at the end, and the error of the initial state as it grows.
-        huber_delta: error, over its spread, from which Huber's loss is linear.
+        floor: (6,) error of a perfect simulator after the horizon, estimated from the recording: measurement noise at
+            the end, and the propagated error of the initial state.
+        huber_delta: error, over its robust standard deviation, from which Huber's loss is linear.
     """
 
     windows: PredictionWindows
@@ -40,7 +40,7 @@ class HeldOut:
         config: SimulatorConfig,
         settings: IdentificationSettings = DEFAULT.identification,
     ) -> HeldOut:
-        """With the floor of a simulator that is near enough for how errors of initial states grow."""
+        """Compute the noise floor; ``config`` propagates the errors of initial states."""
         return cls(windows, noise_floor(windows, noise, config, settings)[-1], settings.huber_delta)
 
     def final_error(self, model: SimulatorConfig | PredictiveModel) -> FloatArray:
@@ -75,7 +75,7 @@ class HeldOut:
 
     @staticmethod
     def fingerprint(without: FloatArray, with_it: FloatArray) -> dict[str, float]:
-        """Relative rise of each channel's rms error when an effect is taken out."""
+        """Relative increase of each channel's rms error when an effect is removed."""
         before, after = (np.sqrt(np.mean(e**2, axis=0)) for e in (without, with_it))
         return {name: float(b / max(a, 1e-12) - 1.0) for name, a, b in zip(STATE_NAMES, after, before, strict=True)}
 
@@ -86,7 +86,7 @@ def noise_floor(
     config: SimulatorConfig,
     settings: IdentificationSettings = DEFAULT.identification,
 ) -> FloatArray:
-    """Error (K + 1, 6) that noise alone causes along a window: measurement noise, and the grown initial error."""
+    """Error (K + 1, 6) that noise alone causes along a window: measurement noise and propagated initial error."""
     reference = simulate_windows(windows, config)
     variance = np.tile(noise.measured**2, (windows.steps + 1, 1))
     for k in range(6):

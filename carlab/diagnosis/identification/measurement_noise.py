@@ -1,8 +1,8 @@
 """Noise of a recording and of the estimated initial states of its windows, from the recording alone.
 
-Noise is the residual of a local cubic. The cubic follows slow noise and amplifies some faster noise, so the spectrum of
-the residual is divided by that of the filter. Below the edge frequency, where motion hides the noise, the spectrum is
-extrapolated: flat for poses, falling with the square of the frequency for velocities, which are differentiated poses.
+The estimate uses the residual of a local cubic. The cubic follows slow noise and amplifies some faster noise, so the
+spectrum of the residual is divided by that of the filter. Below the edge frequency, where motion dominates, it is
+extrapolated: flat for poses, proportional to the square of the frequency for velocities (differentiated poses).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from carlab.prediction.windows import MIN_QUINTIC_WIDTH, Track, smoothing_width
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations (6,) of x, y, yaw, vx, vy, yaw rate as measured, and of estimated initial states."""
+    """Standard deviations (6,) of measured x, y, yaw, vx, vy, yaw rate and of estimated initial states."""
 
     measured: FloatArray
     initial_state: FloatArray
@@ -36,14 +36,14 @@ def estimate_noise(
     """Estimate the noise of each channel and of initial states.
 
     Motion faster than the cubic counts as noise; medians limit the influence of hard manoeuvres. The variance of an
-    initial state is the noise that its cubic passes, and the squared difference of a quintic from the cubic beyond the
-    quintic's own noise.
+    initial state is the noise that passes the cubic, plus the squared difference of a quintic from the cubic minus the
+    noise of that difference.
 
     Args:
         tracks: the recordings.
         curvature_bias: (S, 6) of prediction windows: initial states by a local quintic minus those by the local cubic.
-        slowest: whether only the slowest rows count for the noise of the channels.
-        settings: of the estimate.
+        slowest: whether to use only the slowest rows for the noise of the channels.
+        settings: settings of the estimate.
     """
     period_s = tracks[0].sampled_s
     width = smoothing_width(period_s)
@@ -64,31 +64,32 @@ def estimate_noise(
         return np.pad(pair, ((0, 0), ((wide - width) // 2,) * 2))
 
     cubic, quintic = weights(3, width), weights(5, wide)
-    let_through = np.concatenate([np.linalg.norm(w) * measured[:3] for w in cubic])
-    of_quintic = np.concatenate([np.linalg.norm(w) * measured[:3] for w in cubic - quintic])
+    cubic_noise = np.concatenate([np.linalg.norm(w) * measured[:3] for w in cubic])
+    difference_noise = np.concatenate([np.linalg.norm(w) * measured[:3] for w in cubic - quintic])
     squared = curvature_bias**2
     clipped = np.minimum(squared, np.quantile(squared, settings.max_error_quantile, axis=0))
-    bias = np.mean(clipped, axis=0) - of_quintic**2
-    return Noise(measured, np.sqrt(let_through**2 + np.maximum(bias, 0.0)))
+    bias = np.mean(clipped, axis=0) - difference_noise**2
+    return Noise(measured, np.sqrt(cubic_noise**2 + np.maximum(bias, 0.0)))
 
 
 def _deviation(
     residual: FloatArray, period_s: float, width: int, *, velocity: bool, settings: IdentificationSettings
 ) -> float:
-    """Standard deviation of the noise that leaves ``residual`` (n,) of a local cubic over ``width`` samples."""
+    """Standard deviation of the noise whose residual (n,) of a local cubic over ``width`` samples is ``residual``."""
     spread = 1.4826 * float(np.median(np.abs(residual)))
     if spread == 0.0:
         return 0.0
     limit = settings.noise_max_z * spread
-    left = np.clip(residual, -limit, limit)
-    frequency, power = welch(left, 1.0 / period_s, nperseg=min(settings.noise_segment_rows, len(left)), detrend=False)
-    taken = -savgol_coeffs(width, 3)
-    taken[width // 2] += 1.0
-    kept = np.abs(freqz(taken, worN=2.0 * np.pi * frequency * period_s)[1]) ** 2
-    edge = int(np.argmax(kept > settings.min_power_share))
-    noise = power / np.maximum(kept, settings.min_power_share)
+    clipped = np.clip(residual, -limit, limit)
+    rows = min(settings.noise_segment_rows, len(clipped))
+    frequency, power = welch(clipped, 1.0 / period_s, nperseg=rows, detrend=False)
+    high_pass = -savgol_coeffs(width, 3)
+    high_pass[width // 2] += 1.0
+    power_gain = np.abs(freqz(high_pass, worN=2.0 * np.pi * frequency * period_s)[1]) ** 2
+    edge = int(np.argmax(power_gain > settings.min_power_share))
+    noise = power / np.maximum(power_gain, settings.min_power_share)
     noise[:edge] = np.mean(noise[edge : edge + 3])
     if velocity:
         noise[:edge] *= (frequency[:edge] / frequency[edge]) ** 2
     total = float(np.sum(noise[1:-1]) + 0.5 * (noise[0] + noise[-1])) * (frequency[1] - frequency[0])
-    return spread * float(np.sqrt(total / np.mean(left**2)))
+    return spread * float(np.sqrt(total / np.mean(clipped**2)))

@@ -1,10 +1,10 @@
-"""Window over which a recording's velocities were differentiated: it acts on them like a lag.
+"""Window over which the velocities of a recording were differentiated.
 
 A symmetric window of variance s2 gives the velocity ``v + s2 / 2 d2v/dt2`` to fourth order. The difference of the poses
-before and after a tick is such a velocity, of a box as wide as two ticks, whose variance is known. So the difference of
-the velocity columns from it, regressed on d2v/dt2, gives the variance of their window. All of that is measured, so
-physics that the simulator leaves out does not matter; the simulator's own d2v/dt2, free of noise, is the instrument of
-the regression.
+before and after a tick is such a velocity, of a box of two ticks with known variance. The regression of the difference
+between the velocity columns and this box velocity on d2v/dt2 gives the variance of their window. The regression uses
+measured quantities, so physics that the simulator lacks does not bias it. Its instrument is the noise-free simulated
+d2v/dt2.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ def with_initial_states(
     config: SimulatorConfig,
     settings: IdentificationSettings = DEFAULT.identification,
 ) -> tuple[PredictionWindows, PredictionWindows]:
-    """Two sets of windows with their velocity window and initial states estimated.
+    """Estimate velocity window and initial states of two sets of windows.
 
     Args:
-        windows: those that the velocity window is estimated from, and others of the same recordings.
-        config: a simulator that is roughly right.
-        settings: of the estimate.
+        windows: windows for the estimate of the velocity window, and other windows of the same recordings.
+        config: an approximate simulator.
+        settings: settings of the estimate.
     """
     variance_s2 = velocity_window_variance_s2(windows[0], config, settings)
     first, second = (without_curvature_bias(replace(w, velocity_window_s2=variance_s2), config) for w in windows)
@@ -42,35 +42,35 @@ def with_initial_states(
 def velocity_window_variance_s2(
     windows: PredictionWindows, config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
 ) -> float:
-    """Variance [s2] of the window of the velocity columns; 0 where it is not significant.
+    """Variance [s2] of the window of the velocity columns; 0 if it is not significant.
 
     Args:
-        windows: of recordings with velocities of one origin.
-        config: a simulator that is roughly right.
-        settings: of the estimate.
+        windows: windows of recordings with the same velocity estimator.
+        config: an approximate simulator.
+        settings: settings of the estimate.
     """
     period_s = windows.period_s
     if period_s > settings.velocity_max_period_s or windows.steps < 6:
         return 0.0
     boxed = _box_velocities(windows)
     difference = (boxed[:, 1:-1] - windows.measured[:, 2:-2])[..., 3:]
-    bend = velocity_curvature(boxed, period_s)[:, 1:-1]
+    curvature = velocity_curvature(boxed, period_s)[:, 1:-1]
     instrument = velocity_curvature(simulate_windows(windows, config)[0], period_s)[:, 2:-2]
-    variances, certainties = [], []
+    variances, precisions = [], []
     for channels in ((0, 1), (2,)):
-        z, d, b = (values[..., channels].ravel() for values in (instrument, difference, bend))
-        both = float(z @ b)
-        if len(z) < settings.velocity_min_samples or abs(both) < 1e-9:
+        z, d, b = (values[..., channels].ravel() for values in (instrument, difference, curvature))
+        covariance = float(z @ b)
+        if len(z) < settings.velocity_min_samples or abs(covariance) < 1e-9:
             continue
-        slope = float(z @ d) / both
-        error = float(np.linalg.norm(z * (d - slope * b))) / abs(both)
+        slope = float(z @ d) / covariance
+        error = float(np.linalg.norm(z * (d - slope * b))) / abs(covariance)
         variances.append((2.0 * period_s) ** 2 / 12.0 - 2.0 * slope)
-        certainties.append(1.0 / max(2.0 * error, 1e-9) ** 2)
+        precisions.append(1.0 / max(2.0 * error, 1e-9) ** 2)
     if not variances:
         return 0.0
-    mean = float(np.average(variances, weights=certainties))
-    certain = mean * float(np.sqrt(np.sum(certainties))) > settings.velocity_z_min
-    return min(mean, settings.velocity_max_width_s**2 / 12.0) if certain else 0.0
+    mean = float(np.average(variances, weights=precisions))
+    is_significant = mean * float(np.sqrt(np.sum(precisions))) > settings.velocity_z_min
+    return min(mean, settings.velocity_max_width_s**2 / 12.0) if is_significant else 0.0
 
 
 def _box_velocities(windows: PredictionWindows) -> FloatArray:

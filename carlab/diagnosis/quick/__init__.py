@@ -1,1 +1,1 @@
-"""Quick check after each episode of a campaign: whether, where and how the simulator differs from the recordings."""
+"""Quick check after each episode of a campaign: whether the simulator differs from the recordings, where, and why."""

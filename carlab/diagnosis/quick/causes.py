@@ -1,8 +1,8 @@
-"""Causes that may explain errors of a simulator: one effect or one number at a time, tested where not fitted.
+"""Likely causes of a simulator's errors: one effect or one parameter at a time, tested by cross-validation.
 
-Every effect of the catalogue and every number of the car file is screened by itself while the rest stays; those with
-the best scores are fitted. Where none of them explains most of the excess, all numbers are refitted together, and
-effects are added to the refit. The causes are ranked by two-fold cross-validation over alternate blocks.
+Each effect of the catalogue and each parameter of the car file is screened alone, and those with the best scores are
+fitted. If none of them explains most of the excess, all parameters are refitted together, and effects are added to the
+refit. The causes are ranked by two-fold cross-validation over alternate blocks.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ from sim_backends.effects import CATALOGUE
 from sim_backends.registry import REGISTRY
 
 SCREENED_COORDINATES = ((-3.0, -1.0, 1.0, 3.0), (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0))
-"""Steps of a number at which it is screened: of its size, or of its logarithm."""
-NUMBERS = "numbers"
+"""Coordinate steps at which a parameter is screened: of its logarithm, or of its value."""
+ALL_PARAMETERS = "numbers"
+"""Id of the cause "all parameters refitted"."""
 
 
 @dataclass(frozen=True, slots=True)
-class FittedNumber:
-    """A fitted number in ``unit``: by all windows, by either half of them, and as the simulator had it."""
+class FittedParameterValue:
+    """A fitted parameter in ``unit``: by all windows, by each half of them, and in the simulator before the fit."""
 
     value: float
     halves: tuple[float, float]
@@ -49,15 +50,15 @@ class FittedNumber:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """A guess.
+    """A candidate cause.
 
     Attributes:
-        id: an effect of the catalogue, a number by its dotted name, or ``numbers``, all of them together.
-        share: of the excess loss that it explains on windows that it was not fitted to, in [0, 1].
-        own_share: of an effect added to refitted numbers, the share that it explains of the rest.
-        with_refit: whether all numbers of the car file were refitted with it; ``share`` is that of both.
-        ties_with_first: whether the windows do not distinguish it from the first guess (two standard errors).
-        parameters: its numbers; of ``numbers`` those that moved most.
+        id: an effect of the catalogue, a parameter by its dotted name, or ``numbers``: all parameters together.
+        share: share of the excess loss that it explains on windows that were not fitted, in [0, 1].
+        own_share: of an effect added to a refit, its share of the excess loss that the refit leaves.
+        with_refit: whether all parameters were refitted with it; ``share`` is that of both.
+        ties_with_first: whether the windows do not distinguish it from the first cause (two standard errors).
+        parameters: fitted values; of ``numbers``, those with the largest change.
     """
 
     id: str
@@ -65,7 +66,7 @@ class Cause:
     own_share: float
     with_refit: bool
     ties_with_first: bool
-    parameters: dict[str, FittedNumber] = field(default_factory=dict)
+    parameters: dict[str, FittedParameterValue] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,15 +93,15 @@ def find_causes(
     """The most likely causes, the best first.
 
     Args:
-        windows: of recordings that the simulator does not explain.
+        windows: windows of recordings that the simulator does not explain.
         floor: noise floor along a window (K + 1, 6).
-        simulator: as it is.
+        simulator: the simulator without the causes.
         settings: amount of work and thresholds.
     """
     steps = np.unique(np.linspace(windows.steps / settings.used_steps, windows.steps, settings.used_steps).round())
     steps = steps.astype(int)
     fitter = Fitter(windows, Scale(steps, floor[steps]))
-    reference = fitter.loss(simulator, most=settings.max_unseen_error)
+    reference = fitter.loss(simulator, max_error=settings.max_unseen_error)
     perfect = 0.5 * len(steps) * 6 * len(windows)
     excess = max(float(reference.sum()) - perfect, 1e-9)
     halves = _halves(windows)
@@ -127,15 +128,15 @@ def find_causes(
         difference, error = clustered_gain(t.loss, tested[0].loss, windows)
         ties = bool(causes) and difference < settings.tie_z * error
         seen.add(t.candidate.id)
-        numbers = _numbers(t, simulator, settings)
-        causes.append(Cause(t.candidate.id, share, own_share, t.candidate.with_refit, ties, numbers))
+        values = _reported_values(t, simulator, settings)
+        causes.append(Cause(t.candidate.id, share, own_share, t.candidate.with_refit, ties, values))
     return tuple(causes)
 
 
 def _own_share(
     before: FloatArray, after: FloatArray, perfect: float, windows: PredictionWindows, settings: QuickSettings
 ) -> float:
-    """Share that an effect explains of the excess that refitted numbers leave; 0 where it is not significant."""
+    """Share that an effect explains of the excess after a refit; 0 if it is not significant."""
     gain, error = clustered_gain(before, after, windows)
     excess = float(before.sum()) - perfect
     significant = gain > settings.min_additional_z * error
@@ -143,17 +144,17 @@ def _own_share(
 
 
 def _fit_singles(fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings) -> list[_Candidate]:
-    """Single causes with the best screening scores, fitted while the rest stays."""
+    """Single causes with the best screening scores, each fitted alone."""
     screen = Screen(fitter, simulator, fitter.fit(simulator, ()), settings.screened_windows)
     screened: list[tuple[float, str, SimulatorConfig, tuple[FitParameter, ...], FloatArray]] = []
     for name in _new_effects(simulator):
         free = effect_parameters(name, simulator)
         result = screen.score(name, free)
         screened.append((result.score, name, with_effect(simulator, name), free, result.starts))
-    for name, free in _own_numbers(simulator):
-        score, start = _screen_number(screen, simulator, free)
+    for name, free in _simulator_parameters(simulator):
+        score, start = _screen_parameters(screen, simulator, free)
         screened.append((score, name, simulator, free, start[None]))
-    screened.sort(key=lambda p: -p[0])
+    screened.sort(key=lambda entry: -entry[0])
     found = []
     for _, name, config, free, starts in screened[: settings.max_single_fits]:
         start = fitter.best_point(config, free, starts)
@@ -162,14 +163,14 @@ def _fit_singles(fitter: Fitter, simulator: SimulatorConfig, settings: QuickSett
     return found
 
 
-def _screen_number(
+def _screen_parameters(
     screen: Screen, simulator: SimulatorConfig, free: tuple[FitParameter, ...]
 ) -> tuple[float, FloatArray]:
-    """Screening score of numbers that the simulator has, and where to start their fit (n,)."""
+    """Screening score of parameters of the simulator, and the initial point (n,) of their fit."""
     at = _coordinates(simulator, free)
     sizes = SCREENED_COORDINATES[not free[0].logarithmic]
     points = np.array([at + z * axis for axis in np.eye(len(free)) for z in sizes])
-    gains = [screen.gain(moved) for moved in screen.fitter.white(simulator, free, points)]
+    gains = [screen.gain(whites) for whites in screen.fitter.white(simulator, free, points)]
     best = int(np.argmax([gain for gain, _ in gains]))
     low, high = screen.settings.step_range
     return gains[best][0] / screen.share, at + (points[best] - at) * min(max(gains[best][1], low), high)
@@ -178,7 +179,7 @@ def _screen_number(
 def _fit_with_refit(
     fitter: Fitter, simulator: SimulatorConfig, settings: QuickSettings
 ) -> tuple[_Candidate, list[_Candidate]]:
-    """All numbers refitted, and the effects with the best screening scores added to the refit."""
+    """Refit all parameters, and add the effects with the best screening scores to the refit."""
     own = [f for name in simulator.effects for f in effect_parameters(name, simulator)]
     free = (*base_parameters(simulator), *own)
     refit = fitter.fit(simulator, free, _coordinates(simulator, free), iterations=settings.fit_iterations)
@@ -192,7 +193,7 @@ def _fit_with_refit(
         start = np.concatenate([refit.z, result.starts[0]])
         fit = fitter.fit(config, all_free, start, iterations=settings.fit_iterations)
         found.append(_Candidate(result.effect, config, all_free, fit, with_refit=True))
-    return _Candidate(NUMBERS, simulator, free, refit), found
+    return _Candidate(ALL_PARAMETERS, simulator, free, refit), found
 
 
 def _test(
@@ -206,7 +207,7 @@ def _test(
         own = Fitter(fitter.windows.take(mine), fitter.scale)
         fits.append(own.fit(candidate.config, candidate.free, start, iterations=iterations))
         unseen = Fitter(fitter.windows.take(others), fitter.scale)
-        loss[others] = unseen.loss(candidate.config, candidate.free, fits[-1].z, most=settings.max_unseen_error)
+        loss[others] = unseen.loss(candidate.config, candidate.free, fits[-1].z, max_error=settings.max_unseen_error)
     return _Tested(candidate, loss, (fits[0], fits[1]))
 
 
@@ -223,8 +224,8 @@ def _new_effects(simulator: SimulatorConfig) -> list[str]:
     return [name for name in CATALOGUE if name not in simulator.effects and is_applicable(simulator, name)]
 
 
-def _own_numbers(simulator: SimulatorConfig) -> list[tuple[str, tuple[FitParameter, ...]]]:
-    """Numbers that the simulator has: those of the base model one by one, those of each of its effects together."""
+def _simulator_parameters(simulator: SimulatorConfig) -> list[tuple[str, tuple[FitParameter, ...]]]:
+    """Parameters of the simulator: those of the base model one by one, those of each effect together."""
     single = [(f.name, (f,)) for f in base_parameters(simulator)]
     return [*single, *((f"effects.{name}", effect_parameters(name, simulator)) for name in simulator.effects)]
 
@@ -234,24 +235,26 @@ def _coordinates(simulator: SimulatorConfig, free: Sequence[FitParameter]) -> Fl
     return np.array([f.coordinate(values[f.name]) for f in free])
 
 
-def _numbers(tested: _Tested, simulator: SimulatorConfig, settings: QuickSettings) -> dict[str, FittedNumber]:
+def _reported_values(
+    tested: _Tested, simulator: SimulatorConfig, settings: QuickSettings
+) -> dict[str, FittedParameterValue]:
     candidate = tested.candidate
     before = simulator.values()
     whole, (first, second) = candidate.fit.values(), (half.values() for half in tested.halves)
-    if candidate.id == NUMBERS:
-        moved = sorted(candidate.free, key=lambda f: -_moved(whole[f.name], before[f.name]))
-        names = [f.name for f in moved[: settings.max_causes]]
+    if candidate.id == ALL_PARAMETERS:
+        ordered = sorted(candidate.free, key=lambda f: -_change(whole[f.name], before[f.name]))
+        names = [f.name for f in ordered[: settings.max_causes]]
     else:
         own = f"effects.{candidate.id.removeprefix('effects.')}."
         names = [name for name in whole if name == candidate.id or name.startswith(own)]
     return {
-        name: FittedNumber(whole[name], (first[name], second[name]), before.get(name), REGISTRY[name].unit)
+        name: FittedParameterValue(whole[name], (first[name], second[name]), before.get(name), REGISTRY[name].unit)
         for name in names
     }
 
 
-def _moved(value: float, before: float) -> float:
+def _change(value: float, before: float) -> float:
     return abs(math.log(value / before)) if value > 0.0 and before > 0.0 else abs(value - before)
 
 
-__all__ = ["NUMBERS", "Cause", "FittedNumber", "find_causes"]
+__all__ = ["ALL_PARAMETERS", "Cause", "FittedParameterValue", "find_causes"]

@@ -1,4 +1,4 @@
-"""Conditions in which a simulator has large errors: how the car was driven, where it was, and when."""
+"""Conditions in which a simulator has large errors: speed, commands, place and time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BoolArray = NDArray[np.bool_]
 class Condition:
     """A condition.
 
-    text               in words
+    text               such as ``speed > 2 m/s``
     inside, outside    root mean square error of the worst channel in and outside the condition, in noise floors
     windows            number of windows in it
     """
@@ -33,9 +33,9 @@ class Condition:
 def find_conditions(
     windows: PredictionWindows, size: FloatArray, settings: QuickSettings = DEFAULT.quick
 ) -> tuple[Condition, ...]:
-    """Conditions in which errors ``size`` (S,) are clearly larger than elsewhere, the clearest first.
+    """Conditions in which errors ``size`` (S,) are significantly larger than elsewhere, the most significant first.
 
-    Of conditions of one kind (thresholds of a feature, places) only the clearest is returned.
+    Of conditions of one kind (thresholds of a feature, places) only the most significant is returned.
     """
     best: dict[str, tuple[float, Condition]] = {}
     for kind, text, inside in _candidates(windows, settings):

@@ -1,8 +1,8 @@
-"""Quick check: whether, where and how recordings disagree with a simulator, in seconds instead of a minute.
+"""Quick check of a simulator against recordings, in seconds instead of the minute of a diagnosis.
 
-It uses the parts of the diagnosis (prediction windows, noise floors, screening, fits) with a fixed amount of work, so
-that the same recordings give the same answer on any machine. The causes that it names are first guesses, one at a
-time. The diagnosis finds several together, tests their names, and scores them on whole held-out recordings.
+It uses the stages of the diagnosis (prediction windows, noise floors, screening, fits) with a fixed amount of work, so
+the same recordings give the same result on any machine. It tests candidate causes one at a time. The diagnosis fits
+several effects together, tests them against confusable effects, and scores them on held-out recordings.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
-from carlab.diagnosis.own_recordings import as_captured, window_variance_s2, with_known_latency
 from carlab.diagnosis.quick.causes import Cause, find_causes
 from carlab.diagnosis.quick.conditions import Condition, find_conditions
 from carlab.diagnosis.recording_faults import find as data_faults
 from carlab.diagnosis.settings import DEFAULT, QuickSettings
+from carlab.diagnosis.state_alignment import align_states, window_variance_s2, with_known_latency
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
@@ -65,9 +65,9 @@ class QuickCheck:
         score: root mean square over windows and channels of the error after ``horizon_s``, in noise floors.
         score_std: its standard error; blocks of recordings count as independent.
         channels: the six, the largest error first.
-        conditions: in which the worst channel has large errors, the clearest first; empty where there are none.
-        causes: at most three guesses, the best first; only with "left".
-        windows, episodes, seconds: how much was checked; seconds of driving.
+        conditions: in which the worst channel has large errors, the most significant first; may be empty.
+        causes: at most three candidate causes, the most likely first; only with "left".
+        windows, episodes, seconds: amount of data; seconds of driving.
     """
 
     verdict: Verdict
@@ -84,7 +84,7 @@ class QuickCheck:
 
     @property
     def excess(self) -> float:
-        """Noise floors by which the score is above that of a perfect simulator."""
+        """Score minus 1, the score of a perfect simulator [noise floors]."""
         return self.score - 1.0
 
     def to_dict(self) -> dict[str, Any]:
@@ -99,33 +99,31 @@ def quick_check(
     """Check recordings against a simulator.
 
     Args:
-        episodes: recordings as read; those of carlab are interpolated to the pose age that the simulator states.
+        episodes: recordings as read; states of carlab recordings are aligned to the latency of ``simulator``.
         simulator: with its effects.
         settings: thresholds and amount of work.
 
     Returns:
-        The result; "undecided", and no error, where recordings are not sufficient.
+        The result; "undecided" if the recordings are not sufficient.
     """
     seconds = sum(e.ticks * e.period_s for e in episodes if e.ticks > 0)
     undecided = QuickCheck("undecided", horizon_s=settings.window_s, episodes=len(episodes), seconds=float(seconds))
     usable = [e for e in episodes if e.ticks >= 2]
     if not usable:
-        return replace(undecided, why="nothing was driven.")
-    captured = [as_captured(e, simulator.mocap.latency_s) for e in usable]
+        return replace(undecided, why="they contain no commands.")
+    captured = [align_states(e, simulator.mocap.latency_s) for e in usable]
     simulator = with_known_latency(simulator, captured)
     repaired, _, faults = data_faults.check(captured, [], simulator)
     unusable = [f for f in faults if f.action.startswith("unusable")]
     if unusable:
-        return replace(undecided, why=f"the recordings are at fault ({unusable[0].id} of {unusable[0].channel}).")
+        return replace(undecided, why=f"they are faulty ({unusable[0].id} of {unusable[0].channel}).")
     try:
         windows, floor = _windows(repaired, simulator, window_variance_s2(usable), settings)
     except DataError:
         length_s = settings.window_s + HISTORY_S
-        return replace(undecided, why=f"no recording has a stretch of {length_s:.1f} s in which the car moves.")
+        return replace(undecided, why=f"the car moves in no stretch of {length_s:.1f} s.")
     if len(windows) < settings.min_windows:
-        return replace(
-            undecided, why=f"the car moved too little: {len(windows)} stretches of {settings.window_s:.1f} s."
-        )
+        return replace(undecided, why=f"the car moves in only {len(windows)} windows of {settings.window_s:.1f} s.")
     return _checked(undecided, windows, floor, simulator, settings)
 
 
@@ -136,7 +134,7 @@ def _checked(
     simulator: SimulatorConfig,
     settings: QuickSettings,
 ) -> QuickCheck:
-    """The result of windows with their noise floor (K + 1, 6)."""
+    """Check windows with their noise floor (K + 1, 6)."""
     last = prediction_errors(simulate_windows(windows, simulator), windows)[0, :, -1]
     limit = settings.max_error
     final = np.nan_to_num(last / floor[-1], nan=limit).clip(-limit, limit)
@@ -146,7 +144,7 @@ def _checked(
     if score <= settings.score_max:
         return replace(scored, verdict="explains")
     if _blocks_above(final, windows, settings.score_max) < settings.min_blocks:
-        why = "the errors are larger than the noise in one stretch alone, which may be an accident."
+        why = "the errors exceed the noise in one stretch only, which may be an outlier."
         return replace(scored, why=why)
     worst = STATE_NAMES.index(channels[0].channel)
     return replace(
@@ -160,7 +158,7 @@ def _checked(
 def _windows(
     episodes: Sequence[EpisodeData], simulator: SimulatorConfig, window_s2: float | None, settings: QuickSettings
 ) -> tuple[PredictionWindows, FloatArray]:
-    """Windows of all recordings, and the noise floor along them (K + 1, 6). DataError where there are none."""
+    """Windows of all recordings, and the noise floor along them (K + 1, 6). Raises DataError without windows."""
     tracks = tracks_of([e for e in episodes if e.ticks >= 2])
     if not tracks:
         raise DataError("No recording has an unbroken stretch of half a second.")

@@ -1,1 +1,1 @@
-"""Faults of the recordings themselves: stamps, pose, velocities, commands."""
+"""Detection and repair of faults of recordings: stamps, pose, velocities, commands."""

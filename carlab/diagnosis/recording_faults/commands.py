@@ -1,7 +1,7 @@
-"""Repair of command columns by how the motion follows them: sign, shifted rows, a clock of their own.
+"""Repair of command columns by the response of the motion: sign, shifted rows, a separate clock.
 
-A delay that a car can have is physics and stays. No car responds before the command, responds the other way round, or
-responds later every minute.
+A plausible delay is physics and stays. A response before the command, a response of the opposite sign, and a delay that
+grows with time are faults of the recording.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from carlab.recording.faults.settings import LIMITS
 from sim_backends.car_parameters import SimulatorConfig
 
 METHOD_LAG_S = (0.02, -0.007)
-"""[s] Lag that the method finds for steering and throttle of a car without delay: tyres are no pure lag."""
+"""[s] Lag that the method estimates for steering and throttle of a car without delay, because of its dynamics."""
 PLAUSIBLE_EXTRA_S = (0.25, 0.45)
-"""[s] Delay of steering and throttle beyond that of the car file that an actuator can have."""
+"""[s] Maximum plausible delay of steering and throttle in addition to that of the car file."""
 MIN_VARIANCE_RATIO = 1.15
 """Residual variance at the best plausible delay over that at the best delay."""
 SAME_SHIFT_S = 0.06
-"""[s] A recording whose shift is this near to that of the others has the same one."""
+"""[s] Maximum difference between a recording's shift and the median shift of the recordings to count as equal."""
 MIN_DRIFT_SIGMAS, MIN_DRIFT_S, MIN_DRIFT_RATE = 6.0, 0.04, 3e-4
 
 
 def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -> None:
-    """Check and repair the command columns of all recordings; what they have in common needs less evidence in each."""
+    """Check and repair the command columns of all recordings; a common fault needs less evidence in each of them."""
     expected_s = nominal.command_delay_s + nominal.mocap.latency_s
     motions = [grid_motion(repair.times_s, repair.motion(), repair.segment) for repair in repairs]
     _check_clock(repairs, motions)
@@ -55,7 +55,7 @@ def _response(repair: EpisodeRepair, motion: GridMotion, channel: int) -> Comman
 
 
 def _check_sign(repairs: Sequence[EpisodeRepair], clear: Sequence[CommandResponse], channel: int) -> None:
-    """Change the sign if the car does the opposite of the command in every recording with a clear response."""
+    """Change the sign if the response is opposite to the command in every recording with a clear response."""
     if any(a.gain > 0 for a in clear) or all(a.lag_s < -LIMITS.early_response_s for a in clear):
         return
     fault = wrong_command_sign(COMMAND_CHANNELS[channel], max(clear, key=lambda a: a.best))
@@ -67,7 +67,7 @@ def _check_sign(repairs: Sequence[EpisodeRepair], clear: Sequence[CommandRespons
 def _check_shift(
     repairs: Sequence[EpisodeRepair], answers: Sequence[CommandResponse | None], channel: int, expected_s: float
 ) -> None:
-    """Move a column whose effect comes before it, or later than any actuator takes."""
+    """Shift a column if the response precedes it, or follows later than a plausible delay."""
     zero_s = expected_s + METHOD_LAG_S[channel]
     shifts = [zero_s - a.lag_s for a in answers if a is not None and _is_impossible(a, channel, expected_s)]
     name = COMMAND_CHANNELS[channel]
@@ -82,15 +82,15 @@ def _check_shift(
         repair.retime(channel, -rows * repair.period_s)
         repair.trim(abs(rows) + 1, at_end=is_late)
         observation = (
-            f"the motion comes {abs(shift_s) * 1e3:.0f} ms {'before' if is_late else 'after'} its {name}, "
-            f"{'which no car can do' if is_late else 'longer than any actuator takes'}"
+            f"the motion {'precedes' if is_late else 'follows'} the {name} command by {abs(shift_s) * 1e3:.0f} ms, "
+            f"{'which is impossible' if is_late else 'later than any actuator responds'}"
         )
-        remedy = f"the column was moved by {rows} rows, to the delay of the car file ({expected_s * 1e3:.0f} ms)"
+        remedy = f"the column was shifted by {rows} rows to the delay of the car file ({expected_s * 1e3:.0f} ms)"
         repair.repaired(Fault("column_shift", name, observation), remedy)
 
 
 def _is_impossible(answer: CommandResponse, channel: int, expected_s: float) -> bool:
-    """Whether no plausible delay explains nearly as much of the motion as the best one."""
+    """Whether no plausible delay explains nearly as much of the motion as the best delay."""
     earliest = METHOD_LAG_S[channel] - LIMITS.early_response_s
     latest = METHOD_LAG_S[channel] + expected_s + PLAUSIBLE_EXTRA_S[channel]
     if answer.best < LIMITS.command_explained[channel] or answer.gain <= 0 or earliest <= answer.lag_s <= latest:
@@ -100,7 +100,7 @@ def _is_impossible(answer: CommandResponse, channel: int, expected_s: float) -> 
 
 
 def _check_clock(repairs: Sequence[EpisodeRepair], motions: Sequence[GridMotion]) -> None:
-    """Bring back commands that were stamped by a clock that gains or loses."""
+    """Correct the stamps of commands from a clock that runs fast or slow."""
     lags = [_window_lags(repair, motion) for repair, motion in zip(repairs, motions, strict=True)]
     longest_s = max((float(np.ptp(repair.times_s)) for repair in repairs), default=0.0)
     pooled = clock_rate(WindowLags.joined(lags))
@@ -118,9 +118,12 @@ def _check_clock(repairs: Sequence[EpisodeRepair], motions: Sequence[GridMotion]
             repair.trim(math.ceil(-rate * length_s / repair.period_s) + 1, at_end=True)
         observation = (
             f"the delay of the commands {'grows' if rate > 0 else 'shrinks'} by {abs(rate) * 1e3:.2f} ms a second "
-            f"({len(windows.t_s)} windows of {WINDOW_S:.0f} s): they were stamped by another clock"
+            f"({len(windows.t_s)} windows of {WINDOW_S:.0f} s): commands and poses have different clocks"
         )
-        repair.repaired(Fault("clock_drift", "steering, throttle", observation), "brought to the clock of the poses")
+        repair.repaired(
+            Fault("clock_drift", "steering, throttle", observation),
+            "the commands were converted to the clock of the poses",
+        )
 
 
 def _window_lags(repair: EpisodeRepair, motion: GridMotion) -> WindowLags:
@@ -137,10 +140,10 @@ def _significant(found: tuple[float, float] | None, length_s: float) -> float | 
 
 
 def _restamp(repair: EpisodeRepair, motion: GridMotion, rate: float) -> float:
-    """Take the commands from the moments of a clock that gains ``rate`` [s/s]; refine and return the rate."""
+    """Resample the commands from a clock that gains ``rate`` [s/s]; refine and return the rate."""
     recorded = repair.commands.copy()
     for _ in range(2):
-        # A logger's rows show what was sent up to a row before, so each moment belongs to the row that follows it.
+        # A row contains the command sent since the previous row, so each time belongs to the following row.
         moments = repair.times_s - rate * (repair.times_s - repair.times_s[0])
         rows = np.searchsorted(repair.times_s, moments - 0.02 * repair.period_s)
         repair.commands = recorded[np.minimum(rows, len(recorded) - 1)]

@@ -22,15 +22,15 @@ class EpisodeRepair:
     """A recording under repair.
 
     Attributes:
-        episode: the recording as it was.
+        episode: the recording before repair.
         times_s: stamps (N,).
         states: states (N, 6).
-        commands: as sent (N, 2); the last row's is never executed.
+        commands: sent commands (N, 2); that of the last row is never executed.
         segment: number of the unbroken stretch (N,).
         rows: indices (N,) of the remaining rows in the recording.
         interpolated: rows (N,) whose pose was interpolated.
-        has_velocity_columns: False where the velocities are estimated from the pose.
-        faults: what was found and done.
+        has_velocity_columns: False if the velocities are estimated from the pose.
+        faults: faults found, with the action taken.
         is_changed: whether anything was repaired.
     """
 
@@ -67,19 +67,19 @@ class EpisodeRepair:
         return len(self.times_s) >= 60 and bool(np.isfinite(self.states).all() and np.isfinite(self.commands).all())
 
     def motion(self) -> PoseMotion:
-        """Motion by the pose alone."""
+        """Motion estimated from the pose."""
         x, y, yaw = self.states.T[:3]
         return pose_motion(self.times_s, x, y, yaw, self.segment)
 
     def cut_at_jumps(self) -> int:
-        """Number the stretches between gaps and jumps of the pose. Returns how many jumps."""
+        """Split into segments at gaps and jumps of the pose. Returns the number of jumps."""
         gaps = gap_rows(self.times_s)
         jumps = np.setdiff1d(pose_jumps(self.times_s, *self.states.T[:3]), gaps)
         self.segment = segments(len(self.times_s), np.union1d(gaps, jumps))
         return len(jumps)
 
     def keep(self, rows: BoolArray) -> None:
-        """Remove all other rows (N,). A gap remains; the command before is held across it."""
+        """Keep the selected rows (N,). The previous command is held across gaps."""
         self.is_changed = True
         self.times_s, self.states, self.commands = self.times_s[rows], self.states[rows], self.commands[rows]
         self.segment, self.rows, self.interpolated = self.segment[rows], self.rows[rows], self.interpolated[rows]
@@ -90,17 +90,17 @@ class EpisodeRepair:
         self.keep(index < len(index) - count if at_end else index >= count)
 
     def report(self, identity: str, channel: str, rows: int, action: str) -> None:
-        """Note a fault; ``action`` begins with repaired, reported or unusable."""
+        """Add a fault; ``action`` begins with repaired, reported or unusable."""
         self.faults.append(DataFault(identity, channel, int(rows), action))
 
     def repaired(self, fault: Fault, remedy: str, rows: int | None = None) -> None:
-        """Note a fault that was repaired: what was done, and in how many rows (all by default)."""
+        """Add a repaired fault with its remedy and number of rows (by default all)."""
         self.is_changed = True
         count = len(self.times_s) if rows is None else rows
         self.report(fault.id, fault.channel, count, f"repaired: {fault.observation}; {remedy}.")
 
     def retime(self, channel: int, later_s: FloatArray | float) -> None:
-        """Take a command column from another moment: its value at t becomes that of t - ``later_s``."""
+        """Delay a command column: its value at t becomes that at t - ``later_s``."""
         self.is_changed = True
         begin = self.times_s - later_s
         self.commands[:, channel] = held_means(
@@ -108,7 +108,7 @@ class EpisodeRepair:
         )
 
     def result(self) -> EpisodeData:
-        """The repaired recording; the same object where nothing was changed."""
+        """The repaired recording; the same object if nothing was changed."""
         if not self.is_changed:
             return self.episode
         if not self.has_velocity_columns:
@@ -134,7 +134,7 @@ class EpisodeRepair:
 
 
 def merged(faults: Sequence[DataFault]) -> list[DataFault]:
-    """One entry a fault, channel and kind of action: rows added up, the sentence of the one with the most rows."""
+    """Merge entries of equal fault, channel and kind of action: sum of the rows, text of the largest entry."""
     groups: dict[tuple[str, str, str], list[DataFault]] = {}
     for fault in faults:
         groups.setdefault((fault.id, fault.channel, fault.action.split(":")[0]), []).append(fault)

@@ -1,4 +1,4 @@
-"""Faults of the recordings themselves, found before any physics is fitted, and repaired where that is safe."""
+"""Detect faults of recordings before any fit, and repair them if that is safe."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from sim_backends.car_parameters import SimulatorConfig
 def check(
     fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], nominal: SimulatorConfig
 ) -> tuple[list[EpisodeData], list[EpisodeData], list[DataFault]]:
-    """Look for faults of the data in recordings and repair them.
+    """Detect and repair faults of recordings.
 
-    Stamps and pose are checked by themselves, velocities against the pose (kinematics alone), commands against the
-    motion, and the simulator's own step against a finer one. A delay that a car can have is no fault.
+    Stamps and pose are checked for consistency, velocities against the pose (kinematics only), commands against the
+    motion, and the simulator's integration step against a finer one. A plausible delay is not a fault.
 
     Args:
         fit: recordings to fit.
         held_out: held-out recordings.
-        nominal: the simulator of the car file, for the control period and for the delay it states.
+        nominal: the simulator of the car file, for its control period and command delay.
 
     Returns:
         The recordings to fit and those held out, repaired (the same objects where nothing was changed), and

@@ -1,4 +1,4 @@
-"""Whether the simulator's own step is fine enough: the nominal car at its step and at a quarter of it."""
+"""Check of the integration step: the nominal simulator at its step and at a quarter of it."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ HORIZON_S = 1.0
 def check_integration(
     fit: Sequence[EpisodeData], nominal: SimulatorConfig, max_step_s: float = MAX_STEP_S
 ) -> list[DataFault]:
-    """Compare predictions of windows of the recordings at ``max_step_s`` and at a quarter of it, with the noise.
+    """Compare the difference of predictions at ``max_step_s`` and at a quarter of it with the noise, by channel.
 
-    The root mean square of the difference after a second, per channel; a tenth of the windows that differ most do not
-    count (a car that spins amplifies anything). Returns nothing where there are no windows.
+    The difference is the root mean square after 1 s without the tenth of the windows with the largest differences,
+    because a spinning car amplifies all errors. Returns an empty list without windows.
     """
     try:
         tracks = tracks_of(fit)
@@ -39,19 +39,19 @@ def check_integration(
         return []
     windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, WINDOWS).round().astype(np.int64)))
     noise = estimate_noise(tracks, windows.curvature_bias).measured
-    with np.errstate(all="ignore"):  # a step that is far too coarse overflows, which is what is looked for
+    with np.errstate(all="ignore"):  # a step that is far too coarse overflows
         difference = np.abs(_ends(windows, nominal, max_step_s) - _ends(windows, nominal, 0.25 * max_step_s))
     difference = np.where(np.isfinite(difference), difference, np.inf)
-    usual = np.sqrt(np.mean(np.sort(difference, axis=0)[: max(round(0.9 * len(windows)), 1)] ** 2, axis=0))
+    difference_rms = np.sqrt(np.mean(np.sort(difference, axis=0)[: max(round(0.9 * len(windows)), 1)] ** 2, axis=0))
     return [
         DataFault(
             "integration_error",
             name,
             len(windows),
             f"reported: a finer step changes the simulator's {name} after {HORIZON_S:.0f} s by {size:.2g}, more than "
-            f"the noise of the recording ({own:.2g}); no physics is to be read out of that.",
+            f"the noise of the recording ({own:.2g}); do not interpret an error of this size as missing physics.",
         )
-        for name, size, own in zip(STATE_NAMES, usual, noise, strict=True)
+        for name, size, own in zip(STATE_NAMES, difference_rms, noise, strict=True)
         if size > own
     ]
 

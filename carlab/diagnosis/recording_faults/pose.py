@@ -1,4 +1,4 @@
-"""Repair of stamps and poses: unit, sense, repeated rows, outliers, missing rows."""
+"""Repair of stamps and poses: unit, sign, repeated rows, outliers, missing rows."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from carlab.recording.faults.stamps import gap_rows
 from carlab.recording.pose_velocity import BoolArray
 
 CONTROL_PERIODS_S = (5e-4, 0.6)
-"""[s] Between these lies any period at which a model car is controlled or seen."""
+"""[s] Range of plausible control and sampling periods of a model car."""
 MAX_INTERPOLATION_S = 0.25
-"""[s] Longest interpolation: a car of 2 Hz at 10 m/s^2 is 2 mm from a cubic."""
+"""[s] Maximum interpolated gap: motion of 2 Hz at 10 m/s^2 deviates by 2 mm from a cubic."""
 MIN_OFFSET_RAD = math.radians(30.0)
 """[rad] A smaller constant offset of yaw is a parameter of the measurement."""
 
 
 def check_pose(repair: EpisodeRepair, control_period_s: float) -> None:
-    """Check and repair stamps and pose: units, then repeated rows (they look like jumps), outliers, gaps."""
+    """Check and repair stamps and pose: units, then repeated rows (they resemble jumps), outliers, gaps."""
     _check_time_unit(repair, control_period_s)
     _check_frame(repair)
     _check_repeats(repair)
@@ -33,24 +33,26 @@ def check_pose(repair: EpisodeRepair, control_period_s: float) -> None:
 
 
 def _check_time_unit(repair: EpisodeRepair, control_period_s: float) -> None:
-    """Stamps in milli-, micro- or nanoseconds: a period that no control loop has."""
+    """Detect stamps in milli-, micro- or nanoseconds by an implausible period."""
     low, high = CONTROL_PERIODS_S
     period = repair.period_s
     if low <= period <= high:
         return
     fitting = {unit: f for unit, f in UNITS["t"].items() if low <= period * f <= high}
     if not fitting:
-        repair.report("wrong_unit", "t", len(repair.times_s), f"reported: rows are {period:.3g} s apart.")
+        repair.report(
+            "wrong_unit", "t", len(repair.times_s), f"reported: the period of {period:.3g} s fits no time unit."
+        )
         return
     unit = min(fitting, key=lambda u: abs(math.log(period * fitting[u] / control_period_s)))
     repair.times_s = repair.times_s * fitting[unit]
     repair.cut_at_jumps()
-    fault = Fault("wrong_unit", "t", f"rows {period:.3g} s apart are no control loop")
+    fault = Fault("wrong_unit", "t", f"a period of {period:.3g} s is implausible")
     repair.repaired(fault, f"the stamps are in {unit} and were converted")
 
 
 def _check_frame(repair: EpisodeRepair) -> None:
-    """Unit, sense and axis of the pose by the course over ground."""
+    """Repair unit, sign and axes of the pose by the course over ground."""
     states = repair.states
     for fault in heading_faults(repair.times_s, {"x": states[:, 0], "y": states[:, 1], "yaw": states[:, 2]}):
         option = fault.option or ""
@@ -75,21 +77,21 @@ def _check_frame(repair: EpisodeRepair) -> None:
 
 
 def _check_repeats(repair: EpisodeRepair) -> None:
-    """Interpolate rows that repeat the pose before while the car moves."""
+    """Interpolate rows that repeat the previous pose while the car moves."""
     stale = stale_rows(repair.times_s, repair.states[:, :3])
     if not stale.any():
         return
     count = int(stale.sum())
     observation = (
-        f"{count} rows ({stale.mean():.1%}) repeat the pose before although the car moves (the logger was faster than "
-        "the cameras, or a frame was lost)"
+        f"{count} rows ({stale.mean():.1%}) repeat the previous pose although the car moves (the logger was faster "
+        "than the cameras, or a frame was lost)"
     )
     channel = "x, y, yaw, vx, vy, yaw_rate" if repair.has_velocity_columns else "x, y, yaw"
     repair.repaired(Fault("stale_samples", channel, observation), _interpolate(repair, stale, columns=6), count)
 
 
 def _check_outliers(repair: EpisodeRepair) -> None:
-    """Interpolate single rows, or a few, whose pose is not where their neighbours put it."""
+    """Interpolate short runs of rows whose pose is far from the path of their neighbours."""
     outliers = rows_off_path(repair.times_s, repair.states[:, :3])
     if outliers.any():
         count = int(outliers.sum())
@@ -100,15 +102,15 @@ def _check_outliers(repair: EpisodeRepair) -> None:
 
 
 def _check_gaps(repair: EpisodeRepair) -> None:
-    """Cut at the remaining jumps, where tracking was lost, and at gaps; count the rows that an even clock misses."""
+    """Cut at gaps and at the remaining jumps (lost tracking), and count missing rows of an even clock."""
     jumps = repair.cut_at_jumps()
     if jumps:
-        fault = Fault("outliers", "x, y, yaw", f"the pose jumps {jumps} times without coming back, tracking was lost")
-        repair.repaired(fault, "cut there", jumps)
+        fault = Fault("outliers", "x, y, yaw", f"the pose jumps {jumps} times without a return: tracking was lost")
+        repair.repaired(fault, "the recording was cut at the jumps", jumps)
     step, period = np.diff(repair.times_s), repair.period_s
     gaps = gap_rows(repair.times_s)
     is_even = np.mean(np.abs(step - period) < 0.1 * period) > 0.9
-    missing = np.where(np.diff(repair.rows) == 1, np.round(step / period) - 1.0, 0.0)  # not what was removed here
+    missing = np.where(np.diff(repair.rows) == 1, np.round(step / period) - 1.0, 0.0)  # without the rows removed here
     places = missing >= 1 if is_even else np.isin(np.arange(len(step)), gaps - 1)
     count = int(missing[places].sum())
     if count < 1:
@@ -126,7 +128,7 @@ def _check_gaps(repair: EpisodeRepair) -> None:
 def _interpolate(repair: EpisodeRepair, bad: BoolArray, *, columns: int) -> str:
     """Interpolate the first ``columns`` states of short runs of ``bad`` rows by a cubic; remove long runs.
 
-    Returns what was done, as a clause.
+    Returns the action as a clause.
     """
     states, t_s = repair.states, repair.times_s
     repair.interpolated = repair.interpolated | bad

@@ -1,4 +1,4 @@
-"""Repair of velocity columns by the motion of the pose."""
+"""Repair of velocity columns by comparison with the motion of the pose."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def check_velocities(repair: EpisodeRepair) -> None:
     if fault is not None:
         _rebuild_clock(repair, motion)
         repair.has_velocity_columns = False
-        repair.repaired(fault, "taken from the pose without delay")
+        repair.repaired(fault, "the velocities were estimated from the pose without delay")
 
 
 def _check_frame(repair: EpisodeRepair, motion: PoseMotion) -> None:
@@ -49,7 +49,7 @@ def _check_frame(repair: EpisodeRepair, motion: PoseMotion) -> None:
     c, s = np.cos(motion.yaw_unwrapped), np.sin(motion.yaw_unwrapped)
     vx, vy = repair.states[:, 3:5].T.copy()
     repair.states[:, 3], repair.states[:, 4] = c * vx + s * vy, c * vy - s * vx
-    repair.repaired(fault, "rotated by the yaw")
+    repair.repaired(fault, "the velocities were rotated by the yaw")
 
 
 def _check_scale(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> None:
@@ -59,11 +59,13 @@ def _check_scale(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> Non
     for fault in scale_faults(channel, fit_column(repair.times_s, reference, column, rows), reference[rows]):
         factor = fault.evidence.get("factor")
         column[:] = reference if factor is None else factor * column
-        repair.repaired(fault, "taken from the pose" if factor is None else f"multiplied by {factor:.4g}")
+        repair.repaired(
+            fault, "replaced by the velocity of the pose" if factor is None else f"multiplied by {factor:.4g}"
+        )
 
 
 def _check_spikes(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> None:
-    """Single rows far off, and the velocities next to interpolated poses if those were part of them."""
+    """Replace outliers of a velocity, and velocities that were computed from interpolated poses."""
     column = repair.states[:, 3 + VELOCITY_CHANNELS.index(channel)]
     fit = fit_column(repair.times_s, velocity_references(motion)[channel], column, np.ones(len(column), dtype=bool))
     spikes = velocity_spikes(channel, repair.period_s, column, fit.prediction)
@@ -74,7 +76,7 @@ def _check_spikes(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> No
         column[replaced] = fit.prediction[replaced]
         repair.is_changed = True
     if fault is not None:
-        repair.repaired(fault, "those rows were taken from the pose", len(fault.rows))
+        repair.repaired(fault, "these rows were replaced by the velocity of the pose", len(fault.rows))
 
 
 def _rebuild_clock(repair: EpisodeRepair, motion: PoseMotion) -> None:

@@ -1,4 +1,4 @@
-"""Material for the report's pictures: traces, scores, regimes and correlations of a scored search."""
+"""Data of the report's figures: traces, scores, regimes and correlations of a scored search."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 
 TRACES_TRIED = 6
-"""Longest held-out recordings that are tried for the traces; those without motion are left out."""
+"""Number of the longest held-out recordings that are searched for traces with motion."""
 
 
 def exhibits_of(scored: ScoredSearch, tracks: Sequence[Track]) -> Exhibits:
-    """Material for the pictures; ``tracks`` are held out."""
+    """Data of the figures; ``tracks`` are held-out tracks."""
     settings, found = scored.problem.settings.report, scored.found
     correlation = {
         name: _correlation(scored.problem.windows, found.base.config, EFFECTS[name].command == "throttle", settings)
@@ -92,7 +92,7 @@ def _traces(scored: ScoredSearch, tracks: Sequence[Track]) -> tuple[Trace, ...]:
 
 
 def _trace(track: Track, models: Mapping[str, SimulatorConfig], horizon_s: float, worst_stretches: int) -> Trace | None:
-    """Predictions along a track, restarted every horizon; None where the car does not move long enough."""
+    """Predictions along a track, restarted every horizon; None if the car does not move for a horizon."""
     try:
         windows = cut_windows([track], horizon_s, horizon_s)
     except DataError:

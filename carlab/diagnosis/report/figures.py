@@ -18,7 +18,7 @@ from carlab.diagnosis.report.svg import Chart, bar_rows, padded
 MODELS = ("nominal", "refit", "with_effects")
 LABELS = {
     "nominal": "car file as given",
-    "refit": "numbers refitted",
+    "refit": "parameters refitted",
     "with_effects": "with effects",
     "constant_velocity": "constant velocity",
     "noise floor": "noise floor",
@@ -27,6 +27,7 @@ LABELS = {
 }
 UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 RESTART_FALL = 0.3
+"""A restart lowers the position error below this share of that of the row before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,30 +39,30 @@ class Figure:
 
 
 def restarts(recorded: FloatArray, predicted: FloatArray) -> list[int]:
-    """Rows (k,) at which a prediction starts anew: it jumps back onto the recording, or begins after a gap.
+    """Rows (k,) at which a prediction restarts: it jumps back to the recording, or begins after a gap.
 
     Args:
         recorded: states (T, 6).
-        predicted: states (T, 6), NaN where there is none.
+        predicted: states (T, 6), NaN without a prediction.
     """
     error = np.linalg.norm(predicted[:, :2] - recorded[:, :2], axis=1)
     whole: NDArray[np.bool_] = np.asarray(np.isfinite(predicted).all(axis=1))
     step = np.linalg.norm(np.diff(predicted[:, :2] - recorded[:, :2], axis=0), axis=1)
-    usual = float(np.nanmedian(step)) if np.isfinite(step).any() else 0.0
+    median_step = float(np.nanmedian(step)) if np.isfinite(step).any() else 0.0
     with np.errstate(invalid="ignore"):
-        back = (error[1:] < RESTART_FALL * error[:-1]) & (step > 4.0 * usual)
+        back = (error[1:] < RESTART_FALL * error[:-1]) & (step > 4.0 * median_step)
     return [int(k) for k in np.flatnonzero(whole[1:] & (back | ~whole[:-1])) + 1]
 
 
 def residual(trace: Trace, which: str) -> FloatArray:
-    """Predicted less recorded, shape (T + 1, 6); the heading's part wrapped."""
+    """Predicted minus recorded states (T + 1, 6), yaw wrapped."""
     error = np.asarray(trace.predicted[which] - trace.recorded, dtype=np.float64)
     error[:, 2] = np.asarray(wrap(error[:, 2]))
     return error
 
 
 def without_effects(exhibits: Exhibits) -> Exhibits:
-    """The same exhibits without the curves of a simulator with effects, for a verdict that names none."""
+    """Remove the curves of the simulator with effects, for a verdict without effects."""
     traces = tuple(
         replace(t, predicted={m: rows for m, rows in t.predicted.items() if m != "with_effects"})
         for t in exhibits.traces
@@ -72,7 +73,7 @@ def without_effects(exhibits: Exhibits) -> Exhibits:
 
 
 def worst_stretch(traces: Sequence[Trace]) -> tuple[Trace, tuple[float, float]] | None:
-    """The marked stretch with the largest error of position of the refit (or of what there is), and its trace."""
+    """The marked stretch with the largest position error of the refit (or the first available model), and its trace."""
     best: tuple[float, Trace, tuple[float, float]] | None = None
     for trace in traces:
         which = next((m for m in ("refit", "nominal", "with_effects") if m in trace.predicted), None)
@@ -93,7 +94,7 @@ def _rows(trace: Trace, stretch: tuple[float, float]) -> NDArray[np.intp]:
 
 
 def overlay(trace: Trace, stretch: tuple[float, float], effects: Sequence[EffectFinding]) -> list[Figure]:
-    """Plan and velocities in one stretch: the recording and each prediction from the same start."""
+    """Plan view and velocities in one stretch: the recording and each prediction from the same initial state."""
     rows = _rows(trace, stretch)
     seen = trace.recorded[rows]
     models = [m for m in MODELS if m in trace.predicted]
@@ -117,7 +118,7 @@ def overlay(trace: Trace, stretch: tuple[float, float], effects: Sequence[Effect
         plan.dots(states[-1:, 0], states[-1:, 1], model)
     plan.dots(seen[-1:, 0], seen[-1:, 1], "recorded")
     plan.dots(seen[:1, 0], seen[:1, 1], "recorded hollow")
-    made = [Figure(plan.render(), "Seen from above. The ring is the common start, the dots are where each ends.")]
+    made = [Figure(plan.render(), "Plan view. The ring is the common start, the dots are the end points.")]
     for k in (3, 4, 5):
         values = np.concatenate([seen[:, k], *(trace.predicted[m][rows][:, k] for m in models)])
         chart = Chart(
@@ -136,7 +137,7 @@ def overlay(trace: Trace, stretch: tuple[float, float], effects: Sequence[Effect
 
 
 def error_in_time(trace: Trace) -> Figure | None:
-    """Distance between prediction and recording along a whole recording, the marked stretches shaded."""
+    """Position error along a whole recording, with the marked stretches shaded."""
     models = [m for m in ("refit", "with_effects") if m in trace.predicted]
     if not models:
         return None
@@ -146,7 +147,7 @@ def error_in_time(trace: Trace) -> Figure | None:
     chart = Chart("Position error in time", span, (0.0, top), (880, 200), ("time [s]", "position error [m]"))
     chart.spans(trace.marked, "marked")
     for model in models:
-        # Thinned, the saw-teeth would lose their tips: the largest of each few rows is drawn instead.
+        # Draw the maximum of each few rows, because thinning would cut the peaks of the saw-tooth.
         every = max(len(trace.times_s) // 500, 1)
         count = len(trace.times_s) // every
         folded = np.where(np.isfinite(far[model]), far[model], -1.0)[: count * every].reshape(count, every).max(axis=1)
@@ -155,7 +156,7 @@ def error_in_time(trace: Trace) -> Figure | None:
 
 
 def regime_charts(exhibits: Exhibits) -> list[Figure]:
-    """Error against each feature of the driving, before and after."""
+    """Error against each driving condition, for the refit and with effects."""
     made = []
     top = padded([v for _, a, b in exhibits.regimes.values() for v in (*a, *b)])[1] if exhibits.regimes else 1.0
     for name, (centres, before, after) in exhibits.regimes.items():
@@ -172,7 +173,7 @@ def regime_charts(exhibits: Exhibits) -> list[Figure]:
 
 
 def correlation_chart(exhibits: Exhibits, effect_id: str) -> Figure | None:
-    """Cross-correlation of the refit's residual with what the effect acts on, with its bounds."""
+    """Cross-correlation of the refit's residual with the command of the effect, with its 99 % bounds."""
     if effect_id not in exhibits.correlation:
         return None
     lags_s, values, bound = exhibits.correlation[effect_id]
@@ -194,19 +195,19 @@ def correlation_chart(exhibits: Exhibits, effect_id: str) -> Figure | None:
     if beyond:
         words = (
             f"Correlation of the residual of the refitted simulator with earlier commands. {beyond} of {len(values)} "
-            f"lags lie outside the shaded band, the 99 % bounds of chance. The largest correlation is "
+            f"lags lie outside the shaded 99 % band of uncorrelated data. The largest correlation is "
             f"{number(float(values[peak]))} at a lag of {number(float(lags_s[peak]))} s."
         )
     else:
         words = (
             "Correlation of the residual of the refitted simulator with earlier commands. All lags lie inside the "
-            "shaded band, the 99 % bounds of chance. The correlation alone does not show the effect."
+            "shaded 99 % band of uncorrelated data. The correlation alone does not show the effect."
         )
     return Figure(chart.render(), words)
 
 
 def ladder_chart(exhibits: Exhibits) -> Figure | None:
-    """The score from the car file as given, rung by rung, down to the noise floor."""
+    """Scores of the car file, the refit, each added effect, and the noise floor."""
     if not exhibits.ladder:
         return None
     rows = []
@@ -220,11 +221,11 @@ def ladder_chart(exhibits: Exhibits) -> Figure | None:
 
 
 def fingerprint_chart(effect: EffectFinding) -> Markup:
-    """Rise of each channel's error when the effect is taken out."""
+    """Relative increase of each channel's error without the effect."""
     known = effect.evidence.deletion_fingerprint
     ordered = sorted(known.items(), key=lambda item: -item[1] if np.isfinite(item[1]) else 0.0)
     rows = [
         (CHANNEL_WORDS.get(c, c), rise, ("+" if rise > 0 else "") + percent(rise), "with_effects")
         for c, rise in ordered
     ]
-    return bar_rows("Rise of each channel's error without the effect", rows, label_px=140, size=(420, 23))
+    return bar_rows("Increase of each channel's error without the effect", rows, label_px=150, size=(430, 23))

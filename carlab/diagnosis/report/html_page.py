@@ -1,4 +1,4 @@
-"""The report as one HTML page: what the template is given, and the template filled."""
+"""The report as one HTML page, rendered from a template."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate, Exhibits
-from carlab.diagnosis.report import figures as figures
+from carlab.diagnosis.report import figures
 from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import DEFAULT
 
 
 def render_page(diagnosis: Diagnosis, exhibits: Exhibits) -> str:
-    """The page as text: self-contained, without scripts; every text from outside is escaped."""
+    """Render the page: self-contained, without scripts; all text from outside is escaped."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {
         "num": text.number,
@@ -29,7 +29,7 @@ def render_page(diagnosis: Diagnosis, exhibits: Exhibits) -> str:
 
 
 def page_context(diagnosis: Diagnosis, exhibits: Exhibits) -> dict[str, Any]:
-    """What the template reads. Pictures show effects only where the verdict names some."""
+    """Variables of the template. Figures contain effects only if the verdict names some."""
     exhibits = exhibits if diagnosis.effects else figures.without_effects(exhibits)
     drive, why = text.next_drive(diagnosis)
     rest = diagnosis.unexplained
@@ -66,7 +66,7 @@ def page_context(diagnosis: Diagnosis, exhibits: Exhibits) -> dict[str, Any]:
 
 
 def _has_own_sentence(diagnosis: Diagnosis) -> bool:
-    """Whether the diagnosis brings its own verdict sentence; the reason of an inconclusive diagnosis is framed."""
+    """Whether the diagnosis has a verdict sentence; that of an inconclusive one is a reason, not a verdict."""
     return bool(diagnosis.sentence) and diagnosis.verdict != "inconclusive"
 
 
@@ -75,7 +75,7 @@ def _bar(e: Estimate) -> Any:
 
 
 def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """The figures on top: the score of each stage."""
+    """Scores of the models, for the head of the page."""
     order = ("nominal", "refit", "with_effects", "noise_floor")
     shown = [k for k in order if k in diagnosis.held_out and (k != "with_effects" or diagnosis.effects)]
     return [{"label": figures.LABELS[k], "errors": diagnosis.held_out[k], "style": k} for k in shown]
@@ -111,7 +111,7 @@ def _effect(effect: EffectFinding, exhibits: Exhibits) -> dict[str, Any]:
         "reason": text.separating_reason(effect.id, effect.indistinguishable_from)
         if effect.indistinguishable_from
         else "",
-        "wrong": text.wrong_sentence(effect.id),
+        "refutation": text.refutation_sentence(effect.id),
         "correlation": figures.correlation_chart(exhibits, effect.id),
         "fingerprint": figures.fingerprint_chart(effect) if evidence.deletion_fingerprint else None,
     }
@@ -123,14 +123,16 @@ def _evidence_words(effect: EffectFinding) -> list[str]:
     fall = evidence.held_out_error_reduction
     if math.isfinite(fall):
         verb = "lowers" if fall >= 0 else "raises"
-        words.append(f"When it is added last, it {verb} the error on held-out recordings by {text.percent(abs(fall))}.")
+        words.append(f"Added last, the effect {verb} the error on held-out recordings by {text.percent(abs(fall))}.")
     strength = evidence.standard_errors
     if math.isfinite(strength):
-        side = "speak against" if strength < 0 else "favour"
-        weak = ", which is weak" if abs(strength) < 3 else ""
-        words.append(f"Held-out recordings {side} it by {text.number(abs(strength))} standard errors{weak}.")
+        verb = "lowers" if strength < 0 else "raises"
+        weak = " (weak evidence)" if abs(strength) < 3 else ""
+        size = text.number(abs(strength))
+        words.append(f"The effect {verb} the held-out log-likelihood by {size} standard errors{weak}.")
     visible = evidence.visibility
     if math.isfinite(visible):
-        hidden = " Most of it is hidden by other numbers." if visible < 0.3 else ""
-        words.append(f"Other numbers cannot imitate {text.percent(visible)} of its influence.{hidden}")
+        hidden = " Most of it is confounded with other parameters." if visible < 0.3 else ""
+        share = text.percent(visible)
+        words.append(f"Other parameters cannot reproduce {share} of its influence on the errors.{hidden}")
     return words

@@ -1,4 +1,4 @@
-"""The diagnosis in one picture: the fall of the held-out error, and the worst second before and after."""
+"""Summary picture of a diagnosis: held-out scores, and plan views of the largest errors."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 
 from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
 from carlab.diagnosis.settings import DEFAULT
-from carlab.recording.rerun import blueprint as look
+from carlab.recording.rerun import blueprint
 
 ORDER = ("nominal", "refit", "with_effects")
 LABELS = {"nominal": "car file", "refit": "refit", "with_effects": "with effects"}
 
 
-def _plain(words: str) -> str:
-    """Words that a figure shows as they are: names of files may hold anything."""
+def _escaped(words: str) -> str:
+    """Escape text for matplotlib; file names may contain any character."""
     return "".join(c if " " <= c <= "~" else "?" for c in words).replace("$", r"\$")
 
 
@@ -26,16 +26,20 @@ def _color(rgb: tuple[int, int, int]) -> tuple[float, float, float]:
     return rgb[0] / 255.0, rgb[1] / 255.0, rgb[2] / 255.0
 
 
-COLORS = {"nominal": _color(look.ORANGE), "refit": _color(look.VERMILION), "with_effects": _color(look.BLUE)}
+COLORS = {
+    "nominal": _color(blueprint.ORANGE),
+    "refit": _color(blueprint.VERMILION),
+    "with_effects": _color(blueprint.BLUE),
+}
 
 
 def draw_picture(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
-    """Write a PNG; panes without material are left out.
+    """Write a PNG; panes without data are omitted.
 
     Args:
-        diagnosis: the answer.
-        exhibits: the ladder and the traces.
-        path: the file, replaced where it is there.
+        diagnosis: the result.
+        exhibits: scores and traces.
+        path: the file; an existing one is replaced.
     """
     figure = Figure(figsize=(13.0, 4.6), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
@@ -50,7 +54,7 @@ def draw_picture(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
     )
     if len(diagnosis.effects) > DEFAULT.report.max_picture_names:
         names += f" and {len(diagnosis.effects) - DEFAULT.report.max_picture_names} more"
-    figure.suptitle(_plain(names), fontsize=11)
+    figure.suptitle(_escaped(names), fontsize=11)
     figure.savefig(path, dpi=110)
 
 
@@ -59,11 +63,11 @@ def _ladder(axes: Axes, exhibits: Exhibits) -> None:
     scores = np.array([score for _, score in exhibits.ladder])
     places = np.arange(len(labels))[::-1]
     kinds = [COLORS.get(name, COLORS["with_effects"]) for name in labels]
-    axes.barh(places, scores, color=[_color(look.GREY) if n == "noise floor" else c for n, c in zip(labels, kinds,
+    axes.barh(places, scores, color=[_color(blueprint.GREY) if n == "noise floor" else c for n, c in zip(labels, kinds,
               strict=True)])  # fmt: skip
     for place, score in zip(places, scores, strict=True):
         axes.text(score, place, f" {score:.2f}", va="center", fontsize=8)
-    axes.set_yticks(places, [_plain(label.replace("_", " ")) for label in labels], fontsize=8)
+    axes.set_yticks(places, [_escaped(label.replace("_", " ")) for label in labels], fontsize=8)
     axes.set_xlabel("held-out error after one second, in noise floors")
     axes.margins(x=0.15)
 
@@ -71,16 +75,16 @@ def _ladder(axes: Axes, exhibits: Exhibits) -> None:
 def _worst(axes: Axes, trace: Trace) -> None:
     """Plan view of the stretches where the refit is worst."""
     for number, (begin, end) in enumerate(trace.marked):
-        rows = (trace.times_s >= begin - 1e-6) & (trace.times_s < end - 1e-6)  # at the end the prediction starts anew
-        once = number == 0
-        axes.plot(*trace.recorded[rows, :2].T, color="black", lw=2.2, label="recorded" if once else None)
+        rows = (trace.times_s >= begin - 1e-6) & (trace.times_s < end - 1e-6)  # the prediction restarts at the end
+        has_label = number == 0
+        axes.plot(*trace.recorded[rows, :2].T, color="black", lw=2.2, label="recorded" if has_label else None)
         for name in ORDER[1:]:
             if name in trace.predicted:
                 path = trace.predicted[name][rows, :2]
-                axes.plot(*path.T, color=COLORS[name], lw=1.6, label=LABELS[name] if once else None)
+                axes.plot(*path.T, color=COLORS[name], lw=1.6, label=LABELS[name] if has_label else None)
         axes.plot(*trace.recorded[np.argmax(rows), :2], "o", color="black", ms=5)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.set_title(_plain(f"{trace.name}: its worst seconds"), fontsize=9)
+    axes.set_title(_escaped(f"{trace.name}: largest errors"), fontsize=9)
     axes.legend(fontsize=8, frameon=False)

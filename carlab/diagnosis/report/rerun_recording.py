@@ -1,13 +1,13 @@
 """The report as a rerun recording: the recorded car, the predictions, the residuals, and their worst stretches.
 
-Each held-out recording has entities of its own under ``/NAME`` and a tab of its own; all lie on the timeline
-``car_time``, the time of each recording [s].
+Each held-out recording has its entities under ``/NAME`` and one tab. The timeline ``car_time`` is the time since its
+first row [s].
 
     NAME/map/{recorded,nominal,refit,with_effects}/{base_link,trail}     plan view
-    NAME/map/worst, NAME/map/place                                       located stretches and places
+    NAME/map/worst, NAME/map/place                                       largest errors, places of effects
     NAME/state/{vx,vy,yaw_rate}/{recorded,nominal,refit,with_effects}    series
-    NAME/residual/{position,yaw,vx,vy,yaw_rate}/{nominal,...}            predicted less recorded
-    NAME/marks                                                           what is where, in words
+    NAME/residual/{position,yaw,vx,vy,yaw_rate}/{nominal,...}            predicted minus recorded
+    NAME/marks                                                           text of the stretches and effects
     verdict                                                              the verdict and each effect
 """
 
@@ -25,20 +25,25 @@ from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
 from carlab.diagnosis.report.figures import LABELS, MODELS, residual, restarts
 from carlab.diagnosis.report.sentences import number, verdict_sentence
 from carlab.recording.atomic_files import rerun_file
-from carlab.recording.rerun import blueprint as look
+from carlab.recording.rerun import blueprint
 from carlab.recording.rerun.columns import Columns, entity_part
 
 VERDICT = "verdict"
-COLORS = {"recorded": look.GREY, "nominal": look.ORANGE, "refit": look.VERMILION, "with_effects": look.SKY}
+COLORS = {
+    "recorded": blueprint.GREY,
+    "nominal": blueprint.ORANGE,
+    "refit": blueprint.VERMILION,
+    "with_effects": blueprint.SKY,
+}
 CHANNELS = {"vx": 3, "vy": 4, "yaw_rate": 5}
 UNITS = {"position": "m", "yaw": "rad", "vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 
 
 def write_rrd(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
-    """Write the recording; one that is there already is replaced once the new one is whole.
+    """Write the recording; an existing file is replaced when the new one is complete.
 
     Raises:
-        DataError: it cannot be written.
+        DataError: the file cannot be written.
     """
     parts = entity_names(exhibits)
     with rerun_file(path, blueprint=_blueprint(parts, exhibits)) as stream:
@@ -49,7 +54,7 @@ def write_rrd(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
 
 
 def entity_names(exhibits: Exhibits) -> list[str]:
-    """First part of the entity paths of each trace: its name as such, numbered where two are alike."""
+    """First part of the entity paths of each trace: its name, with a number if names are equal."""
     names: list[str] = []
     for trace in exhibits.traces:
         name = base = entity_part(trace.name)
@@ -97,10 +102,10 @@ def _send_car(
     states: FloatArray,
     begins: list[int],
 ) -> None:
-    """A car that moves and the trail it leaves, which is interrupted where a prediction starts anew."""
+    """Log a car and its trail; the trail is interrupted where a prediction restarts."""
     car, trail = f"{part}/map/{name}/base_link", f"{part}/map/{name}/trail"
     color = COLORS[name]
-    half = [0.5 * size for size in look.CAR_SIZE_M]
+    half = [0.5 * size for size in blueprint.CAR_SIZE_M]
     mode = rr.components.FillMode.Solid if name == "recorded" else rr.components.FillMode.MajorWireframe
     stream.log(f"{car}/body", rr.Boxes3D(half_sizes=[half], colors=color, fill_mode=mode), static=True)
     width = rr.Radius.ui_points(3.0 if name == "recorded" else 1.5)
@@ -115,8 +120,8 @@ def _send_car(
     turns = np.column_stack([zeros, zeros, np.sin(half_rad), np.cos(half_rad)])
     stream.send_columns(car, indexes, rr.Transform3D.columns(translation=places, quaternion=turns))
     starts = np.vstack([places[:1], places[:-1]])
-    anew = np.isin(rows, begins)
-    starts[anew] = places[anew]
+    restarted = np.isin(rows, begins)
+    starts[restarted] = places[restarted]
     strips = list(np.stack([starts, places], axis=1))
     stream.send_columns(trail, indexes, rr.LineStrips3D.columns(strips=strips))
 
@@ -138,10 +143,10 @@ def _send_marks(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: 
         places = places[np.isfinite(places).all(axis=1)]
         if len(places) > 1:
             strips.append(np.column_stack([places, np.full(len(places), -0.002)]))
-        marks.append((start_s, f"The refit is worst from {number(start_s)} s to {number(end_s)} s", "WARN"))
+        marks.append((start_s, f"Largest error of the refit from {number(start_s)} s to {number(end_s)} s", "WARN"))
     if strips:
         width = rr.Radius.ui_points(7.0)
-        stream.log(f"{part}/map/worst", rr.LineStrips3D(strips, radii=width, colors=look.YELLOW), static=True)
+        stream.log(f"{part}/map/worst", rr.LineStrips3D(strips, radii=width, colors=blueprint.YELLOW), static=True)
     circles = []
     first_s = float(trace.times_s[0]) if len(trace.times_s) else 0.0
     for effect in diagnosis.effects:
@@ -153,11 +158,11 @@ def _send_marks(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: 
         marks.append((at_s, f"{effect.id}: {effect.sentence}", "INFO"))
     if circles:
         width = rr.Radius.ui_points(2.0)
-        stream.log(f"{part}/map/place", rr.LineStrips3D(circles, radii=width, colors=look.PURPLE), static=True)
+        stream.log(f"{part}/map/place", rr.LineStrips3D(circles, radii=width, colors=blueprint.PURPLE), static=True)
     for at_s, words, level in sorted(marks):
         step = int(np.searchsorted(trace.times_s, at_s))
-        stream.set_time(look.CAR_TIME, duration=at_s)
-        stream.set_time(look.STEP, sequence=step)
+        stream.set_time(blueprint.CAR_TIME, duration=at_s)
+        stream.set_time(blueprint.STEP, sequence=step)
         stream.log(f"{part}/marks", rr.TextLog(words, level=level))
 
 
@@ -168,7 +173,7 @@ def _blueprint(parts: list[str], exhibits: Exhibits) -> rrb.Blueprint:
         rrb.Tabs(*tabs, verdict, active_tab=0),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=look.CAR_TIME),
+        rrb.TimePanel(state="collapsed", timeline=blueprint.CAR_TIME),
         auto_views=False,
     )
 
@@ -188,7 +193,7 @@ def _tab(part: str, trace: Trace) -> rrb.Horizontal:
         rrb.Vertical(
             _plan(part, trace),
             rrb.Horizontal(
-                rrb.TextLogView(origin=f"/{part}/marks", name="What is where"),
+                rrb.TextLogView(origin=f"/{part}/marks", name="Marks"),
                 rrb.TextDocumentView(origin=f"/{VERDICT}", name="Verdict"),
             ),
             row_shares=[3, 1],
@@ -207,7 +212,7 @@ def _plan(part: str, trace: Trace) -> rrb.Spatial3DView:
     so_far = rrb.VisibleTimeRanges(
         [
             rrb.VisibleTimeRange(
-                look.CAR_TIME,
+                blueprint.CAR_TIME,
                 start=rrb.TimeRangeBoundary.infinite(),
                 end=rrb.TimeRangeBoundary.cursor_relative(),
             )

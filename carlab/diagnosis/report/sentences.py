@@ -1,6 +1,6 @@
-"""Sentences of a diagnosis: of each effect, of the verdict, of its refutation, and of the next drive.
+"""Sentences of a report: each effect, the verdict, the test that would refute it, and the next drive.
 
-No sentence is more certain than the numbers: a set is named as a set, and an interval across zero is stated.
+The sentences state the uncertainty: indistinguishable effects, and intervals that contain zero.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from carlab.diagnosis.settings import DEFAULT
 from sim_backends.effects import EFFECTS, Confusable, separation
 
 CHANNEL_WORDS = {
-    "x": "position ahead",
-    "y": "position to the side",
+    "x": "longitudinal position",
+    "y": "lateral position",
     "yaw": "heading",
-    "vx": "speed ahead",
-    "vy": "side velocity",
+    "vx": "longitudinal velocity",
+    "vy": "lateral velocity",
     "yaw_rate": "yaw rate",
 }
 AT_90 = " at 90 %"
 VERDICT_TITLES = {
-    "mismatch": "Physics is missing, and has a name",
-    "parameters": "Only numbers of the car file are wrong",
-    "none": "Nothing is found missing",
-    "data": "The recording is at fault",
-    "unexplained": "Physics is missing that has no name in the catalogue",
+    "mismatch": "Missing physics is found and named",
+    "parameters": "Only parameters of the car file are wrong",
+    "none": "No missing physics is found",
+    "data": "The recording is faulty",
+    "unexplained": "Physics outside the catalogue is missing",
     "inconclusive": "The recordings are not sufficient",
 }
 
 
 def number(value: float) -> str:
-    """Three significant digits, without an exponent where that reads well; a real minus sign."""
+    """Format three significant digits with a minus sign (U+2212); an exponent only outside [1e-6, 1e6)."""
     if not math.isfinite(value):
         return "no limit" if value == math.inf else "minus no limit" if value == -math.inf else "unknown"
     if value == 0.0:
@@ -49,7 +49,7 @@ def number(value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """A share in per cent: two significant digits, but never a rounded 100 for less, nor a rounded 0 for more."""
+    """Format a share in per cent. A share below 1 is never rounded to 100 %, a share above 0 never to 0 %."""
     value = 100.0 * share
     if not math.isfinite(value):
         return "an unknown share"
@@ -60,7 +60,7 @@ def percent(share: float) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """A unit as people write it: ``N s2/m2`` -> ``N s²/m²``; nothing for 1."""
+    """Format a unit with superscripts: ``N s2/m2`` -> ``N s²/m²``; empty for 1."""
     if unit in ("", "1"):
         return ""
     return re.sub(r"(?<=[a-z])([23])", lambda m: "²³"[int(m[1]) - 2], unit)
@@ -75,9 +75,8 @@ class _Filled:
     """An estimate in the sentence template of an effect (``Effect.sentence``).
 
     ``{p}`` is the number with unit and interval, ``{p:size}`` its magnitude (with ``{p:left|right}`` for the sign),
-    ``{p:percent}`` and ``{p:size percent}`` the same in per cent, ``{p:each minute}`` a rate [1/s] in per cent a
-    minute,
-    ``{p:choice a|b}`` a word for a choice.
+    ``{p:percent}`` and ``{p:size percent}`` the same in per cent, ``{p:each minute}`` a rate [1/s] in per cent per
+    minute, ``{p:choice a|b}`` a word for a choice.
     """
 
     def __init__(self, estimate: Estimate | None) -> None:
@@ -122,33 +121,33 @@ class _Fields(dict[str, _Filled]):
 
 
 def effect_noun(effect_id: str) -> str:
-    """An effect as a noun: ``a lag of the steering servo``. An id beyond the catalogue stands for itself."""
+    """Name of an effect: ``a lag of the steering servo``; for an unknown id, the id with spaces."""
     effect = EFFECTS.get(effect_id)
     return effect.name if effect is not None and effect.name else effect_id.replace("_", " ")
 
 
 def effect_sentence(effect_id: str, parameters: Mapping[str, Estimate]) -> str:
-    """What was left out, with numbers, units and 90 % intervals: ``Left out: the servo lags by 0.11 s ...``."""
+    """Sentence of an effect with values, units and 90 % intervals: ``Left out: the servo lags by 0.11 s ...``."""
     effect = EFFECTS.get(effect_id)
     if effect is None or not effect.sentence:
         numbers = ", ".join(f"{name} {_Filled(e)}" for name, e in parameters.items())
         return f"Left out: {effect_noun(effect_id)}" + (f", with {numbers}." if numbers else ".")
     fields = _Fields({name: _Filled(e) for name, e in parameters.items()})
     filled = re.sub(r"\s+", " ", effect.sentence.format_map(fields))
-    head, level, tail = filled.partition(AT_90)  # the first interval states the level, which holds for all
+    head, level, tail = filled.partition(AT_90)  # only the first interval states the level
     return f"Left out: {head}{level}{tail.replace(AT_90, '')}."
 
 
-def wrong_sentence(effect_id: str) -> str:
-    """What would refute an effect."""
+def refutation_sentence(effect_id: str) -> str:
+    """The observation that would refute an effect."""
     effect = EFFECTS.get(effect_id)
     if effect is None or not effect.refuted_if:
-        return "This would be wrong if a fit to another recording gave the effect other numbers."
+        return "This would be wrong if a fit to another recording gave the effect other parameters."
     return f"This would be wrong if {effect.refuted_if}."
 
 
 def _separations(effect_id: str, others: Sequence[str]) -> list[Confusable]:
-    """How the pairs of a set of confusable effects are separated, those with ``effect_id`` first."""
+    """Drives and reasons that separate the pairs of a set, pairs with ``effect_id`` first."""
     names = [effect_id, *others]
     pairs = [(effect_id, other) for other in others]
     pairs += [(a, b) for k, a in enumerate(names[1:]) for b in names[k + 2 :]]
@@ -156,16 +155,13 @@ def _separations(effect_id: str, others: Sequence[str]) -> list[Confusable]:
 
 
 def separating_drive(effect_id: str, others: Sequence[str]) -> str:
-    """Name of the manoeuvre that separates an effect from its confusable ones; empty where no drive can.
-
-    Of several confusable effects, the manoeuvre that separates most pairs of the set.
-    """
+    """Name of the manoeuvre that separates the most pairs of a set of confusable effects; empty if none does."""
     drives = [found.drive for found in _separations(effect_id, others) if found.drive]
     return max(drives, key=drives.count) if drives else ""
 
 
 def separating_reason(effect_id: str, others: Sequence[str]) -> str:
-    """Why that manoeuvre separates them, or what to do where no manoeuvre can."""
+    """Why the manoeuvre of ``separating_drive`` separates a set, or what to do if no manoeuvre does."""
     drive, found = separating_drive(effect_id, others), _separations(effect_id, others)
     reasons = [entry.reason for entry in found if entry.drive == drive and entry.reason]
     if drive:
@@ -177,18 +173,18 @@ def separating_reason(effect_id: str, others: Sequence[str]) -> str:
 
 
 def verdict_title(diagnosis: Diagnosis) -> str:
-    """The verdict in a few words."""
+    """Title of the verdict."""
     if diagnosis.effects and all(effect.indistinguishable_from for effect in diagnosis.effects):
-        return "Physics is missing, with more than one possible name"
+        return "Missing physics is found, with more than one possible name"
     return VERDICT_TITLES[diagnosis.verdict]
 
 
 def confidence_words(confidence: float, rivals: int = 0) -> str:
-    """A confidence in words; ``rivals`` is the number of effects that share it."""
+    """A confidence in words; ``rivals`` is the number of effects that are indistinguishable from it."""
     if rivals:
-        return f"one of {rivals + 1} that look alike"
+        return f"one of {rivals + 1} indistinguishable effects"
     levels = ((0.98, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.5, "more likely than not"))
-    return next((words for level, words in levels if confidence >= level), "a guess that needs another recording")
+    return next((words for level, words in levels if confidence >= level), "uncertain, record another drive")
 
 
 def listed(parts: Sequence[str], last: str = "and") -> str:
@@ -197,16 +193,16 @@ def listed(parts: Sequence[str], last: str = "and") -> str:
 
 
 def set_noun(effect: EffectFinding) -> str:
-    """An effect's noun, with those that are indistinguishable from it."""
+    """Name of an effect, with those that are indistinguishable from it."""
     noun = effect_noun(effect.id)
     if not effect.indistinguishable_from:
         return noun
     others = listed([effect_noun(name) for name in effect.indistinguishable_from], "or")
-    return f"{noun} (or {others}: these recordings cannot tell)"
+    return f"{noun} (or {others}; these recordings do not distinguish them)"
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one to four sentences, with the figures that carry it."""
+    """The verdict in one to four sentences with the scores."""
     made = {
         "mismatch": _mismatch,
         "parameters": _parameters,
@@ -219,14 +215,15 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
 
 
 def _worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
-    """A warning where the best simulator predicts held-out recordings worse than a car that keeps its velocity."""
+    """A warning if constant velocity predicts the held-out recordings better than every simulator; else empty."""
     held = diagnosis.held_out
     ours = [held[name].score for name in ("nominal", "refit", "with_effects") if name in held]
     if not ours or "constant_velocity" not in held or held["constant_velocity"].score >= min(ours):
         return ""
     return (
-        f" Constant velocity predicts these recordings better ({number(held['constant_velocity'].score)} noise floors "
-        f"for {number(min(ours))}), so do not rely on this simulator there."
+        " A constant-velocity model predicts these recordings better "
+        f"({number(held['constant_velocity'].score)} against {number(min(ours))} noise floors). "
+        "Do not rely on this simulator for such drives."
     )
 
 
@@ -241,7 +238,7 @@ def _fall(diagnosis: Diagnosis, before: str, after: str) -> str:
 
 
 def attained(diagnosis: Diagnosis) -> float:
-    """Share of what a refit left above the noise that the effects remove, in [-inf, 1]; NaN where unknown."""
+    """Share of the refit's score above 1 that the effects remove, at most 1; NaN if unknown."""
     held = diagnosis.held_out
     if "refit" not in held or "with_effects" not in held or not held["refit"].score > 1.0:
         return math.nan
@@ -250,9 +247,9 @@ def attained(diagnosis: Diagnosis) -> float:
 
 def _mismatch(diagnosis: Diagnosis) -> str:
     effects = diagnosis.effects
-    counted = {1: "one thing", 2: "two things", 3: "three things", 4: "four things"}
-    count = counted.get(len(effects), f"{len(effects)} things")
-    nouns = listed([set_noun(effect) for effect in effects]) or "an effect that this report does not hold"
+    counted = {1: "one effect", 2: "two effects", 3: "three effects", 4: "four effects"}
+    count = counted.get(len(effects), f"{len(effects)} effects")
+    nouns = listed([set_noun(effect) for effect in effects]) or "an effect that is not in this report"
     text = f"The simulator leaves out {count}: {nouns}."
     if fall := _fall(diagnosis, "refit", "with_effects"):
         removed = min(attained(diagnosis), 1.0)
@@ -265,34 +262,37 @@ def _mismatch(diagnosis: Diagnosis) -> str:
 
 def _parameters(diagnosis: Diagnosis) -> str:
     fall = _fall(diagnosis, "nominal", "refit")
-    tail = f" With fitted numbers, {fall}." if fall else ""
-    text = "No missing physics is found. Numbers of the car file are wrong."
+    tail = f" With fitted parameters, {fall}." if fall else ""
+    text = "No missing physics is found. Parameters of the car file are wrong."
     return f"{text}{tail}{_warning_above_noise(diagnosis, 'refit')}"
 
 
 def _warning_above_noise(diagnosis: Diagnosis, which: str) -> str:
-    """A warning where the verdict leaves an error well above the noise."""
+    """A warning if the score stays well above the noise floor; else empty."""
     held = diagnosis.held_out.get(which)
     if held is None or not held.score > DEFAULT.report.score_above_noise:
         return ""
-    return " This is still above the noise: something is missing that the diagnosis does not find."
+    return " This error is above the noise: the simulator lacks physics that the diagnosis does not find."
 
 
 def _none(diagnosis: Diagnosis) -> str:
     held = diagnosis.held_out.get("nominal")
-    text = "Nothing is found missing. Neither other numbers nor a named effect helps on these recordings."
+    text = (
+        "No missing physics is found. Neither other parameters nor an effect of the catalogue improves the prediction "
+        "of these recordings."
+    )
     if held is None:
         return text
     return (
-        f"{text} Its error after {with_unit(diagnosis.horizon_s, 's')} is {number(held.score)} noise floors, "
-        f"where 1 is the noise of the recording itself.{_warning_above_noise(diagnosis, 'nominal')}"
+        f"{text} The error after {with_unit(diagnosis.horizon_s, 's')} is {number(held.score)} noise floors "
+        f"(1 is the error that measurement noise alone causes).{_warning_above_noise(diagnosis, 'nominal')}"
     )
 
 
 def _data(diagnosis: Diagnosis) -> str:
     ids = list(dict.fromkeys(fault.id.replace("_", " ") for fault in diagnosis.data_faults))
     faults = f" ({listed(ids)})" if ids else ""
-    return f"The recording is at fault{faults}. No physics can be identified from it until the fault is corrected."
+    return f"The recording is faulty{faults}. No physics can be identified from it until the fault is corrected."
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:
@@ -301,8 +301,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     if rest is None:
         return text + "."
     where = listed([CHANNEL_WORDS.get(c, c) for c in rest.channels])
-    shows = f" It shows in {where}" if where else " It shows"
-    return f"{text}.{shows}, {regime_words(rest.regime)}; its kind: {rest.kind or 'unknown'}."
+    shows = f" The error appears in {where}" if where else " The error appears"
+    return f"{text}.{shows}, {regime_words(rest.regime)}. Class: {rest.kind or 'unknown'}."
 
 
 def _inconclusive(diagnosis: Diagnosis) -> str:
@@ -311,35 +311,35 @@ def _inconclusive(diagnosis: Diagnosis) -> str:
 
 
 def regime_words(regime: str) -> str:
-    """A regime rule in a sentence: ``mostly where speed > 2 m/s``."""
+    """A regime as a clause: ``mostly where speed > 2 m/s``."""
     if not regime or regime == "everywhere alike":
-        return "everywhere alike"
+        return "equally in all driving conditions"
     return f"mostly where {regime}"
 
 
 def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
-    """The manoeuvre to drive next, empty where none would help, and the reason."""
+    """The manoeuvre to drive next (empty if none would help) and the reason."""
     for effect in diagnosis.effects:
         if effect.indistinguishable_from:
             drive = effect.separating_drive
             drive = drive if drive in MANOEUVRES else separating_drive(effect.id, effect.indistinguishable_from)
             reason = separating_reason(effect.id, effect.indistinguishable_from)
             others = listed([effect_noun(name) for name in effect.indistinguishable_from], "or")
-            return drive, f"It is open whether it is {effect_noun(effect.id)} or {others}. {reason}"
+            return drive, f"These recordings do not distinguish {effect_noun(effect.id)} from {others}. {reason}"
     advice = diagnosis.advice or (diagnosis.sentence if diagnosis.verdict == "inconclusive" else "")
     if diagnosis.verdict == "data":
         return "", advice or "Correct the recording or record again. Then diagnose again."
     if diagnosis.verdict == "inconclusive":
         drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
         own = advice if advice != diagnosis.sentence else ""
-        return drive, own or "This drive contains what these recordings lack:"
+        return drive, own or "This drive provides the excitation that these recordings lack."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
         channels = diagnosis.unexplained.channels
         along = bool(channels) and channels[0] in ("x", "vx")
-        what = "the drive" if along else "steering and tyres"
+        motion = "longitudinal" if along else "lateral"
         return (
             "coast_down" if along else "steering_chirp",
-            advice or f"The residual shows in {what}. A drive that excites it shows its form.",
+            advice or f"The residual is in the {motion} motion. Record a drive that excites it.",
         )
     if diagnosis.verdict == "mismatch":
         return "figure_eight", advice or (

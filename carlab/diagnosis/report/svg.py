@@ -1,4 +1,4 @@
-"""Small charts as inline SVG whose colours come from the page's style sheet, so that they follow light and dark."""
+"""Charts as inline SVG. The page's style sheet sets their colours, so they follow the light and dark schemes."""
 
 from __future__ import annotations
 
@@ -12,41 +12,41 @@ from numpy.typing import ArrayLike
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.report.sentences import number
 
-MOST_POINTS = 600
+MAX_LINE_POINTS = 600
 
 
-def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Round numbers (1, 2 or 5 times a power of ten) within [low, high], at most ``most`` + 1."""
+def nice_ticks(low: float, high: float, max_steps: int = 5) -> list[float]:
+    """Ticks in [low, high], a step of 1, 2 or 5 times a power of ten apart, at most ``max_steps`` + 1."""
     if not (math.isfinite(low) and math.isfinite(high)) or high <= low:
         return [low] if math.isfinite(low) else []
-    raw = (high - low) / most
+    raw = (high - low) / max_steps
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= raw * (1 - 1e-9))
     first = math.ceil(low / step - 1e-9)
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def padded(values: ArrayLike, share: float = 0.06, least: float = 1e-9) -> tuple[float, float]:
+def padded(values: ArrayLike, share: float = 0.06, min_margin: float = 1e-9) -> tuple[float, float]:
     """Range of the finite values with a margin; (0, 1) for none."""
     seen = np.asarray(values, dtype=np.float64).ravel()
     seen = seen[np.isfinite(seen)]
     if not len(seen):
         return 0.0, 1.0
     low, high = float(seen.min()), float(seen.max())
-    margin = max(share * (high - low), least, 1e-3 * max(abs(low), abs(high)) if high - low < 1e-12 else 0.0)
+    margin = max(share * (high - low), min_margin, 1e-3 * max(abs(low), abs(high)) if high - low < 1e-12 else 0.0)
     return low - margin, high + margin
 
 
 class Chart:
-    """Axes with lines, dots, spans and words in data coordinates.
+    """Axes with lines, dots, spans and text in data coordinates.
 
     Args:
-        title: What a screen reader says; not drawn.
+        title: Text for screen readers; not drawn.
         x: Range of the abscissa.
         y: Range of the ordinate.
         size: Width and height of the drawing [px]; it scales with the page.
         labels: Names of both axes, with units.
-        equal: One unit is as long on both axes: the ranges grow to fit.
+        equal: Give both axes the same scale by extending one range.
     """
 
     def __init__(
@@ -87,8 +87,8 @@ class Chart:
         return self._size[1] - self._bottom - (y - low) / (high - low) * (self._size[1] - self._top - self._bottom)
 
     def line(self, x: FloatArray, y: FloatArray, style: str, breaks: Sequence[int] = ()) -> None:
-        """A line; it is broken at NaN and before each row of ``breaks``. Long ones are thinned."""
-        every = max(len(x) // MOST_POINTS, 1)
+        """Draw a line, broken at NaN and before each row of ``breaks``; long lines are thinned."""
+        every = max(len(x) // MAX_LINE_POINTS, 1)
         broken = set(breaks)
         pieces: list[str] = []
         pen = "M"
@@ -124,7 +124,7 @@ class Chart:
         right = self._size[0] - self._right
         self._back.append(f'<path class="level {style}" d="M{self._left:.1f} {self.py(y):.1f}H{right:.1f}"/>')
         if words:
-            self.words(self._x[1], y, words, "end", -4.0)
+            self.text(self._x[1], y, words, "end", -4.0)
 
     def spans(self, pieces: Sequence[tuple[float, float]], style: str) -> None:
         """Stretches of the abscissa, shaded from top to bottom."""
@@ -153,7 +153,7 @@ class Chart:
         size = abs(self.px(x + radius) - self.px(x))
         self._back.append(f'<circle class="{style}" cx="{self.px(x):.1f}" cy="{self.py(y):.1f}" r="{size:.1f}"/>')
 
-    def words(self, x: float, y: float, text: str, anchor: str = "start", above: float = 0.0) -> None:
+    def text(self, x: float, y: float, text: str, anchor: str = "start", above: float = 0.0) -> None:
         """Words at a place; ``above`` moves them [px], negative up."""
         self._front.append(
             f'<text class="note" x="{self.px(x):.1f}" y="{self.py(y) + above:.1f}" '
@@ -165,12 +165,12 @@ class Chart:
         wide, high = self._size
         bottom, right = high - self._bottom, wide - self._right
         parts = [f'<svg viewBox="0 0 {wide} {high}" role="img"><title>{escape(self._title)}</title>']
-        for tick in nice_ticks(*self._y, most=4):
+        for tick in nice_ticks(*self._y, max_steps=4):
             at = self.py(tick)
             parts.append(f'<path class="grid" d="M{self._left:.1f} {at:.1f}H{right:.1f}"/>')
             place = f'x="{self._left - 6:.1f}" y="{at + 3.5:.1f}" text-anchor="end"'
             parts.append(f'<text class="tick" {place}>{number(tick)}</text>')
-        for tick in nice_ticks(*self._x, most=5):
+        for tick in nice_ticks(*self._x, max_steps=5):
             at = self.px(tick)
             parts.append(f'<path class="grid" d="M{at:.1f} {self._top:.1f}V{bottom:.1f}"/>')
             parts.append(

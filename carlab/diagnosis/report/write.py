@@ -25,19 +25,19 @@ COMMENT_CHARACTERS = 110
 
 
 def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: SimulatorConfig) -> None:
-    """Write the whole report; a report that is there already is replaced.
+    """Write the whole report and replace an existing one.
 
-    Each file appears whole or not at all. report.json is written last: where it exists, the others do. A diagnosis
+    Each file is written atomically. report.json is written last, so if it exists, all files exist. A diagnosis
     without a sentence or advice gets those of ``report.sentences``.
 
     Args:
-        diagnosis: the answer.
-        exhibits: material for the pictures; may be empty.
-        folder: made where it is missing.
-        model: the simulator with everything found, for model.toml.
+        diagnosis: the result.
+        exhibits: data of the figures; may be empty.
+        folder: created if missing.
+        model: the simulator with the fitted parameters and effects, for model.toml.
 
     Raises:
-        DataError: the folder cannot be made or written to; the message says why and what to do.
+        DataError: the folder cannot be created or written; the message states reason and remedy.
     """
     from carlab.diagnosis.report.html_page import render_page
     from carlab.diagnosis.report.picture import draw_picture
@@ -73,7 +73,7 @@ def write_decisions(exhibits: Exhibits, folder: Path) -> Path:
 
 
 def completed(diagnosis: Diagnosis) -> Diagnosis:
-    """The diagnosis with sentences and advice in words, where it brings none."""
+    """The diagnosis with default sentences and advice where it has none."""
     sentence = diagnosis.sentence or text.verdict_sentence(diagnosis)
     drive, why = text.next_drive(diagnosis)
     command = text.drive_command(drive)
@@ -85,7 +85,7 @@ def completed(diagnosis: Diagnosis) -> Diagnosis:
 
 
 def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
-    """The simulator as a car file, with comments that say where its numbers come from."""
+    """The simulator as a car file; comments state the origin of its numbers."""
     fitted = [use.path for use in diagnosis.recordings if use.role == "fit"]
     found = text.listed([effect.id for effect in diagnosis.effects])
     held = diagnosis.held_out
@@ -95,8 +95,8 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
         lines.append(effect.sentence or text.effect_sentence(effect.id, effect.parameters))
         if effect.indistinguishable_from:
             others = text.listed(list(effect.indistinguishable_from), "or")
-            lines.append(f"These recordings cannot tell {effect.id} from {others}.")
-    lines += [f"Fitted to: {path}" for path in fitted] or ["Fitted to no recording: the car file as it was given."]
+            lines.append(f"These recordings do not distinguish {effect.id} from {others}.")
+    lines += [f"Fitted to: {path}" for path in fitted] or ["Not fitted: the car file as given."]
     scores = [
         f"{name} {text.number(held[name].score)}" for name in ("nominal", "refit", "with_effects") if name in held
     ]
@@ -107,7 +107,7 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
 
 
 def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:
-    """The simulator with the standard deviation of every estimated number, which becomes a prior of learning."""
+    """The simulator with the standard deviation of every estimate; ``carlab learn`` uses it as prior width."""
     estimates = dict(diagnosis.parameters)
     for effect in diagnosis.effects:
         estimates |= {f"effects.{effect.id}.{name}": found for name, found in effect.parameters.items()}
@@ -121,7 +121,7 @@ def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> Simulato
 
 
 def _rows(line: str) -> list[str]:
-    """A comment in rows; characters that TOML forbids in comments are shown as question marks."""
+    """Wrap a comment; characters that TOML forbids in comments become question marks."""
     words = "".join(c if c.isprintable() else "?" for c in line).split(" ")
     rows = [words[0]]
     for word in words[1:]:

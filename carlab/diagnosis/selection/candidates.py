@@ -1,4 +1,4 @@
-"""Candidates for the next effect: screened, refitted, tested on unseen blocks, and accepted or not.
+"""Candidates for the next effect: screening, refit, test on unseen blocks, acceptance.
 
 A gain in likelihood is divided by its design effect, the ratio of the sandwich covariance to the naive one (Kent 1982),
 because neighbouring errors are dependent. It must hold on blocks of the recording that are not fitted.
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -> tuple[Candidate, ...]:
-    """Candidates refitted together with ``model``: those tested on unseen blocks first, the best of them first."""
+    """Refitted candidates, sorted by gain; those tested on unseen blocks come first."""
     names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
     screened = screen_candidates(problem, model, names)
     refitted = []
@@ -84,7 +84,7 @@ def with_unseen_gain(problem: SearchProblem, fitter: Fitter, candidate: Candidat
 
 
 def acceptance(problem: SearchProblem, candidate: Candidate) -> tuple[tuple[Condition, ...], ...]:
-    """Alternatives of which one must hold for a candidate to be accepted."""
+    """Alternative sets of conditions; a candidate is accepted if all conditions of one set hold."""
     settings = problem.settings.selection
     share = candidate.unseen_gain / problem.perfect_loss()
     ratio = candidate.unseen_gain / candidate.gain if candidate.gain > 0.0 else -math.inf
@@ -118,7 +118,7 @@ def is_accepted(problem: SearchProblem, candidate: Candidate) -> bool:
 def accept(
     problem: SearchProblem, model: Model, candidates: tuple[Candidate, ...], control: RunControl
 ) -> Candidate | None:
-    """The first acceptable candidate; None where there is none."""
+    """The first candidate that is accepted, or None."""
     for c in candidates:
         if c.is_tested:
             conditions = acceptance(problem, c)

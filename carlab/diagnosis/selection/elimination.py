@@ -1,4 +1,4 @@
-"""Backward elimination: effects that unseen blocks do not miss are removed."""
+"""Backward elimination: remove effects whose removal does not increase the loss on unseen blocks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Deletion:
-    """A model without one of its effects, refitted, and the rise of the loss on unseen blocks in standard errors."""
+    """A refitted model without one effect, and the increase of its loss on unseen blocks in standard errors."""
 
     without: Fit
     standard_errors: float
@@ -24,14 +24,14 @@ class Deletion:
 
 @dataclass(frozen=True, slots=True)
 class EliminationResult:
-    """A model whose effects unseen blocks miss, and the deletion of each of them."""
+    """The remaining model, and the deletion of each of its effects."""
 
     model: Model
     deletions: Mapping[str, Deletion]
 
 
 def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> dict[str, Deletion]:
-    """Each effect of the model removed, everything else refitted."""
+    """Remove each effect in turn and refit the others."""
     if not model.effects:
         return {}
     fitter = problem.fitter(model.scale)
@@ -47,7 +47,7 @@ def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> di
 
 
 def eliminate(problem: SearchProblem, model: Model, control: RunControl) -> EliminationResult:
-    """Remove the effect that unseen blocks miss least, until they miss all that are left."""
+    """Remove the weakest effect on unseen blocks until all remaining effects are significant."""
     keep_z_min = problem.settings.selection.keep_z_min
     deletions = delete_each(problem, model, control)
     while len(model.effects) > 1 and not control.stop():
@@ -58,7 +58,7 @@ def eliminate(problem: SearchProblem, model: Model, control: RunControl) -> Elim
         control.record(Decision("keep", weakest, ((condition,),), kept, len(model.effects)))
         if kept:
             break
-        log.info("unseen blocks do not miss %s (%.1f standard errors)", weakest, z)
+        log.info("removed %s: the loss on unseen blocks rises by %.1f standard errors only", weakest, z)
         model = Model(tuple(e for e in model.effects if e != weakest), deletions[weakest].without, model.scale)
         deletions = delete_each(problem, model, control)
     return EliminationResult(model, deletions)

@@ -1,6 +1,6 @@
-"""Moves after an effect is accepted: earlier effects are removed, or swapped with confusable ones.
+"""Moves after an effect is accepted: remove earlier effects, or swap them with confusable effects.
 
-The first effect that is accepted is often a proxy of the true one.
+The first accepted effect is often a proxy of the true effect.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Model:
-    """Remove earlier effects that are no longer needed, and swap those that a confusable effect replaces better."""
+    """Remove earlier effects that are no longer significant, and swap those with a better confusable effect."""
     if len(model.effects) < 2 or control.stop():
         return model
     fitter = problem.fitter(model.scale)
@@ -25,7 +25,7 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
         reduced = refit(problem, others, model.fit, model.scale)
         chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / design_effect_of(fitter.with_covariance(model.fit), name)
         if chi2 < problem.settings.selection.keep_chi2_min:
-            log.info("%s is no longer needed (chi2 %.1f)", name, chi2)
+            log.info("%s is no longer significant (chi2 %.1f)", name, chi2)
             config = problem.config_with(others)
             smaller = fit_with_scale(problem, others, config, reduced.fit.free, reduced.fit.z)
             return apply_moves(problem, smaller, control)
@@ -36,7 +36,7 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
 
 
 def _swap(problem: SearchProblem, model: Model, reduced: Model, name: str, control: RunControl) -> Model | None:
-    """The model with a confusable effect in place of ``name``; None where none is clearly better."""
+    """The model with a confusable effect in place of ``name``; None if none is significantly better."""
     settings = problem.settings.selection
     screening = problem.settings.screening
     fitter = problem.fitter(model.scale)

@@ -1,4 +1,4 @@
-"""Pairwise comparison of each accepted effect with the effects that it may be confused with, on unseen blocks.
+"""Pairwise comparison of each accepted effect with its confusable effects on unseen blocks.
 
 The comparison is that of non-nested models (Vuong 1989), with losses on blocks that are not fitted and standard errors
 clustered by block.

@@ -1,4 +1,4 @@
-"""What a search for missing effects works on, and the fitted models that its stages hand on."""
+"""Data of a search for missing effects: the problem, fitted models, candidates and the result."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from sim_backends.effects import CATALOGUE, EFFECTS
 
 @dataclass(frozen=True, slots=True)
 class SearchProblem:
-    """A simulator that lacks effects, and prediction windows that show it.
+    """A simulator, prediction windows of recordings, and candidate effects.
 
-    nominal       the car file's simulator; its own effects stay, with their numbers fitted
-    windows       of the recordings to fit
-    floor   (6,)  standard deviation of each channel's error that a perfect simulator would leave
-    confusable    by effect id, the effects that may be taken for it
+    nominal       simulator of the car file; its effects stay, and their parameters are fitted
+    windows       windows of the recordings to fit
+    floor   (6,)  standard deviation of each channel's error of a perfect simulator
+    confusable    confusable effects by effect id
     candidates    effects that may be accepted
     """
 
@@ -44,34 +44,34 @@ class SearchProblem:
     settings: DiagnosisSettings = DEFAULT
 
     def free_parameters(self, effects: Sequence[str]) -> tuple[FitParameter, ...]:
-        """The numbers that a fit with ``effects`` moves."""
+        """Free parameters of a fit with ``effects``."""
         own = [f for name in self.nominal.effects for f in effect_parameters(name, self.nominal)]
         added = [f for name in effects for f in effect_parameters(name, self.nominal)]
         return (*base_parameters(self.nominal, self.settings.identification), *own, *added)
 
     def fitter(self, scale: Scale) -> Fitter:
-        """A fitter of the windows with a scale of errors."""
+        """A fitter for the windows with an error scale."""
         return Fitter(self.windows, scale, self.settings.identification)
 
     def config_with(self, effects: Sequence[str]) -> SimulatorConfig:
-        """The simulator with ``effects`` switched on at their identities."""
+        """The simulator with ``effects`` added at their identity values."""
         config = self.nominal
         for name in effects:
             config = with_effect(config, name)
         return config
 
     def nominal_coordinates(self, free: Sequence[FitParameter]) -> FloatArray:
-        """Coordinates of ``free`` at the car file's numbers; 0 where it has none."""
+        """Coordinates of ``free`` at the values of the car file; 0 without a value."""
         values = self.nominal.values()
         return np.array([f.coordinate(values[f.name]) if f.name in values else 0.0 for f in free])
 
     def is_candidate(self, effect: str) -> bool:
-        """Whether the effect may be accepted at all."""
+        """Whether the effect may be accepted."""
         known = effect in self.candidates and effect not in self.nominal.effects
         return known and is_applicable(self.nominal, effect)
 
     def folds(self) -> IndexArray:
-        """Number of each window's fold (S,); windows of a block share it."""
+        """Index of each window's fold (S,); the windows of a block are in one fold."""
         blocks = np.unique(self.windows.block)
         count = min(self.settings.selection.folds, max(len(blocks), 1))
         return np.asarray(np.searchsorted(blocks, self.windows.block) % count)
@@ -81,7 +81,7 @@ class SearchProblem:
         return 0.5 * len(self.windows) * 6 * self.settings.identification.loss_steps
 
     def required_chi2(self, effect: str) -> float:
-        """What an effect's chi2 must exceed: more for more numbers and for an infinite identity."""
+        """Minimum chi2 of an effect; it grows with the number of parameters and for an infinite identity value."""
         settings = self.settings.selection
         numbers = [p for p in EFFECTS[effect].parameters if not p.choices]
         infinite = any(p.identity is not None and math.isinf(p.identity) for p in numbers)
@@ -103,9 +103,9 @@ class Candidate:
 
     gain            fall of the loss on the windows that are fitted
     chi2            twice the gain over its design effect
-    unseen_gain     fall of the loss on blocks that are not fitted; -inf where not tested
+    unseen_gain     fall of the loss on blocks that are not fitted; -inf if not tested
     unseen_error    its clustered standard error
-    unseen_loss     of each window (S,); empty where not tested
+    unseen_loss     of each window (S,); empty if not tested
     """
 
     effect: str
@@ -129,16 +129,16 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """What a search found.
+    """Result of a search.
 
     base      refit without effects
     best      fit with the accepted effects
     effects   accepted, the strongest first
-    chi2      of each accepted effect when it is removed from ``best``
+    chi2      chi2 of the removal of each accepted effect from ``best``
     rivals    effects that unseen blocks do not distinguish from each accepted effect
     history   (effect, fit) in the order of acceptance
     tried     candidates for the first effect
-    scale     of the errors of ``best``
+    scale     error scale of ``best``
     """
 
     base: Fit
@@ -156,17 +156,17 @@ class SearchResult:
         return Model(self.effects, self.best, self.scale)
 
     def without_effects(self) -> SearchResult:
-        """The same search where no effect is accepted."""
+        """The result with no accepted effect."""
         return replace(self, best=self.base, effects=(), chi2={}, rivals={}, history=())
 
 
 @dataclass(frozen=True, slots=True)
 class RunControl:
-    """Who is informed of a run, and who ends it.
+    """Callbacks of a run.
 
-    progress    called with the activity and the share that is done, in [0, 1]
-    stop        asked between fits; once true, a stage ends with what it has
-    record      called with each decision about a name
+    progress    called with the activity and the completed share in [0, 1]
+    stop        called between fits; if it returns true, a stage ends with its present result
+    record      called with each decision about an effect
     """
 
     progress: Callable[[str, float], None] = lambda activity, share: None
@@ -175,7 +175,7 @@ class RunControl:
 
 
 def is_applicable(config: SimulatorConfig, effect: str) -> bool:
-    """Whether the effect can be identified beside this simulator's base model and what a fit estimates of it."""
+    """Whether the effect can be identified with this base model and its free parameters."""
     of_unknown = any(p.same_as in config.unknown for p in EFFECTS[effect].parameters)
     return config.kind in EFFECTS[effect].base_models and not of_unknown
 

@@ -1,4 +1,4 @@
-"""Joint refits: an effect is fitted together with the base parameters, which absorb most of any effect."""
+"""Joint refits of effects and base parameters, because base parameters absorb most of an effect."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim_backends.car_parameters import SimulatorConfig
 
 
 def refit(problem: SearchProblem, effects: tuple[str, ...], initial: Fit, scale: Scale) -> Model:
-    """Fit with ``effects``, starting from the numbers that ``initial`` has of them."""
+    """Fit with ``effects``, starting from their values in ``initial``."""
     free = problem.free_parameters(effects)
     known = {f.name: float(z) for f, z in zip(initial.free, initial.z, strict=True)}
     start = np.array([known.get(f.name, 0.0) for f in free])
@@ -44,7 +44,7 @@ def fit_with_scale(
     free: tuple[FitParameter, ...],
     start: FloatArray,
 ) -> Model:
-    """Fit until the scale of the errors has converged with it."""
+    """Alternate fits and estimates of the error scale until the scale converges."""
     settings, identification = problem.settings.selection, problem.settings.identification
     windows, floor = problem.windows, problem.floor
     scale = Scale.of(

@@ -1,7 +1,7 @@
-"""Uncatalogued physics as a rival of the names: a name is not given to what a rival explains as well.
+"""Uncatalogued physics as a rival of effects: an effect is not accepted if a rival explains as much.
 
-Rivals are fitted like any effect (``sim_backends.effects.uncatalogued``) but are never named. Where the recordings call
-for one of them, its class statement describes the residual.
+Rivals are fitted like effects (``sim_backends.effects.uncatalogued``) but are never named. The class statement of a
+significant rival describes the residual.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class RivalPhysics:
-    """Uncatalogued physics that a fit calls for.
+    """Significant uncatalogued physics.
 
-    effect   its id among the uncatalogued effects
-    fit      with it and with ``names`` of the catalogue
-    gain     fall of the cost by it
+    effect   id of the uncatalogued effect
+    fit      fit with it and with ``names``
+    gain     fall of the cost with it
+    names    effects of the catalogue in the fit
     """
 
     effect: str
@@ -33,18 +34,18 @@ class RivalPhysics:
     names: tuple[str, ...] = ()
 
     def class_statement(self) -> str:
-        """What kind of physics it is."""
+        """Class of the physics."""
         return EFFECTS[self.effect].class_statement
 
     def formula(self) -> str:
-        """Its numbers."""
+        """Fitted parameters in one line."""
         values = self.fit.values()
         numbers = ((p.name, values[f"effects.{self.effect}.{p.name}"], p.unit) for p in EFFECTS[self.effect].parameters)
         return f"{self.effect}: " + ", ".join(f"{name} {value:.3g} {unit}".strip() for name, value, unit in numbers)
 
 
 def replacing_physics(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
-    """A rival that explains as much as all names together, or as one of two names; None where there is none."""
+    """A rival that explains as much as all effects together or as one of two effects, or None."""
     settings = problem.settings.rivals
     names = found.effects
     if not names or len(names) > 2 * settings.max_single_names or control.stop():
@@ -60,14 +61,14 @@ def replacing_physics(problem: SearchProblem, found: SearchResult, control: RunC
             more_numbers = len(EFFECTS[rival.effect].parameters) - numbers
             penalty = 0.5 * settings.chi2_per_number * design_effect * more_numbers
             lead = found.best.cost - rival.fit.cost - penalty
-            log.info("%s replacing %s: leads by %.1f", rival.effect, ", ".join(replaced), lead)
+            log.info("%s replacing %s: cost lower by %.1f", rival.effect, ", ".join(replaced), lead)
             if lead > 0.0:
                 return RivalPhysics(rival.effect, rival.fit, rival.gain, kept)
     return None
 
 
 def additional_physics(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
-    """The rival that the fit with all names still calls for; None where there is none."""
+    """The strongest significant rival in addition to all effects, or None."""
     if control.stop():
         return None
     chi2_min = problem.settings.rivals.additional_chi2_min
@@ -82,7 +83,7 @@ def additional_physics(problem: SearchProblem, found: SearchResult, control: Run
 
 
 def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float) -> list[Candidate]:
-    """Rivals added to ``model`` whose screening scores are above ``min_score``, fitted, the best first."""
+    """Rivals added to ``model`` whose screening scores are above ``min_score``, fitted, the highest score first."""
     names = [e.id for e in EFFECTS.values() if not e.catalogued and e.id not in problem.nominal.effects]
     screened = [result for result in screen_candidates(problem, model, names) if result.score > min_score]
     return [refit_candidate(problem, model, result) for result in screened[: problem.settings.rivals.max_refits]]

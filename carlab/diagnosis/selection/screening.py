@@ -1,9 +1,8 @@
-"""Score test of every candidate effect before it is fitted, with the present parameters projected out.
+"""Score test of every candidate effect before its fit, with the free parameters projected out.
 
-The error changes by a secant g when a candidate is switched on at some size. The Jacobian of the parameters that are
-already free is projected out of it, as in a score test (Rao 1948). The sizes are finite because a dead band or a
-clipped force has no slope at its identity. They are chosen by the change of the errors that they cause, so that
-nothing depends on a guess of an effect's usual size.
+A candidate at a finite size changes the errors by a secant g. The Jacobian of the free parameters is projected out of
+g, as in a score test (Rao 1948). The sizes are finite because a dead band or a clipped force has no slope at its
+identity value. Sizes are chosen by the change of the errors that they cause, not by a typical size of the effect.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ class Screen:
 
     Args:
         fitter: windows and scale.
-        config: simulator with the effects of ``best`` switched on.
-        best: the present fit.
-        max_windows: windows that are used, evenly taken; scores refer to all windows. All unless given.
-        settings: of the screening.
+        config: simulator with the effects of ``best``.
+        best: fit to which candidates are added.
+        max_windows: maximum number of windows, thinned evenly; scores refer to all windows. Default: all.
+        settings: settings of the screening.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class Screen:
         return np.asarray(weighted - self._inside @ (self._inside.T @ weighted))
 
     def score(self, effect: str, free: Sequence[FitParameter]) -> ScreeningResult:
-        """Score of a candidate, the largest over its sizes, signs and places."""
+        """Score of a candidate: the maximum over its sizes, signs and places."""
         settings = self.settings
         config = with_effect(self.config, effect)
         points = self._points(config, effect, tuple(free))
@@ -109,7 +108,7 @@ class Screen:
         return self.fitter.white(config, (*self.best.free, *free), full)
 
     def _points(self, config: SimulatorConfig, effect: str, free: tuple[FitParameter, ...]) -> FloatArray:
-        """Coordinates (P, n) at which the candidate is tried."""
+        """Coordinates (P, n) at which the candidate is evaluated."""
         own = EFFECTS[effect].screening_points(_Probe(self, config, free))
         if own is not None:
             return own
@@ -155,7 +154,7 @@ def _grid(free: FitParameter, settings: ScreeningSettings) -> FloatArray:
 
 
 class _Probe:
-    """A screen as effects see it (``ScreeningProbe``): in the effect's own numbers instead of coordinates."""
+    """Implements ``ScreeningProbe``: a screen in the effect's parameter values instead of coordinates."""
 
     def __init__(self, screen: Screen, config: SimulatorConfig, free: tuple[FitParameter, ...]) -> None:
         self._screen, self._config, self._free = screen, config, free

@@ -2,7 +2,7 @@
 
 Each step screens all candidates, refits the best of them together with the base parameters, tests them on unseen
 blocks, accepts one, and applies moves. Elimination and pairwise comparison follow. The stages exchange fitted models
-(``selection.problem``); none of them calls a later one.
+(``selection.problem``); no stage calls a later stage.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
     history: list[tuple[str, Fit]] = []
     tried: tuple[Candidate, ...] = ()
     while len(model.effects) < max_effects and not control.stop():
-        control.progress(f"looking for effect {len(model.effects) + 1}", len(model.effects) / max_effects)
+        control.progress(f"searching for effect {len(model.effects) + 1}", len(model.effects) / max_effects)
         candidates = next_candidates(problem, model, control)
         if not model.effects:
             tried = candidates

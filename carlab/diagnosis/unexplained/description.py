@@ -1,8 +1,8 @@
-"""The residual when every accepted effect is in: its channel, its regime, its class, and a formula.
+"""Residual with all accepted effects: its channels, regime, class, and a formula.
 
-Terms of a library with physical meaning are added one by one to the acceleration of a channel, each by its effect on
-the errors of whole windows with the free parameters following (forward selection, as in discrepancy modelling with
-sparse regression; Brunton et al. 2016, Kaheman et al. 2019). The inputs of the chosen terms make the class statement.
+Forward selection adds terms of a library to the acceleration of a channel, by their influence on the errors of whole
+windows with the free parameters projected out (discrepancy modelling with sparse regression; Brunton et al. 2016,
+Kaheman et al. 2019). The chosen terms give the class statement.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _ACTS_ON = (
     ("vy and yaw_rate, like a side force of the front axle", "F_front/m"),
     ("vy and yaw_rate, like a side force of the rear axle", "F_rear/m"),
 )
-"""What a term may act on, in words and symbols; forces are in m/s2 of the whole car's mass."""
+"""Channels of a term as text and symbol; forces are divided by the mass of the car [m/s2]."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChosenTerm:
-    """One term with what it acts on (its number in ``_ACTS_ON``), its coefficient and its gain in likelihood."""
+    """A term, its channel (index in ``_ACTS_ON``), coefficient and gain in log-likelihood."""
 
     term: Term
     channel: int
@@ -43,9 +43,9 @@ class ChosenTerm:
 
 @dataclass(frozen=True, slots=True)
 class ResidualModel:
-    """Terms without a name that a fit calls for.
+    """Significant unnamed terms.
 
-    fall  (6,)  fall of the mean squared error at the ends of windows that they predict, in squared units
+    fall  (6,)  predicted fall of the mean squared error at the ends of windows, in squared units
     """
 
     chosen: tuple[ChosenTerm, ...]
@@ -53,11 +53,11 @@ class ResidualModel:
 
     @property
     def gain(self) -> float:
-        """Fall of the loss by all terms."""
+        """Fall of the loss with all terms."""
         return sum(c.gain for c in self.chosen)
 
     def class_statement(self) -> str:
-        """What kind of physics is missing."""
+        """Class of the missing physics."""
         if not self.chosen:
             return "no term of the library explains it: like noise, vibration (oscillating), or a hidden state"
         parts: list[str] = []
@@ -68,7 +68,7 @@ class ResidualModel:
         return ". ".join(parts)
 
     def formula(self) -> str:
-        """Missing accelerations in SI units; steering d and throttle u in [-1, 1] as they act, r the yaw rate."""
+        """Missing accelerations in SI units; d is steering and u throttle in [-1, 1] after delays, r yaw rate."""
         rows = []
         for channel, (_, symbol) in enumerate(_ACTS_ON):
             own = [c for c in self.chosen if c.channel == channel]
@@ -79,7 +79,7 @@ class ResidualModel:
 
 @dataclass(frozen=True, slots=True)
 class _Library:
-    """Unit columns (N, S U 6) of the terms by what they act on, projected, with their terms, channels and lengths."""
+    """Projected unit columns (N, S U 6) of terms on channels, with term, channel and norm of each."""
 
     columns: FloatArray
     labels: tuple[tuple[Term, int, float], ...]
@@ -92,14 +92,14 @@ def fit_residual_terms(
     term_chi2_min: float | None = None,
     settings: UnexplainedSettings = DEFAULT.unexplained,
 ) -> ResidualModel:
-    """Forward selection of unnamed terms in addition to everything that ``fit`` has.
+    """Forward selection of unnamed terms in addition to ``fit``.
 
     Args:
-        windows: that were fitted.
-        fit: with its accepted effects.
-        scale: of the errors.
-        term_chi2_min: least chi2 of a term; that of the settings unless given.
-        settings: of the selection.
+        windows: windows of the fit.
+        fit: fit with the accepted effects.
+        scale: error scale.
+        term_chi2_min: minimum chi2 of a term; by default that of the settings.
+        settings: settings of the selection.
     """
     fitter = Fitter(windows, scale)
     screen = Screen(fitter, fit.config, fit)
@@ -125,7 +125,7 @@ def fit_residual_terms(
 def _library(
     windows: PredictionWindows, fit: Fit, scale: Scale, screen: Screen, settings: UnexplainedSettings
 ) -> _Library | None:
-    """Columns of all terms that change the errors; None where there are none."""
+    """Columns of all terms that change the errors, or None."""
     response = responses(windows, fit.config, scale, settings)
     arms = _arms(fit.config)
     columns, labels = [], []
@@ -142,7 +142,7 @@ def _library(
 def _select(
     library: _Library, residual: FloatArray, chi2_min: float, design_effect: float, settings: UnexplainedSettings
 ) -> tuple[list[int], list[float]]:
-    """Columns that are chosen one after the other by orthogonal projection, and their gains."""
+    """Indices of the columns chosen by orthogonal matching pursuit, and their gains."""
     design, labels = library.columns, library.labels
     picked: list[int] = []
     gains: list[float] = []
@@ -174,14 +174,14 @@ def _arms(config: SimulatorConfig) -> tuple[float, float]:
 def describe(
     share: float, statement: str, formula: str, of_channel: FloatArray, size: FloatArray, seen: dict[str, FloatArray]
 ) -> Unexplained:
-    """The report's entry of what stays unexplained.
+    """Entry of the report for the unexplained residual.
 
     Args:
-        share: of the squared excess.
-        statement: what kind of physics is missing.
-        formula: of the missing accelerations.
-        of_channel: how much is missing in each channel (6,), in squared noise floors.
-        size: of each held-out window's error (S,).
+        share: unexplained share of the squared excess.
+        statement: class of the missing physics.
+        formula: formula of the missing accelerations.
+        of_channel: squared error of the missing physics in each channel (6,), in squared noise floors.
+        size: error of each held-out window (S,).
         seen: features at the starts of the held-out windows, each (S,).
     """
     order = np.argsort(-of_channel)
@@ -190,7 +190,7 @@ def describe(
 
 
 def start_features(windows: PredictionWindows) -> dict[str, FloatArray]:
-    """Speeds, yaw rate, commands and their rates, place and time at the start of each window (S,)."""
+    """Speeds, yaw rate, commands and their rates, and time at the start of each window (S,)."""
     past = windows.past_commands[:, -max(round(0.1 / windows.period_s), 2) :]
     span = past.shape[1] * windows.period_s
     return {

@@ -1,8 +1,8 @@
-"""A library of accelerations without a name, and the change of the errors of whole windows by each of them.
+"""Library of unnamed accelerations, and the change of the errors of whole windows by each of them.
 
-A missing acceleration g(t) on a channel changes the error at the end of a window by the sum of its impulses, each
-carried on by the simulator. Impulse responses are computed by restarts of the simulator within the windows. Each term
-then costs a matrix product (a linear response, as in the adjoint method of discrepancy modelling).
+A missing acceleration g(t) on a channel changes the error at the end of a window by the sum of its impulses, propagated
+by the simulator. Impulse responses are computed by restarts of the simulator within the windows. Each term then costs a
+matrix product (a linear response, as in the adjoint method of discrepancy modelling).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Features = dict[str, FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """A term of the library: formula in plain symbols, its class statement, what it depends on, and its value."""
+    """A term of the library: formula, class statement, inputs, and its value as a function of features."""
 
     formula: str
     statement: str
@@ -56,7 +56,7 @@ STEP_SHARES = tuple(float(p) for p in np.geomspace(0.05, 0.8, 22))
 WAVELENGTHS_M = (0.4, 0.5, 0.64, 0.8, 1.0, 1.3, 1.7, 2.2)
 """Wavelengths [m] of terms that repeat with the place."""
 TERMS: tuple[Term, ...] = (
-    Term("1", "constant: a bias whatever the car does", ("bias",), lambda f: np.ones_like(f["v"])),
+    Term("1", "constant: a bias in all driving conditions", ("bias",), lambda f: np.ones_like(f["v"])),
     Term("sign(v)", "odd in speed and independent of its size, like dry friction", ("speed",),
          lambda f: np.tanh(f["v"] / 0.05)),
     Term("v", "odd in speed, proportional to it", ("speed",), lambda f: f["v"]),
@@ -131,7 +131,7 @@ TERMS: tuple[Term, ...] = (
 class Responses:
     """Changes of the whitened errors by impulses: matrix (3, J, S, U, 6) per unit of velocity; features (S, J) each.
 
-    ``span_s`` is the time that each impulse stands for.
+    ``span_s`` is the time between impulses.
     """
 
     matrix: FloatArray
@@ -150,7 +150,7 @@ def responses(
     scale: Scale,
     settings: UnexplainedSettings = DEFAULT.unexplained,
 ) -> Responses:
-    """Impulse responses of ``config`` along its own predictions of windows, from the middle of each span of time."""
+    """Impulse responses of ``config`` along its predictions of windows, at the middle of each time span."""
     predicted = simulate_windows(windows, config)[0]
     impulses = settings.impulse_sizes
     every = max(windows.steps // settings.impulses, 1)
@@ -192,7 +192,7 @@ def _remainder(windows: PredictionWindows, predicted: FloatArray, begin: int, st
 
 
 def features(windows: PredictionWindows, predicted: FloatArray, config: SimulatorConfig, at: np.ndarray) -> Features:
-    """Inputs of the terms, each (S, J) at steps ``at`` (J,): commands as they act, motion, place and time."""
+    """Inputs of the terms, each (S, J) at steps ``at`` (J,): commands after delays, motion, place and time."""
     period_s, past = windows.period_s, windows.past_commands.shape[1]
     commands = np.concatenate([windows.past_commands, windows.commands], axis=1)
     age_s = config.command_delay_s + config.mocap.latency_s

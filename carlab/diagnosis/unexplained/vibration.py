@@ -1,9 +1,9 @@
-"""Vibration that turns with the wheels: a spectral line of the local cubic's residual over the distance travelled.
+"""Vibration at the rotation of the wheels: a spectral line of the local cubic's residual over the distance travelled.
 
-An unbalanced or bent wheel shakes the car once per turn, harder the faster it turns. Its frequency varies with the
-speed in time; over the distance travelled it is one line (order tracking of rotating machines). The line must be
-stronger than any line over time: vibration of a fixed frequency is no wheel. The powers of blocks of a few seconds are
-added without phase, because the distance over a whole recording is not known to a fraction of a turn.
+An unbalanced or bent wheel excites the car once per revolution, with an amplitude that grows with speed. Its frequency
+in time varies with speed; over the distance travelled it is one line (order tracking of rotating machines). The line
+must be stronger than any line in time, because a vibration of fixed frequency does not come from a wheel. The power
+spectra of blocks of a few seconds are added, because the distance error over a whole recording exceeds a revolution.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from carlab.prediction.windows import Track
 PERIODS_PER_M = np.arange(1.0, 12.0, 0.05)
 """Lines over the distance travelled [1/m]: wheels of 13 to 160 mm radius."""
 FREQUENCIES_HZ = np.arange(1.0, 25.0, 0.1)
-"""Lines over time [Hz] that a wheel's line must exceed, up to half the rate of the recording."""
+"""Lines in time [Hz] that a wheel's line must exceed, up to half the sampling rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vibration:
-    """A line in x, y, yaw, vx, vy, yaw rate.
+    """A spectral line in x, y, yaw, vx, vy, yaw rate.
 
-    periods_per_m     its position
+    periods_per_m     spatial frequency
     amplitude   (6,)  at the median speed, in the channel's unit; a lower bound
     ratio       (6,)  power over the mean power of all lines
     min_ratio         ratio at which a channel counts as vibrating
@@ -41,12 +41,12 @@ class Vibration:
     min_ratio: float
 
     def class_statement(self) -> str:
-        """What kind of physics it is."""
+        """Class of the physics."""
         radius_mm = 1e3 / (2.0 * np.pi * self.periods_per_m)
         channels = [STATE_NAMES[k] for k in (5, 4, 3, 2) if self.ratio[k] > self.min_ratio]
         return (
-            f"vibration in {', '.join(channels)}: {self.periods_per_m:.3g} periods per metre travelled, and harder "
-            f"at speed, as an unbalanced or bent wheel of {radius_mm:.0f} mm radius would shake the car"
+            f"vibration in {', '.join(channels)}: {self.periods_per_m:.3g} periods per metre travelled, with an "
+            f"amplitude that grows with speed, as of an unbalanced or bent wheel of {radius_mm:.0f} mm radius"
         )
 
     def formula(self) -> str:
@@ -56,7 +56,7 @@ class Vibration:
 
 
 def find_vibration(tracks: Sequence[Track], settings: UnexplainedSettings = DEFAULT.unexplained) -> Vibration | None:
-    """The strongest line in yaw, vx, vy or yaw rate; None where none is significant."""
+    """The strongest significant line in yaw, vx, vy or yaw rate, or None."""
     power, strength, by_time = (np.zeros((6, n)) for n in (len(PERIODS_PER_M), len(PERIODS_PER_M), len(FREQUENCIES_HZ)))
     blocks = 0
     for track in tracks:
@@ -73,11 +73,11 @@ def find_vibration(tracks: Sequence[Track], settings: UnexplainedSettings = DEFA
             if track.speed[block].mean() < settings.vibration_speed_min_mps:
                 continue
             weighted = residual[block] * track.speed[block, None]
-            own = np.maximum(np.sum(weighted**2, axis=0), 1e-30)[:, None]
+            energy = np.maximum(np.sum(weighted**2, axis=0), 1e-30)[:, None]
             of_line = np.abs(_lines(PERIODS_PER_M, distance_m[block]) @ weighted).T ** 2
-            power += of_line / own
+            power += of_line / energy
             strength += of_line / np.sum(track.speed[block] ** 2) ** 2
-            by_time += np.abs(in_time @ weighted).T ** 2 / own
+            by_time += np.abs(in_time @ weighted).T ** 2 / energy
             blocks += 1
     if blocks == 0:
         return None
@@ -94,6 +94,6 @@ def find_vibration(tracks: Sequence[Track], settings: UnexplainedSettings = DEFA
 
 
 def _lines(frequencies: FloatArray, at: FloatArray) -> NDArray[np.complex128]:
-    """Waves (F, n) of so many periods per unit of ``at`` (n,)."""
+    """Complex exponentials (F, n) of ``frequencies`` (F,) at ``at`` (n,)."""
     waves: NDArray[np.complex128] = np.exp(2j * np.pi * np.outer(frequencies, at))
     return waves

@@ -1,9 +1,9 @@
-"""Recordings of carlab, converted to what a diagnosis expects: all states of one known age.
+"""Align the states of carlab recordings to a constant age, as a diagnosis requires.
 
-A control loop uses the newest pose, whose age changes with the phase of motion capture, and velocities of a line
-through earlier poses, which are older. Both ages are recorded, and so are all poses, later ones included. A local
-quadratic through the poses gives the state at the tick less the latency of motion capture in the car file. The
-difference between a velocity column and the line through its own poses (a filter behind the estimator) is kept.
+A control loop uses the newest pose, whose age varies with the phase of motion capture, and velocities of a line through
+earlier poses, which are older. Both ages and all poses are recorded. A local quadratic through the poses gives the
+state at the tick minus the latency of motion capture in the car file. The difference between a velocity column and the
+line through its poses (the effect of a filter after the estimator) is added to the velocity.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from carlab.recording.episode_builder import POSE_AGE, VELOCITY_DELAY
 from sim_backends.car_parameters import LATENCY, SimulatorConfig
 
 HALF_WINDOW_S = 0.025
-"""Half of the quadratic's window: seven poses at 120 Hz; two on either side at least."""
+"""Half of the quadratic's window: seven poses at 120 Hz; at least two poses on each side."""
 MIN_POSES_PER_SIDE = 2
 MAX_LINE_POSES = 64
 MAX_AGE_MISMATCH_S = 5e-4
-"""Poses of the line behind a velocity are known if their mean time matches the recorded age this closely."""
+"""The poses of a velocity's line are identified if their mean time matches the recorded age within this."""
 STATE_AGE = "state_age_s"
-"""Metadata of an episode whose states ``as_captured`` has computed."""
+"""Metadata key of an episode that ``align_states`` has aligned."""
 
 
-def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
-    """States of ``latency_s`` before each tick, from all recorded poses.
+def align_states(episode: EpisodeData, latency_s: float) -> EpisodeData:
+    """Compute the states ``latency_s`` before each tick from all recorded poses.
 
     Args:
         episode: as read; returned unchanged if it lacks the ages of its poses and velocities.
-        latency_s: of motion capture, by the car file.
+        latency_s: latency of motion capture in the car file.
 
     Returns:
-        The episode, without the first and last rows about which there are no poses; rows inside that have too few
-        poses about them are not a number, so that they break the recording.
+        The episode without the first and last rows that lack poses on one side. Inner rows with too few poses nearby
+        are NaN and split the recording.
     """
     poses = episode.poses[np.unique(episode.poses[:, 0], return_index=True)[1]]
     known = POSE_AGE in episode.extra and VELOCITY_DELAY in episode.extra
@@ -46,7 +46,7 @@ def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
         return episode
     poses = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
     states = _quadratic(poses, episode.times_s - latency_s)
-    states[:, 3:] += _behind_the_line(episode, poses)
+    states[:, 3:] += _filter_offset(episode, poses)
     states[:, 2] = (states[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
     seen = np.flatnonzero(np.isfinite(states).all(axis=1))
     if len(seen) < MIN_SAMPLES:
@@ -66,13 +66,13 @@ def as_captured(episode: EpisodeData, latency_s: float) -> EpisodeData:
 
 
 def with_known_latency(config: SimulatorConfig, episodes: Sequence[EpisodeData]) -> SimulatorConfig:
-    """The simulator; its latency is known where ``as_captured`` gave the states of all episodes that very age."""
+    """Mark the latency as known if ``align_states`` has aligned all episodes to it."""
     known = LATENCY in config.unknown and all(STATE_AGE in e.metadata for e in episodes)
     return replace(config, unknown=config.unknown - {LATENCY}) if known else config
 
 
 def window_variance_s2(episodes: Sequence[EpisodeData]) -> float | None:
-    """Variance [s2] of the window that ``as_captured`` differentiates by; None where recordings are unchanged.
+    """Variance [s2] of the window of the differentiation in ``align_states``; None if no recording was aligned.
 
     A line through evenly spaced poses at t gives v + s2 / 2 d2v/dt2 with s2 = sum(t^4) / (3 sum(t^2)).
     """
@@ -90,7 +90,7 @@ def _half(gap_s: float) -> int:
 
 
 def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
-    """States (n, 6) at times (n,) of local quadratics through poses (P, 4); NaN where poses lie on one side only."""
+    """States (n, 6) at times (n,) of local quadratics through poses (P, 4); NaN if poses lie on one side only."""
     t_s = poses[:, 0]
     gap_s = float(np.median(np.diff(t_s)))
     half = _half(gap_s)
@@ -112,8 +112,8 @@ def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
     return states
 
 
-def _behind_the_line(episode: EpisodeData, poses: FloatArray) -> FloatArray:
-    """Velocity columns less those of the lines that they were estimated by (n, 3); zero where that is not known."""
+def _filter_offset(episode: EpisodeData, poses: FloatArray) -> FloatArray:
+    """Velocity columns minus the velocities of their lines (n, 3); zero if the line is unknown."""
     difference = np.zeros((len(episode.times_s), 3))
     capture_s = episode.times_s - episode.extra[POSE_AGE]
     mean_s = capture_s - episode.extra[VELOCITY_DELAY]
@@ -130,4 +130,4 @@ def _behind_the_line(episode: EpisodeData, poses: FloatArray) -> FloatArray:
     return np.asarray(difference)
 
 
-__all__ = ["as_captured", "window_variance_s2", "with_known_latency"]
+__all__ = ["align_states", "window_variance_s2", "with_known_latency"]
