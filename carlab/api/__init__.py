@@ -1,7 +1,8 @@
 """The Python interface: load, load_car, predict, diagnose, check, drive, replay, learn.
 
-``carlab`` re-exports these names. The command line is a layer over it: each option of a verb is an argument of the same
-name. Nothing here prints. Heavy libraries (torch, scipy, matplotlib, rerun) are imported by the call that needs them.
+``carlab`` re-exports these names. The command line calls this interface: each option of a verb is an argument of the
+same name. The interface does not print. Each call imports the heavy libraries that it needs (torch, scipy, matplotlib,
+rerun).
 """
 
 from carlab.api.cars import load_car

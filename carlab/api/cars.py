@@ -11,17 +11,17 @@ if TYPE_CHECKING:
 
 
 def load_car(car: str | Path | CarFile = "sim") -> CarFile:
-    """Read a car file: the parameters of a simulator, and of the real car where it has ``[hardware]``.
+    """Read a car file: the parameters of a simulator and, with ``[hardware]``, the configuration of the real car.
 
     Args:
-        car: ``sim`` (the default car), a car that comes with the package (``eth_rc_car``, ``dart_jetracer`` ...), or
-            the path of a TOML file. A car file that was read comes back as it is.
+        car: ``sim`` (the default car), a preset (``eth_rc_car``, ``dart_jetracer`` ...), the path of a TOML file, or
+            a ``CarFile``, which is returned unchanged.
 
     Returns:
         The car file; ``simulator`` has its parameters in SI units, ``save`` writes it.
 
     Raises:
-        ConfigError: there is no such file, or it is wrong.
+        ConfigError: the file does not exist or is invalid.
     """
     from carlab.cars import CarFile, default_car, load_car_file
 
@@ -30,13 +30,13 @@ def load_car(car: str | Path | CarFile = "sim") -> CarFile:
     return default_car() if str(car) == "sim" else load_car_file(Path(car))
 
 
-def typed_car(
+def car_options_text(
     car: str | CarFile,
     vehicle: Path | CarFile | None = None,
     reality: Path | CarFile | None = None,
     dry_run: bool = False,
 ) -> str:
-    """The options that name a car on the command line, each with a space before it; nothing for those not needed."""
+    """Command-line options that select a car, each with a leading space; options with default values are omitted."""
     words = [] if car == "sim" else ["--car", _word(car)]
     words += [] if vehicle is None else ["--vehicle", _word(vehicle)]
     words += ["--dry-run"] if dry_run else []

@@ -1,4 +1,4 @@
-"""Whether a car can be armed."""
+"""Check whether a car can be armed."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CarCheck:
-    """What ``carlab.check`` measured.
+    """Result of ``carlab.check``.
 
     Attributes:
-        health: readings by name, with their unit at the end, and problems as sentences.
-        latency: samples [s] of each part of the delay; None where no pose arrived.
-        problems: why the car is not ready; empty where it is.
+        health: readings by name, which ends in the unit, and problems as sentences.
+        latency: samples [s] of each part of the latency; None if no pose arrived.
+        problems: why the car is not ready; empty if it is ready.
     """
 
     health: Health
@@ -56,23 +56,22 @@ def check(
     dry_run: bool = False,
     hooks: RunHooks | None = None,
 ) -> CarCheck:
-    """Open a car and move nothing: health, rates and latency of each part.
+    """Open a car without moving it, and measure health, rates and latency of each part.
 
     Args:
-        car: any car, see ``carlab.drive``; so are ``vehicle``, ``reality`` and ``dry_run``.
-        seconds: how long to watch motion capture.
-        wheels: on an emulated car, also steer at standstill to measure the latency of a command; a real car never
-            moves.
-        vehicle: see ``car``.
-        reality: see ``car``.
-        dry_run: see ``car``.
+        car: as for ``carlab.drive``.
+        seconds: duration of the motion-capture measurement [s].
+        wheels: on an emulated car, also steer at rest to measure the latency of a command; a real car never moves.
+        vehicle: as for ``carlab.drive``.
+        reality: as for ``carlab.drive``.
+        dry_run: as for ``carlab.drive``.
         hooks: ``on_start`` is called before the car is opened.
 
     Returns:
-        Readings, latency and problems; ``is_ready`` says whether the car can be armed.
+        Readings, latency and problems; ``is_ready`` states whether the car can be armed.
 
     Raises:
-        ConfigError: an argument is wrong.
+        ConfigError: an argument is invalid.
         NotReadyError, ActuatorFaultError: the hardware cannot be opened.
     """
     from carlab.cars import choose_car

@@ -1,4 +1,4 @@
-"""Diagnosis of recordings: what a simulator leaves out of them."""
+"""Diagnosis of recordings: effects that a simulator does not model."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ REPORTED_FAULTS = (
     *("yaw_wrap_spikes", "outliers", "stale_samples", "clock_drift", "column_shift", "column_scale"),
     *("wrong_unit", "wrong_sign", "wrong_frame", "integration_error"),
 )
-"""Findings of a CSV's audit that the report names as data faults when they were repaired on reading."""
+"""Findings of the CSV audit that the report lists as data faults if they were repaired."""
 
 
 @dataclass(frozen=True)
 class DiagnosisReport:
-    """The result of ``carlab.diagnose``. In a notebook it shows itself as the HTML report.
+    """The result of ``carlab.diagnose``. A notebook displays it as the HTML report.
 
     Attributes:
         diagnosis: the verdict with its evidence as data (schema ``carlab.diagnosis/1``).
-        exhibits: what the report's pictures show.
-        model: the car file with everything that was found; ``model.save("model.toml")`` writes it.
-        is_conclusive: False where the recordings are not sufficient for a verdict; ``sentence`` says what to record.
+        exhibits: data of the report's pictures.
+        model: the car file with the identified parameters and effects; ``model.save("model.toml")`` writes it.
+        is_conclusive: False if the recordings are not sufficient for a verdict; ``sentence`` states what to record.
     """
 
     diagnosis: Diagnosis
@@ -58,7 +58,7 @@ class DiagnosisReport:
 
     @property
     def sentence(self) -> str:
-        """The verdict in a sentence."""
+        """The verdict as a sentence."""
         return self.diagnosis.sentence
 
     @property
@@ -68,7 +68,7 @@ class DiagnosisReport:
 
     @property
     def parameters(self) -> dict[str, Estimate]:
-        """Base parameters as fitted, by dotted name (``motor.drive_gain``), SI units."""
+        """Fitted base parameters by dotted name (``motor.drive_gain``), SI units."""
         return dict(self.diagnosis.parameters)
 
     @property
@@ -77,10 +77,10 @@ class DiagnosisReport:
         return dict(self.diagnosis.held_out)
 
     def save(self, folder: Path | str = "diagnosis") -> Path:
-        """Write report.html, report.json, report.rrd, summary.png and model.toml; a report there is replaced.
+        """Write report.html, report.json, report.rrd, summary.png and model.toml, replacing an existing report.
 
         Args:
-            folder: made where it is missing.
+            folder: created if missing.
 
         Returns:
             The folder.
@@ -94,7 +94,7 @@ class DiagnosisReport:
         return Path(folder)
 
     def save_decisions(self, folder: Path | str = "diagnosis") -> Path:
-        """Write decisions.json: each decision about a name with the statistics and thresholds that it compared.
+        """Write decisions.json: the statistics and thresholds of each decision about an effect.
 
         Raises:
             DataError: the file cannot be written.
@@ -108,7 +108,7 @@ class DiagnosisReport:
         return self.diagnosis.to_dict()
 
     def to_html(self) -> str:
-        """The whole report as one self-contained page."""
+        """The report as one self-contained HTML page."""
         from carlab.diagnosis.report.html_page import render_page
 
         return render_page(self.diagnosis, self.exhibits)
@@ -124,7 +124,7 @@ class DiagnosisReport:
 
 @dataclass(slots=True)
 class Material:
-    """Episodes with what reading them found; ``notes`` say in sentences how files were read."""
+    """Episodes with their data faults; ``notes`` are sentences about the conversion of files."""
 
     episodes: list[EpisodeData] = field(default_factory=list)
     faults: list[DataFault] = field(default_factory=list)
@@ -144,25 +144,25 @@ def diagnose(
     progress: Callable[[str, float], None] = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> DiagnosisReport:
-    """Find what a simulator leaves out of recordings: locate it, name it, model it, and prove it on held-out data.
+    """Identify effects in recordings that a simulator does not model, and validate them on held-out data.
 
     Args:
         recordings: one recording or several, to fit: a ``Recording``, an ``EpisodeData``, a path (MCAP, CSV), or the
             folder of a run, of which every third episode is held out.
-        car: the simulator in question: a car file, its path, or a name (``sim``, ``eth_rc_car`` ...).
-        held_out: recordings for validation only; without any, the last part of each recording.
-        holdout_share: how much of each recording that is, above 0 and at most 0.5; 0.3 unless given.
-        effects: try only these effects of the catalogue.
+        car: the simulator to check: a car file, its path, or a name (``sim``, ``eth_rc_car`` ...).
+        held_out: recordings for validation only; by default the last part of each recording is held out.
+        holdout_share: size of that part, above 0 and at most 0.5; 0.3 by default.
+        effects: restrict the search to these effects of the catalogue.
         seed: written into the report; a diagnosis draws no random numbers.
-        out: folder that the report is written to; ``DiagnosisReport.save`` does it later.
-        progress: called with the current activity and the share that is done, in [0, 1].
-        stop: once it returns true, the search ends, and what it found until then is reported.
+        out: folder for the report; ``DiagnosisReport.save`` can write it later.
+        progress: called with the current activity and the completed share, in [0, 1].
+        stop: once it returns true, the search ends and the report covers the findings so far.
 
     Returns:
-        The report; ``is_conclusive`` is False where the recordings are not sufficient.
+        The report; ``is_conclusive`` is False if the recordings are not sufficient.
 
     Raises:
-        ConfigError: an argument is wrong.
+        ConfigError: an argument is invalid.
         DataError: a recording cannot be read, or the report cannot be written.
     """
     from carlab.core.errors import ConfigError
@@ -171,7 +171,7 @@ def diagnose(
     to_fit, to_validate = _assigned(as_list(recordings), as_list(held_out))
     _check_effects(effects)
     if holdout_share is not None and to_validate:
-        raise ConfigError("--holdout-share counts only where no recording is held out whole; leave it out.")
+        raise ConfigError("--holdout-share has no effect together with held-out recordings; remove one of them.")
     latency_s = file.simulator.mocap.latency_s
     fit = read_material(to_fit, "fit", latency_s)
     validation = read_material(to_validate, "held out", latency_s)
@@ -240,11 +240,11 @@ def _check_effects(effects: Sequence[str]) -> None:
 
     for name in effects:
         if name not in EFFECTS:
-            raise ConfigError(f"There is no effect '{name}'; there are: {', '.join(EFFECTS)}.")
+            raise ConfigError(f"There is no effect '{name}'; choose among {', '.join(EFFECTS)}.")
 
 
 def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLike]:
-    """Recordings as a list; a path is a Path."""
+    """Recordings as a list, with strings converted to paths."""
     from carlab.core.episode_data import EpisodeData
 
     single = isinstance(given, (str, Path, Recording, EpisodeData))
@@ -254,7 +254,7 @@ def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLik
 def _assigned(
     recordings: list[RecordingLike], held_out: list[RecordingLike]
 ) -> tuple[list[RecordingLike], list[RecordingLike]]:
-    """Recordings to fit and to hold out, with the folders of runs resolved. ConfigError where one is both."""
+    """Recordings to fit and to hold out, with run folders resolved. Raises ConfigError if one is both."""
     from carlab.core.errors import ConfigError
 
     if not recordings:
@@ -267,12 +267,12 @@ def _assigned(
         to_validate += validated
     paths = [{p.resolve() for item in items if (p := _path_of(item))} for items in (to_fit, to_validate)]
     if same := paths[0] & paths[1]:
-        raise ConfigError(f"{min(same).name} is both fitted and held out; name it once.")
+        raise ConfigError(f"{min(same).name} is both fitted and held out; remove it from one of the lists.")
     return to_fit, to_validate
 
 
 def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:
-    """Of a run's folder the episodes to fit and to hold out (every third); of anything else the path itself."""
+    """Episodes of a run folder to fit and to hold out (every third); for other paths the path itself, to fit."""
     if not (path / "episodes").is_dir():
         return [path], []
     from carlab.core.errors import ConfigError
@@ -280,7 +280,7 @@ def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:
 
     driven = [recording for recording in sorted((path / "episodes").glob("*.mcap")) if has_ticks(recording)]
     if not driven:
-        raise ConfigError(f"{path} has no finished episode yet.")
+        raise ConfigError(f"{path} has no finished episode; drive one first.")
     return [p for k, p in enumerate(driven) if k % 3 != 2], driven[2::3]
 
 
@@ -289,7 +289,7 @@ def _path_of(item: RecordingLike) -> Path | None:
 
 
 def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Material:
-    """Episodes as a diagnosis expects them: CSV repaired on reading, own recordings as captured by the cameras."""
+    """Read episodes for a diagnosis: CSV files are repaired, states of MCAP files get one known age."""
     from carlab.api.recordings import load
     from carlab.diagnosis.findings import RecordingUse
     from carlab.diagnosis.state_alignment import align_states
@@ -309,13 +309,13 @@ def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Ma
             material.episodes += [align_states(episode, latency_s) for episode in read.episodes]
             if read.is_recovered:
                 ticks = read.episode.ticks
-                material.notes.append(f"{path} was never finished; {ticks} complete ticks were recovered.")
+                material.notes.append(f"{path} is an incomplete recording; {ticks} complete ticks were recovered.")
         material.uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))
     return material
 
 
 def _read_csv(path: Path, mapping: Any, material: Material) -> None:
-    """Add a CSV's episodes and what was repaired; what is wrong and not repaired is found again in the episodes."""
+    """Add a CSV's episodes and its repaired data faults; the diagnosis detects faults without repair itself."""
     from carlab.diagnosis.findings import DataFault
     from carlab.recording.audit.report import Severity
     from carlab.recording.csv.repairing_import import import_mended

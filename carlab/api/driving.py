@@ -50,11 +50,11 @@ PICTURE_FILE = "summary.png"
 
 @dataclass(frozen=True)
 class DriveRun:
-    """What ``carlab.drive`` recorded.
+    """Result of ``carlab.drive``.
 
     Attributes:
         folder: the run's folder.
-        episodes: each with ``data`` (arrays), ``reason`` (how it ended), ``summary`` (figures of the task), ``path``.
+        episodes: each with ``data`` (arrays), ``reason`` (end reason), ``summary`` (figures of the task), ``path``.
     """
 
     folder: Path
@@ -67,12 +67,12 @@ class DriveRun:
 
     @property
     def picture(self) -> Path:
-        """The summary picture; absent where none was drawn."""
+        """Path of the summary picture; the file exists only if it was drawn."""
         return self.folder / PICTURE_FILE
 
     @property
     def end(self) -> EndReason | None:
-        """How the last episode ended; None where nothing was driven."""
+        """End reason of the last episode; None without episodes."""
         return self.episodes[-1].reason if self.episodes else None
 
     def __repr__(self) -> str:
@@ -108,34 +108,34 @@ def drive(
     dry_run: bool = False,
     hooks: RunHooks | None = None,
 ) -> DriveRun:
-    """Drive episodes with a policy on a car, and record them. ^C ends after the tick, twice stops at once.
+    """Drive episodes with a policy on a car, and record them. ^C ends after the tick, a second ^C at once.
 
     Args:
-        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a car that comes with the package, the path of a car
-            file, or a car file: with ``[hardware]`` that real car, else that simulated one.
+        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, the path of a car file, or a car file. A car
+            file with ``[hardware]`` is a real car, another one a simulated car.
         policy: ``parking`` (feedback), a scripted manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, or an object with
             ``name``, ``reset()`` and ``act(view)``, see ``carlab.core.policy.Policy``.
         task: ``parking``, ``path``, or an object, see ``carlab.core.task.Task``: start, reward, end, arena.
-        episodes: how many.
-        ticks: control periods an episode; the task's number unless given.
+        episodes: number of episodes.
+        ticks: control periods per episode; by default the task's number.
         seed: of start poses and sensor noise.
-        max_throttle: largest throttle that passes the safety gate, in (0, 1].
-        place: start each episode at the task's start pose; False: from where the car stands.
-        out: folder that receives the run's folder.
+        max_throttle: upper limit of the throttle in the safety gate, in (0, 1].
+        place: start each episode at the task's start pose; False: at the car's current pose.
+        out: parent of the run's folder.
         name: last part of the run folder's name.
-        rerun: record .rrd files beside the MCAP files.
+        rerun: also record .rrd files.
         picture: draw summary.png.
-        vehicle: car file that ``sim`` and ``emulated`` use in place of the default car's.
-        reality: car file whose physics a simulated or emulated car has in truth; the recordings alone show it.
+        vehicle: car file that replaces the default car of ``sim`` and ``emulated``.
+        reality: car file with the true physics of a simulated or emulated car, which only its recordings reveal.
         dry_run: real inputs, but no command is sent.
-        hooks: functions that are called on the way.
+        hooks: callbacks.
 
     Returns:
-        The run; ``episodes`` is empty where it was interrupted before the first.
+        The run; ``episodes`` is empty if it was interrupted before the first.
 
     Raises:
-        ConfigError: an argument is wrong.
-        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven; nothing has moved.
+        ConfigError: an argument is invalid.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
     from carlab.cars import choose_car
 
@@ -167,21 +167,21 @@ def replay(
 
     Args:
         recording: an MCAP or CSV file, or a loaded recording; its longest episode is replayed.
-        car: any car, see ``drive``. An emulated or simulated car without an arena gets 20 m around the recording.
-        seconds: send the actions of this much of the recording; of all of it unless given.
+        car: as for ``drive``. The arena of an emulated or simulated car extends 20 m beyond the recording by default.
+        seconds: duration of the replay [s]; by default the whole recording.
         seed: of sensor noise.
-        out: folder that receives the run's folder.
-        vehicle: see ``drive``; so are ``reality``, ``dry_run`` and ``hooks``.
-        reality: see ``vehicle``.
-        dry_run: see ``vehicle``.
-        hooks: see ``vehicle``.
+        out: parent of the run's folder.
+        vehicle: as for ``drive``.
+        reality: as for ``drive``.
+        dry_run: as for ``drive``.
+        hooks: as for ``drive``.
 
     Returns:
-        The recorded episode, and the run; its ``episodes`` are empty where it was interrupted before the first.
+        The recorded episode, and the run; its ``episodes`` are empty if it was interrupted before the first.
 
     Raises:
-        ConfigError, DataError: an argument or the recording is wrong.
-        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven; nothing has moved.
+        ConfigError, DataError: an argument or the recording is invalid.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
     from carlab.api.recordings import Recording, load
     from carlab.cars import choose_car
@@ -274,23 +274,23 @@ def _check(policy: PolicyName | Policy, task: TaskName | Task, max_throttle: flo
         if isinstance(given, str) and given not in known:
             raise ConfigError(f"--{option} {given}: choose one of {', '.join(known)}.")
     if max_throttle is not None and not 0.0 < max_throttle <= 1.0:
-        raise ConfigError(f"--max-throttle {max_throttle:g}: above 0, at most 1.")
+        raise ConfigError(f"--max-throttle {max_throttle:g}: give a number above 0 and at most 1.")
     if task == "path" and policy == "parking":
-        raise ConfigError("The parking policy follows no path; choose another --policy for --task path.")
+        raise ConfigError("The parking policy cannot follow a path; choose another --policy for --task path.")
     if policy == "keyboard" and not has_screen():
-        raise NotReadyError("Keyboard", ["its window needs a screen and there is none; use --policy gamepad."])
+        raise NotReadyError("Keyboard", ["its window needs a screen, which is missing; use --policy gamepad."])
 
 
-def _envelope(own: SafetyEnvelope, task: Task, max_throttle: float | None) -> SafetyEnvelope:
-    """The car's limits, in the arena of the task where the car has none of its own."""
-    limits = own if own.arena_m else replace(own, arena_m=task.arena_m)
+def _envelope(car_limits: SafetyEnvelope, task: Task, max_throttle: float | None) -> SafetyEnvelope:
+    """The car's limits; the task's arena if the car has no arena."""
+    limits = car_limits if car_limits.arena_m else replace(car_limits, arena_m=task.arena_m)
     return limits if max_throttle is None else replace(limits, max_throttle=max_throttle)
 
 
 def _policy(
     policy: PolicyName | Policy, max_throttle: float | None, simulator: SimulatorConfig
 ) -> tuple[Policy, TeleopPolicy | None]:
-    """The policy, and the same once more where a person drives."""
+    """The policy, and the same object as a TeleopPolicy if a person drives (else None)."""
     from carlab.core.manoeuvres import MANOEUVRES
     from carlab.experiment.episodes.scripted_policies import ManoeuvrePolicy, NeutralPolicy, ReverseParkingPolicy
     from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
@@ -298,10 +298,10 @@ def _policy(
     if not isinstance(policy, str):
         return policy, None
     if policy in ("keyboard", "gamepad"):
-        # A gamepad at full travel means the largest throttle; a key never means more than that either.
-        top = max_throttle or 1.0
-        source = KeyboardSource(min(KEY_THROTTLE / top, 1.0)) if policy == "keyboard" else GamepadSource()
-        teleop = TeleopPolicy(source, top)
+        # Full travel of a gamepad is the maximum throttle; a key gives KEY_THROTTLE, at most the maximum.
+        maximum = max_throttle or 1.0
+        source = KeyboardSource(min(KEY_THROTTLE / maximum, 1.0)) if policy == "keyboard" else GamepadSource()
+        teleop = TeleopPolicy(source, maximum)
         return teleop, teleop
     if policy == "neutral":
         return NeutralPolicy(), None
@@ -311,7 +311,7 @@ def _policy(
 
 
 def _by_hand(hooks: SessionHooks, teleop: TeleopPolicy, clock: Clock) -> SessionHooks:
-    """Hooks for a person who drives: the dead-man ends an episode, and a simulated car runs in real time."""
+    """Hooks for teleoperation: the dead-man control ends an episode, and a simulated car runs in real time."""
     from carlab.core.clock import MonotonicClock
 
     if isinstance(clock, MonotonicClock):

@@ -1,4 +1,4 @@
-"""Learning to park: learn the car, learn a policy in the learned car, drive, and again."""
+"""Learning to park: fit the car, train a policy in the learned car, drive, repeat."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from carlab.api.arguments import above_zero, at_least
-from carlab.api.cars import typed_car
+from carlab.api.cars import car_options_text
 from carlab.api.runs import RunHooks, existing_run, html_picture, html_table, new_run, write_result
 from carlab.core.errors import ConfigError
 
@@ -35,14 +35,14 @@ PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
 
 @dataclass(slots=True)
 class LearnHooks(RunHooks):
-    """Functions that are called while a campaign goes on; by default nothing is done.
+    """Callbacks of a campaign; the defaults do nothing.
 
     Attributes:
-        on_training: what is being learned, steps done, steps in all.
-        on_learned: figures of a training that ended.
-        on_figures: figures of an episode that ended.
-        on_checking: a quick check of an episode against the simulator begins.
-        on_check: its result.
+        on_training: receives activity, steps done and total steps.
+        on_learned: receives the figures of a finished training.
+        on_figures: receives the figures of a finished episode.
+        on_checking: called before the quick check of an episode against the simulator.
+        on_check: receives the result of the quick check.
     """
 
     on_training: Callable[[str, int, int], None] = lambda activity, done, total: None
@@ -54,13 +54,13 @@ class LearnHooks(RunHooks):
 
 @dataclass(frozen=True)
 class LearnRun:
-    """What ``carlab.learn`` learned and recorded.
+    """Result of ``carlab.learn``.
 
     Attributes:
-        folder: the run's folder; ``carlab.learn(resume=folder)`` goes on with it.
-        wanted: how many episodes the run is to have.
-        episodes: figures of the episodes that this call drove: return, predicted return, distance to the goal ...
-        results: the same episodes with their data and how they ended.
+        folder: the run's folder; ``carlab.learn(resume=folder)`` resumes the run.
+        wanted: target number of episodes.
+        episodes: figures of the episodes of this call: return, predicted return, distance to the goal ...
+        results: the same episodes with their data and end reasons.
     """
 
     folder: Path
@@ -82,16 +82,16 @@ class LearnRun:
 
     @property
     def picture(self) -> Path:
-        """The learning curve as a picture."""
+        """Path of the picture of the learning curve."""
         return self.folder / "learn.png"
 
     @property
     def end(self) -> EndReason | None:
-        """How the last episode ended; None where nothing was driven."""
+        """End reason of the last episode; None without episodes."""
         return self.results[-1].reason if self.results else None
 
     def __repr__(self) -> str:
-        """One line: folder, episodes driven, episodes wanted."""
+        """One line: folder, number of episodes and their target number."""
         return f"<LearnRun {self.folder}: {len(self.recordings)} of {self.wanted} episodes>"
 
     def _repr_html_(self) -> str:
@@ -127,9 +127,9 @@ class _Request:
     dry_run: bool
 
     @property
-    def typed(self) -> str:
-        """The car as one would type it."""
-        return typed_car(self.car, self.vehicle, self.reality, self.dry_run)
+    def car_options(self) -> str:
+        """Command-line options that select the car."""
+        return car_options_text(self.car, self.vehicle, self.reality, self.dry_run)
 
 
 def learn(
@@ -154,36 +154,36 @@ def learn(
     dry_run: bool = False,
     hooks: LearnHooks | None = None,
 ) -> LearnRun:
-    """Learn the car, learn to park in the learned car, drive, and again with what was recorded.
+    """Fit the car to all recordings, train a parking policy in the learned car, drive an episode, and repeat.
 
     Args:
         car: as for ``carlab.drive``.
-        episodes: how many in all; 20 unless given, or as many as a resumed run was started with.
-        ticks: control periods an episode; the task's number (100) unless given.
-        prior: the simulator that is the prior: ``kinematic``, ``nominal``, or a car file such as a diagnosed model.
+        episodes: total number of episodes; by default 20, or the number of the resumed run.
+        ticks: control periods per episode; by default the task's number (100).
+        prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model.
         method: ``sim-fsvgd``; ``fsvgd`` without a simulator; ``fsvgd-authors`` with the settings of the paper.
-        history: past commands that model and policy see; as many as the car's delays need unless given.
-        model_steps: optimiser steps of the model before each episode; 2500 unless given.
+        history: number of past commands that model and policy observe; by default it covers the car's delays.
+        model_steps: optimiser steps of the model before each episode; 2500 by default.
         updates: gradient steps of the policy before an episode.
         seed: of all random numbers.
-        device: where model and policy are trained; ``cpu`` unless given.
-        place: start each episode at the task's start pose; False: from where the car stands.
-        resume: folder of a run to go on with.
-        out: folder that receives the run's folder.
+        device: of the training of model and policy; ``cpu`` by default.
+        place: start each episode at the task's start pose; False: at the car's current pose.
+        resume: folder of a run to resume.
+        out: parent of the run's folder.
         name: last part of the run folder's name.
-        rerun: record .rrd files beside the MCAP files.
+        rerun: also record .rrd files.
         vehicle: as for ``carlab.drive``.
         reality: as for ``carlab.drive``.
         dry_run: real inputs, but no command is sent.
-        hooks: functions that are called on the way.
+        hooks: callbacks.
 
     Returns:
-        The run; ``is_complete`` is False where it was interrupted or ended for safety.
+        The run; ``is_complete`` is False after an interruption or a safety stop.
 
     Raises:
-        ConfigError: an argument is wrong, or not that of the run to resume.
-        DataError: training failed, or the folder to resume is no run.
-        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven; nothing has moved.
+        ConfigError: an argument is invalid, or differs from the run to resume.
+        DataError: training failed, or the folder to resume is not a run.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
     request = _Request(
         car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
@@ -280,7 +280,7 @@ def _begun(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: conte
     run = stack.enter_context(new_run(request.out, request.name, choice, hooks, keep="models"))
     return Campaign(
         choice, plan, request.episodes or EPISODES, run, CampaignHooks(), request.ticks, request.place, request.rerun,
-        _checked_simulator(request), request.typed,
+        _checked_simulator(request), request.car_options,
     )  # fmt: skip
 
 
@@ -291,7 +291,7 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
 
     assert request.resume is not None
     run = stack.enter_context(existing_run(request.resume, choice, hooks))
-    check_same_car(run, choice, request.typed)
+    check_same_car(run, choice, request.car_options)
     campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
     available(campaign.plan.device)
     _check_as_before(request, campaign.plan, choice)
@@ -311,7 +311,7 @@ def _plan(request: _Request, choice: CarChoice) -> TrainingPlan:
     if history is None:
         history = PAPER_HISTORY if request.method == "fsvgd-authors" else needed_history(choice.simulator)
     if (ticks := request.ticks or ParkingTask().max_ticks) <= history:
-        raise ConfigError(f"--ticks {ticks}: nothing is learned from fewer than --history ({history}) and one more.")
+        raise ConfigError(f"--ticks {ticks}: give more than --history ({history}), for at least one transition.")
     text = tomli_w.dumps(_prior(request, choice).to_tables())
     return TrainingPlan(
         text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,
@@ -320,7 +320,7 @@ def _plan(request: _Request, choice: CarChoice) -> TrainingPlan:
 
 
 def _prior(request: _Request, choice: CarChoice) -> SimulatorConfig:
-    """The simulator that is the prior."""
+    """The prior simulator."""
     from carlab.experiment.campaign.campaign import check_period, prior_simulator
 
     if request.prior == "kinematic" or request.prior == "nominal":
@@ -338,7 +338,7 @@ def _prior_file(prior: str | Path | CarFile) -> CarFile:
         return prior
     file = Path(prior)
     if file.suffix != ".toml" and not is_preset(file) and not file.is_file():
-        raise ConfigError(f"--prior {prior}: neither kinematic nor nominal nor a car file that is there.")
+        raise ConfigError(f"--prior {prior}: give kinematic, nominal or an existing car file.")
     return load_car_file(file)
 
 
@@ -347,20 +347,20 @@ def _name_of(car: str | CarFile) -> str:
 
 
 def _checked_simulator(request: _Request) -> SimulatorConfig | None:
-    """The simulator that episodes are checked against, where it is not that of the car's file."""
+    """The simulator of the quick check, if it is not that of the car file."""
     return None if request.prior in ("kinematic", "nominal") else _prior_file(request.prior).simulator
 
 
 def _check_as_before(request: _Request, plan: TrainingPlan, choice: CarChoice) -> None:
-    """Raise ConfigError for an argument that is given and differs from the run to resume."""
-    usual = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
-    before = {name: getattr(plan, name) for name in PLANNED}
-    given = [n for n in PLANNED if getattr(request, n) not in (usual[n], before[n])]
-    if request.prior != usual["prior"] and _plan(request, choice).prior_toml != plan.prior_toml:
-        raise ConfigError("--prior: this run was started with another one; leave it out, or start a new run.")
-    if given:
-        option = given[0].replace("_", "-")
+    """Raise ConfigError for a given argument that differs from the run to resume."""
+    default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
+    saved = {name: getattr(plan, name) for name in PLANNED}
+    changed = [n for n in PLANNED if getattr(request, n) not in (default[n], saved[n])]
+    if request.prior != default["prior"] and _plan(request, choice).prior_toml != plan.prior_toml:
+        raise ConfigError("--prior: this run was started with another prior; remove the option, or start a new run.")
+    if changed:
+        option = changed[0].replace("_", "-")
         raise ConfigError(
-            f"--{option} {getattr(request, given[0])}: this run was started with {before[given[0]]}; leave it out, or "
-            "start a new run."
+            f"--{option} {getattr(request, changed[0])}: this run was started with {saved[changed[0]]}; remove the "
+            "option, or start a new run."
         )

@@ -36,7 +36,7 @@ class PredictionErrors:
 
     @property
     def horizon_s(self) -> float:
-        """How far was predicted [s]: a whole number of control periods."""
+        """Prediction horizon [s], an integer number of control periods."""
         return self.score.horizon_s
 
     @property
@@ -46,7 +46,7 @@ class PredictionErrors:
 
     @property
     def last_part(self) -> dict[str, FitErrors]:
-        """The same in the last part, which a diagnosis of this recording alone holds out; empty where too short."""
+        """The same for the last part, which a diagnosis of this recording alone holds out; empty if it is too short."""
         return {} if self.score.last is None else summary_of(self.score.last)
 
     def channels(self, model: str = "model") -> tuple[ChannelError, ...]:
@@ -122,21 +122,21 @@ def predict(
     stride_s: float = 0.25,
     holdout_share: float = 0.3,
 ) -> PredictionErrors:
-    """Predict a recording from many initial states along it, and compare.
+    """Predict a recording from many of its states, and compare the predictions with it.
 
     Args:
         recording: one recording or several: a ``Recording``, an ``EpisodeData``, or the path of an MCAP or a CSV.
         car: the simulator: a car file, its path, or a name.
-        horizon_s: how far to predict [s].
-        stride_s: from one initial state to the next [s].
-        holdout_share: how much of the recording the last part is, above 0 and at most 0.5.
+        horizon_s: prediction horizon [s].
+        stride_s: time between initial states [s].
+        holdout_share: share of the last part of the recording, above 0 and at most 0.5.
 
     Returns:
-        The errors, beside those of constant velocity and of no change. A model that a diagnosis saved has the error
-        that its report states.
+        The errors of the model, of constant velocity and of no change. For a model of a diagnosis they agree with its
+        report.
 
     Raises:
-        ConfigError: an argument is wrong.
+        ConfigError: an argument is invalid.
         DataError: the recording holds no window of that length in which the car moves.
     """
     from carlab.diagnosis.score_recording import score_recording

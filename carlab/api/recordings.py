@@ -1,4 +1,4 @@
-"""Recordings by path, whatever their format."""
+"""Reading and writing of recordings in all supported formats."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Recording:
 
     Attributes:
         path: the file.
-        episodes: one episode, or several where a CSV was split.
-        announcement: of a CSV, which layout was recognised and what was converted.
-        audit: of a CSV, what was found in it; None for MCAP.
-        mapping: the mapping that the CSV was read with; None where its layout was recognised.
-        is_recovered: whether the MCAP file was never finished, and its complete ticks were recovered.
+        episodes: one episode, or several if a CSV was split.
+        announcement: recognised layout and conversions of a CSV.
+        audit: findings in a CSV; None for MCAP.
+        mapping: the column mapping of a CSV; None if its layout was recognised.
+        is_recovered: whether the MCAP file is incomplete and its complete ticks were recovered.
     """
 
     path: Path
@@ -55,8 +55,8 @@ class Recording:
             The path.
 
         Raises:
-            ConfigError: the ending is none of these.
-            DataError: the file exists or cannot be written, or the format holds one episode and there are several.
+            ConfigError: the ending is not one of these.
+            DataError: the file exists or cannot be written, or several episodes do not fit into its format.
         """
         from carlab.core.errors import ConfigError, DataError
 
@@ -65,14 +65,14 @@ class Recording:
         if not name.endswith((*CSV_ENDINGS, ".mcap", ".parquet", ".rrd", ".png")):
             raise ConfigError(f"{path}: name a .mcap, .csv, .csv.gz, .parquet, .rrd or .png file.")
         if path.exists():
-            raise DataError(f"{path} is there already; remove it or choose another name.")
+            raise DataError(f"{path} exists already; remove it or choose another name.")
         if name.endswith(".png"):
             from carlab.recording import save_summary
 
             save_summary(self.episodes, path, self.path.name)
             return path
         if len(self.episodes) > 1:
-            raise DataError(f"{self.path} holds {len(self.episodes)} episodes; {path.suffix} holds one.")
+            raise DataError(f"{self.path} holds {len(self.episodes)} episodes; a {path.suffix} file can hold only one.")
         from carlab.recording import episode_to_rrd, write_csv, write_episode, write_parquet
 
         if name.endswith(".rrd"):
@@ -101,7 +101,7 @@ class Recording:
 
 
 def is_csv(path: Path) -> bool:
-    """Whether the file name says CSV."""
+    """Whether the file name ends in .csv or .csv.gz."""
     return path.name.lower().endswith(CSV_ENDINGS)
 
 
@@ -109,16 +109,16 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
     """Read an MCAP recording or a CSV (.csv, .csv.gz).
 
     Args:
-        path: the file. A .mcap.partial that was never finished is recovered.
-        mapping: of a CSV, which column is which; a TOML file or a ``ColumnMapping``. Known layouts need none.
-        options: of a CSV, what to change in the mapping, by the names of ``carlab import``'s options:
+        path: the file. An incomplete recording (.mcap.partial) is recovered.
+        mapping: column mapping of a CSV, a TOML file or a ``ColumnMapping``; not needed for known layouts.
+        options: changes of the mapping of a CSV, with the names of ``carlab import``'s options:
             ``velocity_frame="world"``, ``vx_unit="km/h"``, ``steering_sign=-1``, ``gaps="split"`` ...
 
     Returns:
         The recording; ``episodes`` have states in SI units, see ``carlab.core.episode_data.EpisodeData``.
 
     Raises:
-        ConfigError: there is no such file, or an option or mapping is wrong.
+        ConfigError: the file does not exist, or an option or mapping is invalid.
         DataError: the file cannot be read as declared.
     """
     from carlab.core.errors import ConfigError
@@ -131,7 +131,7 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
         imported = import_csv(path, mapping=resolved)
         return Recording(path, imported.episodes, imported.announcement, imported.report, resolved)
     if mapping is not None or options:
-        raise ConfigError(f"{path} is no CSV; a mapping and its options go with .csv and .csv.gz files.")
+        raise ConfigError(f"{path} is not a CSV; remove the mapping and its options.")
     from carlab.recording.mcap.source import read_episode
 
     episode = read_episode(path)
@@ -139,7 +139,7 @@ def load(path: Path | str, *, mapping: ColumnMapping | Path | str | None = None,
 
 
 def required_file(path: Path, what: str = "The recording") -> Path:
-    """The path, where it is a file; ConfigError otherwise."""
+    """Return the path of an existing file. Raises ConfigError if it is not a file."""
     from carlab.core.errors import ConfigError
 
     if not path.exists():
@@ -162,10 +162,10 @@ RENAMED_OPTIONS = {
 def resolved_mapping(
     path: Path, mapping: ColumnMapping | Path | str | None, options: dict[str, Any]
 ) -> ColumnMapping | None:
-    """The mapping with options; None where neither is given, so that the layout is recognised.
+    """The mapping with options; None without both, so that the layout is recognised.
 
     Raises:
-        ConfigError: the mapping file or an option is wrong.
+        ConfigError: the mapping file or an option is invalid.
     """
     from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
     from carlab.recording.csv.table import read_csv

@@ -1,4 +1,4 @@
-"""What calls that drive a car have in common: hooks, the run's folder, and its results."""
+"""Common parts of the calls that drive a car: hooks, the run's folder, and its results."""
 
 from __future__ import annotations
 
@@ -27,22 +27,23 @@ if TYPE_CHECKING:
 
 def _refuse_to_place(start: CarState) -> None:
     raise ConfigError(
-        f"The car cannot be put at x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad by itself; "
-        "pass place=False to start from where it stands, or hooks whose place_by_hand asks a person."
+        f"The car cannot move to x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad by itself; "
+        "pass place=False to start at its current pose, or hooks with a place_by_hand that prompts a person."
     )
 
 
 @dataclass(slots=True)
 class RunHooks:
-    """Functions that are called while a car is driven; by default nothing is done.
+    """Callbacks while a car is driven; the defaults do nothing.
 
     Attributes:
-        on_start: the run's folder and the car, before the car is opened.
-        place_by_hand: called with a start pose that the car cannot reach by itself; returns when it stands there.
-        on_episode: number of an episode that begins, and its largest number of ticks.
-        on_tick: each tick.
-        on_result: each finished episode.
-        on_abandon: reason and detail, after the control loop hung and the car was stopped; the process must end there.
+        on_start: receives the run's folder and the car, before the car is opened.
+        place_by_hand: receives a start pose that the car cannot reach by itself; returns when the car is there.
+        on_episode: receives the number of a starting episode and its maximum number of ticks.
+        on_tick: receives each tick.
+        on_result: receives each finished episode.
+        on_abandon: receives reason and detail after the control loop hung and the car was stopped; it must end the
+            process.
     """
 
     on_start: Callable[[Path, Car], None] = lambda folder, car: None
@@ -69,7 +70,7 @@ class RunHooks:
 def new_run(
     out: Path | str, name: str, choice: CarChoice, hooks: RunHooks, keep: str = "episodes"
 ) -> Iterator[RunDirectory]:
-    """A run's folder, with the program's log in it. It is removed where nothing came into its folder ``keep``."""
+    """Create a run folder with the program's log; remove it finally if its subfolder ``keep`` is empty."""
     from carlab.recording.run_folder import RunDirectory
 
     run = RunDirectory.create(out, name, config_toml=choice.config_toml)
@@ -83,7 +84,7 @@ def new_run(
 
 @contextmanager
 def existing_run(path: Path | str, choice: CarChoice, hooks: RunHooks) -> Iterator[RunDirectory]:
-    """A run's folder that is resumed, with the program's log going on in it."""
+    """Open the folder of a resumed run; the program's log is appended."""
     from carlab.recording.run_folder import RunDirectory
 
     run = RunDirectory.open_existing(path)
@@ -105,7 +106,7 @@ def _logged(run: RunDirectory, choice: CarChoice, hooks: RunHooks) -> Iterator[N
 
 
 def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
-    """Write result.json: each episode's end and figures, after those of a run that was resumed."""
+    """Write result.json: end reason and figures of each episode, after the earlier episodes of a resumed run."""
     from carlab.recording.run_folder import RESULT_FILE
 
     path = run.path / RESULT_FILE
@@ -140,7 +141,7 @@ def html_table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def html_picture(path: Path) -> str:
-    """A PNG file for a notebook; empty where there is none."""
+    """A PNG file for a notebook; empty if the file does not exist."""
     if not path.is_file():
         return ""
     data = base64.b64encode(path.read_bytes()).decode()

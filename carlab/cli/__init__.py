@@ -1,4 +1,4 @@
-"""``carlab VERB``: one file a verb, help from the docstrings, exit codes that mean something.
+"""``carlab VERB``: one file per verb; the help texts are the docstrings.
 
 Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 130 interrupted.
 """
@@ -20,7 +20,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def run(argv: Sequence[str]) -> int:
     """Run one command line and return its exit code."""
-    # A Python program that drives a car on two cores wants neither thread pools fighting over them nor banners.
+    # A limit on threads prevents competing thread pools from delaying the control loop.
     os.environ.setdefault("OMP_NUM_THREADS", "2")
     import tyro
 
@@ -50,9 +50,9 @@ def run(argv: Sequence[str]) -> int:
         if error.errno in DISK_FULL:
             fail(describe_os_error(error, error.filename or os.getcwd()))
             return 1
-        named = f"{error.filename}: " if error.filename else ""
-        what = "the path, its permissions and the disk" if error.filename else "addresses, cables and permissions"
-        fail(f"{named}{error.strerror or error}; check {what}.")
+        prefix = f"{error.filename}: " if error.filename else ""
+        causes = "the path, its permissions and the disk" if error.filename else "addresses, cables and permissions"
+        fail(f"{prefix}{error.strerror or error}; check {causes}.")
         return 1
 
 

@@ -13,7 +13,7 @@ from carlab.cli.options import json_file
 
 @dataclass
 class Bench(BenchOptions):
-    """Measure how fast the parts are, or how well models learn from few rows."""
+    """Measure the speed of the components, or the accuracy of models fitted to few rows."""
 
     def run(self) -> int:
         """Measure and print."""

@@ -1,4 +1,4 @@
-"""Options of ``carlab bench``, and which of them count for which use; every other one is refused."""
+"""Options of ``carlab bench``, and a check that each given option has an effect."""
 
 from __future__ import annotations
 
@@ -17,74 +17,73 @@ class BenchOptions:
     """Options of all uses of ``carlab bench``."""
 
     what: Positional[Literal["speed", "regression", "priors", "parking"]] = "speed"
-    """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios taken in one run.
-    regression: Sim-FSVGD and its baselines on the cases of the paper. priors: what a diagnosed simulator is worth:
-    Sim-FSVGD without a prior, with the kinematic, the nominal and the diagnosed one, on a simulated car with two
-    concealed effects, or on the recordings in --data. parking: carlab learn on the simulated car, method beside method;
-    runs that are in --runs already are continued."""
+    """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios within one run.
+    regression: Sim-FSVGD and its baselines on the cases of the paper. priors: Sim-FSVGD without a prior and with the
+    kinematic, the nominal and the diagnosed prior, on a simulated car with two concealed effects or on the recordings
+    in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are continued."""
 
     out: Path | None = None
-    """Write the figures as JSON into FILE.json (regression and priors after each fit); all but speed draw a picture of
-    the same name beside it, and priors keeps its recordings and the diagnosis in a folder of that name."""
+    """Write the figures to FILE.json (regression and priors after each fit). All but speed also draw FILE.png; priors
+    stores its recordings and the diagnosis in the folder FILE."""
 
     seconds: float = 10.0
     """speed: length of each condition of the sender's measurement [s]."""
 
     case: Literal["1d", "pendulum", "pendulum_motor", "car", "racecar", "realcar"] = "1d"
-    """regression: the system. 1d: sinusoids, two points. pendulum: friction and drag hidden from the prior, as in
-    the authors' code. pendulum_motor: as in the paper; drag that brakes, dry friction and the motor's lag hidden. car:
-    one step of a car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of theirs (with --data).
-    realcar: recordings in the folder --data, the last one held out."""
+    """regression: the system. 1d: sinusoids, two points. pendulum: the prior has no friction and drag, as in the
+    authors' code. pendulum_motor: as in the paper; the prior has no drag, dry friction and motor lag. car: one step of
+    a car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of their car (with --data). realcar:
+    recordings in the folder --data, the last one held out."""
 
     rows: tuple[int, ...] = ()
-    """regression and priors: numbers of rows to learn from; those of the paper's figure unless given."""
+    """regression and priors: numbers of training rows; by default those of the paper's figure."""
 
     seeds: int = 3
     """Repetitions of each fit: with other true systems, other rows of a recording, or (parking) other runs."""
 
     methods: tuple[str, ...] = ()
     """regression: some of Sim-FSVGD, "Sim-FSVGD without gap", FSVGD, SysID, GreyBox, ensemble, ridge; parking: some of
-    sim-fsvgd, fsvgd, fsvgd-authors. All unless given."""
+    sim-fsvgd, fsvgd, fsvgd-authors. All by default."""
 
     way: Literal["ours", "authors"] = "ours"
-    """regression: ours fits particles to a Gaussian-process posterior with simulator parameters (carlab's own method,
-    also in the rows named Sim-FSVGD); authors is functional SVGD as published, with the sizes of the authors' code."""
+    """regression: ours fits particles to a Gaussian-process posterior with simulator parameters (carlab's method, also
+    in the rows named Sim-FSVGD); authors is functional SVGD as published, with the sizes of the authors' code."""
 
     data: Path | None = None
-    """regression: folder with the authors' arrays (pendulum_seed0_n5.npz and so on); rows are drawn here without it.
+    """regression: folder with the authors' arrays (pendulum_seed0_n5.npz and so on); by default rows are generated.
     realcar and priors: folder with recordings, the last one held out."""
 
     car: Path = Path("eth_rc_car")
-    """realcar: the car file whose simulator is the prior, with its ranges and the standard deviations of a diagnosis.
-    priors with --data: the nominal car, which is diagnosed."""
+    """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. priors with
+    --data: car file of the nominal simulator, which is diagnosed."""
 
     history: int | None = None
-    """realcar and priors: past commands; found from the recordings unless given (the paper has 3)."""
+    """realcar and priors: number of past commands; by default estimated from the recordings (the paper has 3)."""
 
     diagnosed: Path | None = None
-    """priors: model.toml of a diagnosis without the last recording; diagnosed here unless given."""
+    """priors: model.toml of a diagnosis without the last recording; by default the study runs the diagnosis."""
 
     pair: int = 1
-    """priors without --data: which two effects are concealed (1, 2 or 3)."""
+    """priors without --data: number of the pair of concealed effects (1, 2 or 3)."""
 
     recorded_s: tuple[float, float] = (100.0, 40.0)
-    """priors without --data: lengths of the recordings to learn from and of the one held out [s]."""
+    """priors without --data: durations of the training recording and of the held-out recording [s]."""
 
     runs: Path = Path("parking-runs")
-    """parking: folder of its runs."""
+    """parking: folder of the runs."""
 
     episodes: int = 20
-    """parking: of each run."""
+    """parking: episodes of each run."""
 
     updates: int = 30000
     """parking: gradient steps of SAC before an episode, as for carlab learn."""
 
     steps: int | None = None
-    """Steps of the model's optimiser. Unless given: 12 000 for regression and priors, 2500 for parking, or what the
-    authors' code has."""
+    """Steps of the model's optimiser. By default 12 000 for regression and priors, 2500 for parking, or those of the
+    authors' code."""
 
     device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the models. speed: of the learning benchmarks alone; all others run on the CPU."""
+    """Device of the models. speed: of the learning benchmarks only; the others run on the CPU."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -92,11 +91,11 @@ class BenchOptions:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A use of ``carlab bench`` in which some options count.
+    """A use of ``carlab bench``.
 
     Attributes:
-        command: as it is typed.
-        holds: whether given options are this use.
+        command: text for messages.
+        holds: whether given options belong to this use.
     """
 
     command: str
@@ -130,14 +129,14 @@ PLACES = {
     "updates": (PARKING,),
     "steps": (REGRESSION, PRIORS, PARKING),
 }
-"""Uses in which an option counts, for options that do not count everywhere."""
+"""Uses in which an option has an effect, for options without an effect in all uses."""
 
 
 def check_options(given: BenchOptions) -> None:
-    """Check that every given option counts.
+    """Check that every given option has an effect.
 
     Raises:
-        ConfigError: one would be ignored; the sentence names its uses.
+        ConfigError: an option has no effect; the message lists the uses of the option.
     """
     for option in fields(given):
         name = option.name
@@ -145,13 +144,11 @@ def check_options(given: BenchOptions) -> None:
             continue
         if not any(place.holds(given) for place in PLACES[name]):
             places = " and ".join(place.command for place in PLACES[name])
-            raise ConfigError(
-                f"--{name.replace('_', '-')} is no option of '{_command(given)}'; it counts for {places}."
-            )
+            raise ConfigError(f"--{name.replace('_', '-')} has no effect in '{_command(given)}'; use it with {places}.")
 
 
 def _command(given: BenchOptions) -> str:
-    """The command with the options that decide which others count."""
+    """The command with the options that determine its use."""
     command = f"bench {given.what}"
     if REGRESSION.holds(given):
         return f"{command} --case {given.case}"

@@ -21,12 +21,12 @@ SPEED_PERIOD_S = 600.0
 
 
 def command() -> str:
-    """The command line that is run."""
+    """The current command line."""
     return " ".join(["carlab", *sys.argv[1:]])
 
 
 def write_figures(path: Path, figures: Mapping[str, Any]) -> None:
-    """Write a JSON file whole, or leave the one that is there; DataError where that fails."""
+    """Write a JSON file atomically. Raises DataError on failure; an existing file then remains."""
     from carlab.recording.atomic_files import write_text
 
     write_text(path, json.dumps(figures, indent=2) + "\n")
@@ -38,7 +38,7 @@ def run_and_write(
     """Run a study, write the figures after each score, and print each failure.
 
     Args:
-        study: starts it with a progress callback.
+        study: function that starts the study with a progress callback.
         options: with the file to write.
         name: of the progress bar.
 
@@ -63,18 +63,18 @@ def run_and_write(
 
 
 def report(scores: Sequence[Score], stopped: bool, options: BenchOptions, title: str, first: str, *others: Path) -> int:
-    """Print and draw a study.
+    """Print and draw the scores of a study.
 
     Args:
-        scores: of it.
-        stopped: whether it was ended early.
+        scores: scores of the study.
+        stopped: whether the study was ended early.
         options: with the file that was written.
         title: of the table.
-        first: head of the column with the compared methods.
+        first: header of the column with the compared methods.
         others: further files that were written.
 
     Returns:
-        The exit code: whether the study was ended early, or some fit failed.
+        The exit code: interrupted, failed (at least one fit failed) or 0.
     """
     from carlab.studies.regression.picture import draw
     from carlab.studies.regression.scores import summarised
@@ -93,9 +93,9 @@ def report(scores: Sequence[Score], stopped: bool, options: BenchOptions, title:
 
 
 def print_rows(title: str, first: str, rows: Sequence[Row]) -> None:
-    """Print scores as a table; ``first`` is the head of the column with the compared methods."""
+    """Print scores as a table; ``first`` is the header of the column with the compared methods."""
     columns = ["rows", first, "NLL [nat]", "+-", "RMSE", "calibration error", "seconds"]
-    cells = [[f"{r.rows}", _named(r), *_figures(r)] for r in rows]
+    cells = [[f"{r.rows}", _label(r), *_figures(r)] for r in rows]
     if any(r.nll_in_world is not None for r in rows):
         columns.append("NLL, seven outputs\nin the world")
         for cell, r in zip(cells, rows, strict=True):
@@ -103,7 +103,7 @@ def print_rows(title: str, first: str, rows: Sequence[Row]) -> None:
     table(title, columns, cells)
 
 
-def _named(row: Row) -> str:
+def _label(row: Row) -> str:
     return f"{row.method}, {row.failed} of {row.seeds + row.failed} failed" if row.failed else row.method
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def run_parking(options: BenchOptions) -> int:
-    """Drive the missing runs of the study, and print the figures of all."""
+    """Drive the missing runs of the study, and print the figures of all runs."""
     from carlab.cli.learn import Learn
     from carlab.cli.options import CarOptions
     from carlab.experiment.campaign.campaign import CAMPAIGN_FILE

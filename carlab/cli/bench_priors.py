@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
 
 HOLDOUT_SHARE = 0.1
-"""Share of the diagnosed recordings that the diagnosis holds out for itself (docs/decisions/0014)."""
+"""Share of each diagnosed recording in the validation split of the diagnosis (docs/decisions/0014)."""
 
 
 def run_priors(options: BenchOptions) -> int:
-    """Record or read, diagnose the recordings that are not held out, learn under each prior, and print."""
+    """Record or read recordings, diagnose all but the held-out one, fit a model under each prior, and print."""
     from carlab.cars import load_car_file
     from carlab.cli.recordings import load_episodes
     from carlab.studies.priors import prior_models, run_prior_study
@@ -57,10 +57,10 @@ def run_priors(options: BenchOptions) -> int:
 
 
 def check_unseen(model: Path, held_out: Path) -> None:
-    """Check that the report beside a diagnosed car does not name the held-out recording.
+    """Check that the report of a diagnosed car does not list the held-out recording.
 
     Raises:
-        ConfigError: it does, or there is no such model.
+        ConfigError: the report lists it, or the model does not exist.
         DataError: the report cannot be read.
     """
     required_file(model, "The diagnosed car")
@@ -73,7 +73,7 @@ def check_unseen(model: Path, held_out: Path) -> None:
         raise DataError(f"{report} cannot be read ({error!r}); diagnose again.") from error
     if hashlib.sha256(held_out.read_bytes()).hexdigest() in known:
         raise ConfigError(
-            f"{model} was diagnosed with {held_out.name}, which is held out here; diagnose without it, or leave out "
+            f"{model} was diagnosed with {held_out.name}, which is held out here; diagnose without it, or remove "
             "--diagnosed."
         )
 
@@ -83,11 +83,11 @@ def _recordings(options: BenchOptions, work: Path) -> tuple[Path, list[Path], st
     if options.data is not None:
         if not options.data.is_dir():
             raise ConfigError(
-                f"--data {options.data} is no folder; name one with two recordings or more (MCAP or CSV)."
+                f"--data {options.data} is not a folder; name a folder with at least two recordings (MCAP or CSV)."
             )
         files = sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
         if len(files) < 2:
-            raise DataError(f"{options.data} has {len(files)} recordings; the last is held out, so two are needed.")
+            raise DataError(f"{options.data} has {len(files)} recordings; add some (two or more are needed).")
         return options.car, files, options.data.name
     from carlab.studies.concealed_recordings import CAR_NAME, HELD_OUT_NAME, TRAINING_NAME, record_pair
 
@@ -102,9 +102,9 @@ def _recordings(options: BenchOptions, work: Path) -> tuple[Path, list[Path], st
 
 
 def _diagnosed(files: Sequence[Path], car: Path, folder: Path) -> Path:
-    """The car file of a diagnosis of some recordings, which holds out the end of each for itself."""
+    """The car file of a diagnosis of recordings, with the end of each as its validation split."""
     from carlab.cli.diagnose import Diagnose
 
     if Diagnose(tuple(files), car=str(car), out=folder, holdout_share=HOLDOUT_SHARE).run() != 0:
-        console.print("Nothing could be diagnosed: the diagnosed prior is the car's file.")
+        console.print("The diagnosis is inconclusive; the diagnosed prior is the car file.")
     return folder / "model.toml"

@@ -39,8 +39,8 @@ def _recorded(options: BenchOptions) -> RecordedCase:
     from carlab.studies.regression.recordings import recorded_case
 
     if options.data is None or not options.data.is_dir():
-        given = "" if options.data is None else f" ('{options.data}' is none)"
-        raise ConfigError(f"--case realcar needs --data FOLDER{given}, with two recordings (MCAP or CSV) at least.")
+        given = "" if options.data is None else f" ('{options.data}' is not a folder)"
+        raise ConfigError(f"--case realcar needs --data FOLDER{given}, with at least two recordings (MCAP or CSV).")
     files = sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
     case = recorded_case([load_episodes(path) for path in files], options.car, options.history)
     console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)

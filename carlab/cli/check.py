@@ -16,18 +16,18 @@ UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM
 
 @dataclass
 class Check:
-    """Open everything and move nothing: health, rates and latency of each part.
+    """Open a car without moving it, and measure health, rates and latency of each part.
 
-    Exit code 0 where the car is ready to be armed, 3 where it is not; the reasons are listed together.
+    Exit code 0 if the car is ready to be armed, 3 if not; all reasons are listed.
     """
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
     seconds: float = 2.0
-    """How long to watch motion capture."""
+    """Duration of the motion-capture measurement [s]."""
 
     wheels: bool = True
-    """On an emulated car, also steer at standstill to measure the way of a command; a real car never moves."""
+    """On an emulated car, also steer at rest to measure the latency of a command; a real car never moves."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -37,20 +37,20 @@ class Check:
         from carlab.api import check
 
         hooks = RunHooks(on_start=lambda folder, car: banner(car.reality, car.name, moves=False))
-        found = check(**self.which_car.arguments(), seconds=self.seconds, wheels=self.wheels, hooks=hooks)
-        if readings := found.health.readings:
+        result = check(**self.which_car.arguments(), seconds=self.seconds, wheels=self.wheels, hooks=hooks)
+        if readings := result.health.readings:
             rows = [[_label(name), f"{value:.4g}", _unit(name)] for name, value in readings.items()]
             table("Readings", ["reading", "value", "unit"], rows)
-        if found.latency is not None and found.latency.parts:
+        if result.latency is not None and result.latency.parts:
             lines = [
                 [name, f"{p50:.2f}", f"{p99:.2f}", f"{top:.2f}", str(count)]
-                for name, p50, p99, top, count in found.latency.rows()
+                for name, p50, p99, top, count in result.latency.rows()
             ]
             table("Latency [ms]", ["part", "p50", "p99", "max", "samples"], lines)
-        for problem in found.problems:
+        for problem in result.problems:
             fail(problem)
-        console.print("[green]Ready.[/green]" if found.is_ready else "[red]Not ready.[/red]")
-        return 0 if found.is_ready else NotReadyError.exit_code
+        console.print("[green]Ready.[/green]" if result.is_ready else "[red]Not ready.[/red]")
+        return 0 if result.is_ready else NotReadyError.exit_code
 
 
 def _unit(name: str) -> str:

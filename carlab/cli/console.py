@@ -1,4 +1,4 @@
-"""The one console. Only this package prints."""
+"""The console of the command line. No other package prints."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from rich.text import Text
 
 from carlab.core.quantities import Reality
 
-WIDTH_OF_A_FILE = 140
+FILE_WIDTH_CHARS = 140
 
 
 def _console(*, stderr: bool) -> Console:
     terminal = (sys.stderr if stderr else sys.stdout).isatty()
-    return Console(stderr=stderr, highlight=False, width=None if terminal else WIDTH_OF_A_FILE)
+    return Console(stderr=stderr, highlight=False, width=None if terminal else FILE_WIDTH_CHARS)
 
 
 console = _console(stderr=False)
@@ -38,22 +38,22 @@ SENTENCES = {
 
 
 def banner(reality: Reality, car: str, *, moves: bool = True) -> None:
-    """Say in capitals what is about to be driven, or (``moves`` off) only looked at."""
+    """Print the kind and name of the car; ``moves`` is False for a verb that does not move the car."""
     word = "LIVE" if reality is Reality.REAL else reality.value.upper()
-    sentence = SENTENCES[reality] if moves or reality is not Reality.REAL else "opened and looked at; nothing will move"
+    sentence = SENTENCES[reality] if moves or reality is not Reality.REAL else "opened for a check; nothing will move"
     text = Text.assemble((word, "bold"), f"  {car}: {sentence}")
     console.print(Panel(text, style=STYLES[reality], expand=False))
 
 
 def fail(message: str) -> None:
-    """Print one error, alone."""
+    """Print an error message."""
     error_console.print("[bold red]carlab:[/bold red]", Text(message), soft_wrap=True)
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: bool = True) -> None:
-    """Print a table, narrow enough for 80 columns; those after the first are right-aligned where they are numbers."""
-    # Text, not str: "[m]" is a unit here and no mark-up.
-    made = Table(
+    """Print a table; with ``numeric``, the columns after the first are right-aligned."""
+    # Text instead of str: rich would interpret the unit "[m]" as mark-up.
+    rich_table = Table(
         title=Text(title, "bold") if title else None,
         title_justify="left",
         header_style="bold",
@@ -62,19 +62,19 @@ def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, 
         pad_edge=False,
     )
     for index, column in enumerate(columns):
-        made.add_column(Text(column), justify="left" if index == 0 or not numeric else "right", overflow="fold")
+        rich_table.add_column(Text(column), justify="left" if index == 0 or not numeric else "right", overflow="fold")
     for row in rows:
-        made.add_row(*(Text(cell) for cell in row))
+        rich_table.add_row(*(Text(cell) for cell in row))
     if title:
         console.print()
-    console.print(made)
+    console.print(rich_table)
 
 
 @contextmanager
 def progress(speed_estimate_period_s: float = 30.0) -> Iterator[Progress]:
-    """A progress bar on a terminal; nothing where the output is a file.
+    """A progress bar on a terminal; it is disabled if the output is a file.
 
-    The time left is estimated from the steps of the last ``speed_estimate_period_s``.
+    The remaining time is estimated from the steps of the last ``speed_estimate_period_s``.
     """
     columns = (
         TextColumn("{task.description}"),
@@ -94,7 +94,7 @@ def progress(speed_estimate_period_s: float = 30.0) -> Iterator[Progress]:
 
 
 def log_to_console(*, verbose: bool) -> None:
-    """Show warnings (all with ``verbose``) of the program's log on the console."""
+    """Show warnings of the program's log on the console; with ``verbose``, all messages."""
     handler = RichHandler(console=error_console, show_path=False, show_time=verbose, rich_tracebacks=False)
     handler.setLevel(logging.DEBUG if verbose else logging.WARNING)
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler], format="%(message)s")

@@ -19,36 +19,36 @@ EXIT_INCONCLUSIVE = 5
 
 @dataclass
 class Diagnose:
-    """Find what a simulator leaves out of recordings: locate it, name it, model it, and show the held-out fit improve.
+    """Identify effects in recordings that a simulator does not model, and validate them on held-out data.
 
-    Writes report.html, report.json, report.rrd, summary.png and model.toml (the car file with what was found). ^C ends
-    the search and reports what was found until then. Exit code 0 with a verdict, 5 where the recordings are not
-    sufficient for one.
+    Writes report.html, report.json, report.rrd, summary.png and model.toml (the car file with the identified effects
+    and parameters). ^C ends the search and reports the findings so far. Exit code 0 with a verdict, 5 if the recordings
+    are not sufficient for a verdict.
     """
 
     recordings: Positional[tuple[Path, ...]]
     """MCAP or CSV files to fit, or folders of runs: every third episode of a run is held out."""
 
     car: str = "sim"
-    """Simulator to question: a car file, a car that comes along (eth_rc_car, dart_jetracer ...), or sim."""
+    """Simulator to check: a car file, a preset (eth_rc_car, dart_jetracer ...), or sim."""
 
     held_out: Annotated[tuple[Path, ...], arg(aliases=("--holdout",))] = ()
-    """Recordings for validation only; without any, the last part of each recording is held out."""
+    """Recordings for validation only; by default the last part of each recording is held out."""
 
     holdout_share: float | None = None
-    """How much of each recording that is, above 0 and at most 0.5; 0.3 unless given."""
+    """Size of that part as a share of the recording, above 0 and at most 0.5; 0.3 by default."""
 
     out: Path = Path("diagnosis")
     """Folder for the report."""
 
     effects: tuple[str, ...] = ()
-    """Try only these effects of the catalogue."""
+    """Restrict the search to these effects of the catalogue."""
 
     seed: int = 0
     """Written into the report; a diagnosis draws no random numbers."""
 
     decisions: bool = False
-    """Also write decisions.json: each decision about a name with the statistics and thresholds that it compared."""
+    """Also write decisions.json: the statistics and thresholds of each decision about an effect."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -84,4 +84,4 @@ class Diagnose:
         for effect in diagnosis.effects:
             console.print(f"  {effect.sentence}", markup=False)
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
-        console.print(f"Read {self.out / 'report.html'}; drive what was found with --car {self.out / 'model.toml'}.")
+        console.print(f"Read {self.out / 'report.html'}; drive the diagnosed car with --car {self.out / 'model.toml'}.")

@@ -27,43 +27,43 @@ if TYPE_CHECKING:
 
 @dataclass
 class Drive:
-    """Drive episodes with a policy, a script or a gamepad on a car, and record them.
+    """Drive episodes with a policy, a scripted manoeuvre or a gamepad on a car, and record them.
 
-    Each episode leaves an MCAP and a rerun recording in a new folder under --out, beside a summary picture. Press ^C
-    once to end after the tick, twice to stop at once.
+    A new folder in --out receives an MCAP and a rerun recording of each episode and a summary picture. Press ^C once to
+    end after the tick, twice to stop at once.
     """
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
     policy: PolicyName = "parking"
-    """parking (feedback), a scripted manoeuvre, neutral, or by hand: keyboard, gamepad (hold the dead-man)."""
+    """parking (feedback), a scripted manoeuvre, neutral, or teleoperation: keyboard, gamepad (hold the dead-man)."""
 
     task: TaskName = "parking"
-    """Where the car starts, what is rewarded, and the arena."""
+    """Start poses, reward and arena."""
 
     episodes: int = 1
-    """How many."""
+    """Number of episodes."""
 
     ticks: int | None = None
-    """Ticks an episode; the task's number (parking: 100) unless given."""
+    """Ticks per episode; by default the task's number (parking: 100)."""
 
     seed: int = 0
-    """Start poses and sensor noise."""
+    """Seed of start poses and sensor noise."""
 
     max_throttle: float | None = None
-    """Largest throttle that passes the safety gate, in (0, 1]."""
+    """Upper limit of the throttle in the safety gate, in (0, 1]."""
 
     place: bool = True
-    """Start each episode at the task's start pose; off: from where the car stands."""
+    """Start each episode at the task's start pose; off: at the car's current pose."""
 
     out: Path = Path("runs")
-    """Folder that receives the run's folder."""
+    """Parent of the run's folder."""
 
     name: str = "drive"
     """Last part of the run folder's name."""
 
     rerun: bool = True
-    """Record .rrd files beside the MCAP files."""
+    """Also record .rrd files."""
 
     picture: bool = True
     """Draw summary.png."""
@@ -72,7 +72,7 @@ class Drive:
     """Show the whole log."""
 
     def run(self) -> int:
-        """Drive and say how it went."""
+        """Drive and print the results."""
         from carlab.api import drive
 
         with progress() as bar:
@@ -147,7 +147,7 @@ class Drive:
                 fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())
         first = results[0].path
         shown = " (summary.png shows it)" if self.picture else ""
-        console.print(f"Recorded in {run.folder}{shown}. Look at an episode with:", soft_wrap=True, markup=False)
+        console.print(f"Recorded in {run.folder}{shown}. View an episode with:", soft_wrap=True, markup=False)
         console.print(f"  carlab view {shlex.quote(str(first))}", soft_wrap=True, markup=False)
         last = results[-1].reason
         if last is EndReason.STOP_REQUESTED:

@@ -13,14 +13,13 @@ from carlab.core.errors import ConfigError, NotReadyError
 
 @dataclass
 class Emulate:
-    """Run fake hardware as a process: a VESC on a pty or CAN bus, and a NatNet server, driven by one physics.
+    """Run emulated hardware as a process: a VESC on a pty or CAN bus and a NatNet server with common physics.
 
-    Any program that speaks these protocols can use it; carlab itself does with a car file that names the port. It
-    runs until ^C.
+    Any program with these protocols can use it; carlab does so with a car file that names the port. It runs until ^C.
     """
 
     actuator: Literal["serial", "can"] = "serial"
-    """A VESC on a pseudo-terminal, or on a CAN bus (python-can udp_multicast, kept on this host)."""
+    """A VESC on a pseudo-terminal, or on a CAN bus (python-can udp_multicast on this host)."""
 
     port: Path = Path("carlab-vesc")
     """Name of the serial port: a link to the pseudo-terminal."""
@@ -29,10 +28,10 @@ class Emulate:
     """Group and port of the CAN bus."""
 
     vehicle: Path | None = None
-    """A car file for physics and motion capture; the default car without it."""
+    """Car file for physics and motion capture; by default the default car's."""
 
     mode: Literal["unicast", "multicast"] = "unicast"
-    """How NatNet frames are sent."""
+    """Transmission type of NatNet frames."""
 
     bitstream: str = "4.1"
     """NatNet bitstream version: 3.0, 3.1, 4.0 or 4.1."""
@@ -44,10 +43,10 @@ class Emulate:
     """NatNet data port; 0 for any."""
 
     seed: int = 0
-    """Of the sensor noise."""
+    """Seed of the sensor noise."""
 
     log: Path | None = None
-    """Write each command the firmware hears as a JSON line."""
+    """Write each command that the firmware receives as a JSON line."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -58,7 +57,7 @@ class Emulate:
         from carlab.cars.emulated_world import World, WorldConfig
         from carlab.experiment.episodes.interrupts import Interrupts
 
-        self._refuse_nonsense()
+        self._check_options()
         file = default_car() if self.vehicle is None else load_car_file(self.vehicle)
         config = WorldConfig(
             simulator=file.simulator.to_tables(),
@@ -73,38 +72,40 @@ class Emulate:
             bitstream=self.bitstream,
         )
         with Interrupts() as interrupts, World(config) as world:
-            there = world.addresses
-            console.print("[bold]EMULATED[/bold]  in the car file of a program on this host:")
-            # Square brackets are rich's mark-up; here they are TOML.
+            addresses = world.addresses
+            console.print("[bold]EMULATED[/bold]  Car file for a program on this host:")
+            # Printed without rich's mark-up, which would interpret the square brackets of TOML.
             lines = ["[hardware.actuator]"]
             if self.actuator == "serial":
-                lines += ['kind = "vesc_serial"', f'port = "{there["port"]}"']
+                lines += ['kind = "vesc_serial"', f'port = "{addresses["port"]}"']
             else:
-                lines += ['kind = "vesc_can"', 'interface = "udp_multicast"', f'channel = "{there["can_channel"]}"']
+                lines += ['kind = "vesc_can"', 'interface = "udp_multicast"', f'channel = "{addresses["can_channel"]}"']
             lines += ["[hardware.mocap]", 'server_address = "127.0.0.1"', 'local_interface = "127.0.0.1"']
-            lines += [f'mode = "{self.mode}"', f"command_port = {there['command_port']}", f'body = "{config.body}"']
+            lines += [f'mode = "{self.mode}"', f"command_port = {addresses['command_port']}", f'body = "{config.body}"']
             console.print("\n".join(lines), markup=False, soft_wrap=True)
             console.print("^C ends it.")
             while not interrupts.requested.wait(0.2):
                 pass
         return 0
 
-    def _refuse_nonsense(self) -> None:
+    def _check_options(self) -> None:
         for name, port in (("command-port", self.command_port), ("data-port", self.data_port)):
             if not 0 <= port <= 65535:
-                raise ConfigError(f"--{name} {port}: 0 to 65535.")
+                raise ConfigError(f"--{name} {port}: give a number from 0 to 65535.")
         if self.actuator == "can":
             group, _, number = self.can_channel.partition(":")
             try:
-                known = ipaddress.IPv4Address(group).is_multicast and 0 < int(number or 1) <= 65535
+                is_valid = ipaddress.IPv4Address(group).is_multicast and 0 < int(number or 1) <= 65535
             except ValueError:
-                known = False
-            if not known:
-                raise ConfigError(f"--can-channel {self.can_channel}: GROUP or GROUP:PORT such as 239.74.163.2:43113.")
+                is_valid = False
+            if not is_valid:
+                raise ConfigError(
+                    f"--can-channel {self.can_channel}: give GROUP or GROUP:PORT such as 239.74.163.2:43113."
+                )
         elif not self.port.absolute().parent.is_dir():
-            raise ConfigError(f"--port {self.port}: its folder does not exist; make it or choose another one.")
+            raise ConfigError(f"--port {self.port}: its folder does not exist; create it or choose another one.")
         elif self.port.exists():
-            # The link of one that was killed points nowhere and is replaced.
+            # A dangling link of a killed process does not count as existing and is replaced.
             raise NotReadyError(
-                f"--port {self.port}", ["it is there already, of another carlab emulate perhaps; choose another name."]
+                f"--port {self.port}", ["it exists already, perhaps of another carlab emulate; choose another name."]
             )

@@ -19,25 +19,25 @@ if TYPE_CHECKING:
     from carlab.recording.column_mapping import ColumnMapping
 
 Sign = Literal[1, -1]
-NOT_OF_THE_MAPPING = ("recording", "out", "mapping", "report", "verbose")
+OTHER_OPTIONS = ("recording", "out", "mapping", "report", "verbose")
 
 
 @dataclass
 class Import:
-    """Turn a foreign CSV (.csv, .csv.gz) into an MCAP recording, and say what is wrong with it.
+    """Convert a CSV of another program (.csv, .csv.gz) to an MCAP recording, and report its data faults.
 
-    Known layouts are recognised by their header; others need --mapping. What is declared is converted; what is merely
-    detected is reported with the option that would act on it, and nothing is guessed.
+    Known layouts are recognised by their header; others need --mapping. Only declared properties are converted;
+    detected ones are reported with the option that would convert them.
     """
 
     recording: Positional[Path]
     """The CSV file."""
 
     out: Path | None = None
-    """The MCAP file to write; beside the CSV unless given. A recording that is split gets -1, -2 ... in the names."""
+    """MCAP file to write; by default in the folder of the CSV. A split recording has -1, -2 ... in its file names."""
 
     mapping: Path | None = None
-    """TOML file that says which column is which: tables [columns.x] with name, unit, sign, scale."""
+    """TOML file with the columns: tables [columns.x] with name, unit, sign, scale."""
 
     report: Path | None = None
     """Also write the findings as JSON."""
@@ -76,34 +76,34 @@ class Import:
     """Factor on vy."""
 
     x_sign: Sign | None = None
-    """-1 where x counts the other way."""
+    """-1 if x has the opposite sign."""
 
     y_sign: Sign | None = None
-    """-1 where y counts the other way."""
+    """-1 if y has the opposite sign."""
 
     yaw_sign: Sign | None = None
-    """-1 where yaw counts clockwise."""
+    """-1 if yaw is positive clockwise."""
 
     yaw_rate_sign: Sign | None = None
-    """-1 where the yaw rate counts clockwise."""
+    """-1 if the yaw rate is positive clockwise."""
 
     yaw_rate_scale: float | None = None
     """Factor on the yaw rate."""
 
     vx_sign: Sign | None = None
-    """-1 where vx counts backwards."""
+    """-1 if vx is positive backwards."""
 
     vy_sign: Sign | None = None
-    """-1 where vy counts to the right."""
+    """-1 if vy is positive to the right."""
 
     steering_sign: Sign | None = None
-    """-1 where positive steering turns right."""
+    """-1 if positive steering turns right."""
 
     steering_scale: float | None = None
     """Factor on steering, to bring it into [-1, 1]."""
 
     throttle_sign: Sign | None = None
-    """-1 where positive throttle drives backwards."""
+    """-1 if positive throttle drives backwards."""
 
     throttle_scale: float | None = None
     """Factor on throttle, to bring it into [-1, 1]."""
@@ -115,23 +115,23 @@ class Import:
     """Exchange x and y."""
 
     repair_yaw_rate: bool | None = None
-    """Replace spikes of a wrapped-angle difference by the turn rate of the pose."""
+    """Replace spikes of a wrapped-angle difference by the yaw rate of the pose."""
 
     missing: Literal["error", "drop"] | None = None
-    """Rows with a value missing: refuse, or leave them out."""
+    """Rows with a missing value: error, or drop them."""
 
     gaps: Literal["error", "split", "keep"] | None = None
-    """Gaps in time: refuse, split into episodes there, or keep one episode."""
+    """Gaps in time: error, split into episodes, or keep one episode."""
 
     stamps: Literal["error", "drop"] | None = None
-    """Stamps that do not increase: refuse, or leave those rows out."""
+    """Time stamps that do not increase: error, or drop those rows."""
 
     clock: Literal["column", "velocity", "even"] | None = None
-    """Take times from their column; rebuild each period from distance over speed where the column was made up later;
-    or put rows on an even clock where they are frames of a camera, stamped as they arrived."""
+    """column: times of the time column. velocity: each period from distance over speed, for a synthetic time column.
+    even: a uniform clock, for camera frames with arrival times."""
 
     command_lag: float | None = None
-    """Known delay of the command columns behind the moment at which the commands were sent [s]."""
+    """Known delay of the command columns relative to the sending of the commands [s]."""
 
     rate: float | None = None
     """Row rate [Hz] of a file without a time column; needs --mapping."""
@@ -140,13 +140,13 @@ class Import:
     """Show the whole log."""
 
     def run(self) -> int:
-        """Import, report, write."""
+        """Import the CSV, print the findings, write the recording."""
         from carlab.recording.csv.foreign import import_csv
         from carlab.recording.mcap.sink import write_episode
 
         required_file(self.recording)
         if not is_csv(self.recording):
-            raise ConfigError(f"{self.recording} is not a .csv or .csv.gz; carlab import reads those.")
+            raise ConfigError(f"{self.recording} is not a CSV; name a .csv or .csv.gz file.")
         stem = self.recording.name.removesuffix(".gz").removesuffix(".csv")
         out = self.out if self.out is not None else self.recording.with_name(f"{stem}.mcap")
         new_file(out, "--out", ".mcap")
@@ -163,7 +163,7 @@ class Import:
             try:
                 write_episode(episode, path)
             except KeyboardInterrupt:
-                # Half an import is worth nothing: the CSV is still there.
+                # A partial import is useless; the CSV remains.
                 path.with_name(f"{path.name}.partial").unlink(missing_ok=True)
                 raise
             seconds = episode.times_s[-1] - episode.times_s[0]
@@ -171,6 +171,6 @@ class Import:
         return 0
 
     def _mapping(self) -> ColumnMapping | None:
-        own = {f.name: getattr(self, f.name) for f in fields(self)}
-        options = {name: value for name, value in own.items() if name not in NOT_OF_THE_MAPPING}
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        options = {name: value for name, value in values.items() if name not in OTHER_OPTIONS}
         return resolved_mapping(self.recording, self.mapping, options)

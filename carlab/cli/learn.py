@@ -34,71 +34,70 @@ STEPS_PERIOD_S = 600.0
 class Learn:
     """Fit the car, train a parking policy in the learned car, drive an episode with it, and repeat.
 
-    The goal is the origin of the motion capture, facing along x; an episode is 100 ticks (3.3 s at 30 Hz). Before each
-    one a person puts a real car at the start that is named; simulated and emulated ones are put there. Between episodes
-    another process learns while the car sits in neutral. A run that was ended anywhere goes on with --resume.
+    The goal is the origin of the motion capture with heading along x; an episode has 100 ticks (3.3 s at 30 Hz). Before
+    each episode a person places a real car at the printed start pose; simulated and emulated cars are placed
+    automatically. Between episodes another process trains while the car is in neutral. --resume continues an
+    interrupted run.
     """
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
     episodes: int | None = None
-    """How many, those that are driven already included: 20 unless given; of a resumed run, as many as it was
-    started with."""
+    """Total number of episodes, including those already driven; by default 20, or the number of the resumed run."""
 
     ticks: int | None = None
-    """Ticks an episode; the task's number (100) unless given. More than --history."""
+    """Ticks per episode, more than --history; by default the task's number (100)."""
 
     prior: str = "kinematic"
-    """The simulator that is the prior: kinematic (the car's file, wheels that do not slip), nominal (the car's file as
-    it is), or FILE.toml (a diagnosed model.toml, say, with its effects and standard deviations). Ranges are those of
-    the file; where it has none, 30 % about motor gain, damping and steering angle, and unless the wheels do
-    not slip about yaw inertia and the tyres' stiffness and grip."""
+    """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), or FILE.toml (for
+    example a diagnosed model.toml with its effects and standard deviations). Ranges are those of the file; without
+    them, 30 % about motor gain, damping and steering angle and, with wheel slip, about yaw inertia and the tyres'
+    stiffness and friction."""
 
     method: Method = "sim-fsvgd"
     """sim-fsvgd: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method). fsvgd:
     the same without a simulator. fsvgd-authors: functional SVGD as in the public code of Sim-FSVGD's authors."""
 
     history: int | None = None
-    """Past commands that model and policy see. Unless given as many as delay, motion capture and the window of the
-    velocities need (4 for the simulated car; fsvgd-authors has the paper's 3); after three episodes it is said how many
-    the recordings ask for."""
+    """Number of past commands that model and policy observe. By default it covers the command delay, the latency of
+    motion capture and the window of the velocity estimate (4 for the simulated car; fsvgd-authors has the paper's 3).
+    After three episodes the number that the recordings support is printed."""
 
     model_steps: int | None = None
-    """Steps of the model's optimiser before each episode: 2500 unless given (fsvgd-authors: 40 000 at most)."""
+    """Steps of the model's optimiser before each episode: 2500 by default (fsvgd-authors: at most 40 000)."""
 
     updates: int = 30000
-    """Gradient steps of SAC before an episode: half as many again before the first, and after the third the fewer the
-    smaller the share of new rows is (3 / episode)."""
+    """Gradient steps of SAC before an episode: 1.5 times as many before the first episode; after the third, the number
+    is multiplied by 3 / episode."""
 
     seed: int = 0
-    """Number from which all that is random follows: the same seed, the same run."""
+    """Seed of all random numbers; the same seed gives the same run."""
 
     device: Device | None = None
-    """Where model and policy learn: cpu unless given; of a resumed run, as before. The car is driven from
-    the CPU."""
+    """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""
 
     place: bool = True
-    """Start each episode at the task's start pose, where a person is asked to put a real car; off: from where the car
-    stands."""
+    """Start each episode at the task's start pose, at which a person places a real car; off: at the car's current
+    pose."""
 
     resume: Path | None = None
-    """Folder of a run to resume; --car must be as it was, --episodes and --device may change, all else is
-    as the run was started."""
+    """Folder of a run to resume. --car must be the same, --episodes and --device may change, all other options are
+    those of the run."""
 
     out: Path = Path("runs")
-    """Folder that receives the run's folder."""
+    """Parent of the run's folder."""
 
     name: str = "learn"
     """Last part of the run folder's name."""
 
     rerun: bool = True
-    """Record .rrd files beside the MCAP files."""
+    """Also record .rrd files."""
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
-        """Learn and say how it went."""
+        """Learn and print the results."""
         from carlab.api import learn
 
         with progress(speed_estimate_period_s=STEPS_PERIOD_S) as bar:
@@ -128,20 +127,20 @@ class Learn:
         folders: list[Path] = []
         rows: dict[str, TaskID] = {}
 
-        def at(what: str, done: int, total: int) -> None:
-            if what not in rows:
+        def show_progress(activity: str, done: int, total: int) -> None:
+            if activity not in rows:
                 for task in rows.values():
                     bar.remove_task(task)
                 rows.clear()
-                rows[what] = bar.add_task(what, total=total, note="")
-            bar.update(rows[what], completed=done, total=total)
+                rows[activity] = bar.add_task(activity, total=total, note="")
+            bar.update(rows[activity], completed=done, total=total)
 
         def on_start(folder: Path, car: Car) -> None:
             folders.append(folder)
             banner(car.reality, car.name)
 
         def on_episode(number: int, ticks: int) -> None:
-            at(f"episode {number}", 0, ticks)
+            show_progress(f"episode {number}", 0, ticks)
 
         def on_tick(tick: Tick) -> None:
             (task,) = rows.values()
@@ -174,10 +173,10 @@ class Learn:
             on_episode=on_episode,
             on_tick=on_tick,
             on_abandon=on_abandon,
-            on_training=at,
+            on_training=show_progress,
             on_learned=on_learned,
             on_figures=on_figures,
-            on_checking=functools.partial(at, "asking whether the simulator still explains it", 0, 1),
+            on_checking=functools.partial(show_progress, "quick check of the simulator", 0, 1),
             on_check=on_check,
         )
 
@@ -185,11 +184,11 @@ class Learn:
         from carlab.experiment.campaign.campaign import CONTINUE_REASONS
 
         if not run.folder.is_dir():
-            console.print("Nothing was learned; start again.")
+            console.print("No model was trained; start the run again.")
             return EXIT_INTERRUPTED
         done = len(run.recordings)
         if not run.results and run.is_complete:
-            console.print(f"All {done} episodes are driven; {run.folder} has nothing left to do.", soft_wrap=True)
+            console.print(f"All {done} episodes are driven; the run in {run.folder} is complete.", soft_wrap=True)
         if run.results:
             table(
                 "",
@@ -214,8 +213,8 @@ class Learn:
             console.print(f"Learned and recorded in {run.folder} (learn.png, learn.rrd).", soft_wrap=True)
         if done < run.wanted:
             console.print(
-                f"{done} of {run.wanted} episodes; go on with: "
-                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.typed()}",
+                f"{done} of {run.wanted} episodes; resume with: "
+                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}",
                 soft_wrap=True,
             )
             last = run.end

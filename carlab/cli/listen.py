@@ -13,16 +13,16 @@ from carlab.core.errors import ConfigError
 
 @dataclass
 class Listen:
-    """Print motion-capture frames as they come: pose, rate, latency, losses."""
+    """Print motion-capture frames on arrival, and statistics: pose, rate, latency, losses."""
 
     car: Path | None = None
-    """A car file whose [hardware.mocap] to use; the options below otherwise."""
+    """Car file with [hardware.mocap], which replaces the options below."""
 
     server: str = "127.0.0.1"
     """Address of the computer that runs Motive."""
 
     interface: str = ""
-    """Address of this computer's interface towards it; empty for the one the system would use."""
+    """Address of this computer's interface to the server; empty: the system's choice."""
 
     mode: Literal["unicast", "multicast"] = "unicast"
     """Transmission type of the server."""
@@ -31,25 +31,25 @@ class Listen:
     """NatNet command port of the server."""
 
     body: str = ""
-    """Rigid body by name; the only one there is where empty."""
+    """Name of the rigid body; empty: the only one of the stream."""
 
     body_id: int | None = None
-    """Rigid body by streaming id, in place of its name."""
+    """Streaming id of the rigid body, instead of its name."""
 
     bitstream: str = "4.1"
-    """Newest bitstream version to ask for."""
+    """Newest bitstream version to request."""
 
     up_axis: Literal["y", "z"] = "y"
     """Up axis of the stream."""
 
     seconds: float | None = None
-    """Stop after this long; without it, at ^C."""
+    """Duration [s]; by default until ^C."""
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
-        """Listen and print four lines a second, then the statistics."""
+        """Print four frames per second, then the statistics."""
         from carlab.cars import load_car_file
         from carlab.core.clock import MonotonicClock
         from carlab.experiment.episodes.interrupts import Interrupts
@@ -83,10 +83,10 @@ class Listen:
                     continue
                 sequence = sample.sequence
                 age_ms = (sample.t_receive_s - sample.t_capture_s) * 1e3
-                seen = "" if sample.tracked else "  [yellow]not tracked[/yellow]"
+                warning = "" if sample.tracked else "  [yellow]not tracked[/yellow]"
                 console.print(
                     f"frame {sample.sequence:8d}  x {sample.x_m:+8.4f} m  y {sample.y_m:+8.4f} m  "
-                    f"yaw {sample.yaw_rad:+7.4f} rad  latency {age_ms:5.1f} ms{seen}"
+                    f"yaw {sample.yaw_rad:+7.4f} rad  latency {age_ms:5.1f} ms{warning}"
                 )
                 clock.sleep_until(min(clock.now_s() + 0.25, end_s))
             statistics = source.statistics()

@@ -1,4 +1,4 @@
-"""Options that several verbs share, and how they become cars and policies."""
+"""Common options of several verbs, and checks of output files."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from carlab.api.cars import typed_car
+from carlab.api.cars import car_options_text
 from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -15,32 +15,32 @@ if TYPE_CHECKING:
 
 @dataclass
 class CarOptions:
-    """Which car."""
+    """Options that select the car."""
 
     car: str = "sim"
-    """sim, emulated (serial), emulated-can, a car that comes along (eth_rc_car, dart_jetracer ...: simulated), or
-    FILE.toml: with [hardware] that real car, else that simulated one."""
+    """sim, emulated (serial), emulated-can, a preset (eth_rc_car, dart_jetracer ...: simulated), or FILE.toml: a real
+    car with [hardware], else a simulated car."""
 
     vehicle: Path | None = None
-    """Car file whose physics and motion capture sim and emulated use in place of the default car's."""
+    """Car file with physics and motion capture of sim and emulated, which replaces the default car."""
 
     dry_run: bool = False
     """Real inputs, but no command is sent."""
 
     reality: Path | None = None
-    """Car file whose physics a simulated or emulated car has in truth: what differs from its own file is concealed from
-    everything that learns and diagnoses, and reaches it through recordings alone."""
+    """Car file with the true physics of a simulated or emulated car. Learning and diagnosis do not read it; they
+    observe differences to the car's own file only through recordings."""
 
     def arguments(self) -> dict[str, Any]:
-        """These options as arguments of the calls that drive."""
+        """These options as keyword arguments of ``carlab.drive`` and other calls."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
-    def typed(self) -> str:
-        """These options as one would type them, each with a space before it; nothing for those that need no word."""
-        return typed_car(**self.arguments())
+    def to_text(self) -> str:
+        """These options as command-line text, each with a leading space; default values are omitted."""
+        return car_options_text(**self.arguments())
 
     def choose(self, *, seed: int, log_folder: Path | None = None) -> CarChoice:
-        """Build the car; nothing is opened yet."""
+        """Build the car without opening it."""
         from carlab.cars import choose_car
 
         given = self.arguments()
@@ -48,18 +48,18 @@ class CarOptions:
 
 
 def new_file(path: Path, option: str, suffix: str) -> Path:
-    """The path, where it has that suffix and nothing is there; ConfigError or DataError otherwise."""
+    """Return a path for a new file. Raises ConfigError for another suffix, DataError if the file exists."""
     if path.suffix != suffix:
         raise ConfigError(f"{option} {path}: name a file that ends in {suffix}.")
     if path.exists():
-        raise DataError(f"{path} is there already; remove it or choose another {option}.")
+        raise DataError(f"{path} exists already; remove it or choose another {option}.")
     return path
 
 
 def json_file(path: Path, option: str) -> Path:
-    """The path, where a JSON file may be written; ConfigError otherwise."""
+    """Return a path for a JSON file. Raises ConfigError for another suffix or a missing folder."""
     if path.suffix != ".json" or path.is_dir():
         raise ConfigError(f"{option} {path}: name a file that ends in .json.")
     if not path.parent.is_dir():
-        raise ConfigError(f"{option} {path}: there is no folder {path.parent}; make it first.")
+        raise ConfigError(f"{option} {path}: there is no folder {path.parent}; create it first.")
     return path

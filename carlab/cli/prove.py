@@ -23,62 +23,63 @@ STAGES = {
     "make": "cases made",
     "diagnose": "cases diagnosed",
     "oracle": "cases diagnosed with the true names",
-    "baselines": "cases put to the baselines",
+    "baselines": "cases scored by the baselines",
 }
 DAY_S = 86400.0
 
 
 @dataclass
 class Prove:
-    """Conceal effects in fresh recordings, diagnose them without their names, then open the seal and score.
+    """Benchmark the diagnosis on new recordings with concealed effects, and score it against the sealed answers.
 
-    Prints a hash over the answers before the first diagnosis. Takes hours (--set short: minutes). ^C ends after the
-    running cases, twice at once; the same command goes on from there. Writes scores.json, confusion.png, results.md.
+    Prints a hash of the answers before the first diagnosis. Takes hours (--set short: minutes). ^C ends after the
+    running cases, a second ^C at once; the same command continues. Writes scores.json, confusion.png, results.md.
     """
 
     out: Path = Path("proof")
-    """Folder of the proof; one that was begun with the same options is gone on with."""
+    """Folder of the benchmark; an unfinished benchmark with the same options is continued."""
 
     set: Literal["short", "full", "development"] = "short"
-    """short: five small cases; full: some 350, from the seeds that figures come from; development: 350 other ones."""
+    """short: five small cases; full: about 350 cases of the test set; development: 350 other cases."""
 
     simulator: Literal["own", "commonroad", "commonroad-drift"] = "own"
-    """own: conceal as above; commonroad: no seal, but a car that nobody here wrote, the multi-body model of the package
-    commonroad-vehicle-models, or its single-track drift model. Writes study.md and study.json."""
+    """own: effects concealed in carlab's simulator; commonroad: no seal, recordings of an independent simulator, the
+    multi-body model of the package commonroad-vehicle-models; commonroad-drift: its single-track drift model. The
+    latter two write study.md and study.json."""
 
     seed: int = 0
-    """Another seed, other cases."""
+    """Seed of the cases."""
 
     limit: int | None = None
-    """Only so many cases, drawn from the set; of a public simulator, so many drives (one, if not said)."""
+    """Number of cases drawn from the set; for a public simulator, number of drives (1 by default)."""
 
     jobs: int = 1
-    """Cases at a time; with more than one, each computes with one thread."""
+    """Number of parallel cases; with more than one, each case has one thread."""
 
     timeout: float = 1800.0
-    """A diagnosis that takes longer counts as failed [s]."""
+    """Time limit of a diagnosis [s]; a longer diagnosis counts as failed."""
 
     oracle: bool = True
     """Diagnose again with the true names, for the oracle ratio."""
 
     baselines: bool = True
-    """Put the same cases to PySINDy, a Gaussian process, stepwise BIC and cross-correlation."""
+    """Also score PySINDy, a Gaussian process, stepwise BIC and cross-correlation on the same cases."""
 
     calibrate: bool = False
-    """Run nothing; print the rates of false and missed names over the range of each decision threshold, from the
-    finished diagnoses of the folder. Use it with --set development: never tune on the test set."""
+    """Run no case; print the rates of false and missed names over the range of each decision threshold, from the
+    finished diagnoses of the folder. Use it with --set development; never tune thresholds on the test set."""
 
     verbose: bool = False
     """Show the whole log."""
 
     def run(self) -> int:
-        """Make, seal, diagnose, open, score."""
+        """Create and seal the cases, diagnose them, open the seal, and score."""
         from carlab.benchmark.baselines.run import require_studies
         from carlab.benchmark.proof.runner import Proof
         from carlab.experiment.episodes.interrupts import Interrupts
 
         if self.jobs < 1 or self.timeout <= 0.0:
-            raise ConfigError("--jobs and --timeout: numbers above zero.")
+            raise ConfigError("--jobs and --timeout: give numbers above zero.")
         specs = self._specs()
         if self.simulator != "own":
             return self._study()
@@ -87,13 +88,13 @@ class Prove:
         if self.baselines:
             require_studies()
         with Interrupts() as interrupts, progress(speed_estimate_period_s=DAY_S) as bar:
-            said = _Bar(bar)
+            stages = _Bar(bar)
             proof = Proof(
-                self.out, specs, command=_diagnose_command(), progress=said, timeout_s=self.timeout, jobs=self.jobs,
+                self.out, specs, command=_diagnose_command(), progress=stages, timeout_s=self.timeout, jobs=self.jobs,
                 stop_requested=interrupts.requested.is_set, abandon=interrupts.urgent.is_set,
             )  # fmt: skip
             if not self._stages(proof, interrupts):
-                fail(f"Stopped with {said.last}; the same command goes on from there.")
+                fail(f"Stopped with {stages.last}; run the same command to continue.")
                 return 130
         return self._score(proof)
 
@@ -146,7 +147,7 @@ class Prove:
         from carlab.benchmark.cases.proof_set import drawn, full_set, short_set
 
         if self.limit is not None and self.limit < 1:
-            raise ConfigError(f"--limit {self.limit}: at least one case.")
+            raise ConfigError(f"--limit {self.limit}: give at least 1.")
         if self.set == "short":
             specs = short_set("test", self.seed)
         else:
@@ -159,7 +160,7 @@ class Prove:
         from carlab.benchmark.proof.scores import draw_confusion, score_cases, summarise, table_rows, write_scores
 
         answers = proof.open_seal()
-        console.print("The seal is whole: the answers are those of the hash.")
+        console.print("The seal is intact: the answers match the hash.")
         runs = proof.reports()
         with console.status("Scoring"):
             rows = score_cases(answers, runs, proof.reports(oracle=True) if self.oracle else None, proof.same)
@@ -167,9 +168,9 @@ class Prove:
         comparison = compare(rows, proof.baseline_reports()) if self.baselines else []
         table(f"{len(rows)} cases", ["figure", "value (95 %)", "n", "target"], table_rows(summary))
         if comparison:
-            table("Beside the baselines, names strictly", ["figure", *COLUMNS], comparison_rows(comparison))
+            table("Comparison with the baselines, exact names", ["figure", *COLUMNS], comparison_rows(comparison))
         if summary["no_report"]:
-            fail(f"{summary['no_report']} diagnoses left no report; results.md says which and why.")
+            fail(f"{summary['no_report']} diagnoses have no report; results.md lists them with the reasons.")
         write_scores(proof.root / "scores.json", rows, summary, comparison)
         draw_confusion(proof.root / "confusion.png", rows.values())
         page = results_page(self._facts(proof, runs), rows, runs, summary, comparison)

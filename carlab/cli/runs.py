@@ -1,4 +1,4 @@
-"""A person who puts the car at its start."""
+"""Prompt for a person to place the car at its start pose."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 def ask_to_place(bar: Progress, otherwise: str) -> Callable[[CarState], None]:
-    """Ask the person there to put the car at a start. ^C at the question ends the run like ^C while driving."""
+    """Create a prompt to place the car at a start pose. ^C at the prompt ends the run like ^C while driving."""
 
     def ask(start: CarState) -> None:
         text = f"Put the car at x {start.x_m:.2f} m, y {start.y_m:.2f} m, yaw {start.yaw_rad:.2f} rad"
         if not sys.stdin.isatty():
-            raise ConfigError(f"{text}: nobody is at the keyboard to confirm it; {otherwise}.")
+            raise ConfigError(f"{text}: the confirmation needs a terminal; {otherwise}.")
         bar.stop()
         handler = signal.signal(signal.SIGINT, signal.default_int_handler)
         interrupted = False

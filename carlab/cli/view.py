@@ -29,7 +29,7 @@ class View:
     """Write FILE.rrd instead of opening the viewer."""
 
     screenshot: Path | None = None
-    """Write FILE.png instead: the viewer's own picture where a Vulkan driver draws it without a screen, else a plot."""
+    """Write FILE.png instead: a screenshot of the viewer if a Vulkan driver can render it off-screen, else a plot."""
 
     verbose: bool = False
     """Show the whole log."""

@@ -49,27 +49,27 @@ def test_an_option_is_heard_or_refused(what: str, others: tuple[tuple[str, objec
     if name in HEARD[what, others]:
         check_options(given)
     else:
-        option = f"--{name.replace('_', '-')} is no option of 'bench {what}"
-        with pytest.raises(ConfigError, match=rf"^{option}.*'; it counts for 'bench .*'.*\.$"):
+        option = f"--{name.replace('_', '-')} has no effect in 'bench {what}"
+        with pytest.raises(ConfigError, match=rf"^{option}.*'; use it with 'bench .*'.*\.$"):
             check_options(given)
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("speed --case pendulum", "--case is no option of 'bench speed'; it counts for 'bench regression'."),
-        ("speed --runs elsewhere", "--runs is no option of 'bench speed'; it counts for 'bench parking'."),
-        ("priors --methods ridge", "'bench priors'; it counts for 'bench regression' and 'bench parking'."),
+        ("speed --case pendulum", "--case has no effect in 'bench speed'; use it with 'bench regression'."),
+        ("speed --runs elsewhere", "--runs has no effect in 'bench speed'; use it with 'bench parking'."),
+        ("priors --methods ridge", "'bench priors'; use it with 'bench regression' and 'bench parking'."),
         (
             "regression --car mine.toml",
-            "--car is no option of 'bench regression --case 1d'; it counts for 'bench regression --case realcar' and "
+            "--car has no effect in 'bench regression --case 1d'; use it with 'bench regression --case realcar' and "
             "'bench priors --data FOLDER'.",
         ),
         (
             "priors --data here --recorded-s 40 20",
-            "--recorded-s is no option of 'bench priors --data here'; it counts for 'bench priors' without --data.",
+            "--recorded-s has no effect in 'bench priors --data here'; use it with 'bench priors' without --data.",
         ),
-        ("parking --way authors", "--way is no option of 'bench parking'; it counts for 'bench regression'."),
+        ("parking --way authors", "--way has no effect in 'bench parking'; use it with 'bench regression'."),
     ],
 )
 def test_it_is_told_where_the_option_counts(

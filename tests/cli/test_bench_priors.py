@@ -92,9 +92,9 @@ def test_what_cannot_be_studied_is_said(carlab: Carlab, folder: Path, model: Pat
         assert code == 2
         return text
 
-    assert "is no folder" in said("--data", tmp_path / "none")
+    assert "is not a folder" in said("--data", tmp_path / "none")
     assert "no pair 7; choose 1 to 3" in said("--pair", 7)
-    assert "--rows 0: a number above zero" in said("--rows", 0)
+    assert "--rows 0: give a number above zero" in said("--rows", 0)
     given = ("--data", folder, "--car", "rc_car", "--diagnosed")
     assert "none.toml" in said(*given, tmp_path / "none.toml")
     used = [

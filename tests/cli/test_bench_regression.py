@@ -142,10 +142,10 @@ def test_data_that_is_missing_is_told_before_anything_is_fitted(tmp_path, monkey
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("regression --out none/x.json", "--out none/x.json: there is no folder none; make it first."),
+        ("regression --out none/x.json", "--out none/x.json: there is no folder none; create it first."),
         ("regression --out x.png", "--out x.png: name a file that ends in .json."),
         ("regression --out folder.json", "--out folder.json: name a file that ends in .json."),
-        ("speed --case pendulum", "--case is no option of 'bench speed'; it counts for 'bench regression'."),
+        ("speed --case pendulum", "--case has no effect in 'bench speed'; use it with 'bench regression'."),
     ],
 )
 def test_what_cannot_be_meant_is_refused_before_anything_is_measured(tmp_path, monkeypatch, capsys, options, words):

@@ -69,15 +69,15 @@ def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFact
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--episodes 0", "--episodes 0: a number above zero."),
-        ("--history -1", "--history -1: at least 0."),
-        ("--seed -1", "--seed -1: at least 0."),
-        ("--ticks 0", "--ticks 0: a number above zero."),
-        ("--history 100", "--ticks 100: nothing is learned from fewer than --history (100) and one more."),
-        ("--ticks 3", "--ticks 3: nothing is learned from fewer than --history (4) and one more."),
-        ("--prior Kinematic", "--prior Kinematic: neither kinematic nor nominal nor a car file that is there."),
-        ("--updates -5", "--updates -5: a number above zero."),
-        ("--model-steps 0", "--model-steps 0: a number above zero."),
+        ("--episodes 0", "--episodes 0: give a number above zero."),
+        ("--history -1", "--history -1: give at least 0."),
+        ("--seed -1", "--seed -1: give at least 0."),
+        ("--ticks 0", "--ticks 0: give a number above zero."),
+        ("--history 100", "--ticks 100: give more than --history (100), for at least one transition."),
+        ("--ticks 3", "--ticks 3: give more than --history (4), for at least one transition."),
+        ("--prior Kinematic", "--prior Kinematic: give kinematic, nominal or an existing car file."),
+        ("--updates -5", "--updates -5: give a number above zero."),
+        ("--model-steps 0", "--model-steps 0: give a number above zero."),
         ("--prior missing.toml", "There is no car file 'missing.toml'"),
         ("--car nosuch", "There is no car 'nosuch'"),
         ("--method guessing", "'sim-fsvgd', 'fsvgd'"),
@@ -115,9 +115,12 @@ def test_a_run_goes_on_with_its_own_car_alone(carlab: Carlab, learned: tuple[int
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ("--method fsvgd", "--method fsvgd: this run was started with sim-fsvgd; leave it out, or start a new run."),
+        (
+            "--method fsvgd",
+            "--method fsvgd: this run was started with sim-fsvgd; remove the option, or start a",
+        ),
         ("--seed 7", "--seed 7: this run was started with"),
-        ("--prior nominal", "--prior: this run was started with another one; leave it out, or start a new run."),
+        ("--prior nominal", "--prior: this run was started with another prior; remove the option, or start a new"),
     ],
 )
 def test_a_run_goes_on_as_it_was_started(
@@ -154,7 +157,7 @@ def test_the_same_numbers_in_other_words_are_the_same_car(
     same.write_text("# A remark.\n" + (folder / "config.toml").read_text())
     code, text = carlab("learn", "--resume", folder, "--car", same)
     assert code == 0
-    assert "has nothing left to do" in text
+    assert "is complete" in text
 
 
 def test_only_a_run_of_learning_is_resumed_again(carlab: Carlab, tmp_path: Path) -> None:
@@ -264,7 +267,7 @@ def test_an_interrupted_run_tells_how_it_goes_on(
     (folder / "campaign.json").write_text(json.dumps(wanted | {"episodes": 5}))
     code, text = carlab("learn", "--resume", folder)
     assert code == 130
-    assert f"2 of 5 episodes; go on with: carlab learn --resume {folder}" in text
+    assert f"2 of 5 episodes; resume with: carlab learn --resume {folder}" in text
 
 
 @pytest.mark.parametrize(
@@ -278,7 +281,7 @@ def test_an_interrupted_run_tells_how_it_goes_on(
 )
 def test_the_car_that_a_command_names_is_the_one_that_it_was(options: CarOptions) -> None:
     """The printed command means the same options when it is parsed."""
-    assert tyro.cli(CarOptions, args=shlex.split(options.typed())) == options
+    assert tyro.cli(CarOptions, args=shlex.split(options.to_text())) == options
 
 
 def test_a_run_that_learned_nothing_is_not_to_be_resumed(
@@ -308,4 +311,4 @@ def test_a_run_folder_of_a_stranger_runs_no_code(
     assert not made.exists()
     assert code == 1
     assert "Traceback" not in text
-    assert "anew." in text
+    assert "to train again." in text

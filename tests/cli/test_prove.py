@@ -54,7 +54,7 @@ def test_a_proof_from_seal_to_results_and_again(small: Path, carlab: Carlab) -> 
     code, text = carlab("prove", "--out", small, "--no-baselines", "--jobs", 2)
     assert code == 0, text
     sealed = json.loads((small / "seal.json").read_text())["sha256"]
-    assert text.index(sealed) < text.index("cases diagnosed") < text.index("The seal is whole")
+    assert text.index(sealed) < text.index("cases diagnosed") < text.index("The seal is intact")
     assert [line["sealed"] for line in seen(small)] == [True] * 3  # two cases, one of them again with its name told
     assert all(line["threads"] == "1" for line in seen(small))
     scores = json.loads((small / "scores.json").read_text())
@@ -156,7 +156,7 @@ def test_interrupted_once_finishes_the_running_case_twice_drops_it(times: int, t
     assert process.returncode == 130, said
     done = len(list((root / "reports").glob("*/run.json")))
     assert done == (1 if times == 1 else 0)
-    assert f"Stopped with {done} of 2 cases diagnosed; the same command goes on from there." in " ".join(said.split())
+    assert f"Stopped with {done} of 2 cases diagnosed; run the same command to continue." in " ".join(said.split())
     (root / "go").touch()
     again = subprocess.run(command, capture_output=True, text=True, check=False)
     assert again.returncode == 0, again.stdout + again.stderr

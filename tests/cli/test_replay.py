@@ -52,8 +52,8 @@ def test_another_share_and_horizon_are_scored(carlab: Carlab, tmp_path: Path) ->
     [
         (("--holdout-share", "0.7"), "at most 0.5"),
         (("--horizon", "60"), "shorter horizon"),
-        (("--horizon", "0"), "--horizon 0: a number above zero"),
-        (("--stride", "-1"), "--stride -1: a number above zero"),
+        (("--horizon", "0"), "--horizon 0: give a number above zero"),
+        (("--stride", "-1"), "--stride -1: give a number above zero"),
     ],
 )
 def test_what_cannot_be_scored_is_said_in_a_sentence(

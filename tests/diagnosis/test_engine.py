@@ -200,7 +200,7 @@ def test_a_share_beside_a_recording_that_is_held_out_is_refused(
 ) -> None:
     paths = [str(concealed[0] / "fit.csv"), "--holdout", str(concealed[0] / "hold.csv")]
     assert run(["diagnose", *paths, "--holdout-share", "0.1", "--out", str(tmp_path / "out")]) == 2
-    assert "counts only where no recording is held out whole" in " ".join(capfd.readouterr().err.split())
+    assert "has no effect together with held-out recordings" in " ".join(capfd.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 
 
