@@ -1,4 +1,4 @@
-"""Concealed proof: a generator, a seal and a scorer that know nothing of the tool they try."""
+"""Proof on concealed effects: generator, sealed answers and scores, independent of the diagnosis that they test."""
 
 from __future__ import annotations
 

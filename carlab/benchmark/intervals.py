@@ -6,7 +6,7 @@ import math
 
 
 def wilson(hits: int, count: int, z: float = 1.96) -> tuple[float, float]:
-    """95 % interval of a share (Wilson, 1927). (0, 1) where nothing was counted."""
+    """95 % interval of a share (Wilson, 1927). (0, 1) without cases."""
     if count == 0:
         return 0.0, 1.0
     share, squared = hits / count, z * z

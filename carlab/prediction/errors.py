@@ -11,7 +11,7 @@ from carlab.prediction.predict import PredictiveModel
 from carlab.prediction.windows import PredictionWindows
 
 MAX_ERROR = 1e3
-"""Bound of a final error, and what stands for one that is not finite: a diverged simulator."""
+"""Bound of a final error; it also replaces non-finite errors of a diverged simulator."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +34,10 @@ def prediction_errors(predicted: FloatArray, windows: PredictionWindows) -> Floa
 
     Args:
         predicted: measurements (..., S, K + 1, 6).
-        windows: what they predict.
+        windows: the predicted windows.
 
     Returns:
-        x and y in the body frame of each window's initial state (ahead, left), the other channels as they are.
+        x and y in the body frame of each window's initial state (ahead, left), the other channels unchanged.
     """
     error = predicted - windows.measured
     yaw = windows.initial_states[:, 2, None]

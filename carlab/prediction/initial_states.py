@@ -1,9 +1,9 @@
 """Initial states of prediction windows: smoothed without the curvature bias of the local cubic, or as recorded.
 
-A car moves more sharply than a cubic where commands step, and the cubic smears later motion into the initial state. A
-roughly right simulator predicts by how much: the same cubic through its own poses, minus its own state. That bias is
-subtracted as far as the recording confirms it: a quintic through the measured poses must differ from the cubic as it
-does in the simulator.
+At command steps the motion has higher derivatives than a cubic, so later motion biases the initial state. An
+approximate simulator predicts this bias: a cubic through simulated poses minus the simulated state. The bias is
+subtracted in proportion to its evidence in the recording: the difference of a quintic and a cubic through the measured
+poses is regressed on the simulated difference.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ def without_curvature_bias(windows: PredictionWindows, config: SimulatorConfig) 
     """The same windows with the curvature bias of the initial states subtracted.
 
     Args:
-        windows: as cut.
-        config: a simulator that is roughly right.
+        windows: windows of ``cut_windows``.
+        config: an approximate simulator.
 
     Returns:
-        Windows whose ``curvature_bias`` is what remains of it; the same windows where they are too short.
+        Windows with the remaining ``curvature_bias``; the same windows if they are too short.
     """
     width = smoothing_width(windows.period_s)
     half = max(width, MIN_QUINTIC_WIDTH) // 2
@@ -88,7 +88,7 @@ def _local_polynomial(pose: FloatArray, width: int, order: int, period_s: float)
 
 
 def _rotated(states: FloatArray, angle: FloatArray) -> FloatArray:
-    """Differences of states (S, 6) in a world that is rotated by ``angle`` (S,)."""
+    """Differences of states (S, 6) with x, y rotated by ``angle`` (S,)."""
     sin, cos = np.sin(angle), np.cos(angle)
     out = states.copy()
     out[:, 0] = cos * states[:, 0] - sin * states[:, 1]

@@ -31,9 +31,9 @@ def sample_paths(
         dynamics: the learned one-step model with a history of H commands.
         initial_states: (S, 6).
         past_commands: (S, H, 2) before the first step.
-        commands: (S, K, 2), one a step.
+        commands: (S, K, 2), one per step.
         n_samples: paths from each initial state.
-        seed: of the samples.
+        seed: seed of the samples.
 
     Returns:
         States (S, K + 1, n_samples, 6), yaw unwrapped along a path.
@@ -56,9 +56,9 @@ class LearnedModel:
     """A learned car as a predictive model: the mean of its sampled paths.
 
     Attributes:
-        dynamics: one-step model of a step as long as that of the windows.
+        dynamics: one-step model with the step of the windows.
         n_samples: paths from each initial state.
-        seed: of the samples.
+        seed: seed of the samples.
     """
 
     dynamics: OneStep
@@ -66,11 +66,12 @@ class LearnedModel:
     seed: int = 0
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
-        """As ``PredictiveModel``. Raises DataError where the model's history is longer than the windows'."""
+        """As ``PredictiveModel``. Raises DataError if the model's history is longer than that of the windows."""
         history = self.dynamics.history
         if history > windows.past_commands.shape[1]:
             raise DataError(
-                f"The learned car takes {history} past commands; the windows have {windows.past_commands.shape[1]}."
+                f"The learned car requires {history} past commands, but the windows have "
+                f"{windows.past_commands.shape[1]}; learn with a shorter history."
             )
         past = windows.past_commands[:, windows.past_commands.shape[1] - history :]
         paths = sample_paths(

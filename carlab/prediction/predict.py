@@ -1,7 +1,7 @@
-"""Predictions of windows by any model; by the simulator for many parameter sets at once.
+"""Predictions of windows by any model; the simulator predicts many parameter sets in one batch.
 
-Time is that of the recording. Motion capture has a latency, so every command acts that much later in the recording.
-Measurements are inverted at the initial state of a window and applied along it by ``sim_backends.measurement``.
+Times are those of the recording, in which commands act later by the latency of motion capture. The measurement model
+(``sim_backends.measurement``) is inverted at the initial state of a window and applied along it.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from sim_backends.measurement import (
 from sim_backends.measurement import velocity_curvature as state_curvature
 
 MAX_STEP_S = 0.017
-"""Longest step of the integration: at 30 Hz its error stays within a hundredth of a noise floor."""
+"""Maximum integration step: at 30 Hz its error is below a hundredth of a noise floor."""
 
 
 class PredictiveModel(Protocol):
-    """Anything that predicts what is measured in windows."""
+    """A model that predicts the measurements in windows."""
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
         """Predicted measurements (S, K + 1, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate."""
@@ -54,7 +54,7 @@ class SimulatorModel:
 
 @dataclass(frozen=True, slots=True)
 class ConstantVelocity:
-    """A car that keeps its body velocities: it drives on circular arcs."""
+    """Baseline with constant body velocities: the path is a circular arc."""
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
         """As ``PredictiveModel``, from the initial state of each window."""
@@ -70,7 +70,7 @@ class ConstantVelocity:
 
 @dataclass(frozen=True, slots=True)
 class NoChange:
-    """A car that stays as it is."""
+    """Baseline with a constant state."""
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
         """As ``PredictiveModel``."""
@@ -82,7 +82,7 @@ def predicted_at(times_s: FloatArray, windows: PredictionWindows, predicted: Flo
 
     Args:
         times_s: since the first row of the recording.
-        windows: of that recording, none overlapping another.
+        windows: windows of that recording, without overlap.
         predicted: (S, K + 1, 6).
     """
     found = np.full((len(times_s), 6), np.nan)
@@ -104,10 +104,10 @@ def simulate_windows(
     """Predict windows by a simulator with P parameter sets.
 
     Args:
-        windows: S of them.
+        windows: S windows.
         config: the simulator, observation effects included.
-        values: parameters by dotted name, each (P,); the others are those of the simulator.
-        max_step_s: longest step of the integration.
+        values: parameters by dotted name, each (P,); default: those of ``config``.
+        max_step_s: maximum integration step.
 
     Returns:
         Predicted measurements (P, S, K + 1, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate.
@@ -154,7 +154,7 @@ def velocity_curvature(states: FloatArray, period_s: float) -> FloatArray:
 
     Args:
         states: (..., K + 1, 6).
-        period_s: from one state to the next.
+        period_s: time between states.
 
     Returns:
         (..., K + 1, 3) by central differences of the velocities in the world; 0 at both ends.
@@ -171,7 +171,7 @@ def _broadcast(value: float | FloatArray, sets: int) -> FloatArray:
 
 
 def _stacked(states: Sequence[State], sets: int) -> FloatArray:
-    """States, one (P or 1, S) row of six for each tick, as one array (P, S, ticks, 6)."""
+    """Stack states, six rows (P or 1, S) per tick, into one array (P, S, ticks, 6)."""
     count = states[0][0].shape[-1]
     stacked = np.empty((len(states), 6, sets, count))
     for k, state in enumerate(states):

@@ -1,8 +1,8 @@
 """Recordings cut into prediction windows: short stretches that a model predicts from an estimated initial state.
 
 The initial state of a window is a local cubic through the poses around it (Savitzky and Golay 1964), not the noisy
-velocity columns. Each window carries the commands before it, so that delays and the states of servo and motor are
-right at its start.
+velocity columns. Each window includes the commands before it, so that delays and the states of servo and motor are
+correct at its start.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ SMOOTHING_SPAN_S = 0.27
 HISTORY_S = 0.6
 """Length of the commands before a window: six time constants of a slow (0.1 s) servo or motor."""
 MIN_QUINTIC_WIDTH = 7
-"""Fewest poses under the quintic that the local cubic is compared with."""
+"""Minimum number of poses of the local quintic that is compared with the cubic."""
 MAX_PERIOD_S = 0.034
-"""Longest period to which a faster recording is thinned."""
+"""Maximum period of a thinned recording [s]."""
 MIN_SPEED_MPS = 0.15
-"""Windows in which the car stays slower are left out: any model predicts a parked car."""
+"""Windows in which the car is slower [m/s] are omitted, because any model predicts a parked car."""
 BLOCK_S = 5.0
-"""Windows that start within one such stretch count as dependent."""
+"""Length of a block [s]; windows that start in the same block count as dependent."""
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """One unbroken stretch of a recording on an even grid of n rows.
+    """An unbroken stretch of a recording on an even grid of n rows.
 
     Attributes:
         recording: index of the recording.
-        period_s: of the grid.
-        t_s: (n,) since the first row of the recording.
+        period_s: period of the grid.
+        t_s: (n,) time since the first row of the recording.
         states: (n, 6) as measured, yaw unwrapped.
         smooth: (n, 6) pose of a local cubic through the poses, and the body velocities of that cubic.
-        commands: (n, 2) mean over each cell of the commands, each held from its stamp on.
+        commands: (n, 2) mean of the held commands over each cell of the grid.
         residual: (m, 6) states minus their local cubic while the car moves, at the period ``sampled_s``.
         speed: (m,) at the rows of ``residual`` [m/s].
         curvature_bias: (n, 6) states of a local quintic minus ``smooth``.
@@ -70,7 +70,7 @@ class Track:
         return len(self.t_s) * self.period_s
 
     def part(self, rows: slice) -> Track:
-        """Some rows of the track; ``residual`` and ``speed`` stay those of the whole."""
+        """Select rows of the track; ``residual`` and ``speed`` remain those of the whole track."""
         return replace(
             self,
             t_s=self.t_s[rows],
@@ -95,9 +95,9 @@ class PredictionWindows:
         curvature_bias: (S, 6) initial state by a local quintic minus that by the local cubic.
         t0_s: (S,) start of the window since the first row of its recording.
         recording: (S,) index of the recording.
-        block: (S,) number of the stretch of a few seconds; blocks count as independent of each other.
+        block: (S,) index of the block of a few seconds; blocks count as independent.
         velocity_window_s2: variance [s2] of the window over which the recording's velocities were differentiated; 0
-            where they count as instantaneous.
+            if they are instantaneous.
         velocities_from_poses: whether the initial velocities are differentiated poses, not recorded velocities.
     """
 
@@ -128,34 +128,34 @@ class PredictionWindows:
         return self.steps * self.period_s
 
     def take(self, which: NDArray[np.bool_] | IndexArray) -> Self:
-        """Some of the windows."""
+        """Select windows."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         chosen: dict[str, Any] = {name: v[which] for name, v in values.items() if isinstance(v, np.ndarray)}
         return replace(self, **chosen)
 
-    def thinned(self, most: int) -> Self:
-        """At most ``most`` windows, evenly taken."""
-        if len(self) <= most:
+    def thinned(self, max_windows: int) -> Self:
+        """Select at most ``max_windows`` windows at even spacing."""
+        if len(self) <= max_windows:
             return self
-        return self.take(np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64)))
+        return self.take(np.unique(np.linspace(0, len(self) - 1, max_windows).round().astype(np.int64)))
 
 
 def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) -> list[Track]:
-    """Put recordings onto an even grid, cut at gaps and where a value is missing.
+    """Resample recordings on an even grid, cut at gaps and missing values.
 
     Faster recordings are thinned to ``MAX_PERIOD_S`` after smoothing; commands become means over the cells.
 
     Args:
         episodes: recordings; the column ``segment`` in ``extra`` numbers stretches that must not be joined.
-        period_s: of the grid; that of the first recording where None.
+        period_s: period of the grid; by default that of the first recording.
 
     Raises:
-        DataError: a recording has no two rows.
+        DataError: a recording has fewer than two commands.
     """
     found = []
     for index, episode in enumerate(episodes):
         if episode.ticks < 2:
-            raise DataError(f"Recording {index + 1} has {episode.ticks} commands; record at least some seconds.")
+            raise DataError(f"Recording {index + 1} has {episode.ticks} commands; record at least 10 s.")
         if period_s is None:
             period_s = episode.period_s * max(int(MAX_PERIOD_S / episode.period_s + 1e-6), 1)
         every = max(round(period_s / episode.period_s), 1)
@@ -253,13 +253,13 @@ def cut_windows(
     """Cut tracks into windows in which the car moves.
 
     Args:
-        tracks: at least one, all of one period.
+        tracks: at least one track; all have the same period.
         horizon_s: length of a window.
-        stride_s: from one start to the next.
-        block_s: length of the stretches that count as independent.
+        stride_s: time between the starts of windows.
+        block_s: length of the blocks that count as independent.
 
     Raises:
-        DataError: there is no such window.
+        DataError: the car moves in no window.
     """
     period_s = tracks[0].period_s
     steps = max(round(horizon_s / period_s), 1)
@@ -273,7 +273,7 @@ def cut_windows(
     ]
     if not starts:
         raise DataError(
-            f"The recording holds no moving stretch of {horizon_s + HISTORY_S:.1f} s; record a longer drive, or choose "
+            f"The car moves in no stretch of {horizon_s + HISTORY_S:.1f} s; record a longer drive, or choose "
             "a shorter horizon."
         )
     return PredictionWindows(
@@ -291,9 +291,9 @@ def cut_windows(
 
 
 def split_tracks(tracks: Sequence[Track], share: float, guard_s: float) -> tuple[list[Track], list[Track]]:
-    """Split each track into its first part and its last ``share``, with ``guard_s`` in between left out.
+    """Split each track into its first part and its last ``share``, with a gap of ``guard_s`` between them.
 
-    Parts that are no longer than the guard are left out.
+    Parts that are not longer than the gap are omitted.
     """
     early, late = [], []
     guard = round(guard_s / tracks[0].period_s) if tracks else 0

@@ -1,4 +1,4 @@
-"""The baselines name what is plain, stay quiet on nothing, and their corrections are what they say."""
+"""Baselines name strong effects, have no false alarm on a null case, and correct predictions as stated."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def askew() -> Case:
     return case("single", 17, "steering_offset", excess=4.0)
 
 
-def test_nothing_is_named_where_nothing_is_missing(quiet: Case) -> None:
+def test_no_effect_is_named_in_a_null_case(quiet: Case) -> None:
     pytest.importorskip("pysindy")
     said = run_baselines(quiet.fit, quiet.hold, quiet.nominal, floors(quiet))
     assert tuple(said) == BASELINES
@@ -69,7 +69,7 @@ def test_an_easy_effect_is_named_and_corrected() -> None:
     assert said["GP residual"]["named"] is None
 
 
-def test_the_term_alone_has_the_angle_that_was_concealed(askew: Case) -> None:
+def test_regression_on_one_term_finds_the_concealed_angle(askew: Case) -> None:
     data = prepared(askew)
     system = System.of(data)
     column = system.fit_x[:, list(system.terms).index("steering_offset")]
@@ -81,14 +81,14 @@ def test_a_late_command_is_the_largest_cross_correlation(late: Case) -> None:
     assert largest_correlation(prepared(late)) == "steering_delay"
 
 
-def test_without_a_correction_the_chained_score_is_the_refits(late: Case) -> None:
+def test_without_a_correction_the_score_is_that_of_the_refit(late: Case) -> None:
     data = prepared(late)
-    assert held_out_score(data, nothing) == pytest.approx(score(data.shots, data.car.free()), rel=1e-9)
+    assert held_out_score(data, nothing) == pytest.approx(score(data.windows, data.car.free()), rel=1e-9)
     system = System.of(data)
     assert corrected_score(data, system, np.zeros(len(system.terms))) == pytest.approx(data.refit_score, rel=1e-9)
 
 
-def test_every_term_is_an_effect_and_nearly_every_effect_a_term(quiet: Case) -> None:
+def test_terms_belong_to_effects_and_cover_nearly_all_of_them(quiet: Case) -> None:
     data = prepared(quiet)
     named = {effect_of(term) for term in library(data)}
     assert named <= set(EFFECT_IDS)
@@ -97,13 +97,13 @@ def test_every_term_is_an_effect_and_nearly_every_effect_a_term(quiet: Case) -> 
 
 
 def test_terms_against_closed_forms(quiet: Case) -> None:
-    """Force terms are F / m; a term of the commands is what they lose."""
+    """Force terms are F / m; a term of the commands is the lost acceleration."""
     data = prepared(quiet)
     terms, steps = library(data), data.steps
     drag = terms["aerodynamic_drag"](steps)
     assert drag[:, 0] == pytest.approx(-steps.middle[:, 3] * np.abs(steps.middle[:, 3]) / steps.car.mass)
     assert not drag[:, 1:].any()
-    # First order: the drive force falls by 0.002 of itself a second; damping takes some of it back within a step.
+    # First order: the drive force falls by 0.2 % per second; damping compensates a part of it within a step.
     sag = terms["battery_sag"](steps)[:, 0]
     push = steps.car.drive_gain * steps.commands()[:, :, 1].mean(axis=1)
     lost = -0.002 * steps.t_s * push / steps.car.mass
@@ -111,7 +111,7 @@ def test_terms_against_closed_forms(quiet: Case) -> None:
     assert 0.75 < float(sag @ lost) / float(lost @ lost) < 1.0
 
 
-def test_gaps_and_jumps_are_mended_before_a_baseline_sees_them(quiet: Case) -> None:
+def test_gaps_and_jumps_are_repaired_for_baselines(quiet: Case) -> None:
     whole = as_table(quiet.recordings[0])
     broken = {name: np.delete(column, [50, 51, 200]) for name, column in whole.items()}
     broken["x"][120] += 0.4
@@ -120,7 +120,7 @@ def test_gaps_and_jumps_are_mended_before_a_baseline_sees_them(quiet: Case) -> N
     assert mended.measured[:, 0] == pytest.approx(whole["x"], abs=0.05)
 
 
-def test_a_recording_that_cannot_be_used_is_said_to_be(quiet: Case) -> None:
+def test_an_unusable_recording_raises_data_error(quiet: Case) -> None:
     milliseconds = {**quiet.fit, "t": quiet.fit["t"] * 1000.0}
     said = run_baselines(milliseconds, quiet.hold, quiet.nominal, floors(quiet))
     assert "control period" in said["failed"]
@@ -132,7 +132,7 @@ def test_the_car_of_a_case_is_not_changed(quiet: Case) -> None:
     assert quiet.nominal == before
 
 
-def test_tool_and_baselines_are_counted_alike() -> None:
+def test_diagnosis_and_baselines_are_scored_on_the_same_cases() -> None:
     def row(kind: str, true: list[str], named: list[str], excess: float) -> dict[str, object]:
         return {"kind": kind, "true": true, "named": named, "excess": excess, "floor_ratio": 0.9}
 
@@ -140,7 +140,7 @@ def test_tool_and_baselines_are_counted_alike() -> None:
         "a": row("single", ["motor_lag"], ["motor_lag"], 2.0),
         "b": row("single", ["battery_sag"], ["motor_lag"], 0.5),
         "c": row("null", [], ["motor_lag"], 0.0),
-        "d": row("single", ["yaw_damping"], ["yaw_damping"], 2.0),  # no baseline has seen it
+        "d": row("single", ["yaw_damping"], ["yaw_damping"], 2.0),  # no baseline result
     }
     one = {"named": "battery_sag", "score": 2.0, "refit_score": 3.0, "seconds": 0.1}
     said = {"a": dict.fromkeys(BASELINES, one), "b": dict.fromkeys(BASELINES, one), "c": {"failed": "why"}}

@@ -37,21 +37,21 @@ def test_a_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed
     counts = {
         r.value / 20.0: (r.false, r.wrong, r.missed, r.true) for r in calibrate(ANSWERS, DECISIONS) if r.setting == CHI2
     }
-    assert counts[0.5] == (1, 2, 0, 1), "the null case gets a name"
+    assert counts[0.5] == (1, 2, 0, 1), "a name in the null case"
     assert counts[1.0] == (0, 2, 0, 1)
-    assert counts[1.5] == (0, 2, 0, 1), "the first that passes is taken, not the second"
-    assert counts[2.0] == (0, 2, 1, 1), "no candidate passes any more"
+    assert counts[1.5] == (0, 2, 0, 1), "only the first that passes is accepted"
+    assert counts[2.0] == (0, 2, 1, 1), "no candidate passes"
     assert [r.is_present_value for r in calibrate(ANSWERS, DECISIONS) if r.value == 20.0] == [True]
 
 
-def test_names_that_are_kept_one_by_one_count_one_by_one() -> None:
+def test_individual_decisions_count_individually() -> None:
     kept = {"a": content(decision("keep", "steering_lag", 25.0), decision("keep", "motor_lag", 25.0))}
     by_value = {r.value / 20.0: (r.false, r.missed) for r in calibrate(ANSWERS, kept) if r.setting == CHI2}
     assert by_value[1.0] == (1, 0)
     assert by_value[1.5] == (0, 1)
 
 
-def test_one_alternative_is_sufficient_and_a_condition_may_hold_below() -> None:
+def test_one_alternative_is_sufficient_and_conditions_may_be_upper_bounds() -> None:
     below = [{"setting": "rivals.spurious_share", "statistic": 0.2, "threshold": 0.1, "above": False}]
     made = decision("stand", "steering_lag", 10.0)
     made["alternatives"].append(below)
@@ -60,7 +60,7 @@ def test_one_alternative_is_sufficient_and_a_condition_may_hold_below() -> None:
     assert passes(made, "rivals.spurious_share", 0.3)
 
 
-def test_a_folder_without_decisions_is_refused_in_a_sentence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_decisions_raises_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert run(["prove", "--set", "development", "--calibrate", "--out", str(tmp_path / "proof")]) == 2
     assert "run the same command without --calibrate" in " ".join(capfd.readouterr().err.split())
 

@@ -1,4 +1,4 @@
-"""Cases: the refit recognises the truth, strengths are reached, seeds decide everything, faults do what they say."""
+"""Cases: score of the true car, strengths, reproducibility by seed, data faults."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 
 from carlab.benchmark.cases.case import Case, make_case
 from carlab.benchmark.cases.proof_set import full_set
-from carlab.benchmark.cases.refit import channel_scores, cut_shots, score
+from carlab.benchmark.cases.refit import channel_scores, cut_windows, score
 from carlab.benchmark.cases.set_check import indistinguishable
-from carlab.benchmark.effects.catalogue import EFFECT_IDS, LOOK_ALIKES
+from carlab.benchmark.effects.catalogue import CONFUSABLE, EFFECT_IDS
 from carlab.benchmark.effects.data_faults import FAULTS
 from carlab.benchmark.effects.forms import all_forms
 from carlab.benchmark.world.base_car import FREE, BaseCar
@@ -29,26 +29,26 @@ def parameters_only() -> Case:
     return make_case("parameters", 11, **SHORT)
 
 
-def test_the_truth_scores_one_and_the_nominal_car_does_not(parameters_only: Case) -> None:
+def test_the_true_car_has_score_one(parameters_only: Case) -> None:
     case = parameters_only
     for recording in case.recordings:
         for true_starts in (False, True):
-            shots = cut_shots(recording, case.true_car, true_starts=true_starts)
-            assert score(shots, case.true_car.free()) == pytest.approx(1.0, abs=0.01)
+            windows = cut_windows(recording, case.true_car, true_starts=true_starts)
+            assert score(windows, case.true_car.free()) == pytest.approx(1.0, abs=0.01)
     assert case.refit.nominal_score > 1.5
-    assert case.refit.score < 1.12  # an easy refit explains it all
+    assert case.refit.score < 1.12  # the refit explains the whole error
     assert case.excess < 0.5
 
 
-def test_measurement_noise_is_what_was_asked_for(parameters_only: Case) -> None:
+def test_measurement_noise_has_the_given_size(parameters_only: Case) -> None:
     error = parameters_only.recordings[0].error
     car = parameters_only.nominal
     np.testing.assert_allclose(error[:, :3].std(axis=0), [car.position_std, car.position_std, car.yaw_std], rtol=0.1)
-    assert 0.003 < error[:, 3].std() < 0.03  # differentiating makes it worse
+    assert 0.003 < error[:, 3].std() < 0.03  # differentiation amplifies it
     assert 0.015 < error[:, 5].std() < 0.08
 
 
-def test_base_parameters_are_off_by_up_to_a_tenth_and_facts_are_not(parameters_only: Case) -> None:
+def test_base_parameters_differ_by_up_to_a_tenth_and_measured_ones_are_equal(parameters_only: Case) -> None:
     nominal, true = parameters_only.nominal, parameters_only.true_car
     ratios = np.array([true.free()[n] / nominal.free()[n] for n in FREE])
     assert (np.abs(ratios - 1.0) <= 0.1 + 1e-12).all()
@@ -67,7 +67,7 @@ def test_driving_excites_the_car(parameters_only: Case) -> None:
     assert max(np.abs(table["x"]).max(), np.abs(table["y"]).max()) < 8.0
 
 
-def test_a_null_car_is_the_nominal_one() -> None:
+def test_a_null_car_equals_the_nominal_car() -> None:
     case = make_case("null", 12, fit_s=15.0, hold_s=10.0)
     assert case.true_car == case.nominal
     assert case.refit.nominal_score == pytest.approx(1.0, abs=0.01)
@@ -85,7 +85,7 @@ def test_strength_is_reached(name: str, form: str, excess: float) -> None:
     assert main & (lateral | {"x"}) if name == "steering_lag" else main & {"x", "vx"}
 
 
-def test_a_seed_decides_everything() -> None:
+def test_a_case_is_reproducible_by_its_seed() -> None:
     one, two = (make_case("parameters", 31, fit_s=8.0, hold_s=5.0) for _ in range(2))
     for name in COLUMNS:
         np.testing.assert_array_equal(one.fit[name], two.fit[name])
@@ -93,7 +93,7 @@ def test_a_seed_decides_everything() -> None:
     assert not np.array_equal(one.fit["steering"], other.fit["steering"])
 
 
-def test_car_file_and_csv_are_what_the_simulator_reads(tmp_path: Path, parameters_only: Case) -> None:
+def test_the_simulator_reads_car_file_and_csv(tmp_path: Path, parameters_only: Case) -> None:
     import tomllib
 
     parameters_only.nominal.write(tmp_path / "car.toml")
@@ -119,7 +119,7 @@ def test_local_polynomial_is_exact_for_polynomials_ends_included() -> None:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_faults_change_what_they_say(name: str, parameters_only: Case) -> None:
+def test_faults_change_only_the_reported_columns(name: str, parameters_only: Case) -> None:
     table = parameters_only.fit
     changed, fault = FAULTS[name](table, np.random.default_rng(1), parameters_only.nominal)
     assert fault.id == name
@@ -160,16 +160,16 @@ def test_forms_cover_the_catalogue() -> None:
     outside = [form for (_, kind), form in known.items() if kind == "outside"]
     assert len(outside) >= 10
     assert all(form.class_words and form.id not in EFFECT_IDS for form in outside)
-    assert all(other in EFFECT_IDS for others in LOOK_ALIKES.values() for other in others)
+    assert all(other in EFFECT_IDS for others in CONFUSABLE.values() for other in others)
 
 
-def test_channel_scores_make_up_the_score(parameters_only: Case) -> None:
-    shots = cut_shots(parameters_only.recordings[1], parameters_only.true_car)
+def test_channel_scores_combine_to_the_score(parameters_only: Case) -> None:
+    windows = cut_windows(parameters_only.recordings[1], parameters_only.true_car)
     values = parameters_only.nominal.free()
-    assert np.sqrt((channel_scores(shots, values) ** 2).mean()) == pytest.approx(score(shots, values))
+    assert np.sqrt((channel_scores(windows, values) ** 2).mean()) == pytest.approx(score(windows, values))
 
 
-def test_bad_requests_are_refused() -> None:
+def test_invalid_arguments_raise_errors() -> None:
     with pytest.raises(ConfigError, match="no effect"):
         make_case("single", 1, effects=["steering_lagg"])
     with pytest.raises(ConfigError, match="takes 2 effects"):
@@ -178,7 +178,7 @@ def test_bad_requests_are_refused() -> None:
         make_case("fault", 1, fault="gremlins")
 
 
-def test_own_refit_tells_what_can_be_told() -> None:
+def test_the_refit_distinguishes_effects_of_commands() -> None:
     case = make_case("single", 51, effects=["steering_delay"], excess=4.0, **SHORT)
     told = (case.nominal, case.fit, case.hold, np.array(case.floor))
     assert indistinguishable("steering_delay", "throttle_delay", *told) is False
@@ -188,8 +188,8 @@ def test_own_refit_tells_what_can_be_told() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_most_forms_reach_a_strength_and_all_are_seen() -> None:
-    """Some cannot be weak (a wheel that slips) or strong; a spin may make a strength jump. None may be invisible."""
+def test_most_forms_reach_a_strength_and_all_have_an_influence() -> None:
+    """Some forms cannot be weak (wheel slip) or strong; a spin changes the strength. Each form has an influence."""
     excesses = {}
     for form in all_forms().values():
         kind = "outside" if form.form == "outside" else "single"

@@ -1,4 +1,4 @@
-"""The generator's physics against the simulator's, which was written apart from it, and against plain mechanics."""
+"""Physics of the generator against the independent simulator and against closed forms of mechanics."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STRONG = {"battery_sag": 0.3, "friction_drift": 0.4, "longitudinal_slip": 2.0, "
 
 
 def commands(seed: int = 1, count: int = 31, period_s: float = CAR.control_period) -> np.ndarray:
-    """Held steps of both commands, braking among them."""
+    """Piecewise constant commands with braking."""
     rng = np.random.default_rng(seed)
     hold = max(1, round(0.1 / period_s))
     steps = rng.uniform((-1.0, -0.3), (1.0, 1.0), (count // hold + 1, 2))
@@ -57,7 +57,7 @@ def draw_of(car: BaseCar) -> Draw:
 
 @pytest.mark.parametrize("kind", ["dynamic", "linear_tyre", "kinematic", "blend"])
 @pytest.mark.parametrize("start", [(0.0, 0.0, 0.3, 1.8, 0.0, 0.0), (0.0,) * 6])
-def test_null_is_the_simulator_within_a_tenth_of_the_noise_floor(kind: Kind, start: tuple[float, ...]) -> None:
+def test_base_model_equals_the_simulator(kind: Kind, start: tuple[float, ...]) -> None:
     car = dataclasses.replace(CAR, kind=kind, latency=0.0)
     for seed in range(3):
         table = commands(seed)
@@ -73,9 +73,9 @@ def comparable() -> list[Form]:
 
 
 @pytest.mark.parametrize("form", comparable(), ids=lambda f: f.id)
-def test_catalogue_form_is_the_simulators_effect(form: Form) -> None:
+def test_catalogue_forms_equal_the_effects_of_the_simulator(form: Form) -> None:
     car = dataclasses.replace(CAR, kind=form.nominal_kind, latency=0.0)
-    # How fast a slipping wheel turns at a moving start is a choice; at a standstill it stands.
+    # The initial speed of a slipping wheel is arbitrary for a moving car; at standstill it is 0.
     start = (0.0, 0.0, 0.3, 0.0 if form.id == "longitudinal_slip" else 1.8, 0.0, 0.0)
     parameters = form.sized(STRONG.get(form.id, min(4.0 * form.typical, form.largest)), draw_of(car))
     table = commands(5)
@@ -88,7 +88,7 @@ def test_catalogue_form_is_the_simulators_effect(form: Form) -> None:
     moved = np.abs(ours - null).max(axis=0) / NOISE_FLOOR
     apart = np.abs(ours - theirs).max(axis=0) / NOISE_FLOOR
     assert moved.max() > 2.0, "the effect must be seen, or the comparison says nothing"
-    # Fixed steps run over the edge of a patch; the adaptive ones find it.
+    # Fixed steps pass the edge of a patch; adaptive steps resolve it.
     share = 0.05 if form.id == "low_friction_patch" else 0.02
     assert apart.max() < max(0.2, share * moved.max())
 
@@ -101,7 +101,7 @@ def test_catalogue_form_is_the_simulators_effect(form: Form) -> None:
         ("mocap_yaw_misalignment", {"angle": 0.04}),
     ],
 )
-def test_observation_effects_are_the_simulators(name: str, parameters: dict[str, float]) -> None:
+def test_observation_effects_equal_those_of_the_simulator(name: str, parameters: dict[str, float]) -> None:
     start = (0.2, 0.1, 0.3, 1.8, 0.0, 0.0)
     table = commands(7)
     world = World(CAR)
@@ -138,7 +138,7 @@ def test_signs_and_energy() -> None:
     assert rows[-1, 2] > 0.5  # positive steering turns left
     assert (np.diff(np.hypot(rows[:, 3], rows[:, 4])) > -0.05).all()
     back = drive_here(World(CAR), held * [1.0, -1.0], (0.0,) * 6).rows
-    assert back[-1, 2] < -0.3  # in reverse the other way
+    assert back[-1, 2] < -0.3  # opposite in reverse
     rolling = drive_here(World(CAR), np.zeros((60, 2)), (0.0, 0.0, 0.0, 2.0, 0.6, 3.0)).rows
     energy = 0.5 * CAR.mass * (rolling[:, 3] ** 2 + rolling[:, 4] ** 2) + 0.5 * CAR.yaw_inertia * rolling[:, 5] ** 2
     assert (np.diff(energy) <= 1e-9).all()
@@ -150,7 +150,7 @@ def test_straight_coasting_is_exponential() -> None:
     np.testing.assert_allclose(rows[1:, 3], 2.0 * np.exp(-CAR.damping / CAR.mass * t[1:]), rtol=1e-7)
 
 
-def test_every_resistance_takes_energy() -> None:
+def test_every_resistance_dissipates_energy() -> None:
     names = ("rolling_resistance", "aerodynamic_drag", "cornering_drag")
     for form in (f for f in FORMS.values() if f.id in names):
         world = World(CAR)
@@ -165,11 +165,11 @@ def test_slope_pulls_down_hill_in_the_world_frame() -> None:
     world = World(CAR)
     FORMS[("road_slope", "catalogue")].attach(world, {"angle": 0.05, "direction": math.pi / 2})
     rows = drive_here(world, np.zeros((31, 2)), (0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0)).rows
-    assert rows[-1, 1] < -0.05  # rises towards +y, so the car rolls back
+    assert rows[-1, 1] < -0.05  # the floor rises towards +y, so the car rolls back
     assert abs(rows[-1, 0]) < 1e-6
 
 
-def test_packets_keep_their_order_and_their_mean() -> None:
+def test_packets_keep_their_order_and_mean_delay() -> None:
     world = World(CAR)
     FORMS[("command_delay", "other")].attach(world, {"extra_delay": 0.05, "seed": 3.0})
     ticks = np.arange(600) * CAR.control_period

@@ -1,4 +1,4 @@
-"""The public simulator is followed and scaled rightly; the study of it hands over and reports what it should."""
+"""The public simulator is scaled correctly; the study has the correct input files and page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from carlab.core.errors import CarlabError, ConfigError
 
 pytest.importorskip("vehiclemodels", reason="commonroad-vehicle-models is not installed: pip install 'carlab[studies]'")
 
-STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in_public.py")))
+FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).with_name("fake_public_diagnosis.py")))
 MODELS: tuple[Model, ...] = ("multi_body", "drift")
 
 # Powers of the length scale of the package's states: lengths 1, speeds 1/2, angles 0, rates of angles -1/2.
@@ -46,7 +46,7 @@ def settled(car: PublicCar, speed: float, steering: float, seconds: float, throt
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_scaled_car_is_similar_to_the_packages_own(model: Model) -> None:
+def test_the_scaled_car_is_dynamically_similar_to_the_original(model: Model) -> None:
     car = PublicCar(model)
     full = PublicCar(model)
     full.p = parameters(1.0)
@@ -64,7 +64,7 @@ def test_the_scaled_car_is_similar_to_the_packages_own(model: Model) -> None:
 
 
 @pytest.mark.parametrize(("model", "wheels"), [("multi_body", 4), ("drift", 2)])
-def test_acceleration_has_to_spin_the_wheels_too(model: Model, wheels: int) -> None:
+def test_acceleration_includes_the_wheel_inertia(model: Model, wheels: int) -> None:
     car = PublicCar(model)
     p = car.p
     speed = settled(car, 1.0, 0.0, 0.5, throttle_mps2=1.0)[3, -1]
@@ -72,7 +72,7 @@ def test_acceleration_has_to_spin_the_wheels_too(model: Model, wheels: int) -> N
     assert speed - 1.0 == pytest.approx(gained, rel=0.02)
 
 
-def test_steady_cornering_is_that_of_a_neutral_car() -> None:
+def test_steady_cornering_equals_that_of_a_neutral_car() -> None:
     # The tyre's slope is K = F_z |p_ky1| at both axles, so that understeer cancels: r = v d / L, and the rear axle's
     # slip a_y / (g |p_ky1|) gives the side slip angle.
     car = PublicCar("drift")
@@ -84,7 +84,7 @@ def test_steady_cornering_is_that_of_a_neutral_car() -> None:
     assert state[6] == pytest.approx(p.b * rate / speed - speed * rate / (9.81 * abs(p.tire.p_ky1)), rel=0.03)
 
 
-def test_the_multi_body_car_leans_by_its_springs() -> None:
+def test_roll_angle_of_the_multi_body_car() -> None:
     # Body roll over the axles, K_phi phi = m_s a_y h_s (roll axes at the ground) + m_s g h_s phi, beside the tyres'.
     car = PublicCar("multi_body")
     p = car.p
@@ -137,7 +137,7 @@ def test_commands_reach_the_wheels_after_the_delay() -> None:
     assert np.abs(angle[(seconds > acts[0] + 0.01) & (seconds < acts[1])]).min() > 1e-6
 
 
-def test_the_nominal_file_loads_and_holds_measured_facts(tmp_path: Path) -> None:
+def test_the_nominal_file_loads_with_measured_values(tmp_path: Path) -> None:
     for model in MODELS:
         path = tmp_path / f"{model}.toml"
         car = PublicCar(model)
@@ -150,7 +150,7 @@ def test_the_nominal_file_loads_and_holds_measured_facts(tmp_path: Path) -> None
             assert f"{given} = {{ value" in text
 
 
-def test_every_effect_of_the_catalogue_is_judged_for_both_models() -> None:
+def test_every_effect_has_a_presence_in_both_models() -> None:
     assert set(PHYSICS) == set(EFFECT_IDS)
     for effect, said in PHYSICS.items():
         assert sorted(m for s in said for m in s.models) == sorted(MODELS), effect
@@ -159,7 +159,7 @@ def test_every_effect_of_the_catalogue_is_judged_for_both_models() -> None:
 
 
 def test_a_study_from_drive_to_page(tmp_path: Path) -> None:
-    rows = study(tmp_path / "study", "drift", [0], command=STAND_IN, lengths_s=(4.0, 2.0))
+    rows = study(tmp_path / "study", "drift", [0], command=FAKE_DIAGNOSIS, lengths_s=(4.0, 2.0))
     assert rows[0]["ratio"] == pytest.approx(1.5 / 4.0)
     seen = json.loads((tmp_path / "study" / "seed_0" / "report.json").read_text())["seen"]
     assert seen["files"] == ["car.toml", "fit.csv", "hold.csv", "out"]
@@ -176,7 +176,7 @@ def test_a_study_from_drive_to_page(tmp_path: Path) -> None:
         assert words in page
 
 
-def test_a_diagnosis_without_a_report_is_said(tmp_path: Path) -> None:
+def test_a_study_states_a_missing_report(tmp_path: Path) -> None:
     gone = (sys.executable, "-c", "raise SystemExit('no idea')")
     rows = study(tmp_path, "drift", [0], command=gone, lengths_s=(3.0, 2.0))
     assert rows[0]["verdict"] is None
@@ -185,8 +185,8 @@ def test_a_diagnosis_without_a_report_is_said(tmp_path: Path) -> None:
     assert "No report (exit status 1): no idea" in page
 
 
-def test_a_study_that_is_stopped_ends_with_what_it_has(tmp_path: Path) -> None:
-    assert study(tmp_path, "drift", [0, 1], command=STAND_IN, lengths_s=(3.0, 2.0), abandon=lambda: True) == []
+def test_a_stopped_study_writes_its_present_results(tmp_path: Path) -> None:
+    assert study(tmp_path, "drift", [0, 1], command=FAKE_DIAGNOSIS, lengths_s=(3.0, 2.0), abandon=lambda: True) == []
     assert json.loads((tmp_path / "study.json").read_text())["seeds"] == []
 
 
@@ -197,7 +197,7 @@ def test_activity_of_a_drive_that_steers_hard(tmp_path: Path) -> None:
     assert said["speed [m/s], 95th percentile"] > 0.7
 
 
-def test_the_missing_package_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_raises_config_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(public_simulator, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"pip install 'carlab\[studies\]'") as caught:
         parameters()

@@ -1,4 +1,4 @@
-"""The seal holds, a proof resumes, and the scorer says right of right and wrong of wrong."""
+"""Seal, resumed proof, and scores of correct and wrong reports."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from carlab.benchmark.proof.scores import (
 )
 from carlab.core.errors import DataError
 
-STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in.py")))
+FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).with_name("fake_diagnosis.py")))
 SPECS = [
     CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=10.0, hold_s=6.0),
     CaseSpec("null", 2, fit_s=8.0, hold_s=5.0),
@@ -63,7 +63,7 @@ def report(*named: str, others: tuple[str, ...] = (), verdict: str | None = None
     }
 
 
-def test_right_name() -> None:
+def test_a_correct_name_counts() -> None:
     row = score_case(answer(), report("steering_lag"), oracle=report("steering_lag"))
     assert row["strict_top1"]
     assert row["set_top1"]
@@ -80,7 +80,7 @@ def test_wrong_name_and_second_place_do_not_count() -> None:
     assert not score_case(answer(), report("motor_lag", "steering_lag"))["set_top1"]
 
 
-def test_a_set_counts_only_by_the_rule() -> None:
+def test_a_set_counts_only_with_confusable_effects() -> None:
     in_set = score_case(answer(name="tyre_relaxation"), report("steering_lag", others=("tyre_relaxation",)))
     assert in_set["set_top1"]
     assert not in_set["strict_top1"]
@@ -94,21 +94,21 @@ def test_a_set_counts_only_by_the_rule() -> None:
     assert valid_set({"id": "yaw_damping", "indistinguishable_from": []})
 
 
-def test_false_alarms_and_quiet_nulls() -> None:
+def test_false_alarms_in_null_cases() -> None:
     for kind, verdict in (("null", "none"), ("parameters", "parameters")):
         quiet, loud = score_case(answer(kind), report(verdict=verdict)), score_case(answer(kind), report("battery_sag"))
         assert (quiet["false_alarm"], quiet["verdict_right"]) == (False, True)
         assert (loud["false_alarm"], loud["verdict_right"]) == (True, False)
 
 
-def test_pairs_need_both() -> None:
+def test_pairs_require_both_effects() -> None:
     pair = answer("pair")
     pair["effects"] = [answer()["effects"][0], answer(name="battery_sag")["effects"][0]]
     assert score_case(pair, report("battery_sag", "steering_lag"))["both_found"]
     assert not score_case(pair, report("steering_lag"))["both_found"]
 
 
-def test_outside_asks_for_channel_and_class_and_no_name() -> None:
+def test_outside_requires_channel_and_class_without_a_name() -> None:
     rest = {"channels": ["yaw_rate"], "class": "odd in steering, acts on yaw_rate", "regime": "", "share": 0.5}
     good = score_case(answer("outside", "camber"), report(verdict="unexplained", unexplained=rest))
     assert (good["is_spurious"], good["main_channel_right"], good["class_right"]) == (False, True, True)
@@ -132,7 +132,7 @@ def test_place_time_and_turns() -> None:
     assert not score_case(truth, said)["place_right"]
 
 
-def test_a_missing_report_is_a_miss_and_another_schema_an_error() -> None:
+def test_a_missing_report_is_a_miss_and_a_wrong_schema_an_error() -> None:
     row = score_case(answer(), None)
     assert not row["set_top1"]
     assert not row["reported"]
@@ -193,20 +193,20 @@ def test_a_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
     root = tmp_path / "proof"
     told: list[tuple[str, int, int, str]] = []
     stops = iter([False, True])
-    first = Proof(root, SPECS, command=STAND_IN, stop_requested=lambda: next(stops))
+    first = Proof(root, SPECS, command=FAKE_DIAGNOSIS, stop_requested=lambda: next(stops))
     assert first.make() is None
     made = {p.name: p.stat().st_mtime_ns for p in (root / "answers").glob("*.json")}
     assert len(made) == 2  # the plan and one answer
     with pytest.raises(DataError, match="Seal"):
         first.diagnose()
-    again = Proof(root, SPECS, command=STAND_IN, progress=lambda *step: told.append(step))
+    again = Proof(root, SPECS, command=FAKE_DIAGNOSIS, progress=lambda *step: told.append(step))
     sealed = again.make()
     assert sealed is not None
     assert ("seal", 2, 2, sealed) in told
     assert all((root / "answers" / name).stat().st_mtime_ns == when for name, when in made.items())
 
     stops = iter([False, True])
-    assert not Proof(root, SPECS, command=STAND_IN, stop_requested=lambda: next(stops)).diagnose()
+    assert not Proof(root, SPECS, command=FAKE_DIAGNOSIS, stop_requested=lambda: next(stops)).diagnose()
     done = {p: p.stat().st_mtime_ns for p in (root / "reports").glob("*/run.json")}
     assert len(done) == 1
     assert again.make() == sealed
@@ -227,14 +227,14 @@ def test_a_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
     assert all(row["seconds"] > 0.0 for row in rows.values())
 
     with pytest.raises(DataError, match="other cases"):
-        Proof(root, SPECS[:1], command=STAND_IN).make()
+        Proof(root, SPECS[:1], command=FAKE_DIAGNOSIS).make()
     handed = next((root / "handed").glob("*/fit.csv"))
     handed.write_bytes(handed.read_bytes() + b"\n")
     with pytest.raises(DataError, match="seal is broken"):
         again.open_seal()
 
 
-def test_a_diagnosis_that_fails_or_hangs_is_noted(tmp_path: Path) -> None:
+def test_a_failed_or_hung_diagnosis_is_recorded(tmp_path: Path) -> None:
     root = tmp_path / "proof"
     proof = Proof(root, SPECS[1:], command=(sys.executable, "-c", "import sys; sys.exit('no such verb')"))
     proof.make()

@@ -18,7 +18,7 @@ from carlab.cli import prove
 
 Carlab = Callable[..., tuple[int, str]]
 ROOT = Path(__file__).resolve().parents[2]
-STAND_IN = ROOT / "tests" / "benchmark" / "stand_in.py"
+FAKE_DIAGNOSIS = ROOT / "tests" / "benchmark" / "fake_diagnosis.py"
 SPECS = [
     CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=10.0, hold_s=6.0),
     CaseSpec("null", 2, fit_s=8.0, hold_s=5.0),
@@ -27,13 +27,13 @@ SPECS = [
 NOTING = """
 import json, os, runpy, sys
 from pathlib import Path
-root, stand_in = sys.argv[1:3]
+root, fake_diagnosis = sys.argv[1:3]
 seen = Path(root, "seen.jsonl")
 with seen.open("a") as file:
     threads = os.environ.get("OMP_NUM_THREADS")
     print(json.dumps({"sealed": Path(root, "seal.json").exists(), "threads": threads}), file=file)
 sys.argv = sys.argv[2:]
-runpy.run_path(stand_in, run_name="__main__")
+runpy.run_path(fake_diagnosis, run_name="__main__")
 """
 
 
@@ -42,7 +42,9 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Two small cases and a stand-in for the tool; the folder of the proof."""
     root = tmp_path / "proof"
     monkeypatch.setattr(proof_set, "short_set", lambda purpose, seed=0: SPECS)
-    monkeypatch.setattr(prove, "_diagnose_command", lambda: (sys.executable, "-c", NOTING, str(root), str(STAND_IN)))
+    monkeypatch.setattr(
+        prove, "_diagnose_command", lambda: (sys.executable, "-c", NOTING, str(root), str(FAKE_DIAGNOSIS))
+    )
     return root
 
 
@@ -115,19 +117,19 @@ from pathlib import Path
 from carlab.cli import prove, run
 from carlab.benchmark.cases import proof_set
 from carlab.benchmark.cases.proof_set import CaseSpec
-root, stand_in = sys.argv[1:]
+root, fake_diagnosis = sys.argv[1:]
 waiting = '''
 import pathlib, runpy, sys, time
-root, stand_in = sys.argv[1:3]
+root, fake_diagnosis = sys.argv[1:3]
 pathlib.Path(root, "begun").touch()
 while not pathlib.Path(root, "go").exists():
     time.sleep(0.02)
 sys.argv = sys.argv[2:]
-runpy.run_path(stand_in, run_name="__main__")
+runpy.run_path(fake_diagnosis, run_name="__main__")
 '''
 specs = [CaseSpec("null", k, fit_s=8.0, hold_s=5.0) for k in (2, 3)]
 proof_set.short_set = lambda purpose, seed=0: specs
-prove._diagnose_command = lambda: (sys.executable, "-c", waiting, root, stand_in)
+prove._diagnose_command = lambda: (sys.executable, "-c", waiting, root, fake_diagnosis)
 sys.exit(run(["prove", "--out", root, "--no-baselines", "--no-oracle"]))
 """
 
@@ -141,7 +143,7 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
 @pytest.mark.parametrize("times", [1, 2])
 def test_interrupted_once_finishes_the_running_case_twice_drops_it(times: int, tmp_path: Path) -> None:
     root = tmp_path / "proof"
-    command = (sys.executable, "-c", INTERRUPTED, str(root), str(STAND_IN))
+    command = (sys.executable, "-c", INTERRUPTED, str(root), str(FAKE_DIAGNOSIS))
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     )

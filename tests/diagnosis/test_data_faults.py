@@ -140,7 +140,7 @@ def channels_of(faults, identity: str) -> list[str]:
     ],
     ids=["plain", "100 Hz", "steering late", "motor late", "early", "latency", "filtered velocities", "drag"],
 )
-def test_nothing_is_claimed_and_nothing_touched_where_all_that_is_off_is_physics(car):
+def test_physics_is_not_reported_as_a_fault(car):
     episode = car.drive()
     (fit,), held, faults = check([episode], [], NOMINAL)
     assert faults == []
@@ -160,7 +160,7 @@ SIGNS_AND_SCALES = [
 
 
 @pytest.mark.parametrize(("identity", "name", "column", "factor"), SIGNS_AND_SCALES)
-def test_a_velocity_column_in_another_unit_scale_or_sense_is_put_right(clean, identity, name, column, factor):
+def test_unit_scale_and_sign_of_a_velocity_column_are_repaired(clean, identity, name, column, factor):
     def change(states):
         states[:, column] *= factor
 
@@ -172,7 +172,7 @@ def test_a_velocity_column_in_another_unit_scale_or_sense_is_put_right(clean, id
     np.testing.assert_allclose(fit.states[:, column], clean.states[:, column], rtol=0.03, atol=1e-6)
 
 
-def test_velocities_in_the_world_frame_are_turned_back(clean):
+def test_velocities_in_the_world_frame_are_rotated_to_the_body_frame(clean):
     def change(states):
         c, s = np.cos(states[:, YAW]), np.sin(states[:, YAW])
         vx, vy = states[:, VX].copy(), states[:, VY].copy()
@@ -184,7 +184,7 @@ def test_velocities_in_the_world_frame_are_turned_back(clean):
 
 
 @pytest.mark.parametrize(("channel", "name"), [(0, "steering"), (1, "throttle")])
-def test_a_command_with_its_sign_turned_is_turned_back_in_every_recording(clean, held, channel, name):
+def test_a_wrong_command_sign_is_repaired_in_every_recording(clean, held, channel, name):
     def change(sent):
         sent[:, channel] *= -1
 
@@ -195,7 +195,7 @@ def test_a_command_with_its_sign_turned_is_turned_back_in_every_recording(clean,
 
 
 @pytest.mark.parametrize(("channel", "name"), [(0, "steering"), (1, "throttle")])
-def test_a_command_column_that_is_later_than_the_motion_is_moved_back(clean, held, channel, name):
+def test_a_command_column_that_is_later_than_the_motion_is_shifted(clean, held, channel, name):
     rows = 7
 
     def change(sent):
@@ -211,7 +211,7 @@ def test_a_command_column_that_is_later_than_the_motion_is_moved_back(clean, hel
 
 
 @pytest.mark.parametrize("rate", [0.003, -0.002])
-def test_commands_by_another_clock_are_brought_back(clean, held, rate):
+def test_commands_of_another_clock_are_converted(clean, held, rate):
     def drifting(episode: EpisodeData) -> EpisodeData:
         held_rows = np.searchsorted(episode.times_s[:-1], episode.times_s[:-1] * (1 + rate), side="right") - 1
         return replace(episode, sent=episode.sent[np.clip(held_rows, 0, episode.ticks - 1)])
@@ -225,7 +225,7 @@ def test_commands_by_another_clock_are_brought_back(clean, held, rate):
         assert after < 0.4 * before
 
 
-def test_spikes_of_a_wrapped_angle_are_taken_from_the_pose(circling):
+def test_spikes_of_a_wrapped_angle_are_replaced(circling):
     clean = circling
     raw = np.gradient(clean.states[:, YAW], clean.times_s)
     wild = np.abs(raw) > 40.0
@@ -255,7 +255,7 @@ def test_poses_of_another_marker_are_interpolated(clean):
     np.testing.assert_allclose(fit.states[:, :2], clean.states[:, :2], atol=0.01)
 
 
-def test_tracking_that_is_lost_for_good_cuts_the_recording(clean):
+def test_lost_tracking_cuts_the_recording(clean):
     def change(states):
         states[900:, X] += 3.0
 
@@ -273,7 +273,7 @@ def test_repeated_rows_are_interpolated(clean):
     (fit,), _, faults = check([replace(clean, states=clean.states[source])], [], NOMINAL)
     (fault,) = faults
     assert fault.id == "stale_samples"
-    assert 0.9 * stale.sum() <= fault.rows <= stale.sum()  # the car stands now and then
+    assert 0.9 * stale.sum() <= fault.rows <= stale.sum()  # the car stands at times
     error = np.abs(fit.states - clean.states)[stale]
     assert np.median(error[:, :2]) < 2e-3
     assert error[:, :2].max() < 0.03
@@ -313,7 +313,7 @@ def test_yaw_in_degrees_and_positions_in_millimetres(clean):
 
 
 def test_backward_differences_by_a_jittering_clock_that_was_logged_as_an_even_one():
-    """What the velocity columns of a public data set are: the true periods can be told from them."""
+    """Velocity columns as in a public data set: they determine the true periods."""
     fine = Car(seed=12, rate_hz=500.0, seconds=90.0).drive()
     rng = np.random.default_rng(2)
     steps = np.where(rng.random(2500) < 0.06, 20, 17)  # 34 or 40 ms
@@ -343,11 +343,11 @@ def test_backward_differences_by_a_jittering_clock_that_was_logged_as_an_even_on
     left_over = (true_s - true_s[0]) - (fit.times_s - fit.times_s[0])
     assert np.abs(drift).max() > 0.5
     assert np.abs(left_over).max() < 0.2 * np.abs(drift).max()
-    # Centred: no longer half a row behind the true speed.
+    # Centred: without the delay of half a row.
     np.testing.assert_allclose(fit.states[50:-50, VX], fine.states[rows, VX][50:-50], atol=0.25)
 
 
-def test_too_little_to_tell_is_left_alone(clean):
+def test_short_recordings_are_unchanged(clean):
     short = left_out(clean, np.arange(len(clean.states)) >= 30)
     parked = with_states(clean, lambda states: states.__setitem__(slice(None), states[0]))
     fit, _, faults = check([short, parked], [], NOMINAL)
@@ -358,7 +358,7 @@ def test_too_little_to_tell_is_left_alone(clean):
 
 def test_a_step_that_is_too_coarse_for_the_simulator_is_reported(clean):
     assert check_integration([clean], NOMINAL) == []
-    # A fifteenth of the yaw inertia: the tyres then settle within a millisecond, which steps of 33 ms cannot follow.
+    # With a fifteenth of the yaw inertia the tyre dynamics take 1 ms, which steps of 33 ms cannot resolve.
     stiff = replace(NOMINAL, priors={}).with_values({"vehicle.yaw_inertia": 0.004})
     found = check_integration([clean], stiff, max_step_s=0.033)
     assert "yaw_rate" in {f.channel for f in found}

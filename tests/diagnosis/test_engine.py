@@ -1,4 +1,4 @@
-"""The whole diagnosis on drives by an independent generator: a concealed effect is named and sized."""
+"""Diagnosis of drives by an independent generator: a concealed effect is named and estimated."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from carlab.cli import run
 
 @pytest.fixture(scope="module")
 def concealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """A servo lag concealed in 60 s of driving, base parameters off by up to 10 %, and 30 s to judge by."""
+    """A servo lag concealed in 60 s to fit and 30 s held out, with base parameters wrong by up to 10 %."""
     folder = tmp_path_factory.mktemp("concealed")
     case = make_case("single", 11, effects=("steering_lag",), excess=4.0, fit_s=60, hold_s=30)
     write_csv(folder / "fit.csv", case.fit)
@@ -29,7 +29,7 @@ def concealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 
 @pytest.fixture(scope="module")
 def diagnosed(concealed: tuple[Path, float]) -> Path:
-    """The folder of its report, judged on the recording to judge by."""
+    """Folder of the report with the held-out recording."""
     folder = concealed[0]
     arguments = [str(folder / "fit.csv"), "--car", str(folder / "car.toml"), "--holdout", str(folder / "hold.csv")]
     assert run(["diagnose", *arguments, "--out", str(folder / "out"), "--decisions"]) == 0
@@ -54,7 +54,7 @@ def test_a_concealed_servo_lag_is_named_first_and_sized(concealed: tuple[Path, f
 
 
 def replayed(recording: Path, car: str, part: str, capfd: pytest.CaptureFixture[str]) -> dict[str, list[float]]:
-    """What ``carlab replay`` prints for one part: errors and score by row."""
+    """Errors and score by row that ``carlab replay`` prints for one part."""
     capfd.readouterr()
     assert run(["replay", str(recording), "--car", car]) == 0
     text = capfd.readouterr().out
@@ -66,7 +66,7 @@ def replayed(recording: Path, car: str, part: str, capfd: pytest.CaptureFixture[
 
 
 def agree(row: list[float], errors: dict[str, float], digits: float = 6e-5) -> None:
-    """To 1 %, and to the last digit that is printed."""
+    """Equality within 1 % or the last printed digit."""
     wanted = [errors[name] for name in ("position_m", "yaw_rad", "vx", "vy", "yaw_rate")]
     assert row[:5] == pytest.approx(wanted, rel=0.01, abs=digits)
 
@@ -77,7 +77,7 @@ def test_replay_of_the_model_prints_the_error_of_the_report(
     held_out = json.loads((diagnosed / "report.json").read_text())["fit"]["held_out"]
     hold = concealed[0] / "hold.csv"
     rows = replayed(hold, str(diagnosed / "model.toml"), "whole recording", capfd)
-    # The model corrects the initial states here, the car file in the report: some hundredths of a noise floor apart.
+    # Here the model corrects the initial states, in the report the car file: they differ by some hundredths of a floor.
     agree(rows["model"], held_out["with_effects"], 2e-4)
     agree(rows["constant velocity"], held_out["constant_velocity"])
     rows = replayed(hold, str(concealed[0] / "car.toml"), "whole recording", capfd)
@@ -97,7 +97,7 @@ def test_replay_scores_the_last_part_as_a_diagnosis_holds_it_out(
 def test_replay_of_a_real_recording_prints_the_error_of_the_report(
     shared: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The ETH car, whose recordings have faults of every kind; the car file as given needs no fit."""
+    """The ETH car, whose recordings have all kinds of faults; the car file as given needs no fit."""
     recording = shared / "data" / "eth_rc_car" / "train_2.csv.gz"
     report = carlab.diagnose(recording, "eth_rc_car", stop=lambda: True)
     rows = replayed(recording, "eth_rc_car", "last 30 %", capfd)
@@ -105,7 +105,7 @@ def test_replay_of_a_real_recording_prints_the_error_of_the_report(
     agree(rows["constant velocity"], asdict(report.held_out["constant_velocity"]))
 
 
-def test_a_parked_car_is_inconclusive_and_says_what_to_record(
+def test_a_parked_car_is_inconclusive_with_advice(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rows = (concealed[0] / "fit.csv").read_text().splitlines()
@@ -132,7 +132,7 @@ def test_a_recording_that_is_too_short_is_inconclusive(
     assert report["effects"] == []
 
 
-def test_a_recording_whose_tracking_is_lost_all_the_time_is_itself_at_fault(
+def test_a_recording_with_frequently_lost_tracking_is_faulty(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Motion capture takes another body for the car for a third of a second in each second."""
@@ -163,17 +163,17 @@ def test_a_constant_command_is_inconclusive_and_names_the_drive_that_varies_it(
     assert "--policy throttle_steps" in " ".join(capfd.readouterr().err.split())
 
 
-def test_what_is_fitted_cannot_judge(concealed: tuple[Path, float], tmp_path: Path) -> None:
+def test_a_fitted_recording_cannot_be_held_out(concealed: tuple[Path, float], tmp_path: Path) -> None:
     same = str(concealed[0] / "fit.csv")
     assert run(["diagnose", same, "--holdout", same, "--out", str(tmp_path / "out")]) == 2
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5])
-def test_the_share_that_judges_is_not_fitted(
+def test_the_held_out_share_is_not_fitted(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float
 ) -> None:
-    """Nor are the second and a half before it, which windows that judge begin with."""
+    """The gap of 1.5 s before it, the history of held-out windows, is not fitted either."""
     rows = [
         r for r in (concealed[0] / "fit.csv").read_text().splitlines() if r[0] == "t" or float(r.split(",")[0]) < 12
     ]
@@ -186,7 +186,7 @@ def test_the_share_that_judges_is_not_fitted(
 
 
 @pytest.mark.parametrize("share", ["0", "0.6", "nan"])
-def test_a_share_that_leaves_too_little_is_refused(
+def test_a_held_out_share_out_of_range_raises_an_error(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], share: str
 ) -> None:
     path = str(concealed[0] / "fit.csv")
@@ -195,7 +195,7 @@ def test_a_share_that_leaves_too_little_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_share_beside_a_recording_that_is_held_out_is_refused(
+def test_a_share_together_with_held_out_recordings_raises_an_error(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     paths = [str(concealed[0] / "fit.csv"), "--holdout", str(concealed[0] / "hold.csv")]
@@ -205,10 +205,10 @@ def test_a_share_beside_a_recording_that_is_held_out_is_refused(
 
 
 @pytest.mark.parametrize("stated", [False, True])
-def test_a_latency_that_the_car_file_does_not_state_is_a_parameter_and_no_effect(
+def test_an_unknown_latency_is_a_parameter_and_not_an_effect(
     concealed: tuple[Path, float], tmp_path: Path, stated: bool
 ) -> None:
-    """Commands logged one row early, 33 ms, beside the 12 ms that the car has: 45 ms of latency."""
+    """Commands logged one row (33 ms) early and 12 ms of latency of the car give 45 ms."""
     rows = [r.split(",") for r in (concealed[0] / "fit.csv").read_text().splitlines()]
     first = rows[0].index("steering")
     late = [r[:first] + c[first:] for r, c in pairwise(rows[1:])]

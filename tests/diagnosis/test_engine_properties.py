@@ -1,4 +1,4 @@
-"""What a diagnosis must not depend on, what it must refuse to name, and its linear shortcuts against the long way."""
+"""Invariances of a diagnosis, physics that it must not name, and linear approximations against exact results."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -50,7 +50,7 @@ def outcome(folder: Path, change: Callable[[Table], Table] = dict, effects: tupl
 
 @pytest.fixture(scope="module")
 def drag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """Drag of the air concealed in a minute of driving, base parameters off."""
+    """Aerodynamic drag concealed in 60 s of driving with wrong base parameters."""
     case = make_case("single", 21, effects=("aerodynamic_drag",), excess=2.0, fit_s=60, hold_s=30)
     folder = write(tmp_path_factory.mktemp("drag"), case)
     return folder, case.answer()["effects"][0]["parameters"]["coefficient"]
@@ -58,7 +58,7 @@ def drag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 
 @pytest.fixture(scope="module")
 def windows(drag: tuple[Path, float]) -> PredictionWindows:
-    """PredictionWindows of that drive."""
+    """Prediction windows of that drive."""
     return cut_windows(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), 0.8, 0.5)
 
 
@@ -78,7 +78,7 @@ NEAREST = ("lateral_bias", "marker_offset", "road_slope", "steering_asymmetry", 
 
 
 @pytest.mark.parametrize("change", [dict, turned_and_mirrored])
-def test_an_effect_is_found_wherever_the_room_is_and_in_a_mirror(
+def test_the_result_is_invariant_to_rotation_translation_and_mirroring(
     drag: tuple[Path, float], change: Callable[[Table], Table]
 ) -> None:
     folder, truth = drag
@@ -89,12 +89,12 @@ def test_an_effect_is_found_wherever_the_room_is_and_in_a_mirror(
 
 
 @pytest.mark.slow
-def test_the_same_recording_gives_the_same_answer_twice(drag: tuple[Path, float]) -> None:
+def test_the_diagnosis_is_deterministic(drag: tuple[Path, float]) -> None:
     one, other = (outcome(drag[0], effects=CANDIDATES).diagnosis for _ in range(2))
     assert replace(one, seconds=0.0) == replace(other, seconds=0.0)
 
 
-def test_the_halves_of_a_recording_do_not_contradict_each_other(drag: tuple[Path, float], tmp_path: Path) -> None:
+def test_the_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -> None:
     folder = drag[0]
     table = read_csv(folder / "fit.csv")
     car = load_car_file(folder / "car.toml").simulator
@@ -111,7 +111,7 @@ def test_the_halves_of_a_recording_do_not_contradict_each_other(drag: tuple[Path
     assert apart < 3.0 * np.hypot(one.std, other.std)
 
 
-def test_nothing_is_named_where_only_base_parameters_are_off(tmp_path: Path) -> None:
+def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path) -> None:
     found = outcome(write(tmp_path, make_case("parameters", 31, fit_s=60, hold_s=30))).diagnosis
     assert found.verdict == "parameters"
     assert found.effects == ()
@@ -121,8 +121,8 @@ def test_nothing_is_named_where_only_base_parameters_are_off(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "among", [pytest.param(NEAREST, id="nearest"), pytest.param(None, id="catalogue", marks=pytest.mark.slow)]
 )
-def test_what_has_no_name_is_described_and_not_forced(tmp_path: Path, among: tuple[str, ...] | None) -> None:
-    """A cable that pulls the car's tail towards a point: no effect of the catalogue is like it."""
+def test_uncatalogued_physics_is_described_without_a_name(tmp_path: Path, among: tuple[str, ...] | None) -> None:
+    """A cable that pulls the rear of the car towards a point resembles no effect of the catalogue."""
     case = make_case("outside", 41, effects=("cable_pull",), excess=4.0, fit_s=60, hold_s=30)
     found = outcome(write(tmp_path, case), effects=among).diagnosis
     assert found.verdict == "unexplained"
@@ -139,10 +139,8 @@ def test_what_has_no_name_is_described_and_not_forced(tmp_path: Path, among: tup
         pytest.param("camber", "steering_offset", "front wheels", marks=pytest.mark.slow),
     ],
 )
-def test_a_name_is_not_given_to_what_something_outside_the_catalogue_explains_better(
-    concealed: str, taken_for: str, said: str, tmp_path: Path
-) -> None:
-    """By itself the nearest name of the catalogue would do."""
+def test_rival_physics_replaces_a_spurious_effect(concealed: str, taken_for: str, said: str, tmp_path: Path) -> None:
+    """Without rivals the most similar effect of the catalogue is accepted."""
     case = make_case("outside", 43, effects=(concealed,), excess=1.5, fit_s=60, hold_s=30)
     folder = write(tmp_path, case)
     whole = outcome(folder)
@@ -155,7 +153,7 @@ def test_a_name_is_not_given_to_what_something_outside_the_catalogue_explains_be
     assert [e.id for e in told.effects] == [taken_for]
 
 
-def test_an_effect_that_unseen_blocks_do_not_miss_is_eliminated(
+def test_an_effect_without_gain_on_unseen_blocks_is_eliminated(
     drag: tuple[Path, float], windows: PredictionWindows
 ) -> None:
     car = load_car_file(drag[0] / "car.toml").simulator
@@ -170,10 +168,8 @@ def test_an_effect_that_unseen_blocks_do_not_miss_is_eliminated(
     assert kept.deletions["aerodynamic_drag"].standard_errors > 2.0
 
 
-def test_impulse_responses_add_up_to_what_the_simulator_does(
-    drag: tuple[Path, float], windows: PredictionWindows
-) -> None:
-    """The linear answer to -c v|v| / m against switching the drag on in the simulator."""
+def test_impulse_responses_sum_to_the_simulated_change(drag: tuple[Path, float], windows: PredictionWindows) -> None:
+    """Linear response to -c v|v| / m against a simulation with drag."""
     car = load_car_file(drag[0] / "car.toml").simulator
     scale = Scale(np.array([8, 16, 24]), np.ones((3, 6)))
     coefficient = 0.02
@@ -183,16 +179,14 @@ def test_impulse_responses_add_up_to_what_the_simulator_does(
     term = next(t for t in TERMS if t.formula == "v |v|")
     linear = -coefficient / car.parameters.mass_kg * responses(windows, car, scale).of(term, 0)
     true = scale.white(dragged - plain)
-    tame = np.abs(true).max(axis=(1, 2)) < 1.0  # a car at the edge of a spin answers by no straight line
+    tame = np.abs(true).max(axis=(1, 2)) < 1.0  # the response of a car at the edge of a spin is not linear
     for channel in (0, 3):  # x and vx
         a, b = linear[tame][..., channel].ravel(), true[tame][..., channel].ravel()
         assert np.corrcoef(a, b)[0, 1] > 0.97
         assert a @ b / (b @ b) == pytest.approx(1.0, abs=0.1)
 
 
-def test_leaving_a_fold_out_by_one_step_is_as_good_as_a_refit(
-    drag: tuple[Path, float], windows: PredictionWindows
-) -> None:
+def test_one_step_without_a_fold_approximates_a_refit(drag: tuple[Path, float], windows: PredictionWindows) -> None:
     car = with_effect(load_car_file(drag[0] / "car.toml").simulator, "aerodynamic_drag")
     free = (*base_parameters(car), *effect_parameters("aerodynamic_drag", car))
     noise = estimate_noise(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), windows.curvature_bias)

@@ -1,4 +1,4 @@
-"""An effect that is registered in one place is simulated, diagnosed, reported, saved and learned with.
+"""A registered effect is simulated, diagnosed, reported, saved and part of the prior of learning.
 
 Three effects, one of each kind, are written here and registered for the time of each test. Nothing else knows them.
 """
@@ -78,7 +78,7 @@ class SpinMoment(DynamicsEffect):
 
 
 class MarkerAhead(ObservationEffect):
-    """``p_meas = p + R(yaw) [ahead, 0]``, so that ``vy_meas = vy + ahead r``; it has no closed inverse here."""
+    """``p_meas = p + R(yaw) [ahead, 0]``, so that ``vy_meas = vy + ahead r``; without a closed-form inverse here."""
 
     id = "marker_ahead"
     parameters = (EffectParameter("ahead", "m", 0.0, -1.0, 1.0, 0.03),)
@@ -94,7 +94,7 @@ class MarkerAhead(ObservationEffect):
 
 
 class SpeedGain(ObservationEffect):
-    """``vx_meas = (1 + gain) vx`` on the velocity columns alone."""
+    """``vx_meas = (1 + gain) vx`` on the velocity columns only."""
 
     id = "speed_gain"
     velocities_only = True
@@ -112,7 +112,7 @@ IDS = tuple(TRUE)
 
 
 pytestmark = pytest.mark.timeout(900)
-"""A diagnosis takes a while on a busy machine."""
+"""Time limit of a diagnosis on a busy machine."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -136,7 +136,7 @@ def recording(seed: int, seconds: float = 16.0) -> EpisodeData:
 
 @pytest.fixture(scope="module")
 def found(_registered: None) -> Outcome:
-    """A diagnosis of the plain car, in which these three may be named."""
+    """Diagnosis of the nominal car with these three candidate effects."""
     texts = Texts(effect_sentence, separating_drive, confusable_effects())
     return diagnose([recording(1)], [recording(2, 8.0)], SimulatorConfig(), texts, effects=IDS)
 
@@ -149,7 +149,7 @@ def report(found: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_every_engine_simulates_it_alike(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_engines_agree(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sim_backends.plant.wrap", lambda yaw: yaw)
     config = SimulatorConfig(effects={name: TRUE[name]}, command_delay_s=0.0)
     start = torch.tensor([[0.2, 0.1, 0.3, 1.5, 0.1, 0.4]], dtype=torch.float64)
@@ -173,7 +173,7 @@ def test_every_engine_simulates_it_alike(name: str, monkeypatch: pytest.MonkeyPa
     assert (arrays.measured - plain.measured).abs().max() > 1e-3
 
 
-def test_its_gradient_is_that_of_finite_differences() -> None:
+def test_gradient_equals_finite_differences() -> None:
     start = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.1, 0.4]], dtype=torch.float64)
     commands = torch.full((1, 6, 2), 0.5, dtype=torch.float64)
     for name, own in TRUE.items():
@@ -203,7 +203,7 @@ class ShiftedHeading(ObservationEffect):
         return (*state[:2], state[2] + values["angle"], *state[3:])
 
 
-def test_the_simulated_car_shows_what_is_measured() -> None:
+def test_the_simulated_car_applies_observation_effects() -> None:
     effects = {"shifted_heading": {"angle": 0.2}, "speed_gain": {"gain": 0.25}}
     with registered(ShiftedHeading(), SpeedGain()):
         for more in ({}, {"velocity_filter_lag": {"time_constant": 0.01}}):
@@ -211,7 +211,7 @@ def test_the_simulated_car_shows_what_is_measured() -> None:
             with SimulatedCar(config, start=CarState(vx_mps=2.0)) as car:
                 seen = car.observe().state
             assert seen.yaw_rad == pytest.approx(0.2, abs=0.01)
-            # The estimator finds the velocity along the shifted heading.
+            # The estimator resolves the velocity along the shifted heading.
             assert seen.vx_mps == pytest.approx(1.25 * 2.0 * np.cos(0.2), abs=0.02)
     assert "shifted_heading" not in EFFECTS
 
@@ -237,7 +237,7 @@ def test_the_report_has_its_texts(found: Outcome, report: Path) -> None:
     assert refutation_sentence("spin_moment") == "This would be wrong if the car drives straight at high speed."
 
 
-def test_confusable_effects_and_the_drive_that_separates_them_go_both_ways() -> None:
+def test_confusable_effects_and_separating_drives_are_symmetric() -> None:
     pairs = confusable_effects()
     assert "steering_nonlinearity" in pairs["cubic_steering"]
     assert "cubic_steering" in pairs["steering_nonlinearity"]
@@ -264,7 +264,7 @@ def test_windows_of_an_effect_on_velocities_start_from_true_velocities() -> None
             assert np.abs(error[..., 3]).max() < 1e-2
 
 
-def test_the_car_file_keeps_it_and_learning_has_it_in_its_prior(found: Outcome, report: Path) -> None:
+def test_car_file_and_prior_contain_the_effects(found: Outcome, report: Path) -> None:
     config = SimulatorConfig.from_tables(tomllib.loads((report / "model.toml").read_text()))
     assert {name: dict(own) for name, own in config.effects.items()} == {
         name: dict(own) for name, own in found.model.effects.items()
@@ -277,7 +277,7 @@ def test_the_car_file_keeps_it_and_learning_has_it_in_its_prior(found: Outcome, 
     rows = torch.tensor(np.random.default_rng(3).uniform(-0.5, 0.5, (5, 3 + 2 * 7))) + torch.eye(1, 17)[0] * 1.5
     together = model(rows, draws)
     assert torch.isfinite(together).all()
-    for k in range(len(numbers)):  # each number matters
+    for k in range(len(numbers)):  # each parameter has an influence
         moved = draws.clone()
         moved[:, k] *= 1.1
         assert (model(rows, moved) - together).abs().max() > 1e-6, model.names[k]
@@ -299,7 +299,7 @@ def test_the_prior_predicts_rows_of_a_recording_with_the_effects() -> None:
     assert errors[0][:, [0, 2, 5]].mean() < 0.5 * errors[1][:, [0, 2, 5]].mean()
 
 
-def test_an_effect_is_forgotten_after_its_block_and_refused_twice() -> None:
+def test_temporary_registration_ends_and_duplicates_raise_an_error() -> None:
     class Other(SpinMoment):
         id = "other_moment"
 
@@ -319,7 +319,7 @@ def test_an_effect_is_forgotten_after_its_block_and_refused_twice() -> None:
         pass
 
 
-def test_a_new_class_under_an_old_id_is_not_taken_from_a_cache() -> None:
+def test_a_new_class_with_an_old_id_is_not_cached() -> None:
     start = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.0, 0.0]], dtype=torch.float64)
     commands = torch.zeros((1, 5, 2), dtype=torch.float64)
 

@@ -1,4 +1,4 @@
-"""Small runs of learning and driving for tests: a plan of seconds, and recordings of a car that goes straight on."""
+"""Small runs of learning and driving for tests: a short training plan, and recordings of a car that drives straight."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ENVELOPE = SafetyEnvelope(arena_m=ParkingTask().arena_m)
 
 
 def tiny_plan(choice: CarChoice, **changes: Any) -> TrainingPlan:
-    """To learn from the car with wheels that do not slip, in a few steps and with the threads of one."""
+    """Training plan with the kinematic prior, few steps and one thread."""
     text = tomli_w.dumps(prior_simulator(choice.simulator, "kinematic").to_tables())
     return replace(TrainingPlan(text, HISTORY, model_steps=60, updates=32, threads=1), **changes)
 
@@ -35,7 +35,7 @@ def names(run: RunDirectory) -> list[str]:
 
 
 def drive(folder: Path, ticks: int, start: CarState | None = None, episodes: int = 1) -> RunDirectory:
-    """A run with recordings of so many ticks, of a car that somebody may have put somewhere."""
+    """A run with recordings of ``ticks`` commands from the state ``start``."""
 
     class Forward:
         name = "forward"

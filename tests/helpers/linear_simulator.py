@@ -1,4 +1,4 @@
-"""A simulator that is linear in its parameters, and rows that it cannot wholly explain."""
+"""A simulator that is linear in its parameters, and rows with a discrepancy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EMPTY = torch.zeros(0, 2)
 
 
 def features(x):
-    """Of two outputs, in numpy (O, N, 3)."""
+    """Features of two outputs in NumPy (O, N, 3)."""
     a, b = np.asarray(x, dtype=float).T
     return np.stack([np.stack([a, b, np.ones_like(a)], axis=1), np.stack([0 * a, 0.3 * a, np.sin(b)], axis=1)])
 
@@ -41,7 +41,7 @@ class Linear:
 
 
 def rows(count, seed=0, noise=NOISE):
-    """Inputs and outputs, which the linear simulator cannot wholly explain."""
+    """Inputs and outputs with a discrepancy from the linear simulator."""
     rng = np.random.default_rng(seed)
     x = np.stack([rng.uniform(-3, 4, count), rng.uniform(-2, 0, count)], axis=1)
     return tensors(x, truth(x) + noise.numpy() * rng.normal(size=(count, 2)))

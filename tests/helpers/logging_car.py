@@ -1,4 +1,4 @@
-"""A car that only writes down its commands, and a safety gate around it."""
+"""A car without physics that records its commands, and a safety gate around it."""
 
 from carlab.core.car import Car
 from carlab.core.clock import SimulatedClock
@@ -8,7 +8,7 @@ from carlab.core.safety import SafeCar, SafetyEnvelope
 
 
 class LoggingCar(Car):
-    """Writes down every command; has no physics."""
+    """Record every command; no physics."""
 
     def __init__(self) -> None:
         self.name, self.reality = "log", Reality.SIMULATED

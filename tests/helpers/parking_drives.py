@@ -1,6 +1,6 @@
-"""Drives like those of a policy that learns to park: a parking feedback that errs, anew in every episode.
+"""Drives of a parking policy with random errors in every episode, as in ``carlab learn``.
 
-On the simulated car, recorded as ``carlab learn`` records; and on the cars of the independent generator.
+The drives are on the simulated car, recorded like ``carlab learn``, and on cars of the independent generator.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from carlab.benchmark.cases.refit import channel_scores, cut_shots
+from carlab.benchmark.cases.refit import channel_scores, cut_windows
 from carlab.benchmark.effects.catalogue import Draw
 from carlab.benchmark.effects.forms import all_forms
 from carlab.benchmark.world.base_car import BaseCar
@@ -37,7 +37,7 @@ TICKS = 100
 
 @dataclass(frozen=True)
 class Concealed:
-    """Episodes, the simulator without what is concealed in them, its parameters, and the channels' true scores."""
+    """Episodes, the simulator without their concealed effect, its parameters, and the true scores of channels."""
 
     episodes: list[EpisodeData]
     simulator: SimulatorConfig
@@ -46,15 +46,15 @@ class Concealed:
 
     @property
     def main_channels(self) -> list[str]:
-        """The channels with at least half of the largest squared excess, by the generator's own simulator."""
+        """The channels with at least half of the largest squared excess, by the generator's simulator."""
         excess = {name: max(score**2 - 1.0, 0.0) for name, score in self.scores.items()}
         return [name for name, e in excess.items() if e >= 0.5 * max(excess.values()) > 0.0]
 
 
-class ErringParker:
-    """Backs into a wrong spot at some speed, its commands disturbed by slow noise; gentler from episode to episode."""
+class NoisyParkingPolicy:
+    """Reverse parking at a wrong goal with slow noise on the commands; the errors decrease from episode to episode."""
 
-    name = "erring_parker"
+    name = "noisy_parking"
 
     def __init__(self, rng: np.random.Generator, skill: float) -> None:
         self._rng = rng
@@ -82,12 +82,12 @@ class ErringParker:
 def drive_like_learning(
     true: SimulatorConfig, folder: Path, episodes: int = 5, seed: int = 0, ticks: int = TICKS
 ) -> RunDirectory:
-    """A run folder with so many recordings of the simulated car ``true``."""
+    """A run folder with ``episodes`` recordings of the simulated car ``true``."""
     run = RunDirectory.create(folder, f"drives{seed}")
     envelope = SafetyEnvelope(arena_m=TASK.arena_m)
     with SimulatedCar(true, seed=seed) as car:
         for k in range(episodes):
-            policy = ErringParker(np.random.default_rng((seed, k)), k / max(episodes, 1))
+            policy = NoisyParkingPolicy(np.random.default_rng((seed, k)), k / max(episodes, 1))
             Session(
                 car, policy, TASK, envelope, run, true.control_period_s, seed=100 * seed + k, max_ticks=ticks,
                 record_rerun=False,
@@ -100,11 +100,11 @@ def concealed_drives(effect: str | None, size: float, seed: int, episodes: int =
     """Episodes of a car of the independent generator with one concealed effect, and the simulator without it.
 
     Args:
-        effect: id; none for a car without.
-        size: in typical sizes of the generator's form of it.
-        seed: of everything drawn.
-        episodes: how many.
-        share: every base parameter of the true car is off by up to so much of itself.
+        effect: effect id, or None.
+        size: size in typical sizes of the generator's form.
+        seed: seed of all random draws.
+        episodes: number of episodes.
+        share: maximum relative error of the base parameters of the true car.
     """
     draws = np.random.default_rng((seed, 1))
     nominal = replace(BaseCar(), position_std=0.0003)
@@ -119,7 +119,7 @@ def concealed_drives(effect: str | None, size: float, seed: int, episodes: int =
             parameters = form.sized(size * form.typical, drawn)
             form.attach(world, parameters)
         rng = np.random.default_rng((seed, 2, k))
-        policy = ErringParker(rng, k / max(episodes, 1))
+        policy = NoisyParkingPolicy(rng, k / max(episodes, 1))
         start = TASK.sample_start(rng).to_array()
         what = drive(
             world,
@@ -138,8 +138,8 @@ def concealed_drives(effect: str | None, size: float, seed: int, episodes: int =
 
 
 def _scores(recordings: Sequence[Recording], nominal: BaseCar, true: BaseCar) -> dict[str, float]:
-    """Scores of the nominal car by channel, by the generator's own shots, simulator and floor."""
+    """Scores of the nominal car by channel, by the generator's windows, simulator and floor."""
     squared = [
-        (channel_scores(cut_shots(r, true, horizon_s=0.8, every_s=0.2), nominal.free()) ** 2) for r in recordings
+        (channel_scores(cut_windows(r, true, horizon_s=0.8, every_s=0.2), nominal.free()) ** 2) for r in recordings
     ]
     return dict(zip(STATE_NAMES, map(float, np.sqrt(np.mean(squared, axis=0))), strict=True))

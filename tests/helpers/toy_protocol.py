@@ -82,12 +82,12 @@ class ToyDevice:
 
 
 def make_device(config: ActuatorConfig) -> ToyDevice:
-    """The toy at the port that a configuration names."""
+    """The toy device at the configured port."""
     return ToyDevice(SerialLink(config.port, config.baud))
 
 
 class ToyFirmware:
-    """Fake firmware on a pseudo-terminal; releases the motor where no command comes for ``MOTOR_TIMEOUT_S``."""
+    """Fake firmware on a pseudo-terminal; releases the motor after ``MOTOR_TIMEOUT_S`` without a command."""
 
     def __init__(self) -> None:
         self._master, self._slave = os.openpty()

@@ -1,9 +1,9 @@
 """The largest cross-correlation between errors and commands, both prewhitened (Box and Jenkins, 1970).
 
-A command whose past is left in the errors acts later (or earlier) than the model thinks. Differentiating the pose
-smears every step of a command over neighbouring rows, earlier ones too, with a sum of zero; single lags therefore
-correlate on null cases as well, and what counts is the correlation summed over the lags that a step can reach. A lag
-leaves the same sum as a delay: the delay is named for both.
+Errors that correlate with past commands indicate that a command acts later (or earlier) than in the model. The
+differentiation of the pose spreads a command step over neighbouring rows with a sum of zero. Single lags therefore
+correlate on null cases too, and the statistic is the sum of correlations over the affected lags. A lag has the same sum
+as a delay; the delay is named for both.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from carlab.benchmark.world.simulation import FloatArray
 
 ORDER = 8
 STEP_S = 0.1
-# Lags in rows of 1/30 s, negative ones too, and how many are summed.
+# Range of lags in rows of 1/30 s before and after zero, and number of summed lags.
 BEFORE, AFTER, WIDE = 7, 10, 12
-# In standard errors of a sum of correlations; quiet on the null cases of the development set.
-LEAST = 1.8
+# Threshold in standard errors of a sum of correlations, without false alarms on the development set.
+MIN_Z = 1.8
 CLIP = 6.0
 
 
 def largest_correlation(data: Prepared) -> str | None:
-    """The delay that the largest cross-correlation stands for, None where all are small."""
+    """The delay with the largest cross-correlation, or None if all are small."""
     steering, throttle = _strongest(data, 0, (1, 2)), _strongest(data, 1, (0,))
-    if max(steering, throttle) < LEAST:
+    if max(steering, throttle) < MIN_Z:
         return None
-    if min(steering, throttle) >= LEAST:
+    if min(steering, throttle) >= MIN_Z:
         return "command_delay"
     return "steering_delay" if steering > throttle else "throttle_delay"
 

@@ -1,9 +1,8 @@
-"""What every baseline starts from: clean columns, the generator's refit, and velocity errors over short steps.
+"""Input of all baselines: clean columns, the generator's refit, and velocity errors over short steps.
 
-A baseline knows the base model, refitted; what it explains is the discrepancy: velocity change of the recording less
-that of the model over 0.3 s, divided by the time: a residual acceleration. (Over 0.1 s PySINDy named fewer effects of
-the development set.) Commands are delayed by what the car file says: the delayed inputs that such methods must be given
-by hand.
+A baseline knows the refitted base model and explains the discrepancy: the velocity change of the recording minus that
+of the model over 0.3 s, divided by the time (a residual acceleration). Commands are delayed by the delay of the car
+file, because such methods require delayed inputs.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.ndimage import median_filter
 
-from carlab.benchmark.cases.refit import Shots, cut_shots, fine_commands, in_start_frame, refit, roll
+from carlab.benchmark.cases.refit import Windows, cut_windows, fine_commands, in_start_frame, refit, roll
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import Recording, body_velocity, window_rows
 from carlab.benchmark.world.simulation import FloatArray
@@ -70,7 +69,7 @@ class Steps:
         series: FloatArray | None = None,
         scaled: Mapping[str, FloatArray] | None = None,
     ) -> FloatArray:
-        """Ends (M, 6) with other starts, other commands, or base parameters (M,) times something."""
+        """Ends (M, 6) with other starts, other commands, or scaled base parameters (M,)."""
         values: dict[str, object] = {**self.car.free()}
         for name, factor in (scaled or {}).items():
             values[name] = self.car.free()[name] * factor
@@ -88,7 +87,7 @@ class Steps:
 
 @dataclass(frozen=True)
 class Prepared:
-    """One case as the baselines see it."""
+    """Input of the baselines for one case."""
 
     nominal: BaseCar
     car: BaseCar
@@ -99,7 +98,7 @@ class Prepared:
     errors: FloatArray
     hold_steps: Steps
     hold_errors: FloatArray
-    shots: Shots
+    windows: Windows
     refit_score: float
 
     @property
@@ -112,19 +111,27 @@ def prepare(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, float
     """Clean the columns, refit the base model, and cut both recordings into short steps."""
     floors = np.array([floor[name] for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate")])
     recordings = [clean(table, nominal, floors) for table in (fit, hold)]
-    shots = [with_floor(cut_shots(r, nominal), floors) for r in recordings]
-    fitted = refit(shots[0], shots[1], nominal)
+    windows = [with_floor(cut_windows(r, nominal), floors) for r in recordings]
+    fitted = refit(windows[0], windows[1], nominal)
     car = nominal.with_free(fitted.values)
     cut = [short_steps(r, car) for r in recordings]
     if not np.isfinite(fitted.score) or min(len(steps.rows) for steps, _ in cut) < 30:
-        raise DataError("Too little of this recording can be used for a regression.")
+        raise DataError("The recording has too few usable rows for a regression; use a longer recording.")
     return Prepared(
-        nominal, car, recordings[0], recordings[1], floors, *cut[0], *cut[1], shots=shots[1], refit_score=fitted.score
+        nominal,
+        car,
+        recordings[0],
+        recordings[1],
+        floors,
+        *cut[0],
+        *cut[1],
+        windows=windows[1],
+        refit_score=fitted.score,
     )
 
 
 def clean(table: Table, car: BaseCar, floors: FloatArray) -> Recording:
-    """Even rows, no gaps, no single rows far from their neighbours; the velocities anew where the pose had jumps."""
+    """Resample on even rows, interpolate gaps and outliers, and re-estimate velocities at jumps of the pose."""
     t = np.asarray(table["t"])
     even = t[0] + car.control_period * np.arange(round((t[-1] - t[0]) / car.control_period) + 1)
     if not 100 <= len(even) <= 200_000:
@@ -149,10 +156,10 @@ def clean(table: Table, car: BaseCar, floors: FloatArray) -> Recording:
     return Recording(even - even[0], measured, commands, np.zeros_like(measured))
 
 
-def with_floor(shots: Shots, floors: FloatArray) -> Shots:
-    """Shots whose noise floor is given."""
-    even = np.repeat(floors[None], len(shots.starts), axis=0)
-    return Shots(shots.car, shots.steps_s, shots.starts, shots.commands, shots.recorded, even)
+def with_floor(windows: Windows, floors: FloatArray) -> Windows:
+    """Windows whose noise floor is given."""
+    even = np.repeat(floors[None], len(windows.starts), axis=0)
+    return Windows(windows.car, windows.steps_s, windows.starts, windows.commands, windows.recorded, even)
 
 
 def short_steps(recording: Recording, car: BaseCar) -> tuple[Steps, FloatArray]:
@@ -170,17 +177,17 @@ def short_steps(recording: Recording, car: BaseCar) -> tuple[Steps, FloatArray]:
 def held_out_score(
     data: Prepared, correction: Callable[[Steps], FloatArray], at_end: Callable[[Steps], FloatArray] | None = None
 ) -> float:
-    """Score over 1 s where ``correction`` (residual acceleration (M, 3)) is added after every short step.
+    """Score over 1 s if ``correction`` (residual acceleration (M, 3)) is added after every short step.
 
     ``at_end`` gives what is added to the measured velocities (M, 3) at the end only.
     """
-    shots, car = data.shots, data.car
+    windows, car = data.windows, data.car
     period = car.control_period
     count = max(1, round(STEP_S / period))
     fine, parts = fine_commands(data.hold, car)
-    total = shots.commands.shape[1] // len(parts)
+    total = windows.commands.shape[1] // len(parts)
     first = np.arange(5, len(data.hold.t_s) - total, max(1, round(0.5 / period)), dtype=np.int64)
-    state = shots.starts.copy()
+    state = windows.starts.copy()
     for begin in range(0, total, count):
         rows = first + begin
         steps = Steps(car, state, rows, data.hold.t_s[rows], fine, parts, min(count, total - begin))
@@ -194,6 +201,6 @@ def held_out_score(
         state[:, 2] += moved[:, 2]
     if at_end is not None:
         state[:, 3:] += at_end(steps)
-    errors = in_start_frame(state - shots.recorded, shots.starts) / data.floor
+    errors = in_start_frame(state - windows.recorded, windows.starts) / data.floor
     total_error = float(np.sqrt((errors**2).mean()))
     return total_error if np.isfinite(total_error) else 1e3

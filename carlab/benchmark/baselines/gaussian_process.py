@@ -1,4 +1,4 @@
-"""A Gaussian process on the discrepancy (scikit-learn): it names nothing, but predicts.
+"""Gaussian process of the discrepancy (scikit-learn); it predicts but names no effect.
 
 Inputs are vx, vy, yaw rate and the acting steering and throttle, outputs the three residual accelerations, as in
 learning-based control of race cars (Kabzan et al., 2019, IEEE RA-L 4(4), 3363).

@@ -1,11 +1,11 @@
 """Two regressions of the discrepancy on the library of terms: PySINDy's, and stepwise selection by BIC.
 
 PySINDy (Kaptanoglu et al., 2022, Journal of Open Source Software 7(69), 3994): sequentially thresholded least squares
-over columns of unit length; of several thresholds the one that predicts the held-out discrepancy best, or sparser
-within one standard error. Stepwise: the term that lowers the Bayesian information criterion most (Schwarz, 1978) is
-added until none does. Base parameters stay at the refit in both, so nothing is projected out; what is named is the
-effect with the largest share, and "none" where the held-out score over 1 s falls by less than LEAST_FALL, chosen on
-the development set: without it both give a name to nearly every null case.
+over columns of unit length, with the threshold that predicts the held-out discrepancy best, or the sparsest within one
+standard error. Stepwise: forward selection by the Bayesian information criterion (Schwarz, 1978). Both keep the base
+parameters of the refit, so nothing is projected out. They name the effect with the largest share, or "none" if the
+held-out score over 1 s falls by less than MIN_SCORE_FALL. This threshold was chosen on the development set; without it
+both name an effect in nearly every null case.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from carlab.benchmark.world.simulation import FloatArray
 from carlab.core.errors import ConfigError
 
 THRESHOLDS = (0.01, 0.02, 0.04, 0.08, 0.15, 0.3)
-LEAST_FALL = 0.03
-MOST_TERMS = 8
-# Effects whose parameter may have either sign; a negative coefficient of any other is no candidate for a name.
+MIN_SCORE_FALL = 0.03
+MAX_TERMS = 8
+# Effects whose parameter may have either sign; other effects need a positive coefficient.
 EITHER_SIGN = frozenset({
     "command_delay", "steering_offset", "steering_asymmetry", "throttle_nonlinearity", "brake_asymmetry", "battery_sag",
     "friction_drift", "torque_steer", "lateral_bias", "road_slope", "marker_offset", "mocap_yaw_misalignment",
@@ -77,10 +77,10 @@ def pysindy_regression(system: System) -> FloatArray:
     unit = max(float(np.linalg.norm(system.fit_y)), 1e-9)
     found = []
     for threshold in THRESHOLDS:
-        # y of unit length too: a coefficient is then about a correlation, and so is the threshold.
+        # y has unit length too, so coefficients and threshold are in the range of correlations.
         solver = pysindy.STLSQ(threshold=threshold, alpha=1e-3, max_iter=50)
         x, y = system.fit_x / lengths, system.fit_y[:, None] / unit
-        # With nothing above the threshold the package warns and leaves an empty model: that is an answer here.
+        # Without coefficients above the threshold the package warns and returns an empty model, which is valid here.
         if np.abs(np.linalg.solve(x.T @ x + 1e-3 * np.eye(x.shape[1]), x.T @ y)).max() < threshold:
             break
         found.append(_quietly(solver, x, y) / lengths * unit)
@@ -96,7 +96,7 @@ def _quietly(solver: object, x: FloatArray, y: FloatArray) -> FloatArray:
     import warnings
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # "sparsity parameter is too big": the coefficients say so too
+        warnings.simplefilter("ignore")  # "sparsity parameter is too big": the coefficients are then zero
         solver.fit(x, y)  # type: ignore[attr-defined]
     return np.asarray(solver.coef_, dtype=np.float64).reshape(-1)  # type: ignore[attr-defined]
 
@@ -110,7 +110,7 @@ def stepwise_bic(system: System) -> FloatArray:
     chosen: list[int] = []
     best = rows * np.log(total / rows)
     coefficients = np.zeros(len(names))
-    while len(chosen) < MOST_TERMS:
+    while len(chosen) < MAX_TERMS:
         trials = []
         for k in range(len(names)):
             if k in chosen or gram[k, k] < 1e-12:

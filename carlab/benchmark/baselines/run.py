@@ -1,8 +1,7 @@
-"""Every baseline on one case: what it names first (sets are not available to it), and its held-out score.
+"""Results of every baseline on one case: first named effect (no sets) and held-out score.
 
-All of them get the same files as the tool and, unlike it, the true noise floor and the generator's own model. A
-correction that makes the held-out score worse is left out, which is judged on the held-out recording itself: two
-advantages that the tool does not have.
+The baselines get the files of the diagnosis, the true noise floor and the generator's model. A correction that
+increases the held-out score is discarded. The diagnosis has none of these advantages.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from carlab.benchmark.baselines.correlation import largest_correlation
 from carlab.benchmark.baselines.data import Prepared, Table, prepare
 from carlab.benchmark.baselines.gaussian_process import gp_score
 from carlab.benchmark.baselines.regression import (
-    LEAST_FALL,
+    MIN_SCORE_FALL,
     System,
     corrected_score,
     pysindy_regression,
@@ -34,7 +33,7 @@ NAMES_NOTHING = ("refit only", "GP residual")
 
 
 def require_studies() -> None:
-    """Raise ConfigError where the packages of the baselines are not installed."""
+    """Raise ConfigError if the packages of the baselines are not installed."""
     missing = [name for name in ("pysindy", "sklearn") if find_spec(name) is None]
     if missing:
         raise ConfigError(
@@ -44,11 +43,11 @@ def require_studies() -> None:
 
 
 def run_baselines(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, float]) -> dict[str, Any]:
-    """What each baseline says of one case.
+    """Run each baseline on one case.
 
     Args:
         fit: Columns of the recording to fit.
-        hold: Columns of the one held out.
+        hold: Columns of the held-out recording.
         nominal: The nominal car.
         floor: True noise floor of each of the six channels.
 
@@ -56,7 +55,7 @@ def run_baselines(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str,
         By baseline ``named`` (an id or None), ``score`` (None where it has none), ``refit_score`` and ``seconds``; or
         ``failed`` with a sentence where the recording cannot be used.
     """
-    with threadpool_limits(1):  # small matrices: threads only fight over the cores
+    with threadpool_limits(1):  # threads slow down small matrices
         return _run_all(fit, hold, nominal, floor)
 
 
@@ -66,8 +65,8 @@ def _run_all(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, floa
         system = System.of(data)
     except (DataError, ValueError, ArithmeticError) as error:
         return {"failed": str(error) or type(error).__name__}
-    said: dict[str, Any] = {}
-    ways: dict[str, Callable[[], Outcome]] = {
+    results: dict[str, Any] = {}
+    methods: dict[str, Callable[[], Outcome]] = {
         "refit only": lambda: (None, data.refit_score),
         "PySINDy": lambda: _regressed(data, system, pysindy_regression(system)),
         "GP residual": lambda: (None, min(gp_score(data), data.refit_score)),
@@ -76,15 +75,15 @@ def _run_all(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, floa
     }
     for name in BASELINES:
         begin = time.perf_counter()
-        named, score = ways[name]()
+        named, score = methods[name]()
         seconds = round(time.perf_counter() - begin, 3)
-        said[name] = {"named": named, "score": score, "refit_score": data.refit_score, "seconds": seconds}
-    return said
+        results[name] = {"named": named, "score": score, "refit_score": data.refit_score, "seconds": seconds}
+    return results
 
 
 def _regressed(data: Prepared, system: System, coefficients: FloatArray) -> Outcome:
-    """What is named, and the score; nothing, and the refit's, where the score hardly falls."""
+    """Named effect and score; no effect and the score of the refit if the score hardly falls."""
     score = corrected_score(data, system, coefficients)
-    if score > (1.0 - LEAST_FALL) * data.refit_score:
+    if score > (1.0 - MIN_SCORE_FALL) * data.refit_score:
         return None, data.refit_score
     return system.dominant(coefficients), score

@@ -15,7 +15,7 @@ COLUMNS = ("tool", *BASELINES)
 
 
 def compare(rows: Mapping[str, Row], answers: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return figures of the tool and of every baseline over the cases that both have answered.
+    """Return figures of the tool and of every baseline over the cases with results of both.
 
     Args:
         rows: Rows by case, from ``score_cases``.
@@ -68,7 +68,7 @@ def compare(rows: Mapping[str, Row], answers: Mapping[str, Mapping[str, Any]]) -
 
 
 def _floor_ratio(row: Row, answers: Mapping[str, Any], column: str) -> float | None:
-    """(refit - corrected) / (refit - 1), each with the refit of its own side."""
+    """(refit - corrected) / (refit - 1), each with its own refit."""
     if column == "tool":
         return row.get("floor_ratio")
     entry = answers.get(column)

@@ -1,10 +1,10 @@
-"""The library of terms for regressions on the discrepancy: one for every effect that has one, each with its name.
+"""Library of terms for regressions on the discrepancy: one or several terms for each effect.
 
-A term is what its effect, at one moderate size, adds to the residual acceleration of the refitted model, (M, 3). This
-is the table that maps a regression's dominant term back to the catalogue; a name may have several terms (a slope has
-two directions, a patch eight places). Exact signatures are a generous library: the usual one has products of states.
+A term is the residual acceleration (M, 3) of its effect at a moderate size in the refitted model. The library maps the
+dominant term of a regression to an effect of the catalogue; an effect may have several terms (a slope has two
+directions, a patch eight places). Exact signatures are more favourable than the usual products of states.
 
-Without a term, and why: mocap_latency (the same column as command_delay), traction_limit (with constant axle loads the
+Effects without a term: mocap_latency (the same column as command_delay), traction_limit (with constant axle loads the
 same as motor_saturation), roll_dynamics (a hidden state of its own).
 """
 
@@ -24,7 +24,7 @@ from carlab.benchmark.world.simulation import FloatArray
 Term = Callable[[Steps], FloatArray]
 PATCHES = 8
 AT_END_ONLY = ("velocity_filter_lag",)
-# Sizes at which the commands are changed: what is moderate for a 1:10 car.
+# Moderate sizes of changes of the commands for a 1:10 car.
 _SIZES = {
     "command_delay": 0.02, "steering_delay": 0.02, "throttle_delay": 0.02, "steering_lag": 0.04, "motor_lag": 0.05,
     "steering_deadband": 0.03, "steering_offset": 0.02, "steering_asymmetry": 0.05, "throttle_deadband": 0.03,
@@ -66,7 +66,7 @@ def library(data: Prepared) -> dict[str, Term]:
 
 
 def effect_of(term: str) -> str:
-    """The catalogue's id behind a term."""
+    """Effect id of a term."""
     return term.partition(":")[0]
 
 
@@ -107,7 +107,7 @@ def _force(forces: Callable[[Steps, FloatArray], tuple[object, object, object]])
 
 
 def _grip(factors: Callable[[Steps], tuple[object, object]]) -> Term:
-    """Friction of the front and the rear axle times something."""
+    """Scaled friction of the front and the rear axle."""
 
     def term(s: Steps) -> FloatArray:
         front, rear = (np.broadcast_to(np.asarray(f), len(s.starts)) for f in factors(s))
@@ -117,7 +117,7 @@ def _grip(factors: Callable[[Steps], tuple[object, object]]) -> Term:
 
 
 def _observed(seen: Callable[[FloatArray, FloatArray], FloatArray], size: float) -> Term:
-    """What is measured is v + size seen(v, rate): undo it at the start, do it at the end."""
+    """Measured velocity v + size seen(v, rate), inverted at the start and applied at the end."""
 
     def term(s: Steps) -> FloatArray:
         starts = s.starts.copy()
@@ -176,7 +176,7 @@ def _by_sides(car: BaseCar, front: FloatArray, rear: FloatArray, d: FloatArray) 
 
 
 def _relaxation(s: Steps, length: float = 0.05) -> FloatArray:
-    """F lags F_steady by length / vx: the force is short of it by that times its slope."""
+    """Tyre relaxation: F = F_steady - (length / vx) dF_steady/dt."""
     angles = s.car.max_angle * s.commands()[:, :, 0]
     begin, end = _sides(s.car, s.starts, angles[:, 0]), _sides(s.car, s.ends, angles[:, -1])
     late = length / np.maximum(np.abs(s.middle[:, 3]), 0.3) / s.length_s
@@ -194,7 +194,7 @@ def _saturated(s: Steps) -> FloatArray:
 
 
 def _places(data: Prepared) -> list[tuple[float, float, float]]:
-    """Discs along the driven path, as far from one another as can be."""
+    """Discs along the driven path at maximum mutual distance."""
     points = data.fit.measured[::5, :2]
     chosen = [points[0]]
     while len(chosen) < PATCHES:
@@ -213,7 +213,7 @@ def _patch(x: float, y: float, radius: float) -> Term:
 
 
 def _other_commands(data: Prepared) -> dict[str, CommandChange]:
-    """Changes of the acting commands whose size follows from the recording's own commands."""
+    """Changes of the acting commands with sizes that depend on the recorded commands."""
     steering, throttle = data.fit.commands.T
     top_rate = float(np.quantile(np.abs(np.diff(steering)), 0.99)) / data.nominal.control_period
     limit = 0.6 * max(top_rate, 0.1)

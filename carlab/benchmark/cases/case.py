@@ -1,4 +1,4 @@
-"""One concealed case: a nominal car, a true car that differs, two recordings, and the answer."""
+"""A case with concealed effects: nominal car, true car, two recordings, and the answer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from carlab.benchmark.cases.refit import Refit, Shots, cut_shots, refit
+from carlab.benchmark.cases.refit import Refit, Windows, cut_windows, refit
 from carlab.benchmark.effects.catalogue import DRIFTS, LAG_PARAMETERS, Draw, Form, FormName
 from carlab.benchmark.effects.data_faults import FAULTS, Table
 from carlab.benchmark.effects.forms import all_forms
@@ -22,12 +22,12 @@ from carlab.core.errors import ConfigError, DataError
 
 CaseKind = Literal["single", "pair", "null", "parameters", "outside", "fault"]
 CHANNELS = ("x", "y", "yaw", "vx", "vy", "yaw_rate")
-NEAR = 0.10  # the search for a strength stops within this share of it
+NEAR = 0.10  # relative tolerance of the search for a strength
 
 
 @dataclass(frozen=True)
 class Concealed:
-    """One concealed effect as it is in the true car."""
+    """A concealed effect of the true car."""
 
     form: Form
     parameters: dict[str, float]
@@ -36,7 +36,7 @@ class Concealed:
 
 @dataclass(frozen=True)
 class Case:
-    """What is handed out (``nominal``, ``fit``, ``hold``) and what is kept (the rest)."""
+    """A case: the diagnosis gets ``nominal``, ``fit`` and ``hold``; the other fields are for scoring."""
 
     kind: CaseKind
     seed: int
@@ -58,7 +58,7 @@ class Case:
         return self.refit.excess
 
     def answer(self) -> dict[str, Any]:
-        """All that a scorer needs, as JSON."""
+        """Data for scoring, as JSON."""
         total = np.array(self.refit.channels)
         share = np.maximum(total**2 - 1.0, 0.0)
         main = [name for name, s in zip(CHANNELS, share, strict=True) if s >= 0.5 * share.max() > 0.0]
@@ -98,7 +98,7 @@ class Case:
 
 
 class _Scene:
-    """Everything of a case that is drawn before its strength is known; drives again with any effects."""
+    """Random draws of a case that do not depend on the strength; it can be driven with any effects."""
 
     def __init__(
         self,
@@ -118,9 +118,9 @@ class _Scene:
         self.seed, self.lengths_s, self.true_starts = seed, lengths_s, true_starts
         self.draws = draws
 
-    def drive(self, concealed: Sequence[Concealed]) -> tuple[Refit, tuple[Recording, ...], Shots]:
+    def drive(self, concealed: Sequence[Concealed]) -> tuple[Refit, tuple[Recording, ...], Windows]:
         recordings: list[Recording] = []
-        shots: list[Shots] = []
+        windows: list[Windows] = []
         for part, length_s in enumerate(self.lengths_s):
             world = World(self.car)
             for c in concealed:
@@ -128,12 +128,12 @@ class _Scene:
             human = HumanDriver(self.car, self.track, np.random.default_rng((self.seed, 2, part)))
             what = drive(world, human, length_s, start=human.start())
             recordings.append(record(what, world, self.noise, np.random.default_rng((self.seed, 3, part))))
-            shots.append(cut_shots(recordings[-1], self.car, true_starts=self.true_starts))
-        fitted = refit(shots[0], shots[1], self.nominal)
-        return fitted, tuple(recordings), shots[1]
+            windows.append(cut_windows(recordings[-1], self.car, true_starts=self.true_starts))
+        fitted = refit(windows[0], windows[1], self.nominal)
+        return fitted, tuple(recordings), windows[1]
 
     def sized(self, form: Form, target: float, tries: int = 8) -> tuple[Concealed, float]:
-        """The effect scaled until its excess is ``target``; as near as can be where that is out of reach."""
+        """Scale the effect until its excess is ``target``, or as near as possible. Returns it and its excess."""
         draw = Draw.from_rng(self.draws, self.car, self.track.points)
         low, high, best, best_miss, best_excess = 0.0, math.inf, None, math.inf, 0.0
         size, last = min(max(form.typical * target, form.smallest), form.largest), (0.0, 0.0)
@@ -159,7 +159,9 @@ class _Scene:
                 size = math.sqrt(low * high) if low > 0.0 else 0.3 * high
             size = min(max(size, form.smallest), form.largest)
         if best is None:
-            raise DataError(f"No size of {form.id} could be driven with seed {self.seed}; take another seed.")
+            raise DataError(
+                f"The car cannot be driven with {form.id} of any size at seed {self.seed}; use another seed."
+            )
         return best, best_excess
 
 
@@ -179,17 +181,17 @@ def make_case(
     """Draw, size and record one case. The same arguments give the same case.
 
     Args:
-        kind: ``null`` (the car file is right), ``parameters`` (only base parameters off), ``single``, ``pair``,
-            ``outside`` (nothing of the catalogue) or ``fault`` (base parameters off and a data fault).
-        seed: Seed of everything drawn.
-        effects: Ids, one or two; for ``outside`` a kind of outside_forms.
-        form: Form of the effects; where an effect has no such form, the one it has.
-        excess: Strength aimed at, each effect by itself.
-        fault: A data fault on top, of FAULTS.
+        kind: ``null`` (correct car file), ``parameters`` (wrong base parameters), ``single``, ``pair``, ``outside``
+            (physics outside the catalogue) or ``fault`` (wrong base parameters and a data fault).
+        seed: Seed of all random draws.
+        effects: One or two ids; for ``outside`` the id of an uncatalogued form.
+        form: Form of the effects; an effect without this form has its other form.
+        excess: Target strength of each effect alone.
+        fault: Additional data fault, of FAULTS.
         period_s: Control period: 1/30 s, or 1/100 s.
         fit_s: Length of the recording to fit [s].
-        hold_s: Length of the one held out [s].
-        true_starts: Measure the excess from noise-free shot starts; the floor is then the recording's noise alone.
+        hold_s: Length of the held-out recording [s].
+        true_starts: Measure the excess from noise-free initial states; the floor is then the recording's noise.
 
     Raises:
         ConfigError: for an unknown effect or fault, or a wrong number of effects.
@@ -197,7 +199,7 @@ def make_case(
     forms = [_form(name, "outside" if kind == "outside" else form) for name in effects]
     wanted = {"single": 1, "outside": 1, "pair": 2}.get(kind, 0)
     if len(forms) != wanted:
-        raise ConfigError(f"A case of kind '{kind}' takes {wanted} effects, not {len(forms)}.")
+        raise ConfigError(f"A case of kind '{kind}' requires {wanted} effects, not {len(forms)}.")
     if fault is not None and fault not in FAULTS:
         raise ConfigError(f"Unknown data fault '{fault}'; known: {', '.join(FAULTS)}.")
     if kind == "fault" and fault is None:
@@ -206,7 +208,7 @@ def make_case(
     scene = _Scene(seed, kind, "linear_tyre" if linear else "dynamic", (fit_s, hold_s), period_s, true_starts)
     found = [scene.sized(f, excess) for f in forms]
     concealed = tuple(c for c, _ in found)
-    fitted, recordings, shots = scene.drive(concealed)
+    fitted, recordings, windows = scene.drive(concealed)
     tables = [as_table(r) for r in recordings]
     described = None
     if fault is not None:
@@ -215,7 +217,7 @@ def make_case(
         described = {"id": fault, "columns": list(done[0][1].columns), "rows": done[0][1].rows}
     return Case(
         kind, seed, scene.nominal, tables[0], tables[1], scene.car, concealed, fitted,
-        tuple(shots.floor.tolist()), excess if forms else 0.0, tuple(e for _, e in found), described, recordings,
+        tuple(windows.floor.tolist()), excess if forms else 0.0, tuple(e for _, e in found), described, recordings,
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Pairs of concealed effects of the proof that studies record anew."""
+"""Pairs of concealed effects of the proof for which studies make new recordings."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ PAIRS = (
     ConcealedPair(("throttle_deadband", "velocity_filter_lag"), "other", 2_000_251),
     ConcealedPair(("steering_rate_limit", "longitudinal_slip"), "catalogue", 2_000_254),
 )
-"""The first pairs of the proof (seed 0) of excess 1 or more without an effect of time or place, which one step of a
-car cannot show; chosen before any of them was learned from."""
+"""The first pairs of the proof (seed 0) of excess 1 or more without effects of time or place, which a one-step model
+cannot represent. They were chosen before any learning on them."""

@@ -1,4 +1,4 @@
-"""Which cases a proof set holds: counts of the full run, a short set, development and test seeds apart."""
+"""Cases of a proof: full and short set, with separate seeds for development and test."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any, Literal
 import numpy as np
 
 from carlab.benchmark.cases.case import Case, CaseKind, make_case
-from carlab.benchmark.effects.catalogue import EFFECT_IDS, FormName, look_alike
+from carlab.benchmark.effects.catalogue import EFFECT_IDS, FormName, are_confusable
 from carlab.benchmark.effects.data_faults import FAULTS
 from carlab.benchmark.effects.forms import all_forms
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0)
 SEED_BASE = {"development": 1_000_000, "test": 2_000_000}
-# Faults that can sit on top of physics which is still to be found.
+# Faults that leave the concealed effects identifiable.
 ON_TOP = ("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples")
 Purpose = Literal["development", "test"]
 
@@ -34,7 +34,7 @@ class CaseSpec:
     hold_s: float = 40.0
 
     def make(self) -> Case:
-        """Draw, size and record it."""
+        """Draw, size and record the case."""
         return make_case(
             self.kind,
             self.seed,
@@ -53,10 +53,10 @@ class CaseSpec:
 
 
 def full_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
-    """The counts of the protocol: 4 cases an effect, 100 null, 40 pairs, 40 outside, 2 a data fault.
+    """Cases of the protocol: 4 per effect, 100 null, 40 pairs, 40 outside, 2 per data fault.
 
-    Half of an effect's cases have the catalogue's form, half another; every strength comes once an effect, and which
-    form has which strength changes from effect to effect. One single case in ten has a data fault on top.
+    Half of an effect's cases have the catalogue's form, half another form. Each strength occurs once per effect, in a
+    random order of the forms. One single case in ten also has a data fault.
     """
     return _specs(purpose, seed, per_effect=4, nulls=100, pairs=40, outside=40, per_fault=2)
 
@@ -64,13 +64,13 @@ def full_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
 def short_set(
     purpose: Purpose, seed: int = 0, effects: tuple[str, ...] = ("steering_lag", "rolling_resistance")
 ) -> list[CaseSpec]:
-    """A handful of short cases of each kind."""
+    """A few short cases of each kind."""
     specs = _specs(purpose, seed, per_effect=1, nulls=2, pairs=0, outside=1, per_fault=0, effects=effects)
     return [CaseSpec(s.kind, s.seed, s.effects, s.form, s.excess, s.fault, s.period_s, 40.0, 20.0) for s in specs]
 
 
 def drawn(specs: list[CaseSpec], count: int, seed: int = 0) -> list[CaseSpec]:
-    """So many of the cases, drawn without replacement, in their order; all where there are no more."""
+    """Draw at most ``count`` cases without replacement, in their order."""
     order = np.random.default_rng((seed, 7)).permutation(len(specs))[:count]
     return [specs[k] for k in sorted(order.tolist())]
 
@@ -107,8 +107,8 @@ def _specs(
     for k in range(pairs):
         while True:
             one, two = (str(n) for n in rng.choice(EFFECT_IDS, 2, replace=False))
-            # A linear nominal car with tyres that saturate differs so much that a second effect would be a detail.
-            if not look_alike(one, two) and "tyre_saturation" not in (one, two):
+            # The error of a linear nominal car with saturating tyres dominates that of a second effect.
+            if not are_confusable(one, two) and "tyre_saturation" not in (one, two):
                 break
         add("pair", (one, two), "catalogue" if k % 2 == 0 else "other", float(rng.choice(STRENGTHS)))
     kinds = [name for name, form in known if form == "outside"]

@@ -1,8 +1,8 @@
-"""The generator's own small least-squares refit of a single-track model; it sizes the concealed effects, nothing else.
+"""Least-squares refit of a single-track model by the generator, used to size the concealed effects.
 
-Shots start from states estimated from the recording (a local cubic over nine poses), as any tool must. The noise floor
-of a channel is what the truth itself would get from the same shot starts: its noise-free state, moved by what the
-start's error grows to within the horizon, against the noisy recording.
+Windows start from states estimated from the recording (a local cubic over nine poses). The noise floor of a channel is
+the error of the true car from the same initial states: its noise-free state plus the propagated error of the initial
+state, against the noisy recording.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from carlab.benchmark.world.simulation import FloatArray
 HORIZON_S = 1.0
 PRIOR_SHARE = 0.15
 _SUB = 4
-# A change of the fine command series: (series (n, 2), steering in 1 and throttle; step lengths (n,) in s) -> the same.
+# Change of the fine command series: (steering and throttle (n, 2), step lengths (n,) [s]) -> changed series.
 CommandChange = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
-class Shots:
-    """Rollouts to compare: starts (M, 6), mean commands of substeps (M, S, 2), recorded ends (M, 6), floor errors."""
+class Windows:
+    """Initial states (M, 6), mean commands of substeps (M, S, 2), recorded final states (M, 6), floor errors (M, 6)."""
 
     car: BaseCar
     steps_s: FloatArray
@@ -42,7 +42,7 @@ class Shots:
 
 @dataclass(frozen=True)
 class Refit:
-    """Base parameters fitted, and scores on the held-out shots (nominal and refitted)."""
+    """Fitted base parameters, and scores on the held-out windows (nominal and refitted)."""
 
     values: dict[str, float]
     nominal_score: float
@@ -52,14 +52,14 @@ class Refit:
 
     @property
     def excess(self) -> float:
-        """sqrt(score^2 - 1), 0 where the score is below 1."""
+        """sqrt(score^2 - 1), 0 for a score below 1."""
         return float(np.sqrt(max(self.score**2 - 1.0, 0.0)))
 
 
 def fine_commands(
     recording: Recording, car: BaseCar, changes: Sequence[CommandChange] = (), shift_s: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean acting commands over every substep, on the clock of the captured states, (N n, 2), and substeps of a period.
+    """Mean acting commands over every substep, at the times of the captured states (N n, 2), and substeps of a period.
 
     A command issued at t acts at t + command_delay; the row's state is latency older than the row. Substeps end where
     commands switch.
@@ -83,7 +83,7 @@ def fine_commands(
     return series, steps
 
 
-def cut_shots(
+def cut_windows(
     recording: Recording,
     car: BaseCar,
     *,
@@ -92,8 +92,8 @@ def cut_shots(
     true_starts: bool = False,
     changes: Sequence[CommandChange] = (),
     shift_s: float = 0.0,
-) -> Shots:
-    """Shots of a recording; ``car`` (the true base parameters, where known) carries start errors over the horizon."""
+) -> Windows:
+    """Cut a recording into windows; ``car`` propagates the errors of initial states over the horizon."""
     period = car.control_period
     steps, stride = round(horizon_s / period), max(1, round(every_s / period))
     first = np.arange(5, len(recording.t_s) - steps, stride)
@@ -114,11 +114,11 @@ def cut_shots(
             car, car.free(), clean[first], commands, steps_s
         )
         floor_errors = floor_errors + in_start_frame(grown, starts)
-    return Shots(car, steps_s, starts, commands, recording.measured[last], floor_errors)
+    return Windows(car, steps_s, starts, commands, recording.measured[last], floor_errors)
 
 
 def in_start_frame(errors: FloatArray, starts: FloatArray) -> FloatArray:
-    """Errors (M, 6) with x, y turned into the body frame of each start."""
+    """Errors (M, 6) with x, y rotated into the body frame of each initial state."""
     cos, sin = np.cos(starts[:, 2]), np.sin(starts[:, 2])
     turned = errors.copy()
     turned[:, 0] = cos * errors[:, 0] + sin * errors[:, 1]
@@ -126,19 +126,19 @@ def in_start_frame(errors: FloatArray, starts: FloatArray) -> FloatArray:
     return turned
 
 
-def channel_scores(shots: Shots, values: Mapping[str, float], floor: FloatArray | None = None) -> FloatArray:
-    """Root mean square over shots of every channel's error after the horizon, in noise floors, (6,)."""
-    ends = roll(shots.car, values, shots.starts, shots.commands, shots.steps_s)
-    errors = in_start_frame(ends - shots.recorded, shots.starts) / (shots.floor if floor is None else floor)
+def channel_scores(windows: Windows, values: Mapping[str, float], floor: FloatArray | None = None) -> FloatArray:
+    """Root mean square over windows of every channel's error after the horizon, in noise floors, (6,)."""
+    ends = roll(windows.car, values, windows.starts, windows.commands, windows.steps_s)
+    errors = in_start_frame(ends - windows.recorded, windows.starts) / (windows.floor if floor is None else floor)
     return np.asarray(np.sqrt((errors**2).mean(axis=0)), dtype=np.float64)
 
 
-def score(shots: Shots, values: Mapping[str, float], floor: FloatArray | None = None) -> float:
-    """Root mean square over shots and channels of the error after the horizon, in noise floors."""
-    return float(np.sqrt((channel_scores(shots, values, floor) ** 2).mean()))
+def score(windows: Windows, values: Mapping[str, float], floor: FloatArray | None = None) -> float:
+    """Root mean square over windows and channels of the error after the horizon, in noise floors."""
+    return float(np.sqrt((channel_scores(windows, values, floor) ** 2).mean()))
 
 
-def refit(fit: Shots, held_out: Shots, nominal: BaseCar, iterations: int = 10) -> Refit:
+def refit(fit: Windows, held_out: Windows, nominal: BaseCar, iterations: int = 10) -> Refit:
     """Fit the base parameters by Levenberg and Marquardt's method with weak priors around the nominal car."""
     names = list(nominal.free())
     centre = np.array([nominal.free()[name] for name in names])
@@ -169,25 +169,29 @@ def refit(fit: Shots, held_out: Shots, nominal: BaseCar, iterations: int = 10) -
 
 
 def _linearise(
-    shots: Shots, names: list[str], centre: FloatArray, logs: FloatArray, floor: FloatArray
+    windows: Windows, names: list[str], centre: FloatArray, logs: FloatArray, floor: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    lanes, count = len(names) + 1, len(shots.starts)
+    lanes, count = len(names) + 1, len(windows.starts)
     delta = 1e-4
     table = np.repeat(logs[None], lanes, axis=0)
     table[1:] += delta * np.eye(len(names))
     values = {name: np.repeat(column, count) for name, column in zip(names, (centre * np.exp(table)).T, strict=True)}
     ends = roll(
-        shots.car, values, np.tile(shots.starts, (lanes, 1)), np.tile(shots.commands, (lanes, 1, 1)), shots.steps_s
+        windows.car,
+        values,
+        np.tile(windows.starts, (lanes, 1)),
+        np.tile(windows.commands, (lanes, 1, 1)),
+        windows.steps_s,
     )
     ends = ends.reshape(lanes, count, 6)
-    errors = np.stack([in_start_frame(e - shots.recorded, shots.starts) / floor for e in ends]).reshape(lanes, -1)
+    errors = np.stack([in_start_frame(e - windows.recorded, windows.starts) / floor for e in ends]).reshape(lanes, -1)
     return errors[0], (errors[1:] - errors[0]).T / delta
 
 
 def roll(
     car: BaseCar, values: Mapping[str, object], starts: FloatArray, commands: FloatArray, steps_s: FloatArray
 ) -> FloatArray:
-    """Ends (M, 6) of M shots of the base model: fixed steps of the classical Runge-Kutta method, all shots at once.
+    """Final states (M, 6) of M windows of the base model by the classical Runge-Kutta method with fixed steps.
 
     ``values`` holds the base parameters by dotted name, numbers or arrays (M,).
     """

@@ -1,4 +1,4 @@
-"""A seal over the answers: a hash that is made known before the first diagnosis and checked before scoring."""
+"""Seal of the answers: a hash that is published before the first diagnosis and checked before scoring."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def file_digest(path: Path) -> str:
 
 
 def check(answers: Mapping[str, Any], nonce: str, seal: str) -> None:
-    """Raise DataError where the answers are not the ones that were sealed."""
+    """Raise DataError if the answers differ from the sealed answers."""
     found = digest(answers, nonce)
     if not secrets.compare_digest(found, seal):
         raise DataError(

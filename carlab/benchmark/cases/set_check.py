@@ -1,7 +1,7 @@
-"""Whether two effects can be told apart on a recording, by the generator's own refit of each with the base parameters.
+"""Test whether a recording distinguishes two effects, by a refit of each with the base parameters by the generator.
 
-Only effects of the commands and of age are cheap enough; for others there is no answer and the rule of the look-alike
-column stands alone.
+The test covers effects of commands and latency, for which it is cheap. For other effects it returns None, and only the
+table of confusable effects counts.
 """
 
 from __future__ import annotations
@@ -11,7 +11,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from carlab.benchmark.cases.refit import CommandChange, Shots, channel_scores, cut_shots, in_start_frame, refit, roll
+from carlab.benchmark.cases.refit import (
+    CommandChange,
+    Windows,
+    channel_scores,
+    cut_windows,
+    in_start_frame,
+    refit,
+    roll,
+)
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import Recording
 from carlab.benchmark.world.simulation import FloatArray
@@ -69,7 +77,7 @@ def _deadband(u: FloatArray, width: float, car: BaseCar) -> FloatArray:
     return u - np.clip(u, -half, half)
 
 
-# Effect: how it changes the acting commands, and where its parameter is looked for.
+# By effect: change of the acting commands, and range of its parameter.
 CHEAP: dict[str, tuple[Callable[[float, BaseCar], CommandChange], tuple[float, float]]] = {
     "command_delay": (_late((0, 1)), (-0.03, 0.15)),
     "mocap_latency": (_late((0, 1)), (-0.03, 0.15)),
@@ -93,52 +101,52 @@ def indistinguishable(
     hold: Mapping[str, FloatArray],
     floor: FloatArray,
 ) -> bool | None:
-    """Whether two effects, each refitted with the base parameters, are within two standard errors on held-out shots.
+    """Whether two effects, each refitted with the base parameters, are within two standard errors on held-out windows.
 
     Args:
         one: An effect's id.
-        other: Another's.
+        other: Another effect's id.
         nominal: The nominal car.
         fit: Columns of the recording to fit, evenly spaced.
-        hold: Columns of the one held out.
+        hold: Columns of the held-out recording.
         floor: Noise floors of the six channels.
 
     Returns:
-        None where either effect is not among the cheap ones.
+        None if one of the effects is not in CHEAP.
     """
     if one not in CHEAP or other not in CHEAP:
         return None
     recordings = [_recording(table) for table in (fit, hold)]
-    gain = _shot_losses(one, nominal, recordings, floor) - _shot_losses(other, nominal, recordings, floor)
+    gain = _window_losses(one, nominal, recordings, floor) - _window_losses(other, nominal, recordings, floor)
     error = float(gain.std(ddof=1) * np.sqrt(len(gain)))
     return abs(float(gain.sum())) <= STANDARD_ERRORS * max(error, 1e-12)
 
 
-def _shot_losses(name: str, nominal: BaseCar, recordings: list[Recording], floor: FloatArray) -> FloatArray:
+def _window_losses(name: str, nominal: BaseCar, recordings: list[Recording], floor: FloatArray) -> FloatArray:
     build, bounds = CHEAP[name]
 
-    def cut(value: float) -> list[Shots]:
-        shots = [cut_shots(r, nominal, every_s=1.0, changes=[build(value, nominal)]) for r in recordings]
-        return [_with_floor(s, floor) for s in shots]
+    def cut(value: float) -> list[Windows]:
+        windows = [cut_windows(r, nominal, every_s=1.0, changes=[build(value, nominal)]) for r in recordings]
+        return [_with_floor(s, floor) for s in windows]
 
     def cost(value: float) -> float:
-        shots = cut(value)
-        fitted = refit(shots[0], shots[0], nominal, iterations=4)
-        return float((channel_scores(shots[0], fitted.values) ** 2).sum())
+        windows = cut(value)
+        fitted = refit(windows[0], windows[0], nominal, iterations=4)
+        return float((channel_scores(windows[0], fitted.values) ** 2).sum())
 
     best = minimize_scalar(
         cost, bounds=bounds, method="bounded", options={"xatol": 0.01 * (bounds[1] - bounds[0]), "maxiter": 14}
     )
-    shots = cut(float(best.x))
-    values = refit(shots[0], shots[1], nominal).values
-    ends = roll(nominal, values, shots[1].starts, shots[1].commands, shots[1].steps_s)
-    errors = in_start_frame(ends - shots[1].recorded, shots[1].starts) / floor
+    windows = cut(float(best.x))
+    values = refit(windows[0], windows[1], nominal).values
+    ends = roll(nominal, values, windows[1].starts, windows[1].commands, windows[1].steps_s)
+    errors = in_start_frame(ends - windows[1].recorded, windows[1].starts) / floor
     return np.asarray(0.5 * (errors**2).sum(axis=1), dtype=np.float64)
 
 
-def _with_floor(shots: Shots, floor: FloatArray) -> Shots:
-    even = np.repeat(floor[None], len(shots.starts), axis=0)
-    return Shots(shots.car, shots.steps_s, shots.starts, shots.commands, shots.recorded, even)
+def _with_floor(windows: Windows, floor: FloatArray) -> Windows:
+    even = np.repeat(floor[None], len(windows.starts), axis=0)
+    return Windows(windows.car, windows.steps_s, windows.starts, windows.commands, windows.recorded, even)
 
 
 def _recording(table: Mapping[str, FloatArray]) -> Recording:

@@ -1,1 +1,1 @@
-"""Physics that a case may conceal, written independently of the simulator's own effects."""
+"""Physics that a case may conceal, implemented independently of the simulator."""

@@ -1,4 +1,4 @@
-"""The same physics of commands as real hardware has it: packets in a queue, servos of second order, soft edges."""
+"""Alternative forms of command effects, closer to hardware: packet queues, second-order servos, soft edges."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from carlab.benchmark.world.physics import Instant, World
 
 
 def packet_queue(world: World, p: Parameters) -> None:
-    """Both commands ride in packets that a bus with jitter hands over one by one, never one before its forerunner."""
+    """Both commands are sent in packets over a bus with jitter that keeps their order."""
     mean, seed = p["extra_delay"], int(p["seed"])
     rng = np.random.default_rng(seed)
     last_issue, last_arrival, extra = -1.0, 0.0, 0.0
@@ -30,7 +30,7 @@ def packet_queue(world: World, p: Parameters) -> None:
 
 
 def polled(world: World, channel: int, mean_s: float) -> None:
-    """A receiver that looks for news every 2 / 3 of the mean delay and hands over what it finds one look later."""
+    """A receiver that polls every 2 / 3 of the mean delay and forwards a command one poll later."""
     look = max(2.0 * mean_s / 3.0, 1e-6)
     before = world.arrival[channel]
 
@@ -58,7 +58,7 @@ def limited_servo(world: World, p: Parameters) -> None:
         return
     z = 0.9
     w = 2.0 * z / lag
-    top = p["current_share"] * 0.5 * w * w  # a share of what a step of 0.5 rad asks for
+    top = p["current_share"] * 0.5 * w * w  # share of the acceleration of a step of 0.5 rad
     angle, rate = world.add_state(), world.add_state()
 
     def servo(now: Instant) -> None:
@@ -85,7 +85,7 @@ def soft_rate_limit(world: World, p: Parameters) -> None:
 
 
 def sprung_play(world: World, p: Parameters) -> None:
-    """Play whose flanks push like springs: the wheel creeps until it is inside the play."""
+    """Play with elastic flanks: the wheel moves slowly until it is inside the play."""
     half = 0.5 * p["play"]
     if half <= 0.0:
         return
@@ -106,20 +106,20 @@ def soft_deadband(world: World, p: Parameters) -> None:
 
 
 def linkage(world: World, p: Parameters) -> None:
-    """A steering linkage: the wheel goes with the sine of the servo horn."""
+    """A steering linkage: the wheel angle is proportional to the sine of the servo angle."""
     top = max(p["saturation"], 0.45)
     world.steering_maps.append(lambda d: top * math.sin(min(max(d / top, -1.5), 1.5)))
 
 
 def soft_throttle_deadband(world: World, p: Parameters) -> None:
-    """An edge rounded by a hyperbola; full throttle stays full."""
+    """An edge rounded by a hyperbola; full throttle is unchanged."""
     width = p["width"]
     top = math.sqrt(1.0 + width * width) - width
     world.throttle_maps.append(lambda u: math.copysign((math.sqrt(u * u + width * width) - width) / top, u))
 
 
 def two_lags(world: World, p: Parameters) -> None:
-    """Winding and rotor: two lags in a row, each half."""
+    """Winding and rotor: two lags in series with half of the time constant each."""
     half = 0.5 * p["time_constant"]
     if half <= 0.0:
         return

@@ -1,4 +1,4 @@
-"""The same physics of forces in another form: exact, softer, or as other books write it."""
+"""Alternative forms of force effects: exact, smoother, or from another textbook."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def soft_motor(world: World, p: Parameters) -> None:
 
 
 def charge_sag(world: World, p: Parameters) -> None:
-    """The battery falls with the charge taken, not with the time (mean throttle about 0.3)."""
+    """The battery voltage falls with the charge drawn, not with time (mean throttle about 0.3)."""
     rate = p["rate"] / 0.3
     k = world.add_state()
 
@@ -35,7 +35,7 @@ def charge_sag(world: World, p: Parameters) -> None:
 
 
 def soft_brake(world: World, p: Parameters) -> None:
-    """The change of gain comes in over 0.2 m/s."""
+    """The gain changes smoothly over 0.2 m/s."""
     ratio = p["gain_ratio"]
 
     def brake(now: Instant) -> None:
@@ -46,7 +46,7 @@ def soft_brake(world: World, p: Parameters) -> None:
 
 
 def soft_traction(world: World, p: Parameters) -> None:
-    """Grip that gives way gradually."""
+    """Grip that saturates gradually."""
     share = p["share"]
 
     def limit(now: Instant) -> None:
@@ -57,7 +57,7 @@ def soft_traction(world: World, p: Parameters) -> None:
 
 
 def stribeck(world: World, p: Parameters) -> None:
-    """Bearings: more friction at a crawl, less when running."""
+    """Bearing friction that is larger at low speed."""
     force = p["force"]
 
     def resist(now: Instant) -> None:
@@ -67,7 +67,7 @@ def stribeck(world: World, p: Parameters) -> None:
 
 
 def powered_drag(world: World, p: Parameters) -> None:
-    """Drag with an exponent that is not quite two."""
+    """Drag with an exponent slightly different from two."""
     c, exponent = p["coefficient"], p["exponent"]
 
     def resist(now: Instant) -> None:
@@ -99,7 +99,7 @@ def brush_shape(slope: float) -> Callable[[float], float]:
 
 
 def brush_tyre(world: World, p: Parameters) -> None:
-    """A brush tyre with the slope and the friction of the formula's numbers."""
+    """A brush tyre with the slope and friction of the magic formula."""
     world.shape_front = brush_shape(p["B_front"] * p["C_front"])
     world.shape_rear = brush_shape(p["B_rear"] * p["C_rear"])
 
@@ -110,7 +110,7 @@ def brush_tyre(world: World, p: Parameters) -> None:
 
 
 def friction_circle(world: World, p: Parameters) -> None:
-    """Nothing is lost until the circle is reached; there the side force is cut."""
+    """The side force is limited at the friction circle and unchanged inside it."""
     scale = p["scale"]
 
     def cut(now: Instant) -> None:
@@ -161,7 +161,7 @@ def pitching(world: World, p: Parameters) -> None:
 
 
 def settling_grip(world: World, p: Parameters) -> None:
-    """Grip that settles exponentially within two minutes."""
+    """Grip that changes exponentially within two minutes."""
     change = 120.0 * p["rate"]
 
     def drift(now: Instant) -> None:
@@ -173,7 +173,7 @@ def settling_grip(world: World, p: Parameters) -> None:
 
 
 def soft_patch(world: World, p: Parameters) -> None:
-    """A patch with a soft edge that each axle meets for itself."""
+    """A patch with a soft edge that acts on each axle separately."""
     x, y, radius, loss, car = p["x"], p["y"], p["radius"], p["loss"], world.car
 
     def slip(now: Instant) -> None:
@@ -190,7 +190,7 @@ def soft_patch(world: World, p: Parameters) -> None:
 
 
 def wing(world: World, p: Parameters) -> None:
-    """Downforce behind the centre of mass: a tenth of it more on the rear axle than the static split."""
+    """Downforce behind the centre of mass: a tenth more on the rear axle than the static split."""
     c, car = p["coefficient"], world.car
     rear_share = car.front_axle / car.wheelbase + 0.1
 
@@ -213,7 +213,7 @@ def viscous_yaw(world: World, p: Parameters) -> None:
 
 
 def torque_by_force(world: World, p: Parameters) -> None:
-    """The moment goes with the force at the axle, not with the throttle."""
+    """The moment is proportional to the axle force, not to the throttle."""
     c = p["coefficient"] / world.car.drive_gain
 
     def pull(now: Instant) -> None:
@@ -223,7 +223,7 @@ def torque_by_force(world: World, p: Parameters) -> None:
 
 
 def gusty_side(world: World, p: Parameters) -> None:
-    """A side pull through the tyres, in proportion to the axle loads, that is weak at a standstill."""
+    """A lateral bias force through the tyres, proportional to the axle loads, weak at standstill."""
     force = p["force"]
 
     def pull(now: Instant) -> None:
@@ -233,7 +233,7 @@ def gusty_side(world: World, p: Parameters) -> None:
 
 
 def bowl(world: World, p: Parameters) -> None:
-    """A floor that rises along a line, a little steeper farther up."""
+    """A floor that rises along a line with increasing slope."""
     weight, direction, angle = world.car.mass * GRAVITY_MPS2, p["direction"], p["angle"]
     cos, sin = math.cos(direction), math.sin(direction)
 

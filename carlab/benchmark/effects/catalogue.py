@@ -1,4 +1,4 @@
-"""What may be concealed: names, look-alikes and the shape of a form. Only the ids of the catalogue are names."""
+"""Effects that may be concealed: ids, confusable effects, and the class of a form. Only ids of the catalogue count."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from carlab.benchmark.world.physics import World
 Parameters = Mapping[str, float]
 FormName = Literal["catalogue", "other", "outside"]
 
-# The look-alike column of the catalogue, row by row.
-LOOK_ALIKES: dict[str, tuple[str, ...]] = {
+# Confusable effects of each effect.
+CONFUSABLE: dict[str, tuple[str, ...]] = {
     "command_delay": ("mocap_latency",),
     "steering_delay": ("steering_lag",),
     "throttle_delay": ("motor_lag",),
@@ -54,7 +54,7 @@ LOOK_ALIKES: dict[str, tuple[str, ...]] = {
     "mocap_yaw_misalignment": ("steering_offset",),
     "velocity_filter_lag": ("motor_lag", "steering_lag"),
 }
-EFFECT_IDS = tuple(LOOK_ALIKES)
+EFFECT_IDS = tuple(CONFUSABLE)
 LAG_PARAMETERS = {
     "command_delay": "extra_delay",
     "steering_delay": "delay",
@@ -66,14 +66,14 @@ LAG_PARAMETERS = {
 DRIFTS = ("battery_sag", "friction_drift")
 
 
-def look_alike(a: str, b: str) -> bool:
-    """Whether either is in the other's look-alike column."""
-    return b in LOOK_ALIKES.get(a, ()) or a in LOOK_ALIKES.get(b, ())
+def are_confusable(a: str, b: str) -> bool:
+    """Whether two effects are confusable."""
+    return b in CONFUSABLE.get(a, ()) or a in CONFUSABLE.get(b, ())
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What is drawn once for a concealed effect, beside its size."""
+    """Random draws of a concealed effect except its size."""
 
     car: BaseCar
     sign: float

@@ -1,4 +1,4 @@
-"""Effects between the command and the wheels, in the catalogue's own form."""
+"""Effects between the command and the wheels, in the catalogue's form."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from carlab.benchmark.world.physics import Hook, Instant, World
 
 
 def delay_channels(world: World, channels: tuple[int, ...], extra_s: float) -> None:
-    """Let channels (0 steering, 1 throttle) act later."""
+    """Delay channels (0 steering, 1 throttle)."""
     for channel in channels:
 
         def later(t: float, before: Callable[[float], float] = world.arrival[channel]) -> float:
@@ -20,17 +20,17 @@ def delay_channels(world: World, channels: tuple[int, ...], extra_s: float) -> N
 
 
 def command_delay(world: World, p: Parameters) -> None:
-    """Both channels later (or earlier) than the car file says."""
+    """Delay of both channels in addition to that of the car file; may be negative."""
     delay_channels(world, (0, 1), p["extra_delay"])
 
 
 def steering_delay(world: World, p: Parameters) -> None:
-    """Steering later."""
+    """Delay of steering."""
     delay_channels(world, (0,), p["delay"])
 
 
 def throttle_delay(world: World, p: Parameters) -> None:
-    """Throttle later."""
+    """Delay of throttle."""
     delay_channels(world, (1,), p["delay"])
 
 
@@ -65,7 +65,7 @@ def motor_lag(world: World, p: Parameters) -> None:
 
 
 def steering_rate_limit(world: World, p: Parameters) -> None:
-    """The wheel moves towards the wanted angle at no more than ``rate``; exact, since the wanted angle is held."""
+    """The wheel moves towards the desired angle at most at ``rate``; exact, because the desired angle is held."""
     rate = p["rate"]
     since, begin, wanted = 0.0, 0.0, 0.0
 
@@ -85,7 +85,7 @@ def steering_rate_limit(world: World, p: Parameters) -> None:
 
 
 def steering_deadband(world: World, p: Parameters) -> None:
-    """Small angles do nothing, larger ones lose half the width."""
+    """Angles below half the width have no influence; half the width is subtracted from larger angles."""
     half = 0.5 * p["width"]
     world.steering_maps.append(lambda d: d - min(max(d, -half), half))
 
@@ -104,7 +104,7 @@ def steering_backlash(world: World, p: Parameters) -> None:
 
 
 def steering_offset(world: World, p: Parameters) -> None:
-    """Trim: constant angle, there from the first moment."""
+    """Trim: constant offset angle."""
     angle = p["angle"]
 
     def trim(now: Instant) -> None:
@@ -114,7 +114,7 @@ def steering_offset(world: World, p: Parameters) -> None:
 
 
 def steering_asymmetry(world: World, p: Parameters) -> None:
-    """More to one side than to the other."""
+    """Different gain to each side."""
     gain = p["gain"]
     world.steering_maps.append(lambda d: d + gain * abs(d))
 
@@ -127,7 +127,7 @@ def steering_nonlinearity(world: World, p: Parameters) -> None:
 
 
 def throttle_deadband(world: World, p: Parameters) -> None:
-    """Small throttle does nothing; full throttle stays full."""
+    """Small throttle has no influence; full throttle is unchanged."""
     width = p["width"]
     world.throttle_maps.append(lambda u: math.copysign(max(abs(u) - width, 0.0) / (1.0 - width), u))
 

@@ -1,4 +1,4 @@
-"""Faults of the recording itself, put on top of a finished table of columns."""
+"""Data faults, applied to the columns of a finished recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Table = dict[str, FloatArray]
 
 @dataclass(frozen=True)
 class Fault:
-    """What was done: the id, the columns it touched and how many rows."""
+    """An applied fault: id, changed columns and number of rows."""
 
     id: str
     columns: tuple[str, ...]
@@ -24,7 +24,7 @@ class Fault:
 
 
 def yaw_wrap_spikes(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """The yaw rate by differentiating a wrapped angle."""
+    """Yaw rate from the difference of a wrapped angle."""
     out = dict(table)
     gap = car.control_period
     raw = np.gradient(wrapped(table["yaw"]), gap)
@@ -34,7 +34,7 @@ def yaw_wrap_spikes(table: Table, rng: np.random.Generator, car: BaseCar) -> tup
 
 
 def outliers(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """Poses of another marker set: jumps of some decimetres in single rows, velocities go with them."""
+    """Poses of another marker set: jumps of some decimetres in single rows, with the resulting velocities."""
     out = dict(table)
     count = max(3, len(table["t"]) // 150)
     rows = rng.choice(np.arange(5, len(table["t"]) - 5), count, replace=False)
@@ -46,7 +46,7 @@ def outliers(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Tabl
 
 
 def dropouts(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """Rows that are not there, some in runs."""
+    """Missing rows, some in runs."""
     keep = np.ones(len(table["t"]), dtype=bool)
     for _ in range(max(2, len(keep) // 250)):
         first = int(rng.integers(5, len(keep) - 15))
@@ -55,7 +55,7 @@ def dropouts(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Tabl
 
 
 def stale_samples(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """The logger repeats the last pose and velocity where no new one has come."""
+    """The logger repeats the last pose and velocity if no new sample has arrived."""
     source = np.arange(len(table["t"]))
     for _ in range(max(3, len(source) // 60)):
         first = int(rng.integers(5, len(source) - 10))
@@ -68,7 +68,7 @@ def stale_samples(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple
 
 
 def clock_drift(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """The commands were logged by another clock: theirs gains or loses up to some milliseconds a second."""
+    """Commands logged by another clock that drifts by up to some milliseconds per second."""
     rate = float(rng.choice((-1.0, 1.0)) * rng.uniform(1e-3, 4e-3))
     out = dict(table)
     source = np.clip(np.searchsorted(table["t"], table["t"] * (1.0 + rate), side="right") - 1, 0, len(table["t"]) - 1)
@@ -78,7 +78,7 @@ def clock_drift(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[T
 
 
 def column_shift(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """One command column some rows early or late."""
+    """A command column shifted by some rows."""
     name = str(rng.choice(("steering", "throttle")))
     rows = int(rng.choice((-1, 1)) * rng.integers(4, 12) * max(1, round(1.0 / 30.0 / car.control_period)))
     out = dict(table)
@@ -95,7 +95,7 @@ def column_scale(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[
 
 
 def wrong_unit(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """Degrees for radians, millimetres for metres or milliseconds for seconds."""
+    """Degrees instead of radians, millimetres instead of metres or milliseconds instead of seconds."""
     columns, scale = (
         (("yaw",), 180.0 / np.pi),
         (("yaw_rate",), 180.0 / np.pi),
@@ -109,7 +109,7 @@ def wrong_unit(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Ta
 
 
 def wrong_sign(table: Table, rng: np.random.Generator, car: BaseCar) -> tuple[Table, Fault]:
-    """A column with its sign turned."""
+    """A column with the opposite sign."""
     name = str(rng.choice(("yaw_rate", "steering", "vy", "throttle")))
     out = dict(table)
     out[name] = -table[name]

@@ -1,4 +1,4 @@
-"""Drive, resistance and body forces in the catalogue's own form."""
+"""Drive, resistance and body forces in the catalogue's form."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def motor_saturation(world: World, p: Parameters) -> None:
 
 
 def brake_asymmetry(world: World, p: Parameters) -> None:
-    """Another gain where the drive force works against the motion."""
+    """Different gain if the drive force opposes the motion (braking)."""
     ratio = p["gain_ratio"]
 
     def brake(now: Instant) -> None:
@@ -43,7 +43,7 @@ def battery_sag(world: World, p: Parameters) -> None:
 
 
 def traction_limit(world: World, p: Parameters) -> None:
-    """F_x at the driven axle at most a share of its friction; ``all_axles`` 1 where every wheel drives."""
+    """F_x at the driven axle at most a share of its friction; ``all_axles`` is 1 with all-wheel drive."""
     share, every = p["share"], p.get("all_axles", 0.0) > 0.5
 
     def limit(now: Instant) -> None:
@@ -64,7 +64,7 @@ def rolling_resistance(world: World, p: Parameters) -> None:
 
 
 def aerodynamic_drag(world: World, p: Parameters) -> None:
-    """Quadratic in speed."""
+    """Resistance quadratic in speed."""
     c = p["coefficient"]
 
     def resist(now: Instant) -> None:
@@ -74,7 +74,7 @@ def aerodynamic_drag(world: World, p: Parameters) -> None:
 
 
 def cornering_drag(world: World, p: Parameters) -> None:
-    """Grows with the wheel angle."""
+    """Resistance that grows with the wheel angle."""
     c = p["coefficient"]
 
     def resist(now: Instant) -> None:
@@ -84,7 +84,7 @@ def cornering_drag(world: World, p: Parameters) -> None:
 
 
 def yaw_damping(world: World, p: Parameters) -> None:
-    """Moment against the yaw rate."""
+    """Moment that opposes the yaw rate."""
     c = p["coefficient"]
 
     def resist(now: Instant) -> None:
@@ -94,7 +94,7 @@ def yaw_damping(world: World, p: Parameters) -> None:
 
 
 def torque_steer(world: World, p: Parameters) -> None:
-    """Moment with the throttle."""
+    """Moment proportional to the throttle."""
     c = p["coefficient"]
 
     def pull(now: Instant) -> None:

@@ -1,4 +1,4 @@
-"""Effects of motion capture and logger, in the catalogue's own form and one other."""
+"""Effects of motion capture and logger, in the catalogue's form and an alternative form."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def marker_offset(world: World, p: Parameters) -> None:
 
 
 def mocap_yaw_misalignment(world: World, p: Parameters) -> None:
-    """The rigid body's heading is turned against the car's."""
+    """The heading of the rigid body has an offset from that of the car."""
     turn = np.array([0.0, 0.0, p["angle"]])
     world.pose_changes.append(lambda t, pose: pose + turn)
 
 
 def velocity_filter_lag(world: World, p: Parameters) -> None:
-    """First-order filter on the velocity columns, fed by what changes linearly between captures."""
+    """First-order filter of the velocity columns with an input that is linear between captures."""
     lag = p["time_constant"]
 
     def smooth(t: FloatArray, v: FloatArray) -> FloatArray:

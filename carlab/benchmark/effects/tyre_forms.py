@@ -1,4 +1,4 @@
-"""Tyres, axle loads and grip in the catalogue's own form (and roll, for which the catalogue has no equation)."""
+"""Tyres, axle loads and grip in the catalogue's form (and roll, for which the catalogue has no equation)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def saturating(size: float, draw: Draw) -> dict[str, float]:
 
 
 def tyre_saturation(world: World, p: Parameters) -> None:
-    """The magic formula where the car file says linear."""
+    """The magic formula instead of the linear tyre of the car file."""
     world.shape_front = pacejka_shape(p["B_front"], p["C_front"])
     world.shape_rear = pacejka_shape(p["B_rear"], p["C_rear"])
 
@@ -37,7 +37,7 @@ def tyre_saturation(world: World, p: Parameters) -> None:
 
 
 def friction_ellipse(world: World, p: Parameters) -> None:
-    """Longitudinal force at the rear takes side force away."""
+    """Longitudinal force at the rear axle reduces its side force."""
     scale = p["scale"]
 
     def share(now: Instant) -> None:
@@ -71,7 +71,7 @@ def driven_wheels(world: World, p: Parameters, curve: Callable[[float], float]) 
 
 
 def tyre_relaxation(world: World, p: Parameters) -> None:
-    """Side forces of both axles build up over a length of road."""
+    """Side forces of both axles follow the slip over a relaxation length."""
     length = p["length"]
     if length <= 0.0:
         return
@@ -131,7 +131,7 @@ def friction_drift(world: World, p: Parameters) -> None:
 
 
 def patch_hook(p: Parameters) -> Hook:
-    """Less grip while the centre of mass is inside a disc."""
+    """Reduced grip while the centre of mass is inside a disc."""
     x, y, radius, kept = p["x"], p["y"], p["radius"], 1.0 - p["loss"]
 
     def slip(now: Instant) -> None:
@@ -143,7 +143,7 @@ def patch_hook(p: Parameters) -> Hook:
 
 
 def low_friction_patch(world: World, p: Parameters) -> None:
-    """A slippery disc on the floor."""
+    """A disc of low friction on the floor."""
     world.hooks["grip"].append(patch_hook(p))
 
 

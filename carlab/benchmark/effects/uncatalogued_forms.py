@@ -1,6 +1,6 @@
-"""Physics that the catalogue has no name for: the right answer is "unexplained", with channel and class.
+"""Physics outside the catalogue: the correct answer is "unexplained" with channel and class.
 
-``class_words``: the class statement is right where it holds at least one word of each group.
+``class_words``: a class statement is correct if it contains at least one word of each group.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def locked_differential(world: World, p: Parameters) -> None:
 
 
 def warm_up(world: World, p: Parameters) -> None:
-    """Tyres that gain grip by the work they do and lose it to the air."""
+    """Tyres whose grip rises with dissipated work and falls by cooling."""
     gain = p["gain"]
     k = world.add_state()
 
@@ -69,7 +69,7 @@ def warm_up(world: World, p: Parameters) -> None:
 
 
 def imbalance(world: World, p: Parameters) -> None:
-    """A bent wheel: a side force at the front that turns with the wheel (radius 0.06 m), growing with speed."""
+    """A bent wheel: a side force at the front that rotates with the wheel (radius 0.06 m) and grows with speed."""
     force, k = p["force"], world.add_state()
 
     def shake(now: Instant) -> None:
@@ -80,14 +80,14 @@ def imbalance(world: World, p: Parameters) -> None:
 
 
 def quantised(world: World, p: Parameters) -> None:
-    """A servo with few positions."""
+    """A servo with quantised positions."""
     step = p["step"]
     if step > 0.0:
         world.steering_maps.append(lambda d: step * math.floor(d / step + 0.5))
 
 
 def scale_error(world: World, p: Parameters) -> None:
-    """Motion capture whose metre is too long."""
+    """Motion capture with a scale error."""
     scale = np.array([1.0 + p["scale"], 1.0 + p["scale"], 1.0])
 
     def stretch(t: FloatArray, pose: FloatArray) -> FloatArray:
@@ -112,7 +112,7 @@ def cable(world: World, p: Parameters) -> None:
 
 
 def motor_hysteresis(world: World, p: Parameters) -> None:
-    """A motor controller that holds its throttle until the command has moved by more than half a width."""
+    """A motor controller that holds its throttle until the command changes by more than half a width."""
     half, held = 0.5 * p["width"], 0.0
 
     def follow(u: float) -> float:
@@ -124,7 +124,7 @@ def motor_hysteresis(world: World, p: Parameters) -> None:
 
 
 def compliance_steer(world: World, p: Parameters) -> None:
-    """Wheels that the side force bends back: less angle the harder the corner, by a lag of 30 ms."""
+    """Compliant steering: the side force reduces the wheel angle with a lag of 30 ms."""
     softness, k = p["softness"], world.add_state()
 
     def bend(now: Instant) -> None:
@@ -138,7 +138,7 @@ def compliance_steer(world: World, p: Parameters) -> None:
 
 
 def sagging_servo(world: World, p: Parameters) -> None:
-    """A servo whose supply sags with the motor: its speed of turning falls with the throttle."""
+    """A servo whose supply voltage falls with the throttle, which reduces its angular velocity."""
     lag = p["lag"]
     if lag <= 0.0:
         return
@@ -154,7 +154,7 @@ def sagging_servo(world: World, p: Parameters) -> None:
 
 
 def bumpy_floor(world: World, p: Parameters) -> None:
-    """Joints between floor plates every 0.8 m: the car is held back as it crosses them."""
+    """Joints between floor plates every 0.8 m that brake the car."""
     force = p["force"]
 
     def hold(now: Instant) -> None:

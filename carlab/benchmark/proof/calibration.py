@@ -1,8 +1,8 @@
-"""Rates of false and missed names over the range of each decision threshold, from the decisions of finished runs.
+"""Rates of false and missed names over a range of each decision threshold, from the decisions of finished runs.
 
-A diagnosis records each decision about a name with the statistics that it compared with thresholds
-(``decisions.json``). One threshold is varied while the others stay, and the recorded decisions are repeated. Later
-decisions of a run are repeated as they were recorded, although an earlier one may turn out differently.
+A diagnosis records each decision about an effect with its statistics and thresholds (``decisions.json``). One threshold
+is varied, the others are fixed, and the recorded decisions are repeated. Later decisions of a run are repeated as
+recorded, even if an earlier decision changes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COLUMNS = ("threshold", "value", "false names", "missed names")
 
 @dataclass(frozen=True)
 class Rates:
-    """Outcome of the decisions that one setting takes part in, at one value of it.
+    """Outcome of the decisions that use one setting, at one value of it.
 
     false, wrong     names accepted that are not concealed, and opportunities to accept one
     missed, true     concealed names not accepted, and opportunities to accept one
@@ -44,7 +44,7 @@ def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, A
     """Repeat the decisions of every case at several values of each threshold.
 
     Args:
-        answers: of the opened seal, by name of the case.
+        answers: opened answers by name of the case.
         decisions: content of ``decisions.json``, by name of the case.
 
     Returns:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from carlab.benchmark.effects.catalogue import LOOK_ALIKES
+from carlab.benchmark.effects.catalogue import CONFUSABLE
 from carlab.core.errors import DataError
 
 SCHEMA = "carlab.diagnosis/1"
@@ -16,7 +16,7 @@ SeparationTest = Callable[[str, str], bool | None]
 
 
 def check_report(report: Json) -> None:
-    """Raise DataError if a report lacks what scoring needs."""
+    """Raise DataError if a report lacks data for scoring."""
     if report.get("schema") != SCHEMA:
         raise DataError(f"report.json has schema {report.get('schema')!r}; it must be '{SCHEMA}'.")
     for key in ("verdict", "effects", "fit"):
@@ -38,8 +38,8 @@ def score_case(
         report: The tool's report; None if there is none.
         oracle: The report of the same tool with the true names given, if there is one.
         seconds: Run time of the diagnosis [s].
-        same: Whether the generator's own refit finds two effects within two standard errors on this case; None if it
-            cannot tell. Then only the list of confusable effects counts.
+        same: Whether the generator's refit finds two effects within two standard errors on this case; None if it
+            does not cover them. Then only the list of confusable effects counts.
 
     Returns:
         A flat table; figures that do not apply to the kind of case are absent.
@@ -86,7 +86,7 @@ def score_case(
 def valid_set(effect: Json, same: SeparationTest | None = None) -> bool:
     """Return whether a set has at most two other members, each confusable with the named effect and not separated."""
     others = list(effect.get("indistinguishable_from") or [])
-    if len(others) > 2 or any(other not in LOOK_ALIKES.get(effect["id"], ()) for other in others):
+    if len(others) > 2 or any(other not in CONFUSABLE.get(effect["id"], ()) for other in others):
         return False
     return same is None or all(same(effect["id"], other) is not False for other in others)
 

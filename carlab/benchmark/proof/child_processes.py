@@ -1,7 +1,6 @@
-"""Work in child processes: one command each, several at a time, with memory measured, stoppable between and within.
+"""Parallel child processes with measured memory that can be stopped between tasks or killed.
 
-Children have sessions of their own: a ^C typed at the terminal reaches only the parent, which then lets the running
-ones finish.
+Each child has its own session, so ^C at the terminal reaches only the parent. The parent lets running children finish.
 """
 
 from __future__ import annotations
@@ -27,11 +26,10 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class ChildEnd:
-    """How a child ended.
+    """End of a child process.
 
-    ``exit_status`` is None where it took too long, negative where a signal ended it. ``peak_memory_mib`` is the largest
-    resident set of the child or of a process that it waited for (getrusage); never less than the parent's own at the
-    start of the child, as Linux counts it.
+    ``exit_status`` is None after a time-out, negative after a signal. ``peak_memory_mib`` is the largest resident set
+    of the child or of a process that it waited for (getrusage); on Linux at least that of the parent at the start.
     """
 
     exit_status: int | None
@@ -55,10 +53,10 @@ def run_child(
     Args:
         command: Program and arguments.
         folder: Working directory.
-        timeout_s: The child and its session are killed after that long.
-        words_in: Its standard input.
+        timeout_s: Time after which the child and its session are killed.
+        words_in: Standard input.
         environment: Changes to the environment.
-        abandon: Asked all along; True kills it.
+        abandon: Polled; True kills the child.
     """
     clock = MonotonicClock()
     inherited = {k: v for k, v in os.environ.items() if k != "PWD"}
@@ -100,7 +98,7 @@ def _kill_session(pid: int) -> None:
     try:
         os.killpg(pid, signal.SIGKILL)
     except ProcessLookupError:
-        return  # it has just ended by itself
+        return  # the process has ended
 
 
 def side_by_side(
@@ -111,18 +109,18 @@ def side_by_side(
     stop_requested: Callable[[], bool] = lambda: False,
     finished: Callable[[Task, Made], None] = lambda task, made: None,
 ) -> bool:
-    """Do tasks in order, ``jobs`` at a time, each in a thread (whose work is to wait for a child process).
+    """Run tasks in order, ``jobs`` at a time, each in a thread that waits for a child process.
 
-    ``stop_requested`` is asked before each task begins; those that run are finished. ``finished`` is called in this
-    thread. The first error ends the whole after the running tasks. Returns whether all were done.
+    ``stop_requested`` is called before each task; running tasks are finished. ``finished`` is called in this thread.
+    The first error is raised after the running tasks have ended. Returns whether all tasks were done.
     """
-    left = iter(tasks)
+    remaining = iter(tasks)
     running: dict[Future[Made], Task] = {}
     more = True
     with ThreadPoolExecutor(jobs) as pool:
         while more or running:
             while more and len(running) < jobs:
-                task = next(left, None)
+                task = next(remaining, None)
                 if task is None:
                     more = False
                 elif stop_requested():
@@ -130,7 +128,7 @@ def side_by_side(
                     return False
                 else:
                     running[pool.submit(work, task)] = task
-            # A time-out, so that the main thread hears signals.
+            # A time-out lets the main thread receive signals.
             for future in wait(running, timeout=0.2, return_when=FIRST_COMPLETED).done:
                 finished(running.pop(future), future.result())
     return True

@@ -1,14 +1,14 @@
-"""A proof from cases to scores: make and seal, diagnose in child processes, open the seal. Resumes where it stopped.
+"""Run of a proof: make and seal cases, diagnose them in child processes, open the seal. A stopped run can resume.
 
 Folder of a proof:
 
-    seal.json            the hash, made known before the first diagnosis
-    handed/NAME/         fit.csv, hold.csv, car.toml: all that a diagnosis gets (copied into a fresh folder elsewhere)
-    answers/             plan, names, nonce and one answer a case; no diagnosis sees it
+    seal.json            hash, published before the first diagnosis
+    handed/NAME/         fit.csv, hold.csv, car.toml: input of a diagnosis (copied into a temporary folder)
+    answers/             plan, names, nonce and one answer per case; not accessible to a diagnosis
     reports/NAME/        report.json, decisions.json and run.json (exit status, seconds, peak memory)
-    oracle/NAME/         the same, where the diagnosis got the true names
-    baselines/NAME.json  what the baselines said
-    checks/NAME.json     whether the generator's refit can tell apart what a report says is one set
+    oracle/NAME/         the same for a diagnosis with the true names given
+    baselines/NAME.json  results of the baselines
+    checks/NAME.json     whether the generator's refit distinguishes the effects of a reported set
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ class Proof:
     """One proof on disk.
 
     Args:
-        root: Folder of the proof; made where it is not there.
-        specs: The cases. A folder that was begun with other ones is refused.
-        command: How a diagnosis is started; ``fit.csv --car car.toml --holdout hold.csv --out out`` is appended, and
-            ``--effects ID ...`` where the diagnosis gets the true names.
+        root: Folder of the proof; created if missing.
+        specs: The cases; they must equal those of an existing folder.
+        command: Command of a diagnosis; ``fit.csv --car car.toml --holdout hold.csv --out out`` is appended, and
+            ``--effects ID ...`` if the true names are given.
         progress: Called with stage (``make``, ``seal``, ``diagnose``, ``oracle``, ``baselines``), done, total and a
             note.
-        timeout_s: A diagnosis that takes longer is ended and counts as failed.
-        stop_requested: Asked before each case; True ends the stage after the running ones, to be resumed.
-        abandon: Asked all along; True kills the running cases, which are done anew when the stage is resumed.
-        jobs: Child processes at a time; with more than one, each computes with one thread.
+        timeout_s: Time-out of a diagnosis, which then counts as failed.
+        stop_requested: Called before each case; True ends the stage after the running cases.
+        abandon: Polled; True kills the running cases, which are repeated when the stage is resumed.
+        jobs: Number of parallel child processes; with more than one, each uses one thread.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Proof:
         self._answers = self.root / "answers"
 
     def make(self) -> str | None:
-        """Make the cases that are not there yet, then seal. Returns the seal's hash, None where it was stopped."""
+        """Make the missing cases, then seal. Returns the hash of the seal, or None if stopped."""
         specs = dict(zip(self._names(), self.specs, strict=True))
 
         def make_one(name: str) -> ChildEnd:
@@ -93,7 +93,7 @@ class Proof:
         return self.seal()
 
     def seal(self) -> str:
-        """Hash the answers, once; the hash is in seal.json and passed to ``progress``."""
+        """Hash the answers once; the hash is written to seal.json and passed to ``progress``."""
         path = self.root / "seal.json"
         if not path.exists():
             nonce = new_nonce()
@@ -105,9 +105,9 @@ class Proof:
         return sealed
 
     def diagnose(self, *, oracle: bool = False) -> bool:
-        """Diagnose every case that has no report yet; with ``oracle`` the single and paired ones, with the true names.
+        """Diagnose the cases without a report; with ``oracle`` single and paired cases with the true names given.
 
-        Returns whether all are done. Raises DataError where nothing is sealed yet.
+        Returns whether all are done. Raises DataError before the answers are sealed.
         """
         self._need_seal()
         names = sorted(self._names())  # sorted: random names give a random order of kinds
@@ -125,9 +125,9 @@ class Proof:
         )
 
     def baselines(self) -> bool:
-        """Run the baselines on cases of the kinds COMPARED; they get the same files and the true noise floor.
+        """Run the baselines on cases of the kinds COMPARED, with the same files and the true noise floor.
 
-        Returns whether all are done. Raises DataError where nothing is sealed yet.
+        Returns whether all are done. Raises DataError before the answers are sealed.
         """
         self._need_seal()
         folder = self.root / "baselines"
@@ -141,7 +141,7 @@ class Proof:
         return self._stage("baselines", names, lambda name: (folder / f"{name}.json").exists(), run_one)
 
     def open_seal(self) -> dict[str, Any]:
-        """The answers by name, after the seal has been checked. Raises DataError where anything was changed."""
+        """Check the seal and return the answers by name. Raises DataError if an answer or file was changed."""
         answers = self._load_answers()
         nonce = str(read_json(self._answers / "nonce.json")["nonce"])
         check(answers, nonce, str(read_json(self.root / "seal.json")["sha256"]))
@@ -149,12 +149,12 @@ class Proof:
             for file, sha in answer["files"].items():
                 if file_digest(self.root / "handed" / name / file) != sha:
                     raise DataError(
-                        f"The seal is broken: {name}/{file} is not the file that was sealed; the run is void."
+                        f"The seal is broken: {name}/{file} differs from the sealed file; repeat the proof."
                     )
         return answers
 
     def reports(self, *, oracle: bool = False) -> dict[str, dict[str, Any]]:
-        """What the diagnoses left, by name: ``report`` (None where there is none), ``exit_status``, ``seconds``."""
+        """Results of the diagnoses by name: ``report`` (None if missing), ``exit_status``, ``seconds``."""
         found = {}
         folder = self.root / ("oracle" if oracle else "reports")
         for run in sorted(folder.glob("*/run.json")):
@@ -168,16 +168,16 @@ class Proof:
         return found
 
     def decisions(self) -> dict[str, dict[str, Any]]:
-        """Decisions about names with their statistics, by name of the case; of cases that recorded them."""
+        """Recorded decisions about effects with their statistics, by name of the case."""
         paths = sorted((self.root / "reports").glob("*/decisions.json"))
         return {path.parent.name: read_json(path) for path in paths}
 
     def baseline_reports(self) -> dict[str, dict[str, Any]]:
-        """What the baselines said, by name of the case."""
+        """Results of the baselines by name of the case."""
         return {path.stem: read_json(path) for path in sorted((self.root / "baselines").glob("*.json"))}
 
     def same(self, name: str, one: str, other: str) -> bool | None:
-        """Whether the generator's own refit cannot tell two effects apart on a case; None where it has no opinion."""
+        """Whether the generator's refit does not distinguish two effects on a case; None if it does not cover them."""
         answer = read_json(self._answers / f"{name}.json")
         if answer["fault"] is not None or any(effect not in CHEAP for effect in (one, other)):
             return None
@@ -203,7 +203,7 @@ class Proof:
             write_json(path, {"plan": plan, "names": [new_name() for _ in plan]})
         kept = read_json(path)
         if kept["plan"] != plan:
-            raise DataError(f"{self.root} was begun with other cases; give it those, or another folder.")
+            raise DataError(f"{self.root} contains a proof of other cases; use the same cases or another folder.")
         return list(kept["names"])
 
     def _load_answers(self) -> dict[str, Any]:
@@ -241,7 +241,7 @@ class Proof:
         )  # fmt: skip
         if end.exit_status != 0 and not end.abandoned:
             last = end.words.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
-            raise DataError(f"A case of the proof could not be done ({what}): {last[0]}")
+            raise DataError(f"A case of the proof failed ({what}): {last[0]}")
         return end
 
     def _diagnose_one(self, name: str, to: Path, true_effects: tuple[str, ...]) -> ChildEnd:

@@ -1,4 +1,4 @@
-"""A child process that makes a case or runs the baselines on one: reads what to do from its standard input (JSON).
+"""Child process that makes a case or runs the baselines on it; it reads its arguments (JSON) from standard input.
 
 python -m carlab.benchmark.proof.worker make|baselines
 """
@@ -18,14 +18,14 @@ from carlab.benchmark.world.measurement import read_csv, write_csv
 from carlab.core.errors import DataError
 
 FILES = ("fit.csv", "hold.csv", "car.toml")
-ANOTHER_SEED = 10_000_000  # far from every seed of a set
+ANOTHER_SEED = 10_000_000  # no set contains such seeds
 ATTEMPTS = 4
 
 
 def make(order: dict[str, Any]) -> None:
     """Make one case: its files into ``handed``, its answer to ``answer``.
 
-    A seed with which the effect cannot be driven at any strength is replaced by another, always the same one.
+    If the car cannot be driven with the effect at any strength, the case gets another, fixed seed.
     """
     spec = CaseSpec(**{**order["spec"], "effects": tuple(order["spec"]["effects"])})
     begin = time.perf_counter()
@@ -48,7 +48,7 @@ def make(order: dict[str, Any]) -> None:
 
 
 def baselines(order: dict[str, Any]) -> None:
-    """Run every baseline on one case and write what they say to ``to``."""
+    """Run every baseline on one case and write the results to ``to``."""
     from carlab.benchmark.baselines.run import run_baselines
     from carlab.benchmark.world.base_car import BaseCar
 

@@ -1,4 +1,4 @@
-"""A car that nobody here wrote: the models of the package commonroad-vehicle-models, made a 1:10 car by similarity.
+"""Independent simulator: models of the package commonroad-vehicle-models, scaled to a 1:10 car by similarity.
 
 The package (Althoff and Würsching, "CommonRoad: Vehicle models (version 2020a)", TU Munich) brings two models with
 tyre forces and wheel spin: ``multi_body`` (29 states: body, axles and four wheels, Magic Formula with combined slip)
@@ -39,8 +39,8 @@ SCALE = 0.1
 MAX_ANGLE_RAD = 0.5
 FULL_MPS2 = 6.0
 START_MPS = 1.0
-ROLLING_MPS = 0.7  # below 0.1 m/s the package forgets its tyres and wheels; it is kept well away from there
-DRIVER_GRIP = 0.75  # share of the tyres' grip that he uses: beyond it inner wheels lift, which the package knows not
+ROLLING_MPS = 0.7  # below 0.1 m/s the package has no tyre and wheel dynamics
+DRIVER_GRIP = 0.75  # share of the tyres' grip that the driver uses; beyond it inner wheels lift, which is not modelled
 RTOL = 1e-6
 SPUN_RAD = 1.4
 CALLS = 1500
@@ -63,13 +63,13 @@ _TYRE_POWERS = {"p_vx1": -3.0}
 
 
 def require_public_simulator() -> None:
-    """Raise ConfigError where the package is not installed."""
+    """Raise ConfigError if the package is not installed."""
     if find_spec("vehiclemodels") is None:
         raise ConfigError("The public simulator needs commonroad-vehicle-models: pip install 'carlab[studies]'.")
 
 
 def parameters(scale: float = SCALE) -> Any:
-    """The package's vehicle, scaled by dynamic similarity; 1.0 gives it as it comes."""
+    """The package's vehicle, scaled by dynamic similarity; 1.0 is the original."""
     require_public_simulator()
     from vehiclemodels.vehicle_parameters import setup_vehicle_parameters
 
@@ -82,7 +82,7 @@ def parameters(scale: float = SCALE) -> Any:
 
 
 class PublicCar:
-    """One of the package's models, and the car it looks like to its driver.
+    """A model of the package, and an equivalent base car for the driver.
 
     Args:
         model: Which.
@@ -100,7 +100,7 @@ class PublicCar:
         self._rates: Callable[[list[float], list[float], Any], list[float]] = rates
         p = self.p
         grip = DRIVER_GRIP * p.tire.p_dy1
-        # Only for the hand and the eye of the driver: he knows his car.
+        # Used by the driver only.
         self.car = BaseCar(
             mass=p.m, yaw_inertia=p.I_z, front_axle=p.a, rear_axle=p.b, mu_front=grip, mu_rear=grip,
             drive_gain=FULL_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=command_delay_s,
@@ -148,7 +148,7 @@ class PublicCar:
 
 
 class RollingDriver(HumanDriver):
-    """The same person, who keeps the car rolling forwards and does not want to spin it.
+    """A driver that keeps the car rolling forwards and avoids spins.
 
     Neither model of the package can stand or reverse with its tyres, and past a right angle of side slip its
     equations mean nothing.
@@ -179,13 +179,13 @@ class PublicDrive:
 
 
 class AbandonedError(Exception):
-    """A drive was given up because somebody asked for it."""
+    """A drive was stopped on request."""
 
 
 def drive_public(
     car: PublicCar, seed: int, part: int, duration_s: float, abandon: Callable[[], bool] = lambda: False
 ) -> PublicDrive:
-    """Drive and record; ``part`` tells the recordings of one seed apart. The same arguments give the same drive.
+    """Drive and record; ``part`` numbers the recordings of a seed. Equal arguments give equal drives.
 
     Raises:
         AbandonedError: where ``abandon``, asked at every tick, says so.
@@ -256,7 +256,7 @@ def _segment(
             raise _ChatteringError
         return car.rates(x, ((acting[0] - x[2]) / period, acting[1]))
 
-    # A capture at the very end is asked for once and given twice.
+    # A capture at the end is returned twice.
     once = np.unique(at)
     try:
         try:
@@ -267,18 +267,20 @@ def _segment(
             found = _small_steps(rates, span[0], state, once)
     except (ZeroDivisionError, ValueError, OverflowError) as error:
         raise DataError(
-            f"The package's {car.model} model broke down at {span[0]:.2f} s ({error}); take another seed."
+            f"The package's {car.model} model failed at {span[0]:.2f} s ({error}); use another seed."
         ) from error
     if not np.isfinite(found).all():
-        raise DataError(f"The package's {car.model} model cannot be integrated beyond {span[0]:.2f} s: another seed.")
+        raise DataError(
+            f"The package's {car.model} model cannot be integrated beyond {span[0]:.2f} s; use another seed."
+        )
     motion = car.motion(found)
     if (np.abs(np.arctan2(motion[:, 4], motion[:, 3])) > SPUN_RAD).any():
-        raise DataError(f"The car has spun at {span[0]:.2f} s, where the package's equations end; take another seed.")
+        raise DataError(f"The car has spun at {span[0]:.2f} s, which the package does not model; use another seed.")
     return np.asarray(found[np.searchsorted(once, at)], dtype=np.float64)
 
 
 class _ChatteringError(Exception):
-    """The step control is caught at a jump of the right-hand side."""
+    """The step control fails at a discontinuity of the right-hand side."""
 
 
 def _small_steps(

@@ -1,4 +1,4 @@
-"""What the equations of the package commonroad-vehicle-models say for or against each effect of the catalogue.
+"""Presence of each effect of the catalogue in the equations of the package commonroad-vehicle-models.
 
 Read off vehicle_dynamics_mb.py, vehicle_dynamics_std.py, tire_model.py, steering_constraints.py and
 acceleration_constraints.py of version 3.0.2. ``yes``: the effect is in the equations. ``akin``: something else is
@@ -94,7 +94,7 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
 
 
 def physics_of(effect: str, model: Model) -> Physics:
-    """What the equations of ``model`` say of an effect; ``no`` for a name that is not in the catalogue."""
+    """Presence of an effect in the equations of ``model``; ``no`` for an unknown id."""
     for said in PHYSICS.get(effect, ()):
         if model in said.models:
             return said
@@ -102,7 +102,7 @@ def physics_of(effect: str, model: Model) -> Physics:
 
 
 def true_values(car: PublicCar) -> dict[tuple[str, str], float]:
-    """What a parameter of an effect is in the package, where it has one of the same meaning: by effect and name."""
+    """True values of parameters with the same meaning in the package, by effect and name."""
     p = car.p
     return {
         ("steering_rate_limit", "rate"): p.steering.v_max,

@@ -1,4 +1,4 @@
-"""The study on a public simulator: drive, write what an owner knows, diagnose in a fresh folder, report."""
+"""Study on a public simulator: drive, write a car file of measurable facts, diagnose in a temporary folder, report."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ KEPT = ("report.json", "report.html", "model.toml")
 
 
 def nominal_text(car: PublicCar) -> str:
-    """The car file of an owner with a scale, a tape and a stop watch; the rest are guesses with wide ranges."""
+    """Car file with measured mass and lengths; the other parameters are guesses with wide ranges."""
     p, base = car.p, car.car
     mass, front, rear = round(p.m, 3), round(p.a, 4), round(p.b, 4)
     return f"""# A 1:10 car of the package {PACKAGE} ({car.model}) as its owner knows it.
@@ -93,7 +93,7 @@ def hand_over(
 
 
 def activity(car: PublicCar, drive: PublicDrive) -> dict[str, float]:
-    """How far the drive went into what a single-track model leaves out."""
+    """Extent of the drive in regimes that a single-track model does not cover."""
     motion, states = drive.drive.captures, drive.states
     rate = np.abs(np.gradient(states[:, 2], drive.drive.capture_s))
     slip = np.abs(car.rear_slip(states))

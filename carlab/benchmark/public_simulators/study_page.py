@@ -1,4 +1,4 @@
-"""The page of the study on a public simulator: what was driven, what was said, and what the equations say of it."""
+"""Page of the study on a public simulator: drive, diagnosis, and comparison with the equations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STANCES = {"yes": "in the equations", "akin": "acts alike", "no": "not in the eq
 
 
 def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
-    """The page, from what study.json holds."""
+    """Page from the content of study.json."""
     parts = [
         "# Diagnosis of a simulator that nobody here wrote",
         f"{facts['package']}, scaled by {SCALE:g} in length and by dynamic similarity in all else. Full steering is "

@@ -1,1 +1,1 @@
-"""The generator's own car: equations of motion, adaptive integration, driver and measurement."""
+"""The generator: equations of motion, adaptive integration, driver and measurement."""

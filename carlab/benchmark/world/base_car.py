@@ -1,4 +1,4 @@
-"""The nominal car and the true car: the numbers of the base model, drawn apart by up to ten per cent."""
+"""Nominal and true car: parameters of the base model, which differ by up to 10 %."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import tomli_w
 Kind = Literal["dynamic", "linear_tyre", "kinematic", "blend"]
 GRAVITY_MPS2 = 9.81
 
-# Dotted names of the base parameters that a refit may move. Mass, axle distances, control period and command delay
-# are measured facts of the car file and stay what they are.
+# Dotted names of the base parameters that a refit may change. Mass, axle distances, control period and command delay
+# are measured and fixed.
 FREE = {
     "vehicle.yaw_inertia": "yaw_inertia",
     "tyre.front.B": "b_front",
@@ -33,7 +33,7 @@ FREE = {
 
 @dataclass(frozen=True)
 class BaseCar:
-    """Numbers of the single-track model, SI units; B and C are Pacejka's stiffness and shape factor."""
+    """Parameters of the single-track model, SI units; B and C are Pacejka's stiffness and shape factor."""
 
     mass: float = 1.65
     yaw_inertia: float = 0.06
@@ -80,7 +80,7 @@ class BaseCar:
         return dataclasses.replace(self, **{FREE[name]: float(value) for name, value in values.items()})  # type: ignore[arg-type]
 
     def perturbed(self, rng: np.random.Generator, share: float = 0.1) -> BaseCar:
-        """Every base parameter moved by up to ``share`` of itself, uniformly."""
+        """Multiply every base parameter by a uniform factor in 1 +- ``share``."""
         return self.with_free({name: value * (1.0 + rng.uniform(-share, share)) for name, value in self.free().items()})
 
     def write(self, path: Path) -> None:
@@ -89,7 +89,7 @@ class BaseCar:
 
     @classmethod
     def read(cls, path: Path) -> BaseCar:
-        """Read what ``write`` wrote."""
+        """Read a file of ``write``."""
         t = tomllib.loads(path.read_text())
         front, rear = t["tyre"]["front"], t["tyre"]["rear"]
         tyres = {"b_front": front["B"], "c_front": front["C"], "mu_front": front["mu"]}

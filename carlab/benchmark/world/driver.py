@@ -1,4 +1,4 @@
-"""A person at the remote control: follows a track, changes speed, steps, coasts, stands, reverses, errs a little."""
+"""Human driver: follows a track, changes speed, makes command steps, coasts, stands, reverses, makes small errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MODES = ("follow", "steps", "coast", "stand", "reverse", "slow")
 
 
 class Track:
-    """A smooth closed curve in a room, given by a few harmonics; points every few centimetres."""
+    """A smooth closed curve of a few harmonics, sampled every few centimetres."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         phase = np.linspace(0.0, 2 * math.pi, 600, endpoint=False)
@@ -34,7 +34,7 @@ class Track:
 
 
 class HumanDriver:
-    """Closed-loop driving with the flaws of a hand: pure pursuit, a proportional foot, slow noise, changing intent.
+    """Closed-loop driver with human errors: pure pursuit, proportional speed control, slow noise, changing modes.
 
     Called with time and newest state; returns commands in [-1, 1], as issued.
     """
@@ -51,7 +51,7 @@ class HumanDriver:
         self._boldness = float(rng.uniform(0.75, 1.05))
 
     def start(self) -> tuple[float, ...]:
-        """Pose on the track at which to begin, standing."""
+        """Initial pose on the track, at standstill."""
         i = int(self._rng.integers(len(self._track.points)))
         heading = self._track.heading[i] + (0.0 if self._direction > 0 else math.pi)
         return (float(self._track.points[i, 0]), float(self._track.points[i, 1]), float(heading), 0.0, 0.0, 0.0)
@@ -94,7 +94,7 @@ class HumanDriver:
         j = (i + self._direction * round(ahead_m / self._track.spacing_m)) % len(self._track.points)
         dx, dy = self._track.points[j] - (x, y)
         bearing = math.remainder(math.atan2(dy, dx) - psi, 2 * math.pi)
-        if abs(bearing) > 2.0:  # behind: turn round
+        if abs(bearing) > 2.0:  # the target is behind the car
             return math.copysign(1.0, bearing)
         distance = max(math.hypot(dx, dy), 0.2)
         angle = math.atan(2 * self._car.wheelbase * math.sin(bearing) / distance)

@@ -1,4 +1,4 @@
-"""What motion capture and logger make of a drive: noise on the pose, velocities by differentiating."""
+"""Measurement of a drive: noise on the pose, velocities by differentiation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLUMNS = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
 
 @dataclass(frozen=True)
 class Recording:
-    """One recording and, beside it, what it would be without noise.
+    """A recording and its noise-free counterpart.
 
     t_s (N,), measured (N, 6) as x, y, yaw (unwrapped), vx, vy, yaw_rate; commands (N, 2); error (N, 6) what noise and
     differentiation add to the noise-free measurement.
@@ -35,7 +35,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Noise:
-    """Motion-capture noise on the pose and the width of the window by which velocities are had from it."""
+    """Noise of the pose, and width of the window over which velocities are differentiated."""
 
     position_std_m: float
     yaw_std_rad: float
@@ -102,12 +102,12 @@ def body_velocity(pose: FloatArray, gap_s: float, window: int) -> FloatArray:
 
 
 def wrapped(yaw: FloatArray) -> FloatArray:
-    """Into (-pi, pi]."""
+    """Wrap to (-pi, pi]."""
     return -np.remainder(-yaw + np.pi, 2 * np.pi) + np.pi
 
 
 def as_table(recording: Recording) -> dict[str, FloatArray]:
-    """The canonical columns."""
+    """Columns of a recording by name."""
     columns = [recording.t_s, *recording.measured.T, *recording.commands.T]
     table = dict(zip(COLUMNS, columns, strict=True))
     table["yaw"] = wrapped(table["yaw"])
@@ -124,7 +124,7 @@ def write_csv(path: Path, table: dict[str, FloatArray]) -> None:
 
 
 def read_csv(path: Path) -> dict[str, FloatArray]:
-    """Read what write_csv wrote."""
+    """Read a file of write_csv."""
     with path.open() as file:
         names = file.readline().strip().split(",")
     return dict(zip(names, np.genfromtxt(path, delimiter=",", skip_header=1, dtype=np.float64).T, strict=True))

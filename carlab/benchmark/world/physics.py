@@ -1,4 +1,4 @@
-"""The equations of motion, written for this package alone; concealed physics hooks into their stages.
+"""Equations of motion, independent of the simulator; concealed effects are hooks of their stages.
 
 Kinematic, dynamic and blended single track after Kabzan et al., "AMZ Driverless"; tyres after Pacejka and Bakker,
 "The magic formula tyre model". Without a hook this is the base model and nothing else.
@@ -21,7 +21,7 @@ BLEND_OVER_MPS = 0.2
 
 
 class Instant:
-    """Everything there is at one time; hooks read and change it, stage by stage.
+    """All variables at one time; hooks read and change them stage by stage.
 
     Stages: ``steer`` (front wheel angle d), ``throttle`` (u), ``drive`` (drive force), ``load`` (axle loads), ``grip``
     (mu), ``limit`` (fx, the force at the rear axle), ``tyre`` (lateral axle forces), ``body`` (push_x, push_y [N] in
@@ -78,7 +78,7 @@ def linear_shape(b: float, c: float) -> Callable[[float], float]:
 
 
 class World:
-    """A true car: base numbers and the hooks of what is concealed in it."""
+    """A true car: base parameters and hooks of the concealed effects."""
 
     def __init__(self, car: BaseCar) -> None:
         self.car = car
@@ -87,12 +87,12 @@ class World:
         self.shape_rear = shape(car.b_rear, car.c_rear)
         self.hooks: dict[str, list[Hook]] = {stage: [] for stage in STAGES}
         self._rolling: list[bool] = []
-        # What is issued at a time acts from: one function a channel (steering, throttle).
+        # Time at which a command acts by time of issue, one function per channel (steering, throttle).
         self.arrival: list[Callable[[float], float]] = [lambda t: t + car.command_delay] * 2
-        # Maps of a command when it starts to act, in order; a map may remember. Steering in rad, throttle in 1.
+        # Maps of a command when it starts to act, in order, may have memory. Steering in rad, throttle in 1.
         self.steering_maps: list[Callable[[float], float]] = []
         self.throttle_maps: list[Callable[[float], float]] = []
-        # Called whenever a command starts to act: (t, wheel angle wanted, throttle wanted).
+        # Called when a command starts to act: (t, desired wheel angle, desired throttle).
         self.switch_listeners: list[Callable[[float, float, float], None]] = []
         # Observation: extra age of every channel [s], and changes of pose and velocity columns (see measurement).
         self.extra_latency_s = 0.0
@@ -100,7 +100,7 @@ class World:
         self.velocity_changes: list[Callable[[Any, Any], Any]] = []
 
     def add_state(self, *, rolling: bool = False) -> int:
-        """A hidden state that starts at 0, or at the car's speed; its index into ``extra`` and ``rates``."""
+        """Add a hidden state that starts at 0 or at the car's speed; returns its index in ``extra`` and ``rates``."""
         self._rolling.append(rolling)
         return len(self._rolling) - 1
 

@@ -1,4 +1,4 @@
-"""A drive of the true car: adaptive integration between the instants at which something switches."""
+"""Drive of the true car: adaptive integration between switching times."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ATOL = 1e-9
 
 @dataclass(frozen=True)
 class Drive:
-    """What happened, without noise.
+    """A noise-free drive.
 
     row_s     (N,)       times of the control ticks, 0 the first
     commands  (N, 2)     steering and throttle as issued at the ticks
@@ -46,7 +46,7 @@ class Drive:
 
 
 class _Acting:
-    """The commands on their way to the wheels, and the integrator's right-hand side that they reach."""
+    """Queue of delayed commands, and the right-hand side that they act on."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -58,7 +58,7 @@ class _Acting:
     def issue(self, t: float, command: tuple[float, float]) -> None:
         for queue, arrival, value in zip(self.queues, self.world.arrival, command, strict=True):
             acts = arrival(t)
-            while queue and queue[-1][0] > acts:  # overtaken: the newer command is the one that stays
+            while queue and queue[-1][0] > acts:  # the newer command replaces a command that it overtakes
                 queue.pop()
             queue.append((acts, value))
 
@@ -98,18 +98,18 @@ def drive(
     rtol: float = RTOL,
     integrator: str = "dop853",
 ) -> Drive:
-    """Drive the car from a standstill with neutral commands behind it.
+    """Drive the car with neutral commands before the start.
 
     Args:
         world: The true car.
         driver: Called at every tick with its time and the newest captured state; returns (steering, throttle).
         duration_s: Length; the last row is the last tick not after it.
-        start: x, y, psi, vx, vy, r at time 0; before it the car is taken to have moved at its first velocity.
+        start: x, y, psi, vx, vy, r at time 0; before it the car moves at its initial velocity.
         rtol: Relative tolerance of the integrator (absolute: a tenth of it).
-        integrator: One of scipy's adaptive ones, ``dop853`` or, for quick looks, ``dopri5``.
+        integrator: Adaptive integrator of scipy, ``dop853`` or the faster ``dopri5``.
 
     Raises:
-        DataError: where the car cannot be integrated (it has left all sense).
+        DataError: the integration fails.
     """
     car = world.car
     period = car.control_period
@@ -131,10 +131,10 @@ def drive(
         if due > t + 1e-12:
             solver.set_initial_value(state, t)
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # asked of the solver below, and said as an error
+                warnings.simplefilter("ignore")  # checked below and raised as an error
                 state = solver.integrate(due)
             if not solver.successful() or not np.isfinite(state).all() or abs(state[3]) > 50.0:
-                raise DataError(f"The concealed car cannot be integrated beyond {t:.3f} s; draw another size or seed.")
+                raise DataError(f"The concealed car cannot be integrated beyond {t:.3f} s; use another size or seed.")
             t = due
         if acting.next_s() <= t + 1e-12:
             acting.switch(t)

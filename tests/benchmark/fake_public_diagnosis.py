@@ -1,4 +1,4 @@
-"""Stands in for a diagnosis of the public simulator: looks at what it is handed and names two effects."""
+"""Fake diagnosis of the public simulator: check the input files and name two effects."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What a recording tells of itself: its noise, the bias of estimated starts, the window of its velocities, vibration.
+"""Estimates from a recording alone: noise, bias of initial states, velocity window, vibration.
 
 The truth is the concealed generator's, which shares no code with the diagnosis and keeps what noise was added.
 """
@@ -38,7 +38,7 @@ SEEDS = (61, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (62, 63)))
 
 @dataclass(frozen=True)
 class Drive:
-    """A case with its recording to fit as the diagnosis sees it."""
+    """A case with its recording to fit as input of the diagnosis."""
 
     case: Case
     folder: Path
@@ -63,7 +63,7 @@ def drive(folder: Path, case: Case) -> Drive:
 
 @pytest.fixture(scope="module", params=SEEDS)
 def plain(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Drive:
-    """Nothing concealed but base parameters that are off."""
+    """A case with wrong base parameters only."""
     return drive(tmp_path_factory.mktemp("plain"), make_case("parameters", request.param))
 
 
@@ -75,8 +75,8 @@ def shaking(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     )
 
 
-def test_noise_is_what_was_added(plain: Drive) -> None:
-    """Differentiated velocities have noise that is not white; a white noise's formula would be 15 % too high."""
+def test_estimated_noise_equals_the_added_noise(plain: Drive) -> None:
+    """Differentiated velocities have coloured noise; the formula for white noise is 15 % too high."""
     windows = cut_windows(plain.tracks, 0.8, 0.3)
     found = estimate_noise(plain.tracks, windows.curvature_bias).measured
     added = np.std(plain.case.recordings[0].error, axis=0)
@@ -85,14 +85,14 @@ def test_noise_is_what_was_added(plain: Drive) -> None:
     assert np.mean(found[3:] / added[3:]) == pytest.approx(1.0, abs=0.08)
 
 
-def test_floor_is_the_generators(plain: Drive) -> None:
-    """The floor after a second against what the generator's own truth and window starts give."""
+def test_estimated_floor_equals_that_of_the_generator(plain: Drive) -> None:
+    """The floor after 1 s against that of the generator's true car and initial states."""
     windows = cut_windows(plain.tracks, 1.0, 0.25)
     floor = noise_floor(windows, estimate_noise(plain.tracks, windows.curvature_bias), plain.nominal)[-1]
     assert np.exp(np.mean(np.log(floor / np.array(plain.case.floor)))) == pytest.approx(1.0, abs=0.15)
 
 
-def test_starts_are_nearer_the_truth_without_their_bias(plain: Drive) -> None:
+def test_initial_states_are_more_accurate_without_curvature_bias(plain: Drive) -> None:
     windows = cut_windows(plain.tracks, 0.8, 0.3)
     better = without_curvature_bias(windows, plain.nominal)
     truth = plain.clean_at(windows)
@@ -103,8 +103,8 @@ def test_starts_are_nearer_the_truth_without_their_bias(plain: Drive) -> None:
     assert np.allclose(noise[[0, 1, 3, 4]] / after[[0, 1, 3, 4]], 1.0, atol=0.25)
 
 
-def test_a_simulator_without_its_steering_takes_less_away(plain: Drive) -> None:
-    """Bent commands have no counterpart in the recording, and so hardly move the starts."""
+def test_wrong_steering_commands_reduce_the_correction(plain: Drive) -> None:
+    """Modified commands disagree with the recording, so they hardly change the initial states."""
     windows = cut_windows(plain.tracks, 0.8, 0.3)
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(len(windows))
@@ -119,7 +119,7 @@ def test_a_simulator_without_its_steering_takes_less_away(plain: Drive) -> None:
 
 
 @pytest.mark.parametrize("window_s", [0.06, 0.075, 0.09])
-def test_window_of_velocities_is_found(plain: Drive, tmp_path: Path, window_s: float) -> None:
+def test_velocity_window_is_estimated(plain: Drive, tmp_path: Path, window_s: float) -> None:
     """One drive, captured at 120 Hz and differentiated over windows of several widths (parabolas: width^2 / 20)."""
     car = plain.case.true_car
     world, course = World(car), Course(np.random.default_rng(5))
@@ -131,7 +131,7 @@ def test_window_of_velocities_is_found(plain: Drive, tmp_path: Path, window_s: f
     assert np.sqrt(20.0 * velocity_window_variance_s2(windows, plain.nominal)) == pytest.approx(window_s, abs=0.025)
 
 
-def test_velocities_of_the_moment_have_no_window(plain: Drive) -> None:
+def test_instantaneous_velocities_have_no_window(plain: Drive) -> None:
     windows = cut_windows(plain.tracks, 0.8, 0.3)
     exact = replace(windows, measured=simulate_windows(windows, plain.nominal)[0])
     assert np.sqrt(20.0 * velocity_window_variance_s2(exact, plain.nominal)) < 0.03
@@ -146,8 +146,8 @@ def test_vibration_of_a_wheel_is_found_with_its_radius(shaking: Drive, plain: Dr
 
 
 @pytest.mark.parametrize(("of_time", "blamed"), [(True, False), (False, True)])
-def test_a_wheel_is_not_blamed_for_a_frequency_of_its_own(plain: Drive, of_time: bool, blamed: bool) -> None:
-    """The same tremble of the yaw rate, once 6 times a second and once 4 times per metre."""
+def test_a_fixed_frequency_is_not_attributed_to_a_wheel(plain: Drive, of_time: bool, blamed: bool) -> None:
+    """The same vibration of the yaw rate at 6 Hz and at 4 periods per metre."""
     made = []
     for track in plain.tracks:
         moved = 6.0 * np.arange(len(track.speed)) if of_time else 4.0 * np.cumsum(track.speed)
@@ -163,7 +163,7 @@ def test_a_wheel_is_not_blamed_for_a_frequency_of_its_own(plain: Drive, of_time:
 @pytest.mark.parametrize(
     "effects", [("aerodynamic_drag", "velocity_filter_lag", "yaw_damping"), pytest.param(None, marks=pytest.mark.slow)]
 )
-def test_vibration_is_said_and_named_nothing_else(shaking: Drive, effects: tuple[str, ...] | None) -> None:
+def test_vibration_is_described_without_an_effect(shaking: Drive, effects: tuple[str, ...] | None) -> None:
     fit, hold = (list(import_csv(shaking.folder / name).episodes) for name in ("fit.csv", "hold.csv"))
     found = diagnose(fit, hold, shaking.nominal, TEXTS, effects=effects).diagnosis
     assert found.verdict == "unexplained"

@@ -1,4 +1,4 @@
-"""Stands in for the tool: reads what it is handed, notes what it can see, writes a report."""
+"""Fake diagnosis: read the input files, record the visible files, write a report."""
 
 import json
 import os
