@@ -172,7 +172,7 @@ def test_channel_scores_combine_to_the_score(parameters_only: Case) -> None:
 def test_invalid_arguments_raise_errors() -> None:
     with pytest.raises(ConfigError, match="no effect"):
         make_case("single", 1, effects=["steering_lagg"])
-    with pytest.raises(ConfigError, match="takes 2 effects"):
+    with pytest.raises(ConfigError, match="requires 2 effects"):
         make_case("pair", 1, effects=["steering_lag"])
     with pytest.raises(ConfigError, match="data fault"):
         make_case("fault", 1, fault="gremlins")

@@ -99,7 +99,7 @@ def test_other_cases_in_the_same_folder_are_refused(small: Path, carlab: Carlab)
     assert carlab("prove", "--out", small, "--no-baselines", "--no-oracle", "--limit", 1)[0] == 0
     code, text = carlab("prove", "--out", small, "--no-baselines", "--no-oracle")
     assert code == 1
-    assert "begun with other cases" in text
+    assert "contains a proof of other cases" in text
 
 
 def test_bad_options(tmp_path: Path, carlab: Carlab) -> None:

@@ -192,7 +192,7 @@ def test_no_window_spans_a_break_or_a_parked_car(even):
         assert not row <= 100 <= row + 15
         assert not row < 180 <= row + 15
     assert np.isfinite(windows.measured).all()
-    with pytest.raises(DataError, match="no moving stretch"):
+    with pytest.raises(DataError, match="moves in no stretch"):
         recorded_windows(replace(even, states=np.zeros_like(even.states)))
 
 
