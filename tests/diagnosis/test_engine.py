@@ -191,7 +191,7 @@ def test_a_held_out_share_out_of_range_raises_an_error(
 ) -> None:
     path = str(concealed[0] / "fit.csv")
     assert run(["diagnose", path, "--holdout-share", share, "--out", str(tmp_path / "out")]) == 2
-    assert "give one above 0 and at most 0.5" in " ".join(capfd.readouterr().err.split())
+    assert "give a share above 0 and at most 0.5" in " ".join(capfd.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 
 

@@ -60,12 +60,12 @@ def run_child(
     """
     clock = MonotonicClock()
     inherited = {k: v for k, v in os.environ.items() if k != "PWD"}
-    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as asked:
-        asked.write(words_in.encode())
-        asked.seek(0)
+    with tempfile.TemporaryFile() as output_file, tempfile.TemporaryFile() as input_file:
+        input_file.write(words_in.encode())
+        input_file.seek(0)
         begin_s = clock.now_s()
         child = subprocess.Popen(
-            command, cwd=folder, env={**inherited, **(environment or {})}, stdin=asked, stdout=said,
+            command, cwd=folder, env={**inherited, **(environment or {})}, stdin=input_file, stdout=output_file,
             stderr=subprocess.STDOUT, start_new_session=True,
         )  # fmt: skip
         too_long = abandoned = False
@@ -86,8 +86,8 @@ def run_child(
             child.wait()
             raise
         seconds = clock.now_s() - begin_s
-        said.seek(max(0, said.seek(0, os.SEEK_END) - TAIL))
-        words = said.read().decode(errors="replace")
+        output_file.seek(max(0, output_file.seek(0, os.SEEK_END) - TAIL))
+        words = output_file.read().decode(errors="replace")
     if too_long:
         words = f"ended after {timeout_s:g} s"
     code = None if too_long else int(child.returncode)

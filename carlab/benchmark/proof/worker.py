@@ -71,7 +71,7 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Do what the argument says; exit status 1 and one sentence where the case cannot be had."""
+    """Run the command of the argument; exit status 1 and one sentence if it fails."""
     order = json.loads(sys.stdin.read())
     try:
         {"make": make, "baselines": baselines}[sys.argv[1]](order)

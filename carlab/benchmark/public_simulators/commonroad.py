@@ -11,8 +11,8 @@ tyre's coefficients are pure numbers and stay, but ``p_vx1``, which the package 
 and so is one over a force.
 
 Interface. The package asks for a steering rate and a longitudinal acceleration (drive torque over mass and wheel
-radius). The rate asked is the one that reaches the commanded angle in one control period; the package itself bounds
-it. The acceleration asked is FULL_MPS2 times the throttle.
+radius). The requested rate is the one that reaches the commanded angle in one control period; the package itself bounds
+it. The requested acceleration is FULL_MPS2 times the throttle.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class PublicCar:
         return np.array(init(core, self.p), dtype=np.float64)
 
     def rates(self, state: FloatArray, inputs: Sequence[float]) -> list[float]:
-        """The package's right-hand side; inputs are steering rate [rad/s] and acceleration [m/s^2] as asked.
+        """The package's right-hand side; inputs are the requested steering rate [rad/s] and acceleration [m/s^2].
 
         The package forbids negative wheel spin by changing its caller's state, and sets the rate to 0 where spin is
         negative. An integrator that tries states does not hear of the change, and a wheel a hair below 0 would stay
@@ -188,7 +188,7 @@ def drive_public(
     """Drive and record; ``part`` numbers the recordings of a seed. Equal arguments give equal drives.
 
     Raises:
-        AbandonedError: where ``abandon``, asked at every tick, says so.
+        AbandonedError: ``abandon``, called at every tick, returned true.
         DataError: where the package cannot be integrated or the car has spun.
     """
     track = Track(np.random.default_rng((seed, 1)))

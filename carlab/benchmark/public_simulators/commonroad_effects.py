@@ -95,9 +95,9 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
 
 def physics_of(effect: str, model: Model) -> Physics:
     """Presence of an effect in the equations of ``model``; ``no`` for an unknown id."""
-    for said in PHYSICS.get(effect, ()):
-        if model in said.models:
-            return said
+    for physics in PHYSICS.get(effect, ()):
+        if model in physics.models:
+            return physics
     return Physics("no", "not a name of the catalogue")
 
 

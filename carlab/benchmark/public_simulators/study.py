@@ -136,7 +136,7 @@ def study(
         abandon: Asked all along; True ends the study after what is done.
 
     Returns:
-        A row a seed, as in study.json; a seed that cannot be driven has no verdict and says why.
+        One row per seed, as in study.json; a seed that cannot be driven has the reason instead of a verdict.
 
     Raises:
         ConfigError: where the package is not installed.
@@ -177,8 +177,8 @@ def _diagnose(
         here = Path(fresh)
         for file in FILES:
             shutil.copyfile(handed / file, here / file)
-        asked = [*command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out"]
-        end = run_child(asked, here, timeout_s=timeout_s, abandon=abandon)
+        arguments = [*command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out"]
+        end = run_child(arguments, here, timeout_s=timeout_s, abandon=abandon)
         if end.abandoned:
             return None
         for file in KEPT:
@@ -207,14 +207,14 @@ def _row(car: PublicCar, seed: int, run: dict[str, Any], path: Path) -> dict[str
 
 
 def _named(car: PublicCar, effect: dict[str, Any]) -> dict[str, Any]:
-    said = physics_of(effect["id"], car.model)
+    physics = physics_of(effect["id"], car.model)
     others = effect.get("indistinguishable_from", [])
     truth = {name: value for (owner, name), value in true_values(car).items() if owner == effect["id"]}
     return {
         **{k: effect.get(k) for k in ("id", "confidence", "parameters", "where", "evidence", "sentence")},
         "indistinguishable_from": others,
-        "in_equations": said.stance,
-        "why": said.why,
+        "in_equations": physics.stance,
+        "why": physics.why,
         "true_values": truth,
         "others": {name: physics_of(name, car.model).stance for name in others},
     }

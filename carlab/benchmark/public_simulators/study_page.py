@@ -32,7 +32,7 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
     for row in rows:
         parts.append(f"## Seed {row['seed']}")
         if row["verdict"] is None:
-            last = str(row["words"]).strip().splitlines()[-1:] or ["nothing said"]
+            last = str(row["words"]).strip().splitlines()[-1:] or ["no output"]
             parts.append(f"No report (exit status {row['exit_status']}): {last[0]}")
             continue
         parts += [f"**{e['id']}**: {e['sentence'] or 'no sentence'}\n\n{_evidence(e)}" for e in row["named"]]
@@ -45,7 +45,7 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
                 + "."
             )
         if row["data_faults"]:
-            parts.append(f"Data faults said: {', '.join(row['data_faults'])}. The recording has none.")
+            parts.append(f"Data faults reported: {', '.join(row['data_faults'])}. The recording has none.")
         parts.append(markdown(("how far the drive went", "value"), [(k, f"{v:g}") for k, v in row["activity"].items()]))
     return "\n\n".join(parts) + "\n"
 
