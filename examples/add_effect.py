@@ -1,7 +1,7 @@
-"""Add an effect: a drag that grows with the cube of speed, simulated and then found again. Takes one minute.
+"""Add an effect: a drag that grows with the cube of speed, simulated and then identified. Takes one minute.
 
-One class holds equation, parameters and texts. ``register`` makes it known to car files, simulators, the diagnosis and
-the prior of learning.
+One class holds equation, parameters and texts. ``register`` adds it to car files, simulators, the diagnosis and the
+prior of learning.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""The whole story: a car that differs from its car file learns to park, and a diagnosis says what the file left out.
+"""Complete example: a car that differs from its car file learns to park, and a diagnosis identifies the differences.
 
-The servo of the emulated car lags by 70 ms, and its motor is weaker than the car file says. carlab reads the car file
-and what comes over the wire, nothing else. Takes about four minutes on two idle cores;
+The servo of the emulated car lags by 70 ms, and its motor is weaker than in the car file. carlab reads only the car
+file and the measurements of the emulated hardware. Takes about four minutes on two idle cores;
 ``python examples/demo.py --car sim --updates 300`` takes one or two.
 """
 
@@ -22,7 +22,7 @@ HALL = RecordedTask(carlab.CarState(), max_ticks=600, arena_m=rectangle(-15.0, 1
 
 
 class Excitation:
-    """Steps of steering and throttle at random times, other ones in each episode."""
+    """Random steps of steering and throttle at random times, different in each episode."""
 
     name = "excitation"
 
@@ -44,7 +44,7 @@ class Excitation:
 
 
 def progress_hooks() -> carlab.LearnHooks:
-    """Lines on the screen while the car learns."""
+    """Hooks that print the progress of learning."""
     hooks = carlab.LearnHooks()
     hooks.on_figures = lambda row: print(
         f"  episode {row.episode}: {'parked' if row.parked else f'{row.distance_m:.2f} m from the goal'}, "
@@ -55,8 +55,8 @@ def progress_hooks() -> carlab.LearnHooks:
     return hooks
 
 
-def tell(report: carlab.DiagnosisReport, nominal: CarFile) -> None:
-    """Print what was concealed beside what was found."""
+def print_comparison(report: carlab.DiagnosisReport, nominal: CarFile) -> None:
+    """Print the concealed parameters and their estimates."""
     print(f"\n{report}\n")
     found = report.parameters | {
         f"effects.{effect.id}.{name}": estimate
@@ -66,10 +66,10 @@ def tell(report: carlab.DiagnosisReport, nominal: CarFile) -> None:
     print(f"{'':36}{'car file':>10}{'concealed':>11}{'found':>9}   90 % interval")
     for name, value in CONCEALED.items():
         known = nominal.simulator.values().get(name)
-        said = "none" if known is None else f"{known:.3g}"
+        nominal_value = "none" if known is None else f"{known:.3g}"
         e = found.get(name)
-        ours = "not found" if e is None else f"{e.value:9.3g}   {e.low90:.3g} to {e.high90:.3g}"
-        print(f"{f'{name} [{UNITS[name]}]':36}{said:>10}{value:>11.3g}{ours}")
+        estimate_text = "not found" if e is None else f"{e.value:9.3g}   {e.low90:.3g} to {e.high90:.3g}"
+        print(f"{f'{name} [{UNITS[name]}]':36}{nominal_value:>10}{value:>11.3g}{estimate_text}")
     for effect in report.effects.values():
         if effect.indistinguishable_from:
             print(f"These recordings do not separate {effect.id} from {', '.join(effect.indistinguishable_from)}.")
@@ -81,7 +81,7 @@ def tell(report: carlab.DiagnosisReport, nominal: CarFile) -> None:
 
 
 def main() -> None:
-    """Learn, drive, diagnose, and say where everything is."""
+    """Learn, drive, diagnose, and print the paths of the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--car", default="emulated", choices=("sim", "emulated", "emulated-can"))
     parser.add_argument("--updates", type=int, default=12000, help="gradient steps of the policy before an episode")
@@ -98,7 +98,7 @@ def main() -> None:
         hooks=progress_hooks(),
     )  # fmt: skip
     if not learned.is_complete:
-        raise SystemExit(f"The run ended early; go on with carlab learn --resume {learned.folder}")
+        raise SystemExit(f"The run ended early; resume it with carlab learn --resume {learned.folder}")
     print("Recording two drives with steps of steering and throttle, 20 s each; the second is held out")
     drive = carlab.drive(
         options.car, reality=reality, policy=Excitation(), task=HALL, episodes=2, out=options.out, name="excitation"
@@ -113,7 +113,7 @@ def main() -> None:
         effects=options.effects,
         out=learned.folder / "diagnosis",
     )
-    tell(report, nominal)
+    print_comparison(report, nominal)
     print(f"\nReport      {learned.folder}/diagnosis/report.html, .json; model.toml is the corrected car file")
     print(f"Recordings  {learned.folder}/episodes, {drive.folder}/episodes (carlab view FILE.mcap)")
     print(f"Pictures    {learned.picture}, {drive.picture}, {learned.folder}/diagnosis/summary.png")

@@ -1,7 +1,7 @@
-"""Diagnose a CSV: what does the car file leave out of this drive? Takes one or two minutes.
+"""Diagnose a CSV: which effects in this drive does the car file not model? Takes one or two minutes.
 
-``python examples/diagnose_csv.py drive.csv --car my_car.toml`` diagnoses a file of yours. Without a file the script
-makes one: a simulated car whose servo lags by 90 ms, which its car file does not state.
+``python examples/diagnose_csv.py drive.csv --car my_car.toml`` diagnoses your file. Without a file the script records
+one: a simulated car whose servo lags by 90 ms, which its car file does not state.
 """
 
 import argparse
@@ -36,8 +36,8 @@ def example_csv(folder: Path) -> Path:
 def main() -> None:
     """Load, predict, diagnose, save."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("csv", nargs="?", type=Path, help="the drive; one is made where none is given")
-    parser.add_argument("--car", default="sim", help="car file, or the name of a car that comes with carlab")
+    parser.add_argument("csv", nargs="?", type=Path, help="the drive; by default one is recorded")
+    parser.add_argument("--car", default="sim", help="car file, or the name of a preset")
     parser.add_argument("--effects", nargs="*", default=(), help="try only these effects, which is faster")
     parser.add_argument("--out", type=Path, default=Path("runs"))
     options = parser.parse_args()
@@ -49,7 +49,7 @@ def main() -> None:
     report = carlab.diagnose(recording, car, effects=options.effects)
     print(report)
     print(f"Report in {report.save(options.out / 'diagnosis') / 'report.html'}")
-    print(f"Errors of the model found:\n{carlab.predict(recording, report.model)}")
+    print(f"Errors of the diagnosed model:\n{carlab.predict(recording, report.model)}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from carlab.core.policy import PolicyInput
 
 
 class ConstantSpeed:
-    """Holds a speed with the throttle while the steering stays where it is."""
+    """Controls the speed with the throttle at constant steering (a PI controller)."""
 
     name = "constant_speed"
 
@@ -30,7 +30,7 @@ class ConstantSpeed:
 
 
 def main() -> None:
-    """Drive one episode and print how fast the car was at its end."""
+    """Drive one episode and print the final speed of the car."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--car", default="sim")
     parser.add_argument("--out", default="runs")

@@ -1,7 +1,7 @@
-"""Train a policy of your own settings in the learned car, then drive it. Takes three minutes; ``--updates 200`` one.
+"""Train a policy with your settings in the learned car, then drive it. Takes three minutes; ``--updates 200`` one.
 
-``carlab.learn`` keeps the car as it was learned before each episode in the run's folder. ``ModelEnv`` runs many copies
-of it as an environment of Stable-Baselines3; here a SAC agent with wider layers is trained in it.
+``carlab.learn`` saves the learned car of each episode in the run's folder. ``ModelEnv`` simulates copies of it as an
+environment of Stable-Baselines3; this example trains a SAC agent with wider layers in it.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from learning.world.model_env import ModelEnv
 
 
 def main() -> None:
-    """Learn the car from one episode, train in it, and drive."""
+    """Fit the car to one episode, train a policy in the learned car, and drive."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--updates", type=int, default=20000, help="gradient steps of each policy")
     parser.add_argument("--model-steps", type=int, default=None, help="optimiser steps of the learned car")

@@ -1,7 +1,7 @@
 """Write a task: drive 1 m forwards and stop there. Takes two seconds.
 
-A task says where the car starts, what a transition is worth, when the task ends and in which arena it takes place.
-Reward and end are written for arrays (NumPy or torch), so that learned and simulated cars use the same functions.
+A task defines start pose, reward, termination and arena. Reward and termination take arrays (NumPy or torch), so that
+learned and simulated cars use the same functions.
 """
 
 import argparse
@@ -57,7 +57,7 @@ class Brake:
 
 
 def main() -> None:
-    """Drive the task once and print how it ended."""
+    """Drive the task once and print the end reason."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", default="runs")
     run = carlab.drive("sim", policy=Brake(), task=StopAfterOneMetre(), out=parser.parse_args().out)

@@ -10,21 +10,21 @@ from carlab.benchmark.world.measurement import write_csv
 from carlab.core.errors import ConfigError
 
 EXCESS_NOISE_FLOORS = 4.0
-"""Excess of the held-out error that each effect is sized for, in noise floors: the largest of the proof."""
+"""Excess of the held-out error by each effect, in noise floors: the maximum of ``carlab prove``."""
 TRAINING_NAME, HELD_OUT_NAME, CAR_NAME = "1_training.csv", "2_held_out.csv", "car.toml"
 
 
 def record_pair(number: int, folder: Path, training_s: float, held_out_s: float) -> ConcealedPair:
-    """Write a pair's two recordings and the nominal car's file into a folder, and return the concealed effects.
+    """Write a pair's two recordings and the nominal car file to a folder; returns the concealed effects.
 
     Args:
         number: of the pair, from 1.
         folder: for the files.
-        training_s: length of the recording to learn from [s].
-        held_out_s: length of the other [s].
+        training_s: duration of the training recording [s].
+        held_out_s: duration of the held-out recording [s].
 
     Raises:
-        ConfigError: there is no such pair.
+        ConfigError: the pair does not exist.
     """
     if not 1 <= number <= len(PAIRS):
         raise ConfigError(f"There is no pair {number}; choose 1 to {len(PAIRS)}.")

@@ -16,7 +16,7 @@ from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.report import CURVE_FILE
 
 FINAL_EPISODES = 5
-"""Last episodes of a run, over which the share of parked ones is taken."""
+"""Number of last episodes of a run for the share of parked episodes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +24,10 @@ class Curve:
     """One run.
 
     Attributes:
-        method: of learning the car.
-        seed: of everything.
+        method: of the fit of the car.
+        seed: of all random numbers.
         updates: requested gradient steps of SAC before an episode.
-        episodes: its figures, in order.
+        episodes: figures of its episodes, in order.
     """
 
     method: str
@@ -46,16 +46,16 @@ class MethodFigures:
     """The runs of one method.
 
     Attributes:
-        method: which.
-        seeds: how many runs.
-        episodes: of the shortest.
-        first_parked: first episode of each run that ended parked; None where none did.
-        median_first_parked: over runs, where a run that never parked counts as infinite.
+        method: name of the method.
+        seeds: number of runs.
+        episodes: number of episodes of the shortest run.
+        first_parked: first episode of each run that ended parked; None if no episode did.
+        median_first_parked: over runs; a run that never parked counts as infinite.
         parked_at_last: share of parked episodes among the last ``FINAL_EPISODES``.
         mean_return: of each episode over the runs (E,).
         return_standard_error: of those means (E,); NaN for a single run.
-        seconds_an_episode: mean duration of learning before an episode.
-        minutes: mean duration of learning in a run.
+        seconds_an_episode: mean training duration before an episode [s].
+        minutes: mean training duration of a run [min].
     """
 
     method: str
@@ -71,7 +71,7 @@ class MethodFigures:
 
 
 def run_folder(runs: Path, method: str, seed: int) -> Path | None:
-    """The folder of an earlier run. Raises DataError where there are several."""
+    """The folder of an earlier run. Raises DataError if there are several."""
     found = sorted(p for p in runs.glob(f"*_{run_name(method, seed)}") if p.is_dir())
     if len(found) > 1:
         raise DataError(f"{runs} has {len(found)} runs named {run_name(method, seed)}; remove all but one.")
@@ -84,11 +84,11 @@ def run_name(method: str, seed: int) -> str:
 
 
 def check_run(folder: Path, options: Mapping[str, tuple[str, int | None]]) -> None:
-    """Check that a run was started with the options that are given now.
+    """Check that a run was started with the current options.
 
     Args:
         folder: of the run.
-        options: by name in the plan, the option and its value; None where it is not given.
+        options: option and value (None if not given), by the name in the plan.
 
     Raises:
         ConfigError: an option differs.
@@ -98,26 +98,26 @@ def check_run(folder: Path, options: Mapping[str, tuple[str, int | None]]) -> No
         earlier = plan.get(name)
         if earlier != value:
             started = f"without {option}" if earlier is None else f"with {option} {earlier}"
-            raise ConfigError(f"{folder} was started {started}; start this study so too, or give it another --runs.")
+            raise ConfigError(f"{folder} was started {started}; use the same option, or choose another folder --runs.")
 
 
 def _plan(folder: Path) -> dict[str, Any]:
     try:
-        found: dict[str, Any] = json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]
-        return found
+        plan: dict[str, Any] = json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]
+        return plan
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{folder} is no run of carlab learn ({error}); remove it.") from error
+        raise DataError(f"{folder} is not a run of carlab learn ({error}); remove it.") from error
 
 
 def read_curve(folder: Path) -> Curve:
-    """A run's figures. Raises DataError where the folder is no run of learning."""
+    """Read the figures of a run. Raises DataError if the folder is not a run of carlab learn."""
     plan = _plan(folder)
     try:
         rows = json.loads((folder / CURVE_FILE).read_text(encoding="utf-8"))["episodes"]
         episodes = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
         return Curve(plan["method"], int(plan["seed"]), int(plan["updates"]), tuple(episodes))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{folder} is no run of carlab learn with figures ({error}); remove it.") from error
+        raise DataError(f"{folder} is not a run of carlab learn with figures ({error}); remove it.") from error
 
 
 def _by_number(curve: Curve, name: str, count: int) -> list[float]:
@@ -127,7 +127,7 @@ def _by_number(curve: Curve, name: str, count: int) -> list[float]:
 
 
 def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
-    """One row a method, in the order in which they come."""
+    """One row per method, in the order of the curves."""
     found = []
     for method in dict.fromkeys(c.method for c in curves):
         own = [c for c in curves if c.method == method and c.episodes]
@@ -156,7 +156,7 @@ def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
 
 
 def as_json(curves: Sequence[Curve], command: str) -> dict[str, Any]:
-    """All figures and the command that made them; numbers that are not finite are null."""
+    """All figures and the command of the study; numbers that are not finite become null."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -182,7 +182,7 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
 
     Args:
         curves: of all runs.
-        path: to write to.
+        path: file to write.
     """
     import matplotlib
 
@@ -216,7 +216,7 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
                 parked.plot(at, [height] * len(at), marker, color=colour, markersize=size)
     reward.set(xlabel="episode", ylabel="return on the car (mean, standard error)")
     reward.legend(fontsize=8)
-    distance.set(xlabel="episode", ylabel="distance from the goal at the end [m]\n(median, all seeds)", ylim=(0.0, 3.0))
+    distance.set(xlabel="episode", ylabel="final distance from the goal [m]\n(median, all seeds)", ylim=(0.0, 3.0))
     parked.set(xlabel="episode", title="squares: parked")
     parked.set_yticks(ticks, labels, fontsize=7)
     for axis in (reward, distance, parked):

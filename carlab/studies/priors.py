@@ -1,8 +1,8 @@
 """Value of a better simulator as a prior: held-out likelihood against the number of rows, by prior.
 
-Four priors with the same rows, seeds, discrepancy, particles and measurement points: none (a zero mean), the car's file
-with wheels that do not slip, the car's file, and the diagnosed simulator with its effects. Every simulator uses the
-velocity delay that is estimated from the rows and the time at which drifting effects are evaluated.
+Four priors with the same rows, seeds, discrepancy, particles and measurement points: none (a zero mean), kinematic (the
+car file without wheel slip), nominal (the car file), and the diagnosed simulator with its effects. All simulators have
+the same velocity delay, estimated from the rows, and the same time for the evaluation of time-dependent effects.
 """
 
 from __future__ import annotations
@@ -37,29 +37,29 @@ class InDomain:
 
     @property
     def size(self) -> int:
-        """Of the simulator."""
+        """Number of parameters of the simulator."""
         return self.model.size
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """Of the domain."""
+        """Inputs of the domain."""
         return self.domain.inputs(count, generator)
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """Of the simulator."""
+        """Parameters of the simulator."""
         return self.model.parameters(normal)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """The simulator's."""
+        """Outputs of the simulator."""
         return self.model(inputs, parameters)
 
 
 def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorConfig) -> dict[str, DomainModel | None]:
-    """The four priors by name; None is no simulator.
+    """The four priors by name; None is a prior without simulator.
 
     Args:
-        case: recordings, with the history that was found.
-        car: simulator of the car's file.
-        diagnosed: simulator diagnosed from the recordings that are not held out, with its standard deviations.
+        case: recordings, with their history.
+        car: simulator of the car file.
+        diagnosed: simulator diagnosed from all recordings but the held-out one, with its standard deviations.
 
     Raises:
         ConfigError: the diagnosed car has another control period than the rows.
@@ -98,17 +98,17 @@ def run_prior_study(
     device: str = "cpu",
     progress: Progress = lambda what, done, total: None,
 ) -> Iterator[Score]:
-    """Fit under every prior to every number of rows with every seed; yield each score with the prior as its method.
+    """Fit with every prior, number of rows and seed; yield each score with the prior's name as its method.
 
-    A fit that fails gives a score with the reason, and the study goes on.
+    The score of a failed fit has the reason; the study continues.
 
     Args:
         case: the recordings.
-        priors: by name, as of ``prior_models``.
-        rows: numbers of rows; those of the case unless given.
-        seeds: how many; rows and fit have the same one.
-        steps: of the particles' optimiser; the method's unless given.
-        device: where models are fitted and judged.
+        priors: by name, from ``prior_models``.
+        rows: numbers of rows; by default those of the case.
+        seeds: number of seeds; rows and fit have the same seed.
+        steps: of the particles' optimiser; by default those of the method.
+        device: of fits and predictions.
         progress: called before each fit and at the end.
 
     Raises:
@@ -117,15 +117,15 @@ def run_prior_study(
     assert case.rows is not None
     counts = tuple(rows) or case.counts
     if max(counts) > len(case.rows):
-        raise DataError(f"The recordings have {len(case.rows)} rows, not {max(counts)}; ask for fewer with --rows.")
+        raise DataError(f"The recordings have {len(case.rows)} rows, not {max(counts)}; give fewer with --rows.")
     domain = priors.get(NOMINAL) or case.prior
     plan = list(itertools.product(counts, range(seeds), priors))
     for done, (count, seed, name) in enumerate(plan):
         progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
         data = case.recorded(Path(), count, seed).to(device)
         prior = priors[name]
-        own = replace(case, prior=domain if prior is None else prior)
-        score = scored(own, data, count, seed, "FSVGD" if prior is None else "Sim-FSVGD", steps=steps)
+        prior_case = replace(case, prior=domain if prior is None else prior)
+        score = scored(prior_case, data, count, seed, "FSVGD" if prior is None else "Sim-FSVGD", steps=steps)
         yield replace(score, method=name)
     progress("", len(plan), len(plan))
 

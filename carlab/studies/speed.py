@@ -1,4 +1,4 @@
-"""How fast the parts are, as ratios taken in one run: what ``carlab bench speed`` prints and writes."""
+"""Speed of the components, as ratios within one run: the figures of ``carlab bench speed``."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ def measure_speed(
 ) -> dict[str, Any]:
     """Measure the simulator, gradients, learning, NatNet decoding and the command sender.
 
-    Everything but the sender runs on one core with one thread. The sender is measured on all cores and, pinned with
-    everything else, on one.
+    All measurements except the sender's run on one core with one thread. The sender is measured twice: with all
+    processes on one core, and on all cores.
 
     Args:
-        seconds: length of each condition of the sender's measurement [s].
-        device: of particles and SAC; everything else is the CPU's.
-        note: called with what is being measured.
+        seconds: duration of each condition of the sender's measurement [s].
+        device: of particles and SAC; all other measurements use the CPU.
+        note: called with the name of each measurement.
 
     Returns:
-        Figures by part and name; the names say the unit.
+        Figures by part and name; the names end in the unit.
     """
     from drivers.speed import sender_lateness
     from learning.devices import device_name
@@ -37,7 +37,7 @@ def measure_speed(
     where = "one core" if device == "cpu" else device
     try:
         _pin(one)
-        with SingleTorchThread():  # Two threads that wait for each other on one core take a hundred times as long.
+        with SingleTorchThread():  # Two threads that synchronise on one core are a hundred times slower.
             note("simulation against a plain loop, one core")
             figures["simulation"] = simulation_speed()
             note("gradient of a rollout against central differences, one core")

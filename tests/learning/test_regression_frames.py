@@ -92,5 +92,5 @@ def test_too_little_is_said() -> None:
     with pytest.raises(DataError, match="give --history"):
         recorded_case([[drives(0, 40)], [drives(1)]], Path("rc_car"), None)
     case = recorded_case([[drives(0)], [drives(1)]], Path("rc_car"), 3)
-    with pytest.raises(DataError, match="ask for fewer"):
+    with pytest.raises(DataError, match="give fewer"):
         case.recorded(Path(), 4000, 0)

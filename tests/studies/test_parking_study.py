@@ -102,6 +102,6 @@ def test_a_run_is_found_by_its_name(runs: list[Path], tmp_path: Path) -> None:
         run_folder(tmp_path, "sim-fsvgd", 1)
 
 
-def test_a_folder_without_figures_is_told(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no run of carlab learn"):
+def test_read_curve_refuses_a_folder_without_figures(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not a run of carlab learn"):
         read_curve(tmp_path)

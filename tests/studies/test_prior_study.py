@@ -264,7 +264,7 @@ def test_knowing_the_effects_helps_where_there_is_little_data() -> None:
 def test_what_does_not_fit_is_said() -> None:
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
-    with pytest.raises(DataError, match="not 5000; ask for fewer with --rows"):
+    with pytest.raises(DataError, match="not 5000; give fewer with --rows"):
         next(run_prior_study(case, models, rows=(5000,)))
     slow = replace(KNOWN, control_period_s=0.05)
     with pytest.raises(ConfigError, match=r"control_period of 0\.05 s, the car's file one of 0\.03333 s"):

@@ -1,4 +1,4 @@
-"""Clocks that are made anew: from distance over speed, and from the even beat of a camera."""
+"""Reconstructed clocks: from distance over speed, and from the constant frame rate of a camera."""
 
 from __future__ import annotations
 
@@ -14,46 +14,46 @@ from carlab.recording.audit.report import Finding, Severity
 from carlab.recording.faults.robust import robust_std
 from carlab.recording.faults.stamps import gap_rows
 
-_LEAST_ROWS = 200
-_BEAT_ROWS = 51
+_MIN_ROWS = 200
+_MEDIAN_FILTER_ROWS = 51
 
 
 def rebuilt_clock(channels: Channels) -> tuple[FloatArray, str]:
-    """Stamps (N,) from distance over speed; slower than 0.3 m/s, the median of those periods. And a note on it."""
+    """Stamps (N,) [s] from distance over speed (below 0.3 m/s the median period), and a note about them."""
     if "vx" not in channels.values or "vy" not in channels.values:
-        raise DataError("The clock can be rebuilt only where vx and vy columns are given; use --clock column.")
+        raise DataError("The clock cannot be rebuilt without vx and vy columns; use --clock column.")
     periods = channels.periods_s()
     median = float(np.nanmedian(periods)) if np.isfinite(periods).any() else float("nan")
-    # Beyond half to three times the median, the speed is at fault (an impact, a stale row), not the clock.
-    trusted = (periods > 0.5 * median) & (periods < 3 * median)
-    if trusted.sum() < 100:
+    # Periods outside 0.5 to 3 medians are due to wrong speeds (an impact, a stale row), not to the clock.
+    plausible = (periods > 0.5 * median) & (periods < 3 * median)
+    if plausible.sum() < 100:
         raise DataError("The car hardly moves: the clock cannot be rebuilt by distance over speed; use --clock column.")
     broken = np.diff(channels.segment) != 0
-    steps = np.where(trusted, periods, np.where(broken, np.diff(channels.t_s), median))
-    note = f"rebuilt from distance over speed for {int(trusted.sum())} of {len(steps)} periods, median elsewhere"
+    steps = np.where(plausible, periods, np.where(broken, np.diff(channels.t_s), median))
+    note = f"rebuilt from distance over speed for {int(plausible.sum())} of {len(steps)} periods, median elsewhere"
     return np.concatenate([[0.0], np.cumsum(steps)]), note
 
 
 def even_clock(t_s: FloatArray) -> tuple[FloatArray, list[Finding]]:
-    """Stamps of frames of a source of constant rate, from the stamps of their arrival (N,), which jitter.
+    """Frame times of a source with constant rate, from arrival stamps (N,) [s] with jitter.
 
-    A straight line through each stretch without a gap; a lasting step of the stamps by whole periods is a lost frame
-    and stays. Stretches of less than 200 rows keep their stamps.
+    The times are a straight line through each part without a gap. A permanent step by an integer number of periods is a
+    lost frame and remains. Parts of less than ``_MIN_ROWS`` rows keep their stamps.
     """
     even = t_s.copy()
     edges = [0, *gap_rows(t_s).tolist(), len(t_s)]
     moved = 0
     for first, last in pairwise(edges):
-        if last - first < _LEAST_ROWS:
+        if last - first < _MIN_ROWS:
             continue
         stamps = t_s[first:last]
         frame = np.arange(last - first, dtype=np.float64)
-        span = min(500, (last - first) // 4)  # most such spans have lost no frame, so their median has not either
+        span = min(500, (last - first) // 4)  # Most spans have no lost frame; the median is that of a span without.
         period, start = float(np.median(stamps[span:] - stamps[:-span])) / span, stamps[0]
         for _ in range(8):
-            late = median_filter(stamps - (start + period * frame), _BEAT_ROWS, mode="nearest")
+            late = median_filter(stamps - (start + period * frame), _MEDIAN_FILTER_ROWS, mode="nearest")
             step = np.round((late - late.min()) / period)
-            step = np.minimum.accumulate(step[::-1])[::-1]  # what does not last was only late
+            step = np.minimum.accumulate(step[::-1])[::-1]  # A temporary step is a late arrival, not a lost frame.
             frame += step
             period, start = np.polyfit(frame, stamps, 1)
             if not step.any():

@@ -1,8 +1,8 @@
-"""An episode as CSV or Parquet, for other people's programs.
+"""Export of an episode as CSV or Parquet, for other programs.
 
 Columns: ``t,x,y,yaw,vx,vy,yaw_rate,steering,throttle`` in s, m, rad, m/s, rad/s (velocities in the body frame) and
-commands in [-1, 1] as they were sent at that row's time and held until the next; then every extra column. The last
-row repeats the last command: nothing was sent after it.
+commands in [-1, 1], sent at the row's time and held until the next row; then every extra column. The last row repeats
+the last command, because no command follows it.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _UNIT_SUFFIXES = {"_s": "s", "_m": "m", "_rad": "rad", "_mps": "m/s", "_radps": 
 
 
 def table_of(episode: EpisodeData) -> dict[str, FloatArray]:
-    """Columns by name, each (T + 1,); an extra one named like a standard one gets ``extra_`` before its name."""
+    """Columns by name, each (T + 1,); an extra column with the name of a standard one has the prefix ``extra_``."""
     commands = np.vstack([episode.sent, episode.sent[-1:]]) if episode.ticks else np.full((1, 2), np.nan)
     columns: dict[str, FloatArray] = {"t": episode.times_s}
     columns |= {name: episode.states[:, k] for k, name in enumerate(STATE_NAMES)}
     columns |= {name: commands[:, k] for k, name in enumerate(ACTION_NAMES)}
     if episode.ticks and not np.array_equal(episode.requested, episode.sent, equal_nan=True):
-        asked = np.vstack([episode.requested, episode.requested[-1:]])
-        columns |= {f"requested_{name}": asked[:, k] for k, name in enumerate(ACTION_NAMES)}
+        requested = np.vstack([episode.requested, episode.requested[-1:]])
+        columns |= {f"requested_{name}": requested[:, k] for k, name in enumerate(ACTION_NAMES)}
     if not np.isnan(episode.rewards).all():
         columns["reward"] = np.append(episode.rewards, np.nan)
     for name, values in episode.extra.items():
@@ -44,7 +44,7 @@ def table_of(episode: EpisodeData) -> dict[str, FloatArray]:
 
 
 def unit_of(column: str) -> str:
-    """Unit of a column by its name; empty where nobody knows."""
+    """Unit of a column by its name; empty if unknown."""
     if column in COLUMN_UNITS:
         return COLUMN_UNITS[column]
     if column.removeprefix("requested_") in ACTION_NAMES or column == "reward":
@@ -53,9 +53,9 @@ def unit_of(column: str) -> str:
 
 
 def write_csv(episode: EpisodeData, path: Path | str) -> None:
-    """Write an episode as CSV, with numbers that read back exactly; empty cells for NaN. Overwrites.
+    """Write an episode as CSV with round-trip precision and empty cells for NaN, replacing an existing file.
 
-    A name that ends in ``.gz`` makes a compressed file, the same bytes for the same episode.
+    A name that ends in ``.gz`` gives a compressed file, with the same bytes for the same episode.
 
     Raises:
         DataError: The file cannot be written.
@@ -77,7 +77,7 @@ def write_csv(episode: EpisodeData, path: Path | str) -> None:
 @contextlib.contextmanager
 def _text_file(path: Path) -> Iterator[TextIO]:
     if path.suffix == ".gz":
-        # No time of day and no name inside: equal episodes give equal files.
+        # Without time and name in the gzip header, equal episodes give equal files.
         with (
             partial_path(path).open("wb") as file,
             gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as packed,

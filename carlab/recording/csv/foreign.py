@@ -1,4 +1,4 @@
-"""Foreign CSV to EpisodeData: converts what the mapping declares, audits the rest, refuses what cannot be meant."""
+"""Import of a foreign CSV: converts units, signs and axes of the mapping, and audits the columns."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
 
 @dataclass(frozen=True, slots=True)
 class ImportedRecording:
-    """What came of a file: one episode, or several where it was split, and everything found out about it.
+    """An imported file: one episode, or several if it was split, with the audit report.
 
-    ``announcement`` says in one sentence which layout was recognised or declared and what was converted.
+    ``announcement`` is a sentence about the recognised or declared layout and the conversions.
     """
 
     episodes: tuple[EpisodeData, ...]
@@ -44,7 +44,7 @@ class ImportedRecording:
 
     @property
     def episode(self) -> EpisodeData:
-        """The episode of a recording that was not split. Raises DataError where there are several."""
+        """The episode of a recording that was not split. Raises DataError if there are several."""
         if len(self.episodes) != 1:
             raise DataError(f"{self.report.source} was split into {len(self.episodes)} episodes; choose one of them.")
         return self.episodes[0]
@@ -53,12 +53,12 @@ class ImportedRecording:
 def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
     """Import a .csv or .csv.gz. Without ``mapping`` the layout is recognised by its header.
 
-    Commands are taken as issued at their row's time and held until the next row, so N rows become N - 1 commands and N
-    states: the last row's command is left out. Times count from the first row. Native row rate is kept.
+    Commands are sent at their row's time and held until the next row, so N rows become N states and N - 1 commands; the
+    last row's command is dropped. Times start at the first row. The row rate is unchanged.
 
-    Raises DataError, in one sentence with the remedy, for what cannot be imported as declared: a file that is not a
-    CSV, a missing column, a cell that is not a number, time that does not increase, gaps, units that plainly are not
-    SI and not declared, commands beyond [-1, 1]. All else that looks wrong is imported as it is and reported.
+    Raises:
+        DataError: the file is not a CSV, a column is missing, a cell is not a number, time does not increase or has
+            gaps, undeclared units are evidently not SI, or commands exceed [-1, 1]. Other findings are only reported.
     """
     table = read_csv(path)
     source = table.path.name
@@ -99,7 +99,7 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
 
 
 def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMapping, str]:
-    """The mapping to read the table with, and how it was chosen. Raises DataError where columns are missing."""
+    """The mapping of the table, and how it was chosen. Raises DataError if columns are missing."""
     source = table.path.name
     if mapping is None:
         mapping = recognise_layout(table.header, source)
@@ -115,7 +115,7 @@ def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMappi
 def _usable_rows(
     table: CsvTable, mapping: ColumnMapping
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], list[Finding]]:
-    """Channels and other columns on the rows with a number in each channel and a stamp that increases."""
+    """Channels and other columns in rows with a number in each channel and an increasing stamp."""
     source = table.path.name
     findings = _text_columns(table, mapping)
     values, extra = _declared(table, mapping)
@@ -134,7 +134,7 @@ def _usable_rows(
 
 
 def _declared(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Channels in SI by units, signs, axes and offset as declared, and all other columns of numbers."""
+    """Channels in SI by the declared units, signs, axes and offset, and all other numeric columns."""
     values: dict[str, FloatArray] = {}
     if mapping.rate_hz is not None:
         values["t"] = np.arange(table.rows) / mapping.rate_hz
@@ -184,7 +184,7 @@ def _segmented(
 
 
 def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tuple[FloatArray, dict[str, str]]:
-    """States (N, 6) with body velocities, and notes on how they came about."""
+    """States (N, 6) with body velocities, and notes about their sources."""
     t_s, values, motion = channels.t_s, channels.values, channels.motion
     if motion is None:
         return _dead_reckoned(t_s, values["vx"], values["yaw_rate"]), {
@@ -259,7 +259,7 @@ def _episodes(
 def _commands(
     t_s: FloatArray, channels: Channels, mapping: ColumnMapping
 ) -> tuple[FloatArray, FloatArray, list[Finding]]:
-    """Commands (N, 2) as requested and as sent, and what was done to them."""
+    """Requested and sent commands (N, 2), and findings about their conversion."""
     requested = np.column_stack([channels.values["steering"], channels.values["throttle"]])
     sent = requested.copy()
     if mapping.throttle_gate:
@@ -283,7 +283,7 @@ def _commands(
 
 
 def _parts(segment: FloatArray, mapping: ColumnMapping) -> tuple[list[slice], list[Finding]]:
-    """Rows of each episode: all, or the stretches of ``segment`` (N,) where the mapping splits at gaps."""
+    """Rows of each episode: all rows, or the parts of ``segment`` (N,) if the mapping splits at gaps."""
     numbers = np.unique(segment)
     if mapping.gaps != "split" or len(numbers) == 1:
         return [slice(0, len(segment))], []
@@ -292,7 +292,7 @@ def _parts(segment: FloatArray, mapping: ColumnMapping) -> tuple[list[slice], li
     parts = [part for part in stretches if part.stop - part.start >= 2]
     short = [part for part in stretches if part.stop - part.start < 2]
     if not parts:
-        raise DataError("No two rows belong together: every row is a gap or a jump away from the next.")
+        raise DataError("No two consecutive rows are without a gap or jump between them; check the time column.")
     if not short:
         return parts, []
     finding = Finding(

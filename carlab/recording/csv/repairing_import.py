@@ -1,4 +1,4 @@
-"""Import of a foreign CSV for those who would rather have it mended than refused: acts on the audit's own options."""
+"""Import of a foreign CSV with automatic repair: applies the options that the audit proposes."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from carlab.recording.csv.foreign import ImportedRecording, import_csv
 from carlab.recording.csv.table import read_csv
 
 _CHANNELS = ("x", "y", "yaw", "vx", "vy", "yaw_rate")
-_KEPT = {"gaps": "keep", "missing": "drop", "stamps": "drop"}
-_MOST_ROUNDS = 6
+_REPAIRS = {"gaps": "keep", "missing": "drop", "stamps": "drop"}
+_MAX_ITERATIONS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class MendedImport:
-    """What came of a file, and the findings that would have refused it and were acted upon."""
+    """The imported recording, and the repaired findings that would have prevented the import."""
 
     imported: ImportedRecording
     mended: tuple[Finding, ...]
 
 
 def import_mended(path: Path | str, *, mapping: ColumnMapping | None = None) -> MendedImport:
-    """Import a CSV; what would refuse it is mended where the audit knows how.
+    """Import a CSV; errors for which the audit proposes an option are repaired.
 
-    Mended are units of pose and velocities, rows with a missing value or a stamp that does not increase (left out),
-    and gaps in time (kept; ``segment`` in ``extra`` numbers the stretches).
+    Repairs: units of pose and velocities are declared, rows with a missing value or a stamp that does not increase are
+    dropped, gaps in time are kept (``segment`` in ``extra`` numbers the parts between them).
 
     Raises:
-        DataError: the file cannot be read, or something else is wrong with it.
+        DataError: the file cannot be read, or has an error without such a repair.
     """
     mended: list[Finding] = []
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ITERATIONS):
         try:
             return MendedImport(import_csv(path, mapping=mapping), tuple(mended))
         except RefusedError as refused:
@@ -48,11 +48,11 @@ def import_mended(path: Path | str, *, mapping: ColumnMapping | None = None) -> 
                     raise
                 mapping = changed
                 mended.append(finding)
-    raise DataError(f"{path} has more faults than can be mended one after another; import it with carlab import.")
+    raise DataError(f"{path} has too many faults for the automatic repair; import it with carlab import.")
 
 
 def _with_option(mapping: ColumnMapping, option: str) -> ColumnMapping | None:
-    """The mapping with an option as the audit writes it, ``--yaw-unit deg``; None where it is not safe to act on."""
+    """The mapping with an option of the audit (``--yaw-unit deg``); None if automatic use of the option is unsafe."""
     words = shlex.split(option)
     columns: dict[str, dict[str, Any]] = {}
     options: dict[str, Any] = {}
@@ -61,8 +61,8 @@ def _with_option(mapping: ColumnMapping, option: str) -> ColumnMapping | None:
         channel, _, part = name.rpartition("_")
         if part == "unit" and channel in _CHANNELS:
             columns[channel] = {"unit": value}
-        elif name in _KEPT:
-            options[name] = _KEPT[name]
+        elif name in _REPAIRS:
+            options[name] = _REPAIRS[name]
         else:
             return None
     return mapping.with_options(columns=columns, **options)

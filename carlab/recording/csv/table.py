@@ -19,9 +19,9 @@ _MISSING = frozenset({"", "none", "null", "na", "n/a"})
 
 @dataclass(frozen=True, slots=True)
 class CsvTable:
-    """Columns of numbers by name, each (N,), NaN where a cell is empty. Row k of the arrays is data row k + 1.
+    """Numeric columns by name, each (N,), with NaN for empty cells. Row k of the arrays is data row k + 1.
 
-    ``texts`` holds, of each column with cells that are not numbers, the first of them; ``columns`` has the others.
+    ``texts`` holds row and content of the first cell that is not a number, for each column with such a cell.
     """
 
     path: Path
@@ -35,7 +35,7 @@ class CsvTable:
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
     def column(self, name: str) -> FloatArray:
-        """Return a column of numbers, shape (N,). Raises DataError where it holds text."""
+        """Return a numeric column (N,). Raises DataError if it holds text."""
         if name in self.texts:
             row, cell = self.texts[name]
             raise DataError(
@@ -48,8 +48,8 @@ class CsvTable:
 def read_csv(path: Path | str) -> CsvTable:
     """Read a comma- or semicolon-separated file with one header line; ``.gz`` is decompressed.
 
-    Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Raises DataError for a file that is not there, is
-    empty, is cut short, is not text, or has a row of another length than its header.
+    Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Raises DataError if the file is missing, empty,
+    truncated or not text, or has a row of another length than its header.
     """
     path = Path(path)
     text = _read_text(path)

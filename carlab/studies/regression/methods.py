@@ -1,4 +1,4 @@
-"""Methods of the regression study: how each one is fitted to the rows of a case.
+"""Methods of the regression study and their fits to the rows of a case.
 
 Particles are fitted in one of two ways. ``ours`` distils the posterior over functions (``learning.posterior``;
 Sim-FSVGD around a simulator, FSVGD and the residual of GreyBox around zero). ``authors`` is functional SVGD as
@@ -34,9 +34,9 @@ Way = Literal["ours", "authors"]
 PRIOR_FUNCTION = 1.0
 """Prior size of a function without a simulator, in units of the outputs."""
 MIN_DISCREPANCY = 0.03
-"""Prior size of GreyBox's residual where the simulator is taken as exact, in units of the outputs."""
+"""Prior size of GreyBox's residual for a case without discrepancy, in units of the outputs."""
 HIDDEN, STEPS = (64, 64), 12_000
-"""Of particles (docs/decisions/0014)."""
+"""Hidden layers and optimiser steps of particles (docs/decisions/0014)."""
 POOL_POINTS = 1024
 PRIOR_DRAWS = 2048
 NOISE_ROWS = 2.0
@@ -72,7 +72,7 @@ class _Linear:
 
 @dataclass(frozen=True, slots=True)
 class FitTask:
-    """One fit: a case, its rows, a seed, the way and the number of optimiser steps (the way's own where None)."""
+    """One fit: a case, its rows, a seed, the way and the number of optimiser steps (None: the way's default)."""
 
     case: Case
     data: Data
@@ -131,10 +131,10 @@ class FitTask:
         """Particles distilled from the posterior over functions.
 
         Args:
-            simulator: the simulator; a zero mean where it is None.
+            simulator: the simulator; None: a zero mean.
             outputs: raw (n, O).
-            prior_discrepancy: prior size of the discrepancy in units of the outputs; None: there is none.
-            noise_std: known noise (O,), raw; the case's prior noise unless given.
+            prior_discrepancy: prior size of the discrepancy in units of the outputs; None: no discrepancy.
+            noise_std: known noise (O,), raw; by default the case's prior noise.
         """
         case = self.case
         noise = self.noise_std if noise_std is None else torch.tensor(noise_std).to(self.noise_std)
@@ -153,7 +153,7 @@ class FitTask:
         return SmoothedParticles(distil(posterior, points, settings))
 
     def sim_fsvgd(self, *, discrepancy: bool) -> Model:
-        """Sim-FSVGD: particles with a simulator as prior."""
+        """Sim-FSVGD: particles with a simulator prior."""
         case, normaliser = self.case, self.normaliser
         if self.way == "ours":
             if discrepancy and case.prior_with_discrepancy is not None:
@@ -170,7 +170,7 @@ class FitTask:
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
     def fsvgd(self) -> Model:
-        """FSVGD: particles with a Gaussian process as prior."""
+        """FSVGD: particles with a Gaussian-process prior."""
         if self.way == "ours":
             return self.distilled(None, self.data.outputs, PRIOR_FUNCTION)
         normaliser, pool = self.normaliser, self.pool()
@@ -212,6 +212,6 @@ METHODS: dict[str, Callable[[FitTask], Model]] = {
     "ensemble": FitTask.ensemble,
     "ridge": FitTask.ridge,
 }
-"""By the name in tables and on the command line; "without gap" is without model discrepancy."""
+"""Methods by their name in tables and on the command line; "without gap" means without model discrepancy."""
 
 __all__ = ["METHODS", "STEPS", "FitTask", "Model", "SmoothedParticles", "Way"]

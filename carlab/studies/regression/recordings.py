@@ -1,4 +1,4 @@
-"""The real car as a case of the regression study: recordings to learn from, and one that is held out."""
+"""The real car as a case of the regression study: training recordings and a held-out recording."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class RecordedCase(Case):
         assert self.held_out is not None
         assert self.held_out_yaw is not None
         if count > len(self.rows):
-            raise DataError(f"The recordings have {len(self.rows)} rows, not {count}; ask for fewer with --rows.")
+            raise DataError(f"The recordings have {len(self.rows)} rows, not {count}; give fewer with --rows.")
         chosen = self.rows.take(np.random.default_rng(seed).choice(len(self.rows), count, replace=False))
         parts = (chosen.inputs, chosen.targets, self.held_out.inputs, self.held_out.targets, self.held_out_yaw)
         return Data(*(torch.from_numpy(part).float() for part in parts))
@@ -77,7 +77,7 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
         DataError: fewer than two recordings, or too short to tell the history.
     """
     if len(recordings) < 2:
-        raise DataError("The real car's study needs two recordings at least; the last one is held out.")
+        raise DataError("The study of the real car needs at least two recordings; the last one is held out.")
     simulator = load_car_file(car).simulator
     check_periods(recordings, simulator)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
@@ -85,13 +85,13 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
     if history is None:
         choice = find_history(fitted)
         if choice is None:
-            raise DataError("The recordings are too short to tell how many past commands count; give --history.")
+            raise DataError("The recordings are too short to estimate the number of past commands; give --history.")
         history, history_message = choice.history, choice.message()
     rows, held_out = (_without_spikes(transitions_of(episodes, history)) for episodes in (fitted, recordings[-1]))
     yaw = np.array([recordings[-1][e].states[t, 2] for e, t in zip(held_out.episode, held_out.tick, strict=True)])
     own = prior_simulator(simulator, "nominal")
     period_s = own.control_period_s
-    # Effects that drift over time act as in the middle of the rows.
+    # Time-dependent effects are evaluated at the mean time of the rows.
     prior = CarModel(
         own, history, {DELAY: DELAY_S, **known_ranges(own)}, at_s=float(rows.tick.mean()) * period_s,
         velocity_delay_s=velocity_delay_s(rows, period_s),
@@ -121,7 +121,7 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
 
 
 def check_periods(recordings: Sequence[Sequence[EpisodeData]], car: SimulatorConfig) -> None:
-    """Raise ConfigError where recordings were not made with the control period of the car's file."""
+    """Raise ConfigError if the control period of a recording differs from that of the car file."""
     for episode in itertools.chain.from_iterable(recordings):
         check_period(car, episode.period_s, "a recording")
 

@@ -16,16 +16,16 @@ FIGURES = ("nll", "rmse", "calibration", "seconds")
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """One method, fitted once.
+    """Scores of one fit.
 
     Attributes:
-        case, method, rows, seed: what was fitted.
+        case, method, rows, seed: identify the fit.
         nll: mean joint negative log density of all outputs [nat].
         rmse: root of the squared error summed over outputs, in mixed units.
         calibration: mean absolute difference of empirical and nominal coverage.
         seconds: duration of the fit.
         nll_in_world: negative log density of the seven outputs that the authors score, for a real car [nat].
-        failed: why there is no model; its figures are NaN then.
+        failed: reason of a failed fit, whose figures are NaN; None for a successful fit.
     """
 
     case: str
@@ -44,7 +44,7 @@ class Score:
 class Row:
     """One method at one number of rows: means over the seeds, and their standard errors.
 
-    Means are over the ``seeds`` fits that succeeded, NaN where there is none; standard errors need two.
+    Means are over the ``seeds`` successful fits, NaN without any; standard errors need at least two.
     """
 
     method: str
@@ -63,29 +63,29 @@ class Row:
 
 
 def summarised(scores: Sequence[Score]) -> list[Row]:
-    """One row for each method and number of rows, in the order in which they were fitted."""
+    """One row for each method and number of rows, in the order of the fits."""
     groups: dict[tuple[int, str], list[Score]] = {}
     for score in scores:
         groups.setdefault((score.rows, score.method), []).append(score)
     rows = []
     for (count, method), group in groups.items():
-        own = [s for s in group if s.failed is None]
+        fitted = [s for s in group if s.failed is None]
         mean, error = {}, {}
         for name in FIGURES:
-            values = np.array([getattr(s, name) for s in own])
-            mean[name] = float(values.mean()) if own else math.nan
+            values = np.array([getattr(s, name) for s in fitted])
+            mean[name] = float(values.mean()) if fitted else math.nan
             error[f"{name}_standard_error"] = (
-                float(values.std(ddof=1) / np.sqrt(len(own))) if len(own) > 1 else math.nan
+                float(values.std(ddof=1) / np.sqrt(len(fitted))) if len(fitted) > 1 else math.nan
             )
-        worlds = [s.nll_in_world for s in own if s.nll_in_world is not None]
-        in_world = float(np.mean(worlds)) if worlds else None
-        failed = len(group) - len(own)
-        rows.append(Row(method, count, len(own), nll_in_world=in_world, failed=failed, **mean, **error))
+        world_nlls = [s.nll_in_world for s in fitted if s.nll_in_world is not None]
+        in_world = float(np.mean(world_nlls)) if world_nlls else None
+        failed = len(group) - len(fitted)
+        rows.append(Row(method, count, len(fitted), nll_in_world=in_world, failed=failed, **mean, **error))
     return rows
 
 
 def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[str, object]:
-    """All scores, their summary and the command that made them; numbers that are not finite are null."""
+    """All scores, their summary and the command of the study; numbers that are not finite become null."""
 
     def plain(row: Row | Score) -> dict[str, object]:
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(row).items()}

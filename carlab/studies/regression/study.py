@@ -18,10 +18,10 @@ from learning.evaluation import Mixture, calibration_error, negative_log_likelih
 from learning.world.world_outputs import measured_seven_outputs, seven_outputs
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is fitted, how many fits are done, and how many there are."""
+"""Called with the name of the fit, the number of completed fits and the total number."""
 MIN_RIDGE_ROWS = 3
 _LINEAR_ALGEBRA = ("linalg", "lapack", "cusolver", "magma")
-"""Words in the RuntimeErrors of torch's linear algebra and of the libraries below it."""
+"""Words that identify RuntimeErrors of torch's linear algebra and its libraries."""
 
 
 def run_study(
@@ -36,24 +36,24 @@ def run_study(
     device: str = "cpu",
     progress: Progress = lambda what, done, total: None,
 ) -> Iterator[Score]:
-    """Fit every method to every number of rows with every seed; yield each score when it is there.
+    """Fit every method to every number of rows with every seed; yield each score after its fit.
 
-    A fit that fails gives a score with the reason, and the study goes on.
+    The score of a failed fit has the reason; the study continues.
 
     Args:
         case: name in ``CASES``, or a case.
-        rows: numbers of rows; those of the case unless given.
-        seeds: how many; data and fit have the same one.
-        methods: of ``METHODS``; all unless given.
-        way: how particles are fitted.
-        data: folder of the authors' arrays; the data is drawn here without it.
-        steps: of the optimiser; those of the way unless given.
+        rows: numbers of rows; by default those of the case.
+        seeds: number of seeds; data and fit have the same seed.
+        methods: names in ``METHODS``; by default all.
+        way: method of the particle fit.
+        data: folder of the authors' arrays; None: the study generates the data.
+        steps: of the optimiser; by default those of the way.
         device: of fits and predictions; random numbers are drawn on the CPU. Ridge runs in NumPy.
         progress: called before each fit and at the end.
 
     Raises:
         ConfigError: an unknown case or method, or too few rows for all methods.
-        DataError: arrays are missing or have fewer rows; before the first fit.
+        DataError: arrays are missing or have fewer rows (raised before the first fit).
     """
     if isinstance(case, str) and case not in CASES:
         raise ConfigError(f"There is no case '{case}'; choose {', '.join(CASES)}.")
@@ -68,7 +68,7 @@ def run_study(
     plan = [fit for fit in all_fits if not (fit[2] == "ridge" and fit[0] < MIN_RIDGE_ROWS)]
     if not plan:
         raise ConfigError(f"Ridge regression needs {MIN_RIDGE_ROWS} rows or more; give --rows, or other methods.")
-    # All data is read before the first fit, so that missing data ends the study at once.
+    # All data is read before the first fit, so that the study fails early if data is missing.
     drawn = {
         (count, seed): chosen.data(count, seed) if data is None else chosen.recorded(data, count, seed)
         for count, seed in itertools.product(counts, range(seeds))
@@ -100,7 +100,7 @@ def scored(
             raise
         return _failed(case, method, count, seed, reason)
     if not all(map(math.isfinite, figures)):
-        return _failed(case, method, count, seed, "What it predicts is not finite.")
+        return _failed(case, method, count, seed, "The prediction is not finite.")
     return Score(case.name, method, count, seed, *figures, seconds, in_world)
 
 
