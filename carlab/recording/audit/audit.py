@@ -1,6 +1,6 @@
-"""The audit of a recording: runs the fault detection on a file's columns and says which option corrects what.
+"""The audit of a recording: runs the fault detection on a file's columns and proposes options that correct them.
 
-Nothing is changed here. Each finding carries numbers and, where there is one, the option that acts on it.
+The audit does not change the data. Each finding has evidence and, if available, the option that acts on it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["AuditReport", "Channels", "Finding", "Severity", "audit_channels"]
 
 MIN_MOVING_ROWS, MIN_TURNING_ROWS = 50, 30
 MIN_COMMAND_RANGE = 0.05
-"""Range of a command (full command = 1) below which nothing is said about its sign."""
+"""Minimum range of a command (full command = 1) for a check of its sign."""
 EFFECTS = {"steering": "the path's curvature", "throttle": "the acceleration"}
 SIGN_REMEDIES = {
     "steering": "use --steering-sign -1",
@@ -51,10 +51,10 @@ SIGN_REMEDIES = {
 
 @dataclass(frozen=True, slots=True)
 class Channels:
-    """A recording's columns after what the mapping declares of units, signs and axes, but before any change of frame.
+    """A recording's columns after conversion of units, signs and axes by the mapping, before any change of frame.
 
-    ``values`` by channel and ``extra`` by column name are (N,); ``segment`` numbers unbroken stretches; ``motion`` is
-    None where there is no pose.
+    ``values`` by channel and ``extra`` by column name are (N,); ``segment`` numbers the parts without a gap or jump;
+    ``motion`` is None without a pose.
     """
 
     t_s: FloatArray
@@ -86,14 +86,14 @@ def audit_channels(channels: Channels, mapping: ColumnMapping) -> tuple[list[Fin
     for name, channel in mapping.references.items():
         if name in channels.extra and channel in states:
             found = file_checks.check_reference(t_s, name, channels.extra[name], channel, states[channel])
-            # Several sensors show the same frozen pose; the first finding is enough.
+            # Several sensors detect the same frozen pose; only the first finding is reported.
             known = {f.id for f in findings} & {"frozen_pose"}
             findings += [f for f in found if f.id not in known]
     return findings, spikes
 
 
 def check_heading(t_s: FloatArray, values: Mapping[str, FloatArray], mapping: ColumnMapping) -> list[Finding]:
-    """Unit, sense and axis of the pose by the course over ground. ``values`` holds x, y and yaw (N,)."""
+    """Check unit, sign and axis of the yaw by the course over ground. ``values`` holds x, y and yaw (N,)."""
     return [_finding(fault, mapping) for fault in heading_faults(t_s, values)]
 
 

@@ -1,4 +1,4 @@
-"""Checks of a file's columns by themselves: missing values, stamps, repeats, range of commands, further sensors."""
+"""Checks of individual columns of a file: missing values, stamps, repeats, range of commands, further sensors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from carlab.recording.faults.stamps import gap_rows
 from carlab.recording.pose_velocity import BoolArray, IndexArray
 
 MAX_NUMBER = 1e12
-"""Larger numbers in SI units are markers or damage, and their squares overflow soon."""
+"""Larger numbers in SI units are markers of missing values or corrupt data."""
 MAX_COMMAND = 1.05
-"""A calibration overshoots by up to 5 %; more is another unit (degrees, per cent, microseconds)."""
+"""A calibration overshoots by up to 5 %; a larger command has another unit (degrees, per cent, microseconds)."""
 
 
 def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> tuple[list[Finding], BoolArray]:
-    """Find cells that are empty, not finite or absurdly large. Returns findings and the mask of whole rows, shape (N,).
+    """Find empty, non-finite or too large cells. Returns findings and the mask of complete rows (N,).
 
     Commands of the last row are never executed, so they may be missing.
     """

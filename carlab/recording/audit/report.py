@@ -1,4 +1,4 @@
-"""What an audit of a recording says: findings with evidence, and the option that acts on each."""
+"""The report of an audit: findings with evidence, and the option that acts on each."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from carlab.recording.faults.fault import Fault
 from carlab.recording.pose_velocity import BoolArray, IndexArray
 
 MAX_ROWS = 60
-"""Row numbers that a finding lists."""
+"""Maximum number of rows that a finding lists."""
 
 
 class Severity(enum.IntEnum):
-    """How much a finding matters, in rising order."""
+    """Severity of a finding, in ascending order."""
 
     INFO = 0
-    """A property worth knowing; nothing is wrong."""
+    """A property of the recording, without a fault."""
     REPAIRED = 1
-    """A fault that the mapping declares how to repair, and that was repaired."""
+    """A fault that was repaired as declared in the mapping."""
     WARNING = 2
-    """Degrades what is learned from the recording."""
+    """A fault that degrades models fitted to the recording."""
     FAULT = 3
-    """Very likely wrong as imported; the option says what would change it."""
+    """The data are very probably wrong as imported; the option corrects them."""
     ERROR = 4
     """The recording cannot be imported as it is."""
 
@@ -35,8 +35,8 @@ class Severity(enum.IntEnum):
 class Finding:
     """One observation about a recording.
 
-    ``rows`` are the first data rows concerned (row 1 follows the header), ``count`` is how many there are; ``option``
-    is the ``carlab import`` option that acts on it.
+    ``rows`` are the first affected data rows (row 1 follows the header), ``count`` is the number of affected rows;
+    ``option`` is the ``carlab import`` option that acts on the finding.
     """
 
     id: str
@@ -59,7 +59,7 @@ class Finding:
         evidence: Mapping[str, float] | None = None,
         option: str | None = None,
     ) -> Finding:
-        """A finding about some rows: their indices (from 0), or a mask."""
+        """A finding about rows, given by indices (from 0) or a mask."""
         indices = np.flatnonzero(rows) if rows.dtype == bool else rows
         numbers = tuple(int(k) + 1 for k in indices[:MAX_ROWS])
         return cls(identity, channel, severity, sentence, len(indices), numbers, evidence or {}, option)
@@ -91,7 +91,7 @@ class AuditReport:
         return max((f.severity for f in self.findings), default=Severity.INFO)
 
     def rows(self) -> list[tuple[str, str, str, int, str, str]]:
-        """Table rows: severity, id, channel, count, sentence, option; the gravest first."""
+        """Table rows: severity, id, channel, count, sentence, option; highest severity first."""
         ordered = sorted(self.findings, key=lambda f: -f.severity)
         return [(f.severity.name.lower(), f.id, f.channel, f.count, f.sentence, f.option or "") for f in ordered]
 
