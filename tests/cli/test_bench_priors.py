@@ -105,10 +105,10 @@ def test_what_cannot_be_studied_is_said(carlab: Carlab, folder: Path, model: Pat
     (model.parent / "report.json").write_text(json.dumps({"recordings": []}))
     slow = tmp_path / "slow.toml"
     slow.write_text(tomli_w.dumps(replace(CAR, control_period_s=0.05).to_tables()))
-    assert "control_period of 0.05 s, a recording one of 0.033" in said(
+    assert "control_period of the prior is 0.05 s, that of a recording is 0.033" in said(
         "--data", folder, "--car", slow, "--diagnosed", model
     )
-    assert "control_period of 0.05 s, the car's file one of 0.033" in said(*given, slow, "--history", 3)
+    assert "prior is 0.05 s, that of the car's file is 0.033" in said(*given, slow, "--history", 3)
     (folder / "2.csv").unlink()
     code, text = carlab("bench", "priors", "--data", folder)
     assert code == 1

@@ -99,7 +99,7 @@ def test_what_diverged_is_learned_again_with_smaller_steps(
     assert "The policy diverged" in caplog.text
     broken.add("always")
     (tmp_path / "other").mkdir()
-    with pytest.raises(DivergedError, match="with smaller steps as well") as error:
+    with pytest.raises(DivergedError, match="with a smaller learning rate") as error:
         train(plan, tmp_path / "other", [], ENVELOPE, lambda *what: None)
     assert "\n" not in str(error.value)
     assert list((tmp_path / "other").iterdir()) == []

@@ -219,7 +219,7 @@ def test_a_car_file_without_ranges_is_uncertain_of_what_is_rarely_known(tmp_path
 def test_a_real_car_recorded_at_another_rate_is_told(tmp_path: Path) -> None:
     path = tmp_path / "slow.toml"
     path.write_text(tomli_w.dumps(replace(SimulatorConfig.from_preset(), control_period_s=0.05).to_tables()))
-    with pytest.raises(ConfigError, match=r"control_period of 0\.05 s, a recording one of 0\.03333 s"):
+    with pytest.raises(ConfigError, match=r"control_period of the prior is 0\.05 s, that of a recording is 0\.03333 s"):
         recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
 
 
@@ -267,7 +267,7 @@ def test_what_does_not_fit_is_said() -> None:
     with pytest.raises(DataError, match="not 5000; give fewer with --rows"):
         next(run_prior_study(case, models, rows=(5000,)))
     slow = replace(KNOWN, control_period_s=0.05)
-    with pytest.raises(ConfigError, match=r"control_period of 0\.05 s, the car's file one of 0\.03333 s"):
+    with pytest.raises(ConfigError, match=r"is 0\.05 s, that of the car's file is 0\.03333 s"):
         prior_models(case, SimulatorConfig.from_preset(), slow)
     with pytest.raises(ConfigError, match=r"a recording one of 0\.03333 s"):
         check_periods([[drive(1)]], slow)
