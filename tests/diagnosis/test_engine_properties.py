@@ -136,9 +136,10 @@ def test_uncatalogued_physics_is_described_without_a_name(tmp_path: Path, among:
     ("concealed", "taken_for", "said"),
     [
         ("locked_differential", "yaw_damping", "curvature"),
-        pytest.param("camber", "steering_offset", "front wheels", marks=pytest.mark.slow),
+        ("camber", "steering_offset", "front wheels"),
     ],
 )
+@pytest.mark.slow
 def test_rival_physics_replaces_a_spurious_effect(concealed: str, taken_for: str, said: str, tmp_path: Path) -> None:
     """Without rivals the most similar effect of the catalogue is accepted."""
     case = make_case("outside", 43, effects=(concealed,), excess=1.5, fit_s=60, hold_s=30)

@@ -308,6 +308,7 @@ class TestCorrelatedErrors:
         shape = back @ (scale[:, None] * prediction.correlation.double().numpy() * scale) @ back.T
         assert shape[0, 1] / np.sqrt(shape[0, 0] * shape[1, 1]) == pytest.approx(tied, abs=0.03)
 
+    @pytest.mark.slow
     def test_errors_that_are_independent_cost_next_to_nothing(self, monkeypatch):
         gained, _ = self.gained(monkeypatch, None, 0.0)
         assert abs(gained) < 0.03

@@ -128,6 +128,7 @@ def test_few_rows_expect_little_of_the_gap_and_of_steps_less_than_of_velocities(
         raise DataError("Enough.")
 
     monkeypatch.setattr(regression_methods, "infer", spied)
+    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 10)  # of GreyBox; its numbers do not matter
     few, many = 100, 450
     list(run_study(case, rows=(few, many), seeds=1, methods=("Sim-FSVGD", "GreyBox"), data=Path()))
     assert [a.tolist() for a in received] == [pytest.approx([0.03] * 3 + [0.1] * 3)] * 2 + [
