@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import select
 import termios
 import time
 from typing import Final
@@ -43,9 +44,7 @@ class SerialLink:
         if self._serial is not None:
             return
         try:
-            self._serial = serial.Serial(
-                self.port, self.baud, timeout=0, write_timeout=self.write_timeout_s, exclusive=True
-            )
+            self._serial = serial.Serial(self.port, self.baud, timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError
             raise NotReadyError(f"Serial port {self.port} cannot be opened", (self._reason(error),)) from error
         self.statistics.opens += 1
@@ -61,16 +60,29 @@ class SerialLink:
             if backlog > BACKLOG_LIMIT_BYTES:
                 port.reset_output_buffer()
                 self.statistics.discarded_bytes += backlog
-            port.write(data)
-        except serial.SerialTimeoutException as error:
+            is_written = self._write_all(port.fileno(), data)
+        except (OSError, termios.error) as error:
+            raise self._lost(error) from error
+        if not is_written:
             self._discard_output()
             raise ActuatorFaultError(
                 f"{self.port} accepts no more bytes; check that the device is powered, then reset the fault."
-            ) from error
-        except (OSError, termios.error) as error:
-            raise self._lost(error) from error
+            )
         self.statistics.bytes_out += len(data)
         self.statistics.writes += 1
+
+    def _write_all(self, fd: int, data: bytes) -> bool:
+        """Write ``data``; False if the port stays full for ``write_timeout_s``.
+
+        ``Serial.write`` also times out if this process was suspended although the port took every byte.
+        """
+        while data:
+            try:
+                data = data[os.write(fd, data) :]
+            except BlockingIOError:
+                if not select.select([], [fd], [], self.write_timeout_s)[1]:
+                    return False
+        return True
 
     def read(self) -> bytes:
         """Bytes that have arrived. Raises ActuatorFaultError if the port was removed."""

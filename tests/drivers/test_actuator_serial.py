@@ -28,6 +28,7 @@ from drivers.emulators.command_log import CommandLog
 from drivers.emulators.faults import WireFaults
 from drivers.emulators.serial_firmware import SerialFirmware
 from drivers.emulators.vesc_firmware import VescFirmware
+from drivers.links.serial_link import SerialLink
 from drivers.sender.logic import SenderState
 from drivers.vesc.payloads import FirmwareVersion, MotorValues, get_values, set_current
 from drivers.vesc.serial_codec import encode_frame
@@ -241,6 +242,27 @@ def test_device_that_stops_reading_is_a_fault(serial_firmware: SerialFirmware) -
         serial_firmware.faults.stops_reading = True
         until(lambda: actuator.status().state == SenderState.FAULT)
         assert "accepts no more bytes" in actuator.status().fault
+
+
+def test_a_suspended_process_is_no_fault_if_the_port_takes_the_bytes(
+    serial_firmware: SerialFirmware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process sleeps longer than the write time-out while it writes."""
+    write = os.write
+
+    def slow_write(fd: int, data: bytes) -> int:
+        time.sleep(0.06)
+        return write(fd, data)
+
+    link = SerialLink(serial_firmware.port, write_timeout_s=0.02)
+    link.open()
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "write", slow_write)
+            link.write(encode_frame(set_current(0.0)))
+    finally:
+        link.close()
+    assert link.statistics.writes == 1
 
 
 def test_garbage_lost_and_broken_frames_are_tolerated_and_counted(tmp_path: Path) -> None:
