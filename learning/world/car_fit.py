@@ -193,6 +193,8 @@ def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
             car = type(car)(posterior.to(device), car.history)
     except DataError:
         raise
+    except pickle.UnpicklingError as error:  # its own message recommends to read the file unsafely
+        raise DataError(f"{path} holds more than numbers, so it is no learned car; {remedy}.") from error
     except _READ_ERRORS as error:
         raise DataError(f"The learned car in {path} cannot be read ({_first_line(error)}); {remedy}.") from error
     if count != network.parameters:
