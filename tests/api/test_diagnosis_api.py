@@ -48,7 +48,7 @@ def test_a_csv_is_loaded_with_its_audit_and_written_in_other_formats(tmp_path: P
     assert "<p>" in recording._repr_html_()
     again = carlab.load(recording.save(tmp_path / "drive.mcap"))
     np.testing.assert_allclose(again.episode.states, recording.episode.states, atol=1e-6)
-    with pytest.raises(DataError, match="there already"):
+    with pytest.raises(DataError, match="exists already"):
         recording.save(tmp_path / "drive.mcap")
     with pytest.raises(ConfigError, match="parquet"):
         recording.save(tmp_path / "drive.xlsx")

@@ -112,4 +112,4 @@ def test_what_cannot_be_studied_is_said(carlab: Carlab, folder: Path, model: Pat
     (folder / "2.csv").unlink()
     code, text = carlab("bench", "priors", "--data", folder)
     assert code == 1
-    assert "1 recordings; the last is held out" in text
+    assert "has 1 recordings; add some (two or more are needed)" in text

@@ -66,8 +66,8 @@ def test_an_output_that_never_changes_keeps_a_share_of_the_expected_noise():
     ("changed", "said"),
     [
         ({"outputs": torch.zeros(5, 2)}, "10 rows of inputs and 5 of outputs"),
-        ({"noise_std": torch.tensor([0.1, 0.0])}, "is zero"),
-        ({"normaliser": replace(UNITS, input_std=torch.tensor([1.0, 0.0]))}, "is zero"),
+        ({"noise_std": torch.tensor([0.1, 0.0])}, "is not positive"),
+        ({"normaliser": replace(UNITS, input_std=torch.tensor([1.0, 0.0]))}, "is not positive"),
         ({"inputs": torch.full((10, 2), torch.nan)}, "missing or infinite"),
     ],
 )

@@ -65,7 +65,7 @@ def test_few_rows_keep_the_prior_scale():
 
 def test_nothing_and_numbers_that_are_missing_are_refused():
     for bad in (torch.zeros((0, 2)), torch.full((4, 2), math.nan)):
-        with pytest.raises(DataError, match="finite and of one row"):
+        with pytest.raises(DataError, match="empty or not finite"):
             fit_residuals(bad)
 
 

@@ -270,7 +270,7 @@ def test_what_does_not_fit_is_said() -> None:
     slow = replace(KNOWN, control_period_s=0.05)
     with pytest.raises(ConfigError, match=r"is 0\.05 s, that of the car's file is 0\.03333 s"):
         prior_models(case, SimulatorConfig.from_preset(), slow)
-    with pytest.raises(ConfigError, match=r"a recording one of 0\.03333 s"):
+    with pytest.raises(ConfigError, match=r"that of a recording is 0\.03333 s"):
         check_periods([[drive(1)]], slow)
     check_period(slow, 0.0501, "a recording")
     with pytest.raises(ConfigError, match="no pair 4; choose 1 to 3"):

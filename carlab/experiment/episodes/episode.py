@@ -162,8 +162,7 @@ def run_episode(
         The episode, complete or ended early; ``metadata`` has ``end_reason``, ``end_sentence`` and ``end_detail``.
 
     Raises:
-        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved.
-        Exception: any other error, after the car was stopped.
+        NotReadyError, ActuatorFaultError, PoseLostError: the car has not moved. Other errors: it was stopped.
     """
     hooks = hooks or EpisodeHooks()
     safe, rows, pacer = SafeCar(car, envelope, hooks.emit), _Rows(), Pacer(car.clock, period_s)
@@ -188,9 +187,18 @@ def run_episode(
             raise
     finally:
         _stop(safe, pacer, rows, hooks, reason, detail)
-    texts = {"car": car.name, "reality": car.reality.value, "policy": policy.name, "task": task.name, "seed": str(seed)}
-    texts |= {**(metadata or {}), "end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
-    return rows.finish(texts)
+    origin = {
+        "car": car.name,
+        "reality": car.reality.value,
+        "policy": policy.name,
+        "task": task.name,
+        "seed": str(seed),
+    }
+    return rows.finish(origin | dict(metadata or {}) | _end_texts(reason, detail))
+
+
+def _end_texts(reason: EndReason, detail: str) -> dict[str, str]:
+    return {"end_reason": reason.name, "end_sentence": reason.value, "end_detail": detail}
 
 
 def _drive(
