@@ -187,14 +187,8 @@ def run_episode(
             raise
     finally:
         _stop(safe, pacer, rows, hooks, reason, detail)
-    origin = {
-        "car": car.name,
-        "reality": car.reality.value,
-        "policy": policy.name,
-        "task": task.name,
-        "seed": str(seed),
-    }
-    return rows.finish(origin | dict(metadata or {}) | _end_texts(reason, detail))
+    origin = {"car": car.name, "reality": car.reality.value, "policy": policy.name, "task": task.name}
+    return rows.finish({**origin, "seed": str(seed), **(metadata or {}), **_end_texts(reason, detail)})
 
 
 def _end_texts(reason: EndReason, detail: str) -> dict[str, str]:
