@@ -178,6 +178,7 @@ def test_invalid_arguments_raise_errors() -> None:
         make_case("fault", 1, fault="gremlins")
 
 
+@pytest.mark.slow
 def test_the_refit_distinguishes_effects_of_commands() -> None:
     case = make_case("single", 51, effects=["steering_delay"], excess=4.0, **SHORT)
     told = (case.nominal, case.fit, case.hold, np.array(case.floor))

@@ -293,7 +293,8 @@ class TestCorrelatedErrors:
         joint, independent = (float(f.prediction(at).log_density(seen).mean()) for f in (found, apart))
         return joint - independent, found.prediction(at)
 
-    @pytest.mark.parametrize("count", [300, pytest.param(600, marks=pytest.mark.slow)])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("count", [300, 600])
     def test_held_out_rows_gain_the_mutual_information_of_the_outputs(self, monkeypatch, count):
         """Mutual information of two Gaussians, ``-log(1 - r^2) / 2``, less what the function's uncertainty hides.
 
