@@ -146,7 +146,7 @@ def test_the_plan_is_resumed_again(story: Story, tmp_path: Path) -> None:
     for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}', *wrong_plans):
         if content is not None:
             (other.path / "campaign.json").write_text(content)
-        with pytest.raises(DataError, match="no run of carlab learn"):
+        with pytest.raises(DataError, match="cannot be resumed"):
             resumed_campaign(other, choose_car("sim"), CampaignHooks())
 
 

@@ -239,7 +239,7 @@ class BlindCar(FusedCar):
     [
         ({}, "not seen yet"),
         ({"tracked": False}, "does not see the car"),
-        ({"velocity_valid": False}, "too rarely to know the car's speed"),
+        ({"velocity_valid": False}, "frame rate of motion capture is too low"),
     ],
 )
 def test_the_first_pose_is_waited_for_with_a_beating_heart(what: dict[str, Any], sentence: str) -> None:
