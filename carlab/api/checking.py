@@ -61,7 +61,7 @@ def check(
     Args:
         car: as for ``carlab.drive``.
         seconds: duration of the motion-capture measurement [s].
-        wheels: on an emulated car, also steer at rest to measure the latency of a command; a real car never moves.
+        wheels: on an emulated car, also steer at rest to measure the latency of a command; a real car does not move.
         vehicle: as for ``carlab.drive``.
         reality: as for ``carlab.drive``.
         dry_run: as for ``carlab.drive``.

@@ -27,7 +27,7 @@ class Check:
     """Duration of the motion-capture measurement [s]."""
 
     wheels: bool = True
-    """On an emulated car, also steer at rest to measure the latency of a command; a real car never moves."""
+    """On an emulated car, also steer at rest to measure the latency of a command; a real car does not move."""
 
     verbose: bool = False
     """Show the whole log."""

@@ -18,7 +18,7 @@ class EndReason(enum.Enum):
     OVERSPEED = "The car was faster than its speed limit; lower the throttle or raise max_speed."
     POSE_STALE = "Motion capture sends no poses; check the camera software, the network and that the body is visible."
     POSE_JUMP = "The pose jumped further than the car can drive; check that Motive confuses no other body with the car."
-    POSE_FROZEN = "The pose did not change while the motor turned; check that the motion-capture software is live."
+    POSE_FROZEN = "The pose did not change while the motor turned; check that motion capture streams live poses."
     TRACKING_LOST = "Motion capture lost the body; check the markers and the capture volume."
     NOT_READY = "The car could not be armed and was not driven; see the reasons and start again."
     ACTUATOR_FAULT = "The actuator link or its firmware failed; check power, cable and the log, then start again."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from carlab.core.errors import ProtocolError
 from drivers.calibration import DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
 from drivers.device import DeviceCounters, Reply
@@ -12,6 +11,7 @@ from drivers.vesc import can_codec as vesc_can_codec
 from drivers.vesc import payloads as vesc_payloads
 from drivers.vesc.can_codec import CanReassembler, ReplyMode
 from drivers.vesc.payloads import FirmwareVersion, MotorValues
+from drivers.vesc.reply_reader import ReplyReader
 
 
 class VescCanDevice:
@@ -23,13 +23,12 @@ class VescCanDevice:
         self.host_id = host_id
         self.status_frames = 0
         self._reassembler = CanReassembler(host_id)
-        self._version: FirmwareVersion | None = None
-        self._garbage_bytes = 0
+        self._replies = ReplyReader()
 
     @property
     def counters(self) -> DeviceCounters:
         """Counts since construction."""
-        return DeviceCounters(self._reassembler.errors, self._garbage_bytes, 0, self.link.statistics.opens)
+        return DeviceCounters(self._reassembler.errors, self._replies.garbage_bytes, 0, self.link.statistics.opens)
 
     def open(self) -> None:
         """Open the bus."""
@@ -52,22 +51,11 @@ class VescCanDevice:
 
     def request_telemetry(self) -> None:
         """GET_VALUES_SELECTIVE (5 bytes) or GET_VALUES in a short buffer: broadcasts carry no fault code."""
-        self._ask(vesc_payloads.telemetry_request(self._version))
+        self._ask(vesc_payloads.telemetry_request(self._replies.version))
 
     def receive(self, now_s: float) -> list[Reply]:
         """Decode status broadcasts and transported replies; ``now_s`` is unused since CAN frames are complete."""
-        replies: list[Reply] = []
-        for frame in self.link.read():
-            try:
-                reply = self._decode(frame)
-            except ProtocolError:
-                self._garbage_bytes += len(frame.data)
-                continue
-            if isinstance(reply, FirmwareVersion):
-                self._version = reply
-            if reply is not None:
-                replies.append(reply)
-        return replies
+        return self._replies.read(self.link.read(), self._decode, lambda frame: frame.data)
 
     def fileno(self) -> int | None:
         """The bus's descriptor."""

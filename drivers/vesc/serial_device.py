@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from carlab.core.errors import ProtocolError
 from drivers.calibration import DeviceCommand, MotorKind
 from drivers.config import ActuatorConfig
 from drivers.device import DeviceCounters, Reply
 from drivers.links.link import ByteLink
 from drivers.links.serial_link import SerialLink
 from drivers.vesc import payloads as vesc_payloads
-from drivers.vesc.payloads import FirmwareVersion
+from drivers.vesc.reply_reader import ReplyReader
 from drivers.vesc.serial_codec import VescFrameDecoder, encode_frame
 
 
@@ -28,8 +27,7 @@ class VescSerialDevice:
     def __init__(self, link: ByteLink) -> None:
         self.link = link
         self._decoder = VescFrameDecoder()
-        self._version: FirmwareVersion | None = None
-        self._garbage_bytes = 0
+        self._replies = ReplyReader()
 
     @property
     def counters(self) -> DeviceCounters:
@@ -37,7 +35,7 @@ class VescSerialDevice:
         decoder = self._decoder
         return DeviceCounters(
             decoder.crc_errors,
-            decoder.garbage_bytes + self._garbage_bytes,
+            decoder.garbage_bytes + self._replies.garbage_bytes,
             decoder.timeouts,
             self.link.statistics.opens,
         )
@@ -58,22 +56,12 @@ class VescSerialDevice:
 
     def request_telemetry(self) -> None:
         """GET_VALUES_SELECTIVE (22 bytes back) or GET_VALUES."""
-        self.link.write(encode_frame(vesc_payloads.telemetry_request(self._version)))
+        self.link.write(encode_frame(vesc_payloads.telemetry_request(self._replies.version)))
 
     def receive(self, now_s: float) -> list[Reply]:
         """Decode what has arrived."""
-        replies: list[Reply] = []
-        for payload in self._decoder.feed(self.link.read(), now_s):
-            try:
-                reply = vesc_payloads.decode_reply(payload)
-            except ProtocolError:
-                self._garbage_bytes += len(payload)
-                continue
-            if isinstance(reply, FirmwareVersion):
-                self._version = reply
-            if reply is not None:
-                replies.append(reply)
-        return replies
+        payloads = self._decoder.feed(self.link.read(), now_s)
+        return self._replies.read(payloads, vesc_payloads.decode_reply, lambda payload: payload)
 
     def fileno(self) -> int | None:
         """The port's descriptor."""

@@ -1,4 +1,4 @@
-"""Learning and driving in turns: whatever ends it, it goes on; and what a recording teaches is what was driven."""
+"""A run alternates training and driving, resumes after interruptions, and trains on the commands that were sent."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import shutil
 import signal
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learning_runs import HISTORY, TICKS, drive, names, tiny_plan
+from learning_runs import HISTORY, TICKS, InterruptedRun, drive, log_sent_actions, names, tiny_plan
 
-from carlab.cars import CarChoice, choose_car
+from carlab.cars import choose_car
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import EpisodeEnded, Tick
 from carlab.core.errors import DataError
@@ -29,8 +29,8 @@ from carlab.experiment.campaign import training
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.report import learning_curve, restore_missing_rows, save_row, write_report
-from carlab.experiment.campaign.training import TrainingPlan, recorded_features
-from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
+from carlab.experiment.campaign.training import recorded_features
+from carlab.experiment.episodes.session import SessionHooks
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.pipe_file import PipeFile
@@ -45,41 +45,13 @@ from learning.world import car_fit
 from learning.world.car_fit import load_car
 
 
-def listened_to(choice: CarChoice) -> list[Action]:
-    """What the car says that it sent, from now on."""
-    heard: list[Action] = []
-    command = choice.car.command
-
-    def listening(action: Action) -> Action:
-        heard.append(command(action))
-        return heard[-1]
-
-    choice.car.command = listening  # type: ignore[method-assign]
-    return heard
-
-
-@dataclass
-class Story:
-    """A run that was stopped before it drove, whose second training was killed, and that was taken up each time."""
-
-    run: RunDirectory
-    plan: TrainingPlan
-    heard: list[Action] = field(default_factory=list)
-    results: list[EpisodeResult] = field(default_factory=list)
-    figures: list[EpisodeFigures] = field(default_factory=list)
-    after_the_stop: list[str] = field(default_factory=list)
-    after_the_kill: list[str] = field(default_factory=list)
-    said: str = ""
-    first_model: bytes = b""
-
-
 @pytest.fixture(scope="module")
-def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> InterruptedRun:
     choice = choose_car("sim", seed=0)
     run = RunDirectory.create(tmp_path_factory.mktemp("runs"), "learn")
-    found = Story(run, tiny_plan(choice), listened_to(choice))
+    found = InterruptedRun(run, tiny_plan(choice), log_sent_actions(choice))
 
-    def go_on(hooks: CampaignHooks) -> None:
+    def run_episodes(hooks: CampaignHooks) -> None:
         hooks.on_figures = found.figures.append
         campaign = Campaign(choice, found.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
         campaign.write_plan()
@@ -95,46 +67,48 @@ def story(tmp_path_factory: pytest.TempPathFactory) -> Story:
             os.kill(child.pid or 0, signal.SIGKILL)
 
     with choice.car:
-        go_on(CampaignHooks(stop=(run.models / "0001").is_dir))
-        found.after_the_stop = names(run)
+        run_episodes(CampaignHooks(stop=(run.models / "0001").is_dir))
+        found.files_after_stop = names(run)
         found.first_model = (run.models / "0001" / "policy.npz").read_bytes()
         with pytest.raises(DataError) as error:
-            go_on(CampaignHooks(on_training=kill))
-        found.said = str(error.value)
-        found.after_the_kill = names(run)
+            run_episodes(CampaignHooks(on_training=kill))
+        found.error_text = str(error.value)
+        found.files_after_kill = names(run)
         (run.models / "0002.partial").mkdir()  # as where the whole program was killed with it
         (run.models / "0002.partial" / "policy.npz").write_bytes(b"rubbish")
-        go_on(CampaignHooks())
+        run_episodes(CampaignHooks())
     return found
 
 
-def test_a_run_goes_on_where_it_was_ended(story: Story) -> None:
-    assert story.after_the_stop == ["models/0001"]
-    assert story.after_the_kill == ["episodes/0001.mcap", "models/0001"]
-    assert "exit code -9" in story.said
-    assert "Resume the run with --resume" in story.said
-    assert "\n" not in story.said
-    assert names(story.run) == ["episodes/0001.mcap", "episodes/0002.mcap", "models/0001", "models/0002"]
-    assert [r.reason for r in story.results] == [EndReason.COMPLETED] * 2
-    assert [p.name for p in sorted((story.run.models / "0002").iterdir())] == [
+def test_an_interrupted_run_resumes_at_the_next_episode(interrupted: InterruptedRun) -> None:
+    assert interrupted.files_after_stop == ["models/0001"]
+    assert interrupted.files_after_kill == ["episodes/0001.mcap", "models/0001"]
+    assert "exit code -9" in interrupted.error_text
+    assert "Resume the run with --resume" in interrupted.error_text
+    assert "\n" not in interrupted.error_text
+    assert names(interrupted.run) == ["episodes/0001.mcap", "episodes/0002.mcap", "models/0001", "models/0002"]
+    assert [r.reason for r in interrupted.results] == [EndReason.COMPLETED] * 2
+    assert [p.name for p in sorted((interrupted.run.models / "0002").iterdir())] == [
         "diagnosis.json", "dynamics.pt", "policy.npz", "training.json",
     ]  # fmt: skip
-    assert (story.run.models / "0001" / "policy.npz").read_bytes() == story.first_model, "it was not learned again"
+    assert (interrupted.run.models / "0001" / "policy.npz").read_bytes() == interrupted.first_model, (
+        "it was not learned again"
+    )
 
 
-def test_a_run_that_has_all_its_episodes_does_nothing(story: Story) -> None:
-    before = names(story.run)
+def test_a_complete_run_does_nothing(interrupted: InterruptedRun) -> None:
+    before = names(interrupted.run)
     choice = choose_car("sim")
-    assert list(Campaign(choice, story.plan, 2, story.run).run_episodes()) == [], "the car is not even open"
-    assert names(story.run) == before
+    assert list(Campaign(choice, interrupted.plan, 2, interrupted.run).run_episodes()) == [], "the car is not even open"
+    assert names(interrupted.run) == before
 
 
-def test_the_plan_is_resumed_again(story: Story, tmp_path: Path) -> None:
-    found = resumed_campaign(story.run, choose_car("sim"), CampaignHooks())
-    assert (found.plan, found.episodes, found.max_ticks) == (story.plan, 2, TICKS)
+def test_the_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, tmp_path: Path) -> None:
+    found = resumed_campaign(interrupted.run, choose_car("sim"), CampaignHooks())
+    assert (found.plan, found.episodes, found.max_ticks) == (interrupted.plan, 2, TICKS)
     assert (found.place, found.record_rerun) == (True, False)
     other = RunDirectory.create(tmp_path, "other")
-    whole = json.loads((story.run.path / "campaign.json").read_text())
+    whole = json.loads((interrupted.run.path / "campaign.json").read_text())
     changes: list[dict[str, object]] = [
         {"threads": "x"},
         {"method": "other"},
@@ -150,12 +124,12 @@ def test_the_plan_is_resumed_again(story: Story, tmp_path: Path) -> None:
             resumed_campaign(other, choose_car("sim"), CampaignHooks())
 
 
-def test_the_curve_has_the_figures_of_the_recordings(story: Story) -> None:
-    rows = json.loads((story.run.path / "learn.json").read_text())["episodes"]
+def test_the_curve_has_the_figures_of_the_recordings(interrupted: InterruptedRun) -> None:
+    rows = json.loads((interrupted.run.path / "learn.json").read_text())["episodes"]
     assert [r["episode"] for r in rows] == [1, 2]
     for row in rows:
-        driven = read_episode(story.run.episode_path(row["episode"]))
-        trained = json.loads((story.run.models / f"{row['episode']:04d}" / "training.json").read_text())
+        driven = read_episode(interrupted.run.episode_path(row["episode"]))
+        trained = json.loads((interrupted.run.models / f"{row['episode']:04d}" / "training.json").read_text())
         assert driven.ticks == TICKS
         assert driven.metadata["model"] == str(row["episode"])
         assert row["total_reward"] == pytest.approx(driven.rewards.sum())
@@ -168,26 +142,28 @@ def test_the_curve_has_the_figures_of_the_recordings(story: Story) -> None:
         assert row["predicted_return"] == trained["return_in_model"]
     assert [r["rows"] for r in rows] == [0, TICKS - HISTORY]
     assert rows[0]["updates"] > rows[1]["updates"] == 32, "before the first there is most to learn"
-    assert [str(r) for r in learning_curve(story.run)] == [str(f) for f in story.figures]
-    assert (story.run.path / "learn.png").read_bytes().startswith(b"\x89PNG")
-    assert (story.run.path / "learn.rrd").stat().st_size > 1000
+    assert [str(r) for r in learning_curve(interrupted.run)] == [str(f) for f in interrupted.figures]
+    assert (interrupted.run.path / "learn.png").read_bytes().startswith(b"\x89PNG")
+    assert (interrupted.run.path / "learn.rrd").stat().st_size > 1000
 
 
-def test_likelihood_is_that_of_the_model_that_had_not_seen_the_episode(story: Story) -> None:
-    rows = transitions_of([read_episode(story.run.episode_path(1))], HISTORY)
+def test_likelihood_uses_the_model_trained_before_the_episode(interrupted: InterruptedRun) -> None:
+    rows = transitions_of([read_episode(interrupted.run.episode_path(1))], HISTORY)
     inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
     nll = [
-        negative_log_likelihood(load_car(story.run.models / n / "dynamics.pt").predict(inputs).smoothed(), outputs)
+        negative_log_likelihood(
+            load_car(interrupted.run.models / n / "dynamics.pt").predict(inputs).smoothed(), outputs
+        )
         for n in ("0001", "0002")
     ]
     assert nll[0] > nll[1] + 0.1, "the second has learned from it"
-    assert story.figures[1].last_episode_nll == pytest.approx(nll[0], abs=1e-3)
-    assert np.isnan(story.figures[0].last_episode_nll)
+    assert interrupted.figures[1].last_episode_nll == pytest.approx(nll[0], abs=1e-3)
+    assert np.isnan(interrupted.figures[0].last_episode_nll)
 
 
-def test_a_recorded_row_ends_in_the_command_of_its_tick(story: Story) -> None:
-    episodes = [read_episode(path) for path in story.run.recordings()]
-    heard = np.array([a.to_array() for a in story.heard])
+def test_a_recorded_row_ends_in_the_command_of_its_tick(interrupted: InterruptedRun) -> None:
+    episodes = [read_episode(path) for path in interrupted.run.recordings()]
+    heard = np.array([a.to_array() for a in interrupted.sent_actions])
     np.testing.assert_array_equal(np.concatenate([e.sent for e in episodes]), heard)
     assert len(np.unique(heard, axis=0)) > TICKS
     rows = transitions_of(episodes, HISTORY)
@@ -196,8 +172,10 @@ def test_a_recorded_row_ends_in_the_command_of_its_tick(story: Story) -> None:
         np.testing.assert_array_equal(row[-2:], heard[number * TICKS + tick])
 
 
-def test_the_policy_saw_the_commands_before_and_starts_are_drawn_from_what_it_saw(story: Story) -> None:
-    path = story.run.episode_path(2)
+def test_policy_and_start_states_use_the_past_commands(
+    interrupted: InterruptedRun,
+) -> None:
+    path = interrupted.run.episode_path(2)
     ticks = [d for d in read_documents(path) if isinstance(d, Tick)]
     assert len(ticks) == TICKS
     assert ticks[0].features[-2 * HISTORY :].tolist() == [0.0] * 2 * HISTORY
@@ -215,8 +193,8 @@ def test_the_policy_saw_the_commands_before_and_starts_are_drawn_from_what_it_sa
 
 
 @pytest.mark.realtime
-def test_over_the_wire_a_row_ends_in_what_the_firmware_heard(
-    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_recorded_command_is_the_command_of_the_firmware(
+    interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def act(self: SacPolicy, view: PolicyInput) -> Action:
         rng = np.random.default_rng(view.step)
@@ -224,12 +202,12 @@ def test_over_the_wire_a_row_ends_in_what_the_firmware_heard(
 
     monkeypatch.setattr(SacPolicy, "act", act)
     run = RunDirectory.create(tmp_path, "wire")
-    shutil.copytree(story.run.models / "0001", run.models / "0001")
+    shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
     choice = choose_car("emulated", seed=0)
     choice.log_to(run.path)
-    heard = listened_to(choice)
+    heard = log_sent_actions(choice)
     with choice.car:
-        (result,) = Campaign(choice, story.plan, 1, run, max_ticks=TICKS, record_rerun=False).run_episodes()
+        (result,) = Campaign(choice, interrupted.plan, 1, run, max_ticks=TICKS, record_rerun=False).run_episodes()
     driven = read_episode(result.path)
     rows = transitions_of([driven], HISTORY)
     assert len(rows) > TICKS // 2
@@ -244,9 +222,7 @@ def test_over_the_wire_a_row_ends_in_what_the_firmware_heard(
 
 
 @pytest.mark.realtime
-def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_something_learns(
-    story: Story, tmp_path: Path
-) -> None:
+def test_training_and_driving_do_not_overlap(interrupted: InterruptedRun, tmp_path: Path) -> None:
     """On the wire: no process but the one that drives is alive at any tick; the firmware hears neutral in between."""
     run = RunDirectory.create(tmp_path, "late")
     choice = choose_car("emulated", seed=0)
@@ -264,7 +240,7 @@ def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_somethi
         SessionHooks(on_tick=on_tick), on_training=lambda what, done, total: learning_s.append(clock.now_s())
     )
     with choice.car:
-        campaign = Campaign(choice, story.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
+        campaign = Campaign(choice, interrupted.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
         assert len(list(campaign.run_episodes())) == 2
     assert len(ticks_s) > TICKS
     assert not {"training", "quick check"} & set(alive)
@@ -284,10 +260,10 @@ def test_nothing_learns_while_commands_are_sent_and_the_car_stands_while_somethi
     assert np.median(late_s) < 0.005
 
 
-def test_an_episode_that_somebody_ended_is_driven_again(story: Story, tmp_path: Path) -> None:
+def test_an_interrupted_episode_is_repeated(interrupted: InterruptedRun, tmp_path: Path) -> None:
     """What was recorded is kept, and the run comes to as many whole episodes as were wanted."""
     run = RunDirectory.create(tmp_path, "stopped")
-    shutil.copytree(story.run.models / "0001", run.models / "0001")
+    shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
     heard: list[int] = []
 
     def on_tick(tick: Tick) -> None:
@@ -298,7 +274,7 @@ def test_an_episode_that_somebody_ended_is_driven_again(story: Story, tmp_path: 
     choice = choose_car("sim", seed=0)
     figures: list[EpisodeFigures] = []
     hooks = CampaignHooks(SessionHooks(on_tick=on_tick), on_figures=figures.append)
-    campaign = Campaign(choice, story.plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False)
+    campaign = Campaign(choice, interrupted.plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False)
     with choice.car:
         assert list(campaign.run_episodes()) == []
         assert (run.recordings(), figures) == ([], [])
@@ -309,13 +285,11 @@ def test_an_episode_that_somebody_ended_is_driven_again(story: Story, tmp_path: 
     assert (result.data.ticks, result.reason, figures[0].episode) == (TICKS, EndReason.COMPLETED, 1)
 
 
-def test_where_the_program_was_killed_by_a_second_signal_the_episode_is_driven_again(
-    story: Story, tmp_path: Path
-) -> None:
+def test_an_episode_is_repeated_after_a_second_signal(interrupted: InterruptedRun, tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path, "killed")
     for model in ("0001", "0002"):
-        shutil.copytree(story.run.models / model, run.models / model)
-    for recording in story.run.recordings():
+        shutil.copytree(interrupted.run.models / model, run.models / model)
+    for recording in interrupted.run.recordings():
         shutil.copy(recording, run.episodes)
     hung = run.recordings()[-1]
     documents = read_documents(hung)
@@ -323,8 +297,8 @@ def test_where_the_program_was_killed_by_a_second_signal_the_episode_is_driven_a
         for document in documents:
             ended = isinstance(document, EpisodeEnded)
             recorder.emit(replace(document, reason=EndReason.LOOP_HUNG) if ended else document)
-    campaign = Campaign(choose_car("sim"), story.plan, 3, run)
-    shutil.copytree(story.run.models / "0002", run.models / "0004")
+    campaign = Campaign(choose_car("sim"), interrupted.plan, 3, run)
+    shutil.copytree(interrupted.run.models / "0002", run.models / "0004")
     campaign.set_aside_stopped_episode()
     assert len(run.recordings()) == 3, "something was learned from it"
     shutil.rmtree(run.models / "0004")
@@ -335,25 +309,25 @@ def test_where_the_program_was_killed_by_a_second_signal_the_episode_is_driven_a
     assert run.next_episode() == 4
 
 
-def test_a_row_that_was_not_written_is_made_up_from_the_recording(story: Story, tmp_path: Path) -> None:
+def test_a_missing_row_is_restored_from_the_recording(interrupted: InterruptedRun, tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path, "rows")
-    for recording in story.run.recordings():
+    for recording in interrupted.run.recordings():
         shutil.copy(recording, run.episodes)
-    for model in story.run.models.iterdir():
+    for model in interrupted.run.models.iterdir():
         shutil.copytree(model, run.models / model.name)
-    whole = json.loads((story.run.path / "learn.json").read_text())
+    whole = json.loads((interrupted.run.path / "learn.json").read_text())
     (run.path / "learn.json").write_text(json.dumps({**whole, "episodes": whole["episodes"][:1]}))
-    restore_missing_rows(run, story.plan.task)
-    wanted = [replace(f, verdict="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in story.figures]
+    restore_missing_rows(run, interrupted.plan.task)
+    wanted = [replace(f, verdict="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in interrupted.figures]
     assert str(learning_curve(run)[1]) == str(wanted[1])
     before = (run.path / "learn.json").read_bytes()
-    restore_missing_rows(run, story.plan.task)
+    restore_missing_rows(run, interrupted.plan.task)
     assert (run.path / "learn.json").read_bytes() == before
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    learned, agent = load_car(story.run.models / "0002" / "dynamics.pt"), story.run.models / "0002"
+def test_a_full_disk_is_named(interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    learned, agent = load_car(interrupted.run.models / "0002" / "dynamics.pt"), interrupted.run.models / "0002"
     taught = SacAgent.load(agent, SacSettings(), 0)
     for name, write in (
         ("dynamics.pt", lambda folder: car_fit.save_car(learned, folder / "dynamics.pt")),
@@ -380,29 +354,29 @@ def test_a_full_disk_is_named(story: Story, tmp_path: Path, monkeypatch: pytest.
             curve, [{"episode": 1.0}], [np.zeros((3, 6))], [(np.zeros((0, 2)), *[np.zeros((0, 2, 6))] * 2)]
         )
     assert curve.read_bytes() == b"what was there"
-    (story.run.path / "learn.json.partial").symlink_to("/dev/full")
+    (interrupted.run.path / "learn.json.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match="the disk is full; free some space"):
-        save_row(story.run, story.figures[0])
+        save_row(interrupted.run, interrupted.figures[0])
 
 
 @pytest.mark.parametrize(("reality", "driven"), [(Reality.SIMULATED, 2), (Reality.REAL, 1)])
-def test_a_real_car_that_nobody_puts_at_its_start_drives_no_more_after_a_safety_stop(
-    story: Story, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reality: Reality, driven: int
+def test_a_real_car_stays_stopped_after_a_safety_stop(
+    interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reality: Reality, driven: int
 ) -> None:
     choice = choose_car("sim", seed=0)
     monkeypatch.setattr(choice.car, "reality", reality)
     run = RunDirectory.create(tmp_path, "outside")
     for model in ("0001", "0002"):
-        shutil.copytree(story.run.models / model, run.models / model)
+        shutil.copytree(interrupted.run.models / model, run.models / model)
     with choice.car as car:
         car.place(CarState(5.0, 5.0))
-        results = list(Campaign(choice, story.plan, 2, run, place=False, record_rerun=False).run_episodes())
+        results = list(Campaign(choice, interrupted.plan, 2, run, place=False, record_rerun=False).run_episodes())
     assert [r.reason.name for r in results] == ["GEOFENCE"] * driven
 
 
-def test_the_report_is_written_beside_an_episode_without_a_tick(story: Story, tmp_path: Path) -> None:
+def test_the_report_is_written_beside_an_episode_without_a_tick(interrupted: InterruptedRun, tmp_path: Path) -> None:
     run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
-    shutil.copytree(story.run.models / "0001", run.models / "0001")
-    row = replace(story.figures[0], end="GEOFENCE", total_reward=0.0)
-    write_report(run, story.plan, row)
+    shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
+    row = replace(interrupted.figures[0], end="GEOFENCE", total_reward=0.0)
+    write_report(run, interrupted.plan, row)
     assert [str(r) for r in learning_curve(run)] == [str(row)]

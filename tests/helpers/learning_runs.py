@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from carlab.core.quantities import Action, CarState
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from carlab.experiment.campaign.campaign import prior_simulator
+from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.training import TrainingPlan
-from carlab.experiment.episodes.session import Session
+from carlab.experiment.episodes.session import EpisodeResult, Session
 from carlab.recording.run_folder import RunDirectory
 
 HISTORY = 2
@@ -55,3 +56,31 @@ def drive(folder: Path, ticks: int, start: CarState | None = None, episodes: int
             record_rerun=False,
         ).drive(episodes)  # fmt: skip
     return run
+
+
+@dataclass
+class InterruptedRun:
+    """A run that was stopped before its first drive, killed in its second training, and resumed each time."""
+
+    run: RunDirectory
+    plan: TrainingPlan
+    sent_actions: list[Action] = field(default_factory=list)
+    results: list[EpisodeResult] = field(default_factory=list)
+    figures: list[EpisodeFigures] = field(default_factory=list)
+    files_after_stop: list[str] = field(default_factory=list)
+    files_after_kill: list[str] = field(default_factory=list)
+    error_text: str = ""
+    first_model: bytes = b""
+
+
+def log_sent_actions(choice: CarChoice) -> list[Action]:
+    """A list that receives each action that the car reports as sent."""
+    sent: list[Action] = []
+    command = choice.car.command
+
+    def logged(action: Action) -> Action:
+        sent.append(command(action))
+        return sent[-1]
+
+    choice.car.command = logged  # type: ignore[method-assign]
+    return sent

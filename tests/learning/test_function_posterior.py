@@ -7,85 +7,15 @@ import math
 import numpy as np
 import pytest
 import torch
+from gaussian_process_reference import discrepancy_alone, raw_noise, simulator_and_discrepancy
 from linear_simulator import EMPTY, NOISE, UNITS, Linear, features, rows, tensors, truth
 from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student
 
 from learning.evaluation import negative_log_likelihood
 from learning.posterior import inference
-from learning.posterior.discrepancy import CHOLESKY_JITTER, PRIOR_DISCREPANCY_STD, PRIOR_LENGTHSCALE
+from learning.posterior.discrepancy import PRIOR_DISCREPANCY_STD, PRIOR_LENGTHSCALE
 from learning.posterior.inference import PARAMETER_DRAWS, infer
-
-
-def simulated_mean(parameters, x):
-    """Normalised outputs of the simulator with the mean of some parameters (O, N)."""
-    raw = features(x) @ parameters.double().numpy().mean(axis=0)
-    return (raw - UNITS.output_mean.numpy()[:, None]) / UNITS.output_std.numpy()[:, None]
-
-
-def kernel(discrepancy, first, second, parameters=None):
-    """The discrepancy's covariance at raw inputs, of raw outputs (O, N, M); with draws of a simulator's parameters."""
-    a, b = ((np.asarray(v, dtype=float) - UNITS.input_mean.numpy()) / UNITS.input_std.numpy() for v in (first, second))
-    found = []
-    for k, unit in enumerate(UNITS.output_std.double().numpy()):
-        s, length, w, c = (
-            v[k].double().numpy()
-            for v in (discrepancy.scales, discrepancy.lengthscales, discrepancy.slopes, discrepancy.offsets)
-        )
-        distance = (((a[:, None] - b[None]) / length) ** 2).sum(axis=2)
-        own = s**2 * np.exp(-0.5 * distance) + (w * a) @ (w * b).T + c**2
-        if parameters is not None:
-            d, long = (
-                v[k].double().numpy() for v in (discrepancy.multiplier_stds, discrepancy.multiplier_lengthscales)
-            )
-            near = np.exp(-0.5 * (((a[:, None] - b[None]) / long) ** 2).sum(axis=2))
-            own = (
-                own
-                + d**2 * simulated_mean(parameters, first)[k][:, None] * simulated_mean(parameters, second)[k] * near
-            )
-        found.append(unit**2 * own)
-    return np.stack(found)
-
-
-def apart(x, y, at, discrepancy, noise):
-    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of the discrepancy alone, output by output."""
-    means, covariances = [], []
-    between, within, own = kernel(discrepancy, x, at), kernel(discrepancy, x, x), kernel(discrepancy, at, at)
-    for k, (middle, unit) in enumerate(zip(UNITS.output_mean.numpy(), UNITS.output_std.double().numpy(), strict=True)):
-        seen = within[k] + (noise[k] ** 2 + CHOLESKY_JITTER * unit**2) * np.eye(len(x))
-        gain = np.linalg.solve(seen, between[k]).T
-        means.append(middle + gain @ (np.asarray(y, dtype=float)[:, k] - middle))
-        covariances.append(own[k] - gain @ between[k])
-    covariance = np.stack(covariances)
-    return np.stack(means, axis=1), np.sqrt(covariance.diagonal(axis1=1, axis2=2).T + noise**2), covariance
-
-
-def raw_noise(posterior):
-    return (posterior.noise_std * UNITS.output_std).double().numpy()
-
-
-def together(x, y, at, discrepancy, noise, parameters=None):
-    """Mean (M, 2), standard deviations (M, 2) and covariances (2, M, M) of simulator and discrepancy, in numpy.
-
-    Outputs share the simulator's parameters, so that all rows of all outputs are conditioned on at once.
-    """
-    n, m, units = len(x), len(at), UNITS.output_std.double().numpy()
-
-    def joint(first, second):
-        """Covariances (2 N, 2 M), output by output."""
-        a, b = (np.concatenate(features(v)) for v in (first, second))
-        of_discrepancy = np.zeros((len(a), len(b)))
-        if discrepancy is not None:
-            for k, block in enumerate(kernel(discrepancy, first, second, parameters)):
-                of_discrepancy[k * len(first) : (k + 1) * len(first), k * len(second) : (k + 1) * len(second)] = block
-        return a @ b.T + of_discrepancy
-
-    seen = joint(x, x) + np.diag(np.repeat(noise**2 + CHOLESKY_JITTER * units**2, n))
-    gain = np.linalg.solve(seen, joint(x, at)).T
-    mean = (gain @ np.asarray(y, dtype=float).T.ravel()).reshape(2, m)
-    covariance = joint(at, at) - gain @ joint(x, at)
-    blocks = np.stack([covariance[k * m : (k + 1) * m, k * m : (k + 1) * m] for k in range(2)])
-    return mean.T, np.sqrt(blocks.diagonal(axis1=1, axis2=2).T + noise**2), blocks
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +32,7 @@ class TestWithoutSimulator:
     def test_predictions_are_the_gaussian_processs(self, found):
         at, _ = rows(1500, seed=1)
         mean, std = found.predict(at)
-        theirs, exact, _ = apart(self.x, self.y, at, found.discrepancy, raw_noise(found))
+        theirs, exact, _ = discrepancy_alone(self.x, self.y, at, found.discrepancy, raw_noise(found))
         assert np.allclose(mean, theirs, atol=2e-5)
         assert np.allclose(std, exact, rtol=1e-5)
 
@@ -111,7 +41,9 @@ class TestWithoutSimulator:
         means, covariances = found.marginals(at.view(7, 5, 2))
         units = UNITS.output_std.numpy()
         for k in range(7):
-            mean, _, exact = apart(self.x, self.y, at[5 * k : 5 * k + 5], found.discrepancy, raw_noise(found))
+            mean, _, exact = discrepancy_alone(
+                self.x, self.y, at[5 * k : 5 * k + 5], found.discrepancy, raw_noise(found)
+            )
             assert np.allclose(means[k].numpy().T * units + UNITS.output_mean.numpy(), mean, atol=2e-5)
             assert np.allclose(covariances[k], exact / units[:, None, None] ** 2, atol=2e-5)
 
@@ -128,7 +60,7 @@ def over_seeds(x, y, at, count, **settings):
     for seed in range(count):
         found = infer(Linear(), x, y, UNITS, NOISE, seed=seed, **settings)
         mean, std = found.predict(at)
-        theirs, exact, _ = together(x, y, at, found.discrepancy, raw_noise(found), found.parameters)
+        theirs, exact, _ = simulator_and_discrepancy(x, y, at, found.discrepancy, raw_noise(found), found.parameters)
         own, wanted = (v**2 - raw_noise(found) ** 2 for v in (std.double().numpy(), exact))
         off.append((mean.numpy() - theirs) / np.sqrt(wanted))
         ratios.append(own / wanted)
@@ -156,7 +88,7 @@ class TestWithSimulator:
         means, covariances = found.marginals(self.at[:20].view(4, 5, 2))
         units = UNITS.output_std.numpy()
         for k in range(4):
-            mean, _, exact = together(
+            mean, _, exact = simulator_and_discrepancy(
                 x, y, self.at[5 * k : 5 * k + 5], found.discrepancy, raw_noise(found), found.parameters
             )
             exact = exact / units[:, None, None] ** 2
@@ -264,7 +196,7 @@ class TestOutliers:
         assert (ours < self.error(clean.predict(self.at)[0]) + 0.2 * self.noise.numpy()).all()
         assert found.dof < 10.0
         assert np.allclose(raw_noise(found), self.noise, rtol=0.5)
-        ordinary = together if model else apart
+        ordinary = simulator_and_discrepancy if model else discrepancy_alone
         theirs = ordinary(self.x, y, self.at, found.discrepancy, raw_noise(found))[0]
         assert (self.error(theirs) > 3.0 * ours).all()
 
@@ -401,5 +333,5 @@ def test_of_too_many_rows_some_are_taken(monkeypatch):
     taken = [int((places == row).all(dim=1).nonzero().item()) for row in found.inputs]
     assert len(set(taken)) == 25
     at, _ = rows(10, seed=1)
-    theirs, _, _ = apart(x[taken], y[taken], at, found.discrepancy, raw_noise(found))
+    theirs, _, _ = discrepancy_alone(x[taken], y[taken], at, found.discrepancy, raw_noise(found))
     assert np.allclose(found.predict(at)[0], theirs, atol=2e-5)

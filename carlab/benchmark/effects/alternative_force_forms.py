@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from carlab.benchmark.effects.catalogue import Form, Parameters, factor, plain, signed
 from carlab.benchmark.effects.force_forms import STICTION_MPS
-from carlab.benchmark.effects.tyre_forms import driven_wheels, placed, saturating
+from carlab.benchmark.effects.tyre_forms import driven_wheels, placed, saturating, slipping
 from carlab.benchmark.world.base_car import GRAVITY_MPS2
 from carlab.benchmark.world.physics import Instant, World
 
@@ -275,7 +275,7 @@ FORMS = (
     Form(
         "longitudinal_slip",
         "other",
-        lambda s, draw: {"inertia": 2e-4 * s, "stiffness": 40.0 / max(s, 1e-9)},
+        slipping,
         brush_slip,
         1.0,
         8.0,

@@ -164,13 +164,18 @@ def placed(size: float, draw: Draw) -> dict[str, float]:
     return {"x": draw.place[0], "y": draw.place[1], "radius": 0.5 + 0.5 * draw.shares[0], "loss": min(size, 0.9)}
 
 
+def slipping(size: float, draw: Draw) -> dict[str, float]:
+    """Inertia of the driven wheels [kg m^2] and longitudinal stiffness of their tyres [N]."""
+    return {"inertia": 2e-4 * size, "stiffness": 40.0 / max(size, 1e-9)}
+
+
 FORMS = (
     Form("tyre_saturation", "catalogue", saturating, tyre_saturation, 0.5, 1.6, nominal_kind="linear_tyre"),
     Form("friction_ellipse", "catalogue", plain("scale"), friction_ellipse, 0.6, 2.5),
     Form(
         "longitudinal_slip",
         "catalogue",
-        lambda size, draw: {"inertia": 2e-4 * size, "stiffness": 40.0 / max(size, 1e-9)},
+        slipping,
         longitudinal_slip,
         1.0,
         8.0,
