@@ -121,7 +121,8 @@ def fit_column(
         reference: what the column should measure.
         column: the column.
         rows: rows to compare; larger values than six times the 90th percentile do not count.
-        lags_s: even grid of dead times; without it, -1 to 2 rows.
+        lags_s: even grid of dead times, refined by a parabola; without it, -1 to 2 rows in half rows, not refined,
+            because velocity columns are differences of poses and lag by whole or half rows.
         time_constants_s: of the first-order filter; ``(0.0,)`` fits a dead time alone.
     """
     period = float(np.median(np.diff(t_s)))
@@ -138,7 +139,8 @@ def fit_column(
     for time_constant_s in time_constants_s:
         filtered = first_order_lag(reference, period, time_constant_s)
         shares = np.array([fit(filtered, lag)[0] for lag in lags])
-        for lag in (float(lags[np.argmin(shares)]), parabola_minimum(lags, shares)):
+        refined = [] if lags_s is None else [parabola_minimum(lags, shares)]
+        for lag in (float(lags[np.argmin(shares)]), *refined):
             unexplained, scale = fit(filtered, lag)
             if unexplained < best[0]:
                 best = (unexplained, scale, lag, filtered)
