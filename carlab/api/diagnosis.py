@@ -15,6 +15,7 @@ from carlab.api.recordings import Recording, is_csv, required_file
 if TYPE_CHECKING:
     from carlab.cars import CarFile
     from carlab.core.episode_data import EpisodeData
+    from carlab.core.recording_noise import RecordingNoise
     from carlab.diagnosis.findings import (
         DataFault,
         Diagnosis,
@@ -222,16 +223,17 @@ def _diagnosed(
             why = f"The recording is faulty ({causes}), so no physics can be identified: {why}"
         undecided = Diagnosis(error.verdict, why, (), {}, 1.0, {}, None, tuple(known), uses, seed, 0.0, why)
         return DiagnosisReport(undecided, Exhibits(), _as_car_file(undecided, file.simulator, file.name), False)
-    model = _as_car_file(outcome.diagnosis, outcome.model, file.name)
+    model = _as_car_file(outcome.diagnosis, outcome.model, file.name, outcome.exhibits.noise)
     return DiagnosisReport(completed(outcome.diagnosis), outcome.exhibits, model)
 
 
-def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str) -> CarFile:
+def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: RecordingNoise | None = None) -> CarFile:
     from carlab.cars import CarFile
     from carlab.diagnosis.report.write import completed, model_toml, with_parameter_std
 
     worded = completed(diagnosis)
-    return CarFile(f"{name} (diagnosed)", model_toml(worded, simulator), with_parameter_std(worded, simulator), None)
+    text = model_toml(worded, simulator, noise)
+    return CarFile(f"{name} (diagnosed)", text, with_parameter_std(worded, simulator), None, noise)
 
 
 def _check_effects(effects: Sequence[str]) -> None:

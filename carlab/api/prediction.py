@@ -141,10 +141,15 @@ def predict(
     """
     from carlab.diagnosis.score_recording import score_recording
 
-    simulator = load_car(car).simulator
-    material = read_material(as_list(recording), "scored", simulator.mocap.latency_s)
+    file = load_car(car)
+    material = read_material(as_list(recording), "scored", file.simulator.mocap.latency_s)
     score = score_recording(
-        material.episodes, simulator, horizon_s=horizon_s, stride_s=stride_s, holdout_share=holdout_share
+        material.episodes,
+        file.simulator,
+        noise=file.recording_noise,
+        horizon_s=horizon_s,
+        stride_s=stride_s,
+        holdout_share=holdout_share,
     )
     return PredictionErrors(material, score)
 

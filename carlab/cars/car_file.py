@@ -11,6 +11,7 @@ from typing import Any
 
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import as_polygon
+from carlab.core.recording_noise import RecordingNoise
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.tables import check_keys, from_table, number
 from drivers.calibration import ActuatorCalibration
@@ -33,12 +34,13 @@ class RealCar:
 
 @dataclass(frozen=True, slots=True)
 class CarFile:
-    """A car file: its text, its simulator, and its real car (None without ``[hardware]``)."""
+    """A car file: text, simulator, real car (None without ``[hardware]``), and the noise (only in a ``model.toml``)."""
 
     name: str
     text: str
     simulator: SimulatorConfig
     real: RealCar | None
+    recording_noise: RecordingNoise | None = None
 
     def save(self, path: Path | str) -> Path:
         """Write the file as TOML, replacing an existing file; returns the path.
@@ -74,11 +76,14 @@ def load_car_file(path: Path) -> CarFile:
         raise ConfigError(f"{path} is not a text file; name a car file in TOML.") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML ({error}); correct it.") from error
-    check_keys(tables, (*TABLES, "hardware"), str(path))
+    check_keys(tables, (*TABLES, "hardware", "recording_noise"), str(path))
+    noise = tables.pop("recording_noise", None)
+    if noise is not None:
+        noise = RecordingNoise.from_table(noise, f"[recording_noise] of {path}")
     hardware = tables.pop("hardware", None)
     simulator = SimulatorConfig.from_tables(tables, str(path))
     real = None if hardware is None else _real_car(hardware, path)
-    return CarFile(path.stem if real is None else real.name, text, simulator, real)
+    return CarFile(path.stem if real is None else real.name, text, simulator, real, noise)
 
 
 def is_preset(path: Path) -> bool:

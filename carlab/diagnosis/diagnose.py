@@ -214,6 +214,7 @@ def _assemble_result(
         seconds=0.0,
     )
     exhibits = exhibits_of(scored, recordings.held_out_tracks)
+    exhibits = replace(exhibits, noise=held_out.recording_noise)
     return Outcome(diagnosis, exhibits, model or scored.found.best.config)
 
 

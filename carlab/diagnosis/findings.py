@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from carlab.core.quantities import FloatArray
+from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.settings import DEFAULT
 
@@ -193,6 +194,7 @@ class Exhibits:
                  and the 99 % bound
     candidates: candidates for the first effect: id, gain on unseen blocks in standard errors, loss with it
     decisions: accepted and rejected effects with statistics and thresholds
+    noise: noise of the recordings, for model.toml
     """
 
     traces: tuple[Trace, ...] = ()
@@ -201,3 +203,4 @@ class Exhibits:
     correlation: Mapping[str, tuple[FloatArray, FloatArray, float]] = field(default_factory=dict)
     candidates: tuple[tuple[str, float, float], ...] = ()
     decisions: tuple[Decision, ...] = ()
+    noise: RecordingNoise | None = None

@@ -1,7 +1,7 @@
 """Prediction errors of a simulator on a recording, computed like the held-out errors of a diagnosis.
 
-Faults of the recording are repaired; the velocity window and the initial states are estimated. A ``model.toml``
-therefore has the error that its report states.
+Faults of the recording are repaired; the initial states are estimated, and the velocity window and the noise unless a
+``model.toml`` states them. A ``model.toml`` therefore has the error that its report states.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import numpy as np
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
+from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.identification.held_out_errors import HeldOut
-from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.recording_faults import find as recording_faults
 from carlab.diagnosis.recordings import check_held_out_share
@@ -70,6 +71,7 @@ def score_recording(
     episodes: Sequence[EpisodeData],
     config: SimulatorConfig,
     *,
+    noise: RecordingNoise | None = None,
     horizon_s: float = DEFAULT.windows.held_out_window_s,
     stride_s: float = DEFAULT.windows.held_out_stride_s,
     holdout_share: float = DEFAULT.windows.default_held_out_share,
@@ -79,6 +81,7 @@ def score_recording(
     Args:
         episodes: the recording as read.
         config: the simulator, observation effects included.
+        noise: noise and velocity window of the diagnosis of the simulator; estimated from the recording if absent.
         horizon_s: prediction horizon.
         stride_s: time between initial states.
         holdout_share: share of the last part, which is scored separately, above 0 and at most 0.5.
@@ -96,10 +99,10 @@ def score_recording(
     tracks = tracks_of(repaired)
     if not tracks:
         raise DataError("The recording has no unbroken stretch of half a second; record without gaps.")
-    whole = _score("whole recording", tracks, tracks, config, horizon_s, stride_s)
+    whole = _score("whole recording", tracks, tracks, config, noise, horizon_s, stride_s)
     early, late = split_tracks(tracks, holdout_share, DEFAULT.windows.held_out_window_s + DEFAULT.windows.split_guard_s)
     try:
-        last = _score(f"last {100.0 * holdout_share:g} %", early, late, config, horizon_s, stride_s)
+        last = _score(f"last {100.0 * holdout_share:g} %", early, late, config, noise, horizon_s, stride_s)
     except DataError:
         last = None
     return RecordingScore(
@@ -113,18 +116,31 @@ def score_recording(
 
 
 def _score(
-    part: str, fit_tracks: list[Track], tracks: list[Track], config: SimulatorConfig, horizon_s: float, stride_s: float
+    part: str,
+    fit_tracks: list[Track],
+    tracks: list[Track],
+    config: SimulatorConfig,
+    known: RecordingNoise | None,
+    horizon_s: float,
+    stride_s: float,
 ) -> PartScore:
-    """Errors on ``tracks``, with velocity window and noise of ``fit_tracks``. Raises DataError without windows."""
+    """Errors on ``tracks``; velocity window and noise are known or those of ``fit_tracks``.
+
+    Raises DataError without windows.
+    """
     if not fit_tracks or not tracks:
         raise DataError("The part is too short.")
     settings = DEFAULT.windows
     fit_windows = cut_windows(fit_tracks, min(settings.fit_window_s, horizon_s), settings.fit_stride_s)
     fit_windows = fit_windows.thinned(settings.max_fit_windows)
     windows = cut_windows(tracks, horizon_s, stride_s).thinned(settings.max_held_out_windows)
-    fit_windows, windows = with_initial_states((fit_windows, windows), config)
-    shakes = find_vibration(fit_tracks) is not None
-    noise = estimate_noise(fit_tracks, fit_windows.curvature_bias, slowest=shakes)
+    window_s2 = None if known is None else known.velocity_window_s2
+    fit_windows, windows = with_initial_states((fit_windows, windows), config, variance_s2=window_s2)
+    if known is None:
+        shakes = find_vibration(fit_tracks) is not None
+        noise = estimate_noise(fit_tracks, fit_windows.curvature_bias, slowest=shakes)
+    else:
+        noise = Noise.of(known)
     held_out = HeldOut.of(windows, noise, config)
     models: dict[str, PredictiveModel] = {
         MODEL: SimulatorModel(config),

@@ -26,7 +26,9 @@ def seeds() -> list[str]:
     block = re.search(r"<!-- test: car file -->\n```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
     assert block is not None
     presets = (resources.files("sim_backends") / "presets").iterdir()
-    return [block[1], *(p.read_text(encoding="utf-8") for p in presets if p.name.endswith(".toml"))]
+    noise = "[recording_noise]\nmeasured_std = [1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.02]\n"
+    noise += "initial_state_std = [1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.02]\nvelocity_window_s2 = 1e-4\n"
+    return [block[1] + noise, *(p.read_text(encoding="utf-8") for p in presets if p.name.endswith(".toml"))]
 
 
 def mutated(text: str, rng: random.Random) -> str:
@@ -79,3 +81,24 @@ def test_invalid_corners_are_refused_with_one_sentence(corners: str, tmp_path: P
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=r"corners_m .* must be at least three corners"):
         load_car_file(path)
+
+
+def test_recording_noise_is_read_and_checked(tmp_path: Path) -> None:
+    """A negative or a missing standard deviation is refused; a car file without the table has no noise."""
+    path = tmp_path / "car.toml"
+    text = seeds()[0]
+    path.write_text(text, encoding="utf-8")
+    noise = load_car_file(path).recording_noise
+    assert noise is not None
+    assert noise.measured_std == (1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.02)
+    assert noise.velocity_window_s2 == 1e-4
+    assert load_car_file(Path("eth_rc_car")).recording_noise is None
+    changes = {
+        "measured_std = [1e-3": "measured_std = [-1.0",
+        "velocity_window_s2 = 1e-4": "velocity_window_s2 = 1e4",
+        "2e-3, 0.01, 0.01, 0.02]": "2e-3]",
+    }
+    for old, new in changes.items():
+        path.write_text(text.replace(old, new), encoding="utf-8")
+        with pytest.raises(ConfigError, match="recording_noise"):
+            load_car_file(path)

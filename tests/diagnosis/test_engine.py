@@ -80,6 +80,8 @@ def test_replay_of_the_model_prints_the_error_of_the_report(
     # Here the model corrects the initial states, in the report the car file: they differ by some hundredths of a floor.
     agree(rows["model"], held_out["with_effects"], 2e-4)
     agree(rows["constant velocity"], held_out["constant_velocity"])
+    scores = [held_out[name]["score"] for name in ("with_effects", "constant_velocity")]
+    assert [rows[name][5] for name in ("model", "constant velocity")] == pytest.approx(scores, rel=0.01, abs=0.03)
     rows = replayed(hold, str(concealed[0] / "car.toml"), "whole recording", capfd)
     agree(rows["model"], held_out["nominal"])
 

@@ -4,7 +4,6 @@ Three effects, one of each kind, are written here and registered for the time of
 """
 
 import json
-import tomllib
 from collections.abc import Iterator
 from html import escape
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from carlab.core.manoeuvres import MANOEUVRES
@@ -265,7 +265,7 @@ def test_windows_of_an_effect_on_velocities_start_from_true_velocities() -> None
 
 
 def test_car_file_and_prior_contain_the_effects(found: Outcome, report: Path) -> None:
-    config = SimulatorConfig.from_tables(tomllib.loads((report / "model.toml").read_text()))
+    config = load_car_file(report / "model.toml").simulator
     assert {name: dict(own) for name, own in config.effects.items()} == {
         name: dict(own) for name, own in found.model.effects.items()
     }

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.identification.fit import clustered_gain, huber
 from carlab.diagnosis.identification.measurement_noise import Noise
@@ -25,11 +26,13 @@ class HeldOut:
         windows: S held-out prediction windows.
         floor: (6,) error of a perfect simulator after the horizon, estimated from the recording: measurement noise at
             the end, and the propagated error of the initial state.
+        noise: noise of the recordings that were fitted.
         huber_delta: error, over its robust standard deviation, from which Huber's loss is linear.
     """
 
     windows: PredictionWindows
     floor: FloatArray
+    noise: Noise
     huber_delta: float = DEFAULT.identification.huber_delta
 
     @classmethod
@@ -41,7 +44,12 @@ class HeldOut:
         settings: IdentificationSettings = DEFAULT.identification,
     ) -> HeldOut:
         """Compute the noise floor; ``config`` propagates the errors of initial states."""
-        return cls(windows, noise_floor(windows, noise, config, settings)[-1], settings.huber_delta)
+        return cls(windows, noise_floor(windows, noise, config, settings)[-1], noise, settings.huber_delta)
+
+    @property
+    def recording_noise(self) -> RecordingNoise:
+        """Noise and velocity window, as ``model.toml`` keeps them."""
+        return self.noise.as_recorded(self.windows.velocity_window_s2)
 
     def final_error(self, model: SimulatorConfig | PredictiveModel) -> FloatArray:
         """Errors (S, 6) of a model after the horizon."""

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from scipy.signal import freqz, savgol_coeffs, welch
 
 from carlab.core.quantities import FloatArray
+from carlab.core.recording_noise import RecordingNoise, StateStd
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.windows import MIN_QUINTIC_WIDTH, Track, smoothing_width
 
@@ -24,6 +26,16 @@ class Noise:
 
     measured: FloatArray
     initial_state: FloatArray
+
+    @classmethod
+    def of(cls, recorded: RecordingNoise) -> Noise:
+        """The noise in a ``model.toml``."""
+        return cls(np.array(recorded.measured_std), np.array(recorded.initial_state_std))
+
+    def as_recorded(self, velocity_window_s2: float) -> RecordingNoise:
+        """The noise as ``model.toml`` keeps it, with the variance of the velocity window [s2]."""
+        measured, initial_state = tuple(self.measured.tolist()), tuple(self.initial_state.tolist())
+        return RecordingNoise(cast(StateStd, measured), cast(StateStd, initial_state), velocity_window_s2)
 
 
 def estimate_noise(

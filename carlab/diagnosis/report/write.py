@@ -10,6 +10,7 @@ from pathlib import Path
 import tomli_w
 
 from carlab.core.errors import DataError
+from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import to_dict
 from carlab.diagnosis.findings import Diagnosis, Exhibits
 from carlab.diagnosis.report import sentences as text
@@ -47,7 +48,7 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
     complete = completed(diagnosis)
     report = json.dumps(complete.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     texts = {
-        MODEL_NAME: model_toml(complete, model),
+        MODEL_NAME: model_toml(complete, model, exhibits.noise),
         HTML_NAME: render_page(diagnosis, exhibits),
         JSON_NAME: report,
     }
@@ -84,8 +85,8 @@ def completed(diagnosis: Diagnosis) -> Diagnosis:
     return replace(diagnosis, sentence=sentence, effects=effects, advice=advice)
 
 
-def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
-    """The simulator as a car file; comments state the origin of its numbers."""
+def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoise | None) -> str:
+    """The simulator as a car file with the noise of the recordings; comments state the origin of its numbers."""
     fitted = [use.path for use in diagnosis.recordings if use.role == "fit"]
     found = text.listed([effect.id for effect in diagnosis.effects])
     held = diagnosis.held_out
@@ -103,7 +104,10 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig) -> str:
     if scores:
         lines.append(f"Held-out error in noise floors: {', '.join(scores)}.")
     comments = "".join(f"# {row}\n" for line in lines for row in _rows(line))
-    return f"{comments}\n{tomli_w.dumps(with_parameter_std(diagnosis, model).to_tables())}"
+    tables = with_parameter_std(diagnosis, model).to_tables()
+    if noise is not None:
+        tables = {**tables, "recording_noise": noise.to_table()}
+    return f"{comments}\n{tomli_w.dumps(tables)}"
 
 
 def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:

@@ -1,0 +1,51 @@
+"""Noise of recordings as a diagnosis estimated it; ``model.toml`` keeps it in the table ``[recording_noise]``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from carlab.core.errors import ConfigError
+from carlab.core.quantities import STATE_NAMES
+from carlab.core.tables import from_table
+
+StateStd = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingNoise:
+    """Noise and velocity window of the recordings that a model was fitted to.
+
+    Attributes:
+        measured_std: standard deviations of measured x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+        initial_state_std: the same of estimated initial states.
+        velocity_window_s2: variance of the time window of the velocity columns [s2]; 0 without a window.
+    """
+
+    measured_std: StateStd
+    initial_state_std: StateStd
+    velocity_window_s2: float
+
+    def __post_init__(self) -> None:
+        for name, std in zip(STATE_NAMES * 2, (*self.measured_std, *self.initial_state_std), strict=True):
+            if not 0.0 < std < math.inf:
+                raise ConfigError(f"The standard deviation of {name} in [recording_noise] is {std:g}; it must be > 0.")
+        if not 0.0 <= self.velocity_window_s2 < 1.0:
+            raise ConfigError(
+                f"velocity_window_s2 in [recording_noise] is {self.velocity_window_s2:g}; it must be from 0 to 1 s2."
+            )
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], where: str) -> RecordingNoise:
+        """Read the table. Raises ConfigError for an unknown or missing key, or a value out of range."""
+        return from_table(cls, table, where)
+
+    def to_table(self) -> dict[str, Any]:
+        """The content of the table."""
+        return {
+            "measured_std": list(self.measured_std),
+            "initial_state_std": list(self.initial_state_std),
+            "velocity_window_s2": self.velocity_window_s2,
+        }
