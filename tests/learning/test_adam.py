@@ -1,4 +1,4 @@
-"""Adam on one tensor against that of torch."""
+"""Test Adam on one tensor against torch's Adam and AdamW."""
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ def generator(seed=0):
 
 
 def gradients(count, shape=(3, 4)):
-    """Of sizes from 1e-8, where the smallest denominator counts, to 1."""
+    """Return gradients of sizes from 1e-8, where Adam's epsilon matters, to 1."""
     sizes = torch.logspace(-8, 0, shape[1], dtype=torch.float64)
     return [sizes * torch.randn(shape, generator=generator(k), dtype=torch.float64) for k in range(count)]
 
@@ -25,40 +25,40 @@ def numbers(shape=(3, 4)):
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.3])
-def test_fifty_steps_with_a_falling_rate_are_torchs(decay):
-    ours, theirs = numbers(), numbers().requires_grad_()
-    adam = Adam(ours, weight_decay=decay)
+def test_fifty_steps_with_a_decreasing_rate_equal_torch(decay):
+    parameters, reference = numbers(), numbers().requires_grad_()
+    adam = Adam(parameters, weight_decay=decay)
     kind = torch.optim.AdamW if decay else torch.optim.Adam
-    stock = kind([theirs], lr=1.0, weight_decay=decay)
+    torch_optimiser = kind([reference], lr=1.0, weight_decay=decay)
     for step, gradient in enumerate(gradients(50)):
         before = gradient.clone()
         adam.step(gradient, rate(step))
-        stock.param_groups[0]["lr"] = rate(step)
-        theirs.grad = before
-        stock.step()
+        torch_optimiser.param_groups[0]["lr"] = rate(step)
+        reference.grad = before
+        torch_optimiser.step()
         assert torch.equal(gradient, before)
-        torch.testing.assert_close(ours, theirs.detach(), rtol=1e-12, atol=1e-12)
-    assert not torch.allclose(ours, numbers(), atol=0.01)
+        torch.testing.assert_close(parameters, reference.detach(), rtol=1e-12, atol=1e-12)
+    assert not torch.allclose(parameters, numbers(), atol=0.01)
 
 
-def test_with_the_state_of_another_it_goes_on_as_torch_without_a_break():
-    theirs = numbers().requires_grad_()
-    stock = torch.optim.Adam([theirs], lr=0.01)
+def test_optimiser_with_a_loaded_state_continues_as_uninterrupted_torch():
+    reference = numbers().requires_grad_()
+    torch_optimiser = torch.optim.Adam([reference], lr=0.01)
     first = Adam(numbers())
     second = None
     for step, gradient in enumerate(gradients(30)):
         if step == 10:
             second = Adam(first.parameters.clone())
             state = first.state()
-            first.step(gradient, 1.0)  # What a state has given is not moved any more.
+            first.step(gradient, 1.0)  # Later steps of the first optimiser do not change its saved state.
             second.load(state)
         (second or first).step(gradient, 0.01)
-        theirs.grad = gradient.clone()
-        stock.step()
-    torch.testing.assert_close(second.parameters, theirs.detach(), rtol=1e-12, atol=1e-12)
+        reference.grad = gradient.clone()
+        torch_optimiser.step()
+    torch.testing.assert_close(second.parameters, reference.detach(), rtol=1e-12, atol=1e-12)
 
 
-def test_loaded_moments_are_a_copy():
+def test_loaded_state_is_a_copy():
     adam, other = Adam(numbers()), Adam(numbers())
     state = adam.state()
     other.load(state)
@@ -69,6 +69,6 @@ def test_loaded_moments_are_a_copy():
 
 
 @pytest.mark.parametrize("shape", [(4, 3), (3, 5), (12,), (1, 4)])
-def test_moments_of_other_numbers_are_refused(shape):
+def test_state_of_another_shape_is_refused(shape):
     with pytest.raises(ValueError, match="shape"):
         Adam(numbers()).load(Adam(numbers(shape)).state())

@@ -1,4 +1,4 @@
-"""FSVGD as the authors set it: its world frame against complex numbers, and what choosing by held-out rows keeps."""
+"""Test FSVGD with the authors' settings: its world frame, its prior weight and its early stopping."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HISTORY = 2
 
 
 def circling(ticks: int = 80, seed: int = 0) -> EpisodeData:
-    """A car whose velocity in the world turns at 1.5 rad/s and whose body looks 0.2 rad beside it."""
+    """Return a drive on a circle at 1.5 rad/s whose yaw is 0.2 rad ahead of its velocity direction."""
     times = np.arange(ticks + 1) / 30.0
     place = np.exp(1j * 1.5 * times) / 1.5j
     yaw = 1.5 * times + 0.2
@@ -40,7 +40,7 @@ def circling(ticks: int = 80, seed: int = 0) -> EpisodeData:
 
 
 def constant(change: list[float]) -> WorldDynamics:
-    """A world that always changes by so much."""
+    """Return dynamics that always predict this change."""
     width = 7 + 2 * (HISTORY + 1)
     network = Network(width, 7, (4,))
     parameters = torch.zeros(3, network.parameters)
@@ -48,7 +48,7 @@ def constant(change: list[float]) -> WorldDynamics:
     return WorldDynamics(ParticlePosterior(network, parameters, torch.zeros(7), units), HISTORY)
 
 
-def test_rows_are_those_of_the_world() -> None:
+def test_rows_are_in_the_world_frame() -> None:
     episode = circling()
     inputs, changes = world_rows([episode], HISTORY)
     assert inputs.shape == (episode.ticks - HISTORY, 7 + 2 * (HISTORY + 1))
@@ -63,18 +63,20 @@ def test_rows_are_those_of_the_world() -> None:
         assert np.allclose(changes[row, 4:6], [later.real - velocity.real, later.imag - velocity.imag], atol=1e-5)
 
 
-def test_a_step_is_carried_on_in_the_world() -> None:
-    """A car that looks along y with 1 m/s ahead and 0.5 m/s to the left; it is moved and rotated to head along -x."""
+def test_step_adds_the_change_in_the_world_frame() -> None:
+    """A car facing y with velocity (1.0, 0.5) in its body frame is moved and rotated to face -x."""
     features = torch.tensor([[2.0, 1.0, 1.0, 0.0, 1.0, 0.5, 0.1, 0.1, 0.2, 0.3, 0.4]])
     assert np.allclose(in_world(features)[0, 4:6], [-0.5, 1.0], atol=1e-6)
     world = constant([0.1, -0.2, -1.0, -1.0, 0.3, 0.0, 0.05])
     after = world.step(features, torch.tensor([[0.5, 0.6]]), torch.Generator().manual_seed(0))[0]
     assert np.allclose(after[:4], [2.1, 0.8, 0.0, -1.0], atol=1e-6)
-    assert np.allclose(after[4:6], [0.2, -1.0], atol=1e-6), "velocity (-0.2, 1.0) seen by a body that looks along -x"
+    assert np.allclose(after[4:6], [0.2, -1.0], atol=1e-6), (
+        "world velocity (-0.2, 1.0) in the frame of a body facing -x"
+    )
     assert np.allclose(after[6:], [0.15, 0.3, 0.4, 0.5, 0.6], atol=1e-6)
 
 
-def test_a_fit_learns_and_before_any_episode_there_is_none() -> None:
+def test_fit_improves_the_held_out_score_and_starts_from_initial_networks() -> None:
     episodes = [circling(seed=s) for s in range(3)]
     unfitted = fit_authors_fsvgd([], HISTORY, seed=1)
     fitted = fit_authors_fsvgd(episodes[:2], HISTORY, 400, seed=1)
@@ -86,12 +88,12 @@ def test_a_fit_learns_and_before_any_episode_there_is_none() -> None:
     assert after < before - 5.0
 
 
-def test_a_handful_of_rows_is_too_few() -> None:
+def test_too_few_rows_for_a_validation_split_are_refused() -> None:
     with pytest.raises(DataError, match="too few for a validation split"):
         fit_authors_fsvgd([circling(ticks=HISTORY + 3)], HISTORY, 10)
 
 
-def test_their_prior_weighs_next_to_nothing() -> None:
+def test_prior_exponent_is_that_of_the_authors() -> None:
     assert authors_settings(1000, 0).prior_exponent == pytest.approx(1 / 480)
 
 
@@ -104,7 +106,7 @@ def noisy() -> tuple[torch.Tensor, ...]:
 
 
 class TestHeldOutRows:
-    """Twelve rows of noise are overfitted; held-out rows show when."""
+    """Early stopping by held-out rows, on twelve noisy rows that the networks overfit."""
 
     SETTINGS = FsvgdSettings(
         particles=4, steps=1500, hidden=(64, 64), learning_rate=3e-3, noise_std=0.3, fit_noise=False, natural=False,
@@ -112,25 +114,25 @@ class TestHeldOutRows:
     )  # fmt: skip
     UNITS = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
 
-    def test_the_best_of_the_looks_is_kept(self, noisy: tuple[torch.Tensor, ...]) -> None:
+    def test_networks_with_the_best_validation_score_are_kept(self, noisy: tuple[torch.Tensor, ...]) -> None:
         x, y, others, truth = noisy
         last = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS)
-        kept = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
-        nll = [negative_log_likelihood(p.predict(others), truth) for p in (kept, last)]
+        best = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
+        nll = [negative_log_likelihood(p.predict(others), truth) for p in (best, last)]
         assert nll[0] < nll[1] - 0.5
 
-    def test_patience_ends_the_fit_with_the_same_networks(self, noisy: tuple[torch.Tensor, ...]) -> None:
+    def test_patience_stops_early_with_the_same_networks(self, noisy: tuple[torch.Tensor, ...]) -> None:
         x, y, others, truth = noisy
         steps_done: list[int] = []
-        kept = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
-        soon = fit_fsvgd(
+        full = fit_fsvgd(x, y, x, None, self.UNITS, self.SETTINGS, held_out=(others, truth))
+        stopped = fit_fsvgd(
             x, y, x, None, self.UNITS, replace(self.SETTINGS, patience=3), steps_done.append, held_out=(others, truth)
         )
         assert max(steps_done, default=0) < 1500
-        assert torch.equal(soon.parameters, kept.parameters)
+        assert torch.equal(stopped.parameters, full.parameters)
 
-    def test_the_priors_exponent_scales_it(self, noisy: tuple[torch.Tensor, ...]) -> None:
-        """Without weight another prior changes nothing; with its weight it does."""
+    def test_prior_exponent_scales_the_prior(self, noisy: tuple[torch.Tensor, ...]) -> None:
+        """A change of the prior has no effect with exponent zero and an effect with exponent one."""
         x, y, others, _ = noisy
         found = {}
         for exponent in (0.0, 1.0):

@@ -1,4 +1,4 @@
-"""A learned car: exact kinematics against a recorded drive, draws against a mixture in closed form, and its file."""
+"""Test the learned car: kinematics of a recorded drive, draws of a mixture with known moments, and its file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ HISTORY = 3
 INPUTS = 3 + 2 * (HISTORY + 1)
 
 
-class Circling:
+class CirclingPolicy:
     """Random commands that turn the car through more than a full circle."""
 
     name = "circling"
@@ -49,35 +49,35 @@ class Circling:
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[EpisodeData, list[Transition]]:
-    """A drive of the simulated car, and each of its transitions as the control loop saw it."""
+    """Drive the simulated car; return the episode and the transitions of the control loop."""
     choice = choose_car("sim", seed=0)
-    seen: list[Document] = []
+    emitted: list[Document] = []
     with choice.car as car:
         car.place(CarState(yaw_rad=3.0))
         driven = run_episode(
-            car, Circling(), replace(ParkingTask(), history_length=HISTORY), choice.envelope,
-            period_s=choice.control_period_s, max_ticks=90, hooks=EpisodeHooks(emit=seen.append),
+            car, CirclingPolicy(), replace(ParkingTask(), history_length=HISTORY), choice.envelope,
+            period_s=choice.control_period_s, max_ticks=90, hooks=EpisodeHooks(emit=emitted.append),
         )  # fmt: skip
-    return driven, [d for d in seen if isinstance(d, Transition)]
+    return driven, [d for d in emitted if isinstance(d, Transition)]
 
 
-def test_a_drive_is_carried_on_exactly(drive: tuple[EpisodeData, list[Transition]]) -> None:
+def test_advance_reproduces_a_recorded_drive(drive: tuple[EpisodeData, list[Transition]]) -> None:
     driven, transitions = drive
     rows = transitions_of([driven], HISTORY)
-    own = [transitions[k] for k in rows.tick]
-    assert len(own) > 60
-    assert np.ptp(driven.states[:, 2]) > 6.0, "yaw jumps from pi to -pi on the way"
-    features = torch.from_numpy(np.array([t.features for t in own]))
-    action = torch.from_numpy(np.array([t.action.to_array() for t in own]))
+    row_transitions = [transitions[k] for k in rows.tick]
+    assert len(row_transitions) > 60
+    assert np.ptp(driven.states[:, 2]) > 6.0, "the drive must wrap yaw from pi to -pi"
+    features = torch.from_numpy(np.array([t.features for t in row_transitions]))
+    action = torch.from_numpy(np.array([t.action.to_array() for t in row_transitions]))
     after = advance(features, action, torch.from_numpy(rows.targets)).numpy()
-    np.testing.assert_allclose(after, [t.next_features for t in own], atol=1e-12)
-    wanted = driven.states[rows.tick + 1]
-    np.testing.assert_allclose(after[:, [0, 1, 4, 5, 6]], wanted[:, [0, 1, 3, 4, 5]], atol=1e-12)
+    np.testing.assert_allclose(after, [t.next_features for t in row_transitions], atol=1e-12)
+    expected = driven.states[rows.tick + 1]
+    np.testing.assert_allclose(after[:, [0, 1, 4, 5, 6]], expected[:, [0, 1, 3, 4, 5]], atol=1e-12)
     yaw = np.arctan2(after[:, 2], after[:, 3])
-    np.testing.assert_allclose(np.exp(1j * yaw), np.exp(1j * wanted[:, 2]), atol=1e-12)
+    np.testing.assert_allclose(np.exp(1j * yaw), np.exp(1j * expected[:, 2]), atol=1e-12)
 
 
-def test_inputs_at_a_step_are_those_of_the_recorded_rows(drive: tuple[EpisodeData, list[Transition]]) -> None:
+def test_inputs_of_a_step_equal_the_recorded_rows(drive: tuple[EpisodeData, list[Transition]]) -> None:
     driven, transitions = drive
     rows = transitions_of([driven], HISTORY)
     features = torch.from_numpy(np.array([transitions[k].features for k in rows.tick]))
@@ -87,14 +87,14 @@ def test_inputs_at_a_step_are_those_of_the_recorded_rows(drive: tuple[EpisodeDat
     np.testing.assert_array_equal(inputs[:, -2:], [transitions[k].action.to_array() for k in rows.tick])
 
 
-def test_without_a_history_a_step_forgets_the_command() -> None:
+def test_advance_without_history_drops_the_command() -> None:
     features = torch.tensor([[1.0, 2.0, 1.0, 0.0, 0.5, 0.0, 0.0]])  # heading along y
     after = advance(features, torch.tensor([[0.3, 0.4]]), torch.tensor([[0.2, 0.1, math.pi / 2, 0.1, 0.0, -0.2]]))
     assert after[0].tolist() == pytest.approx([0.9, 2.2, 0.0, -1.0, 0.6, 0.0, -0.2], abs=1e-6)
 
 
-def known_car(values: Tensor, dof: float = math.inf, noise: float = 0.5) -> CarDynamics:
-    """Particles that each say one value (L, 6), whatever the input."""
+def constant_car(values: Tensor, dof: float = math.inf, noise: float = 0.5) -> CarDynamics:
+    """Return a car whose particles predict constant values (L, 6)."""
     network = Network(INPUTS, 6, (4,))
     parameters = torch.zeros(len(values), network.parameters)
     parameters[:, -6:] = values
@@ -103,13 +103,13 @@ def known_car(values: Tensor, dof: float = math.inf, noise: float = 0.5) -> CarD
 
 
 @pytest.mark.parametrize("dof", [math.inf, 5.0])
-def test_draws_are_those_of_the_mixture(dof: float) -> None:
-    """Equal shares of four Gaussians: mean and variance by the law of total variance, kurtosis by their moments.
+def test_draws_have_the_moments_of_the_mixture(dof: float) -> None:
+    """The mixture has four equally weighted components with known mean, variance and fourth moment.
 
-    Of Student noise each has a scale of its own: the root of 5 over the middle of a quarter of chi square.
+    With Student-t noise each component has the scale ``sqrt(dof / q)`` with q a chi-square quantile.
     """
     values = torch.randn(4, 6, generator=torch.Generator().manual_seed(2))
-    car = known_car(values, dof, noise=0.85)
+    car = constant_car(values, dof, noise=0.85)
     count = 40_000
     drawn = car.sample(torch.zeros(count, INPUTS), torch.Generator().manual_seed(0)).double()
     unit = torch.arange(1.0, 7.0).double()
@@ -117,38 +117,38 @@ def test_draws_are_those_of_the_mixture(dof: float) -> None:
     scales = np.ones(4) if math.isinf(dof) else np.sqrt(dof / chi2.ppf([0.125, 0.375, 0.625, 0.875], dof))
     stds = 0.85 * unit * torch.from_numpy(scales)[:, None]
     mean = means.mean(dim=0)
-    away = means - mean
-    variance = (away**2 + stds**2).mean(dim=0)
-    fourth = (away**4 + 6 * away**2 * stds**2 + 3 * stds**4).mean(dim=0)
+    mean_deviations = means - mean
+    variance = (mean_deviations**2 + stds**2).mean(dim=0)
+    fourth = (mean_deviations**4 + 6 * mean_deviations**2 * stds**2 + 3 * stds**4).mean(dim=0)
     assert torch.all((drawn.mean(dim=0) - mean).abs() < 4 * (variance / count).sqrt())
     found = ((drawn - mean) ** 2).mean(dim=0)
     assert torch.all((found - variance).abs() < 4 * ((fourth - variance**2) / count).sqrt())
     predicted = car.predict(torch.zeros(1, INPUTS))
     torch.testing.assert_close(predicted.mean[0].double(), mean, rtol=1e-5, atol=1e-5)
-    variance = (away**2).mean(dim=0) + (0.85 * unit) ** 2 * (1.0 if math.isinf(dof) else 5.0 / 3.0)
+    variance = (mean_deviations**2).mean(dim=0) + (0.85 * unit) ** 2 * (1.0 if math.isinf(dof) else 5.0 / 3.0)
     torch.testing.assert_close(predicted.std[0].double(), variance.sqrt(), rtol=1e-5, atol=1e-5)
 
 
-def test_every_particle_gets_its_share_and_every_row_a_particle_of_its_own() -> None:
-    car = known_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
+def test_rows_are_assigned_evenly_and_randomly_to_particles() -> None:
+    car = constant_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
     drawn = car.sample(torch.zeros(200, INPUTS), torch.Generator().manual_seed(0))
-    said = (drawn[:, 0] - 0.3).round().int()
-    assert torch.bincount(said).tolist() == [40] * 5
-    assert len(said.unique_consecutive()) > 100, "they are not assigned in order"
+    particle_of_row = (drawn[:, 0] - 0.3).round().int()
+    assert torch.bincount(particle_of_row).tolist() == [40] * 5
+    assert len(particle_of_row.unique_consecutive()) > 100, "rows must not be assigned in order"
 
 
 @pytest.mark.parametrize("count", [1, 3, 7, 64])
-def test_every_row_meets_every_particle_equally_often_however_many_rows_there_are(count: int) -> None:
-    car = known_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
+def test_each_row_draws_each_particle_equally_often_for_any_row_count(count: int) -> None:
+    car = constant_car(torch.arange(5.0)[:, None].expand(5, 6), noise=1e-6)
     generator, inputs = torch.Generator().manual_seed(0), torch.zeros(count, INPUTS)
-    said = torch.stack([(car.sample(inputs, generator)[:, 0] - 0.3).round() for _ in range(1500)])
+    drawn_particles = torch.stack([(car.sample(inputs, generator)[:, 0] - 0.3).round() for _ in range(1500)])
     for row in {0, count - 1}:
-        often = torch.bincount(said[:, row].int(), minlength=5)
-        assert torch.all((often - 300).abs() < 5 * math.sqrt(1500 * 0.2 * 0.8)), (row, often)
+        counts = torch.bincount(drawn_particles[:, row].int(), minlength=5)
+        assert torch.all((counts - 300).abs() < 5 * math.sqrt(1500 * 0.2 * 0.8)), (row, counts)
 
 
-def test_a_row_is_answered_for_its_own_inputs() -> None:
-    """A network that says vx back: the draw of a row must be near that of the row, whichever particle it met."""
+def test_draws_stay_in_the_order_of_their_input_rows() -> None:
+    """Every particle returns vx of its input row, so each draw must equal vx of the same row."""
     network = Network(INPUTS, 6, (2,), slope=1.0)
     parameters = torch.zeros(3, network.parameters)
     (first, _), (last, _) = network.split(parameters)
@@ -161,8 +161,8 @@ def test_a_row_is_answered_for_its_own_inputs() -> None:
     assert torch.allclose(drawn, inputs[:, :1].expand(100, 6), atol=1e-3)
 
 
-def test_a_world_that_feeds_on_itself_does_not_run_away() -> None:
-    """A yaw rate that doubles at each step is that of the edge from there on: it grows by as much, and no more."""
+def test_unstable_model_grows_linearly_beyond_the_input_clip() -> None:
+    """A yaw rate that doubles per step grows by a constant once the network input is clipped."""
     network = Network(INPUTS, 6, (2,), slope=1.0)
     parameters = torch.zeros(1, network.parameters)
     (first, _), (last, _) = network.split(parameters)
@@ -183,12 +183,12 @@ DECORRELATION = torch.eye(6).double() + 0.4 * torch.randn(6, 6, generator=torch.
 
 
 def decorrelated(car: CarDynamics, by: torch.Tensor = DECORRELATION) -> CarDynamics:
-    """The same numbers in decorrelated units."""
+    """Return the car with the same network parameters in decorrelated output units."""
     return replace(car, posterior=replace(car.posterior, normaliser=car.posterior.normaliser.decorrelated(by)))
 
 
-def test_noise_of_one_draw_is_correlated_as_the_turn_says() -> None:
-    car = decorrelated(known_car(torch.zeros(4, 6)))
+def test_noise_of_draws_has_the_covariance_of_the_decorrelation() -> None:
+    car = decorrelated(constant_car(torch.zeros(4, 6)))
     drawn = car.sample(torch.zeros(40_000, INPUTS), torch.Generator().manual_seed(0)).double().numpy()
     unit = np.arange(1.0, 7.0)
     back = np.linalg.inv(DECORRELATION.numpy())
@@ -199,19 +199,19 @@ def test_noise_of_one_draw_is_correlated_as_the_turn_says() -> None:
     assert np.allclose(predicted.mean, 0.3, atol=1e-5)
 
 
-def test_particles_taken_over_into_other_units_are_the_same_functions() -> None:
+def test_particles_converted_to_other_units_are_the_same_functions() -> None:
     inputs = torch.randn(50, INPUTS, generator=torch.Generator().manual_seed(1))
-    for car in (some_car(), decorrelated(some_car(), DECORRELATION.T)):
+    for car in (random_car(), decorrelated(random_car(), DECORRELATION.T)):
         for normaliser in (
             car.posterior.normaliser.without_decorrelation().decorrelated(DECORRELATION),
             car.posterior.normaliser.without_decorrelation(),
         ):
             parameters = car.posterior.parameters_for(normaliser)
-            there = replace(car.posterior, parameters=parameters, normaliser=normaliser).predict(inputs)
-            torch.testing.assert_close(there.means, car.predict(inputs).means, rtol=1e-4, atol=1e-5)
+            converted = replace(car.posterior, parameters=parameters, normaliser=normaliser).predict(inputs)
+            torch.testing.assert_close(converted.means, car.predict(inputs).means, rtol=1e-4, atol=1e-5)
 
 
-def some_car(dof: float = math.inf) -> CarDynamics:
+def random_car(dof: float = math.inf) -> CarDynamics:
     generator = torch.Generator().manual_seed(5)
     network = Network(INPUTS, 6, (8, 4), "silu")
     units = Normaliser(*(torch.rand(n, generator=generator) + 0.5 for n in (INPUTS, INPUTS, 6, 6)))
@@ -219,10 +219,10 @@ def some_car(dof: float = math.inf) -> CarDynamics:
     return CarDynamics(ParticlePosterior(network, network.initial(3, generator), noise, units, dof), HISTORY)
 
 
-def whole_car() -> CarDynamics:
-    """A car as learned from many rows: with a trend, decorrelated and correlated errors, and an input clip."""
+def car_with_all_parts() -> CarDynamics:
+    """Return a car with a trend, decorrelated and correlated errors, and an input clip."""
     generator = torch.Generator().manual_seed(8)
-    car = decorrelated(some_car())
+    car = decorrelated(random_car())
     root = torch.eye(6) + 0.3 * torch.randn((6, 6), generator=generator)
     shape = root @ root.T
     scale = shape.diagonal().rsqrt()
@@ -232,23 +232,23 @@ def whole_car() -> CarDynamics:
     return replace(car, posterior=posterior)
 
 
-def test_draws_of_a_whole_car_have_the_moments_of_its_parts() -> None:
-    car = whole_car()
+def test_draws_of_a_car_with_all_parts_have_known_moments() -> None:
+    car = car_with_all_parts()
     posterior, units = car.posterior, car.posterior.normaliser
     assert posterior.trend is not None
     assert posterior.correlation is not None
     assert posterior.input_clip is not None
     row = 3.0 * torch.randn((1, INPUTS), generator=torch.Generator().manual_seed(1))
-    seen = (row - units.input_mean) / units.input_std
-    assert bool((seen.abs() > posterior.input_clip).any()), "some of it is clipped"
-    seen = seen.clamp(-posterior.input_clip, posterior.input_clip)
-    network = posterior.network(posterior.parameters, seen)[:, 0].double()
-    line = (posterior.trend[0] + seen[0] @ posterior.trend[1:]).double()
+    normalised = (row - units.input_mean) / units.input_std
+    assert bool((normalised.abs() > posterior.input_clip).any()), "some inputs must be clipped"
+    normalised = normalised.clamp(-posterior.input_clip, posterior.input_clip)
+    network = posterior.network(posterior.parameters, normalised)[:, 0].double()
+    line = (posterior.trend[0] + normalised[0] @ posterior.trend[1:]).double()
     back = units.output_std.double()[:, None] * torch.linalg.inv(DECORRELATION.double())
     centres = units.output_mean.double() + (network + line) @ back.T
     noise = posterior.noise_std.double()
-    own = back @ (noise[:, None] * posterior.correlation.double() * noise) @ back.T
-    covariance = own + torch.cov(centres.T, correction=0)
+    noise_covariance = back @ (noise[:, None] * posterior.correlation.double() * noise) @ back.T
+    covariance = noise_covariance + torch.cov(centres.T, correction=0)
     drawn = car.sample(row.expand(60_000, -1), torch.Generator().manual_seed(2)).double()
     spread = covariance.diagonal().sqrt()
     assert torch.allclose(drawn.mean(dim=0), centres.mean(dim=0), atol=0.02 * float(spread.max()))
@@ -258,27 +258,30 @@ def test_draws_of_a_whole_car_have_the_moments_of_its_parts() -> None:
 
 
 @pytest.mark.parametrize("dof", [math.inf, 2.5, None])
-def test_a_car_from_its_file_predicts_alike(tmp_path: Path, dof: float | None) -> None:
-    car = whole_car() if dof is None else some_car(dof)
+def test_car_loaded_from_a_file_predicts_the_same(tmp_path: Path, dof: float | None) -> None:
+    car = car_with_all_parts() if dof is None else random_car(dof)
     if dof == 2.5:
         car = decorrelated(car)
     save_car(car, tmp_path / "car.pt")
-    again = load_car(tmp_path / "car.pt")
-    assert again.history == HISTORY
+    loaded = load_car(tmp_path / "car.pt")
+    assert loaded.history == HISTORY
     inputs = torch.randn(50, INPUTS, generator=torch.Generator().manual_seed(1))
-    ours, theirs = car.predict(inputs), again.predict(inputs)
-    assert torch.equal(ours.means, theirs.means)
-    assert torch.equal(ours.stds, theirs.stds)
-    assert (ours.decorrelation is None) == (theirs.decorrelation is None) == (dof == math.inf)
-    assert ours.dof == theirs.dof == (math.inf if dof is None else dof)
-    densities = [negative_log_likelihood(predicted, torch.zeros(50, 6)) for predicted in (ours, theirs)]
+    original_prediction, loaded_prediction = car.predict(inputs), loaded.predict(inputs)
+    assert torch.equal(original_prediction.means, loaded_prediction.means)
+    assert torch.equal(original_prediction.stds, loaded_prediction.stds)
+    assert (original_prediction.decorrelation is None) == (dof == math.inf)
+    assert (loaded_prediction.decorrelation is None) == (dof == math.inf)
+    assert original_prediction.dof == loaded_prediction.dof == (math.inf if dof is None else dof)
+    densities = [
+        negative_log_likelihood(predicted, torch.zeros(50, 6)) for predicted in (original_prediction, loaded_prediction)
+    ]
     assert densities[0] == densities[1]
-    first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, again))
+    first, second = (c.sample(inputs, torch.Generator().manual_seed(3)) for c in (car, loaded))
     assert torch.equal(first, second)
 
 
-def damaged(path: Path, kind: str) -> None:
-    save_car(some_car(), path)
+def write_damaged_file(path: Path, kind: str) -> None:
+    save_car(random_car(), path)
     whole = path.read_bytes()
     content: dict[str, Any] = torch.load(path, weights_only=True)
     if kind == "of another version":
@@ -302,10 +305,10 @@ def damaged(path: Path, kind: str) -> None:
         path.write_bytes({"cut short": whole[: len(whole) // 2], "empty": b"", "text": b"rubbish\n"}[kind])
 
 
-def test_a_file_of_an_earlier_version_is_called_that(tmp_path: Path) -> None:
-    """Such a file lacks what came later."""
+def test_file_of_an_earlier_version_is_reported_with_its_version(tmp_path: Path) -> None:
+    """An earlier file lacks parts that were added later."""
     path = tmp_path / "car.pt"
-    save_car(some_car(), path)
+    save_car(random_car(), path)
     content: dict[str, Any] = torch.load(path, weights_only=True)
     del content["activation"]
     torch.save(content | {"version": 2}, path)
@@ -323,17 +326,17 @@ KINDS = (
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_file_that_is_no_learned_car_is_refused_with_what_to_do(tmp_path: Path, kind: str) -> None:
+def test_invalid_car_file_is_refused_with_the_remedy(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "car.pt"
-    damaged(path, kind)
-    with pytest.raises(DataError, match=r"remove its folder to train again\.$") as said:
+    write_damaged_file(path, kind)
+    with pytest.raises(DataError, match=r"remove its folder to train again\.$") as error:
         load_car(path)
-    assert str(said.value).count("to train again") == 1
-    assert "car.pt" in str(said.value)
+    assert str(error.value).count("to train again") == 1
+    assert "car.pt" in str(error.value)
 
 
-def test_without_rows_the_learned_car_is_its_simulator() -> None:
-    """Mean and spread of its particles against cars drawn from the ranges."""
+def test_fit_without_rows_reproduces_the_simulator_prior() -> None:
+    """The reference is the mean of cars with gains across the prior range."""
     model = CarModel(SimulatorConfig(kind="kinematic"), 1, {"motor.drive_gain": (5.0, 12.0)})
     steps_done: list[int] = []
     car = fit_car(None, model, CarFitSettings(steps=600, particles=12), progress=steps_done.append)
@@ -341,8 +344,8 @@ def test_without_rows_the_learned_car_is_its_simulator() -> None:
     gains = torch.linspace(5.0, 12.0, 101)[:, None]
     truth = model(inputs, gains)
     found = car.predict(inputs)
-    away = (found.mean - truth.mean(dim=0)).square().mean(dim=0).sqrt()
-    assert torch.all(away < 0.25 * truth.flatten(0, 1).std(dim=0))
+    rms_error = (found.mean - truth.mean(dim=0)).square().mean(dim=0).sqrt()
+    assert torch.all(rms_error < 0.25 * truth.flatten(0, 1).std(dim=0))
     assert steps_done == [200, 400, 600]
 
 
@@ -352,8 +355,8 @@ def test_rows_with_another_history_are_refused(drive: tuple[EpisodeData, list[Tr
         fit_car(transitions_of([drive[0]], HISTORY), model, CarFitSettings(steps=1))
 
 
-class Breaking(CarModel):
-    """A simulator that runs away for strong motors: to where no car has been, or to no number."""
+class PartlyFailingModel(CarModel):
+    """A simulator that gives huge states for strong motors and NaN for stronger ones."""
 
     too_strong: ClassVar[float] = 11.0
 
@@ -367,7 +370,7 @@ class Breaking(CarModel):
         return states
 
 
-class Broken(Breaking):
+class AlwaysFailingModel(PartlyFailingModel):
     too_strong: ClassVar[float] = 5.0
 
 
@@ -377,20 +380,20 @@ def kinematic(kind: type[CarModel]) -> CarModel:
     return kind(replace(config, kind="kinematic", priors={}), HISTORY, ranges)
 
 
-def test_a_prior_that_breaks_down_for_some_draws_is_learned_from_the_others() -> None:
+def test_prior_draws_with_invalid_states_are_excluded() -> None:
     settings = CarFitSettings(steps=40, particles=6)
-    whole, partly = (fit_car(None, kinematic(kind), settings) for kind in (CarModel, Breaking))
-    ours, theirs = whole.posterior.normaliser, partly.posterior.normaliser
-    assert torch.allclose(ours.output_std, theirs.output_std, rtol=0.2)
-    assert torch.allclose(ours.input_std, theirs.input_std, rtol=0.2)
-    inputs = kinematic(Breaking).inputs(500, torch.Generator().manual_seed(0))
+    reference, fitted = (fit_car(None, kinematic(kind), settings) for kind in (CarModel, PartlyFailingModel))
+    reference_units, fitted_units = reference.posterior.normaliser, fitted.posterior.normaliser
+    assert torch.allclose(reference_units.output_std, fitted_units.output_std, rtol=0.2)
+    assert torch.allclose(reference_units.input_std, fitted_units.input_std, rtol=0.2)
+    inputs = kinematic(PartlyFailingModel).inputs(500, torch.Generator().manual_seed(0))
     assert len(inputs) == 500
     assert float(inputs.abs().max()) < 100.0
-    said = partly.predict(inputs)
-    assert bool(torch.isfinite(said.means).all())
+    prediction = fitted.predict(inputs)
+    assert bool(torch.isfinite(prediction.means).all())
 
 
-def test_a_prior_that_cannot_be_integrated_is_said() -> None:
+def test_prior_without_finite_outputs_is_reported() -> None:
     with pytest.raises(DataError, match="simulator gives no finite outputs") as error:
-        fit_car(None, kinematic(Broken), CarFitSettings(steps=5))
+        fit_car(None, kinematic(AlwaysFailingModel), CarFitSettings(steps=5))
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Particles distilled from a posterior: Stein's direction by autograd, moments and noise in closed form."""
+"""Test the distillation of a posterior into particles against autograd and closed forms."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def normal(*shape, seed=0):
 
 
 @dataclass(frozen=True)
-class OneLine:
-    """``0.7 x - 1.2``, whatever its parameter."""
+class FixedLine:
+    """Simulator ``0.7 x - 1.2``; its parameter has no effect."""
 
     size: int = 1
 
@@ -49,8 +49,8 @@ class OneLine:
 
 
 @dataclass(frozen=True)
-class Lines:
-    """``a x + b`` with standard normal a and b, for x in [-3, 4]."""
+class RandomLine:
+    """Simulator ``a x + b`` with standard normal a and b, for x in [-3, 4]."""
 
     size: int = 2
 
@@ -65,62 +65,62 @@ class Lines:
 
 
 def gaussian(groups, points, seed=0):
-    """Means (G, N) and Cholesky factors (G, N, N)."""
+    """Return random means (G, N) and Cholesky factors of covariances (G, N, N)."""
     roots = normal(groups, points, points, seed=seed)
     covariance = roots @ roots.transpose(1, 2) + 0.3 * torch.eye(points)
     return normal(groups, points, seed=seed + 1), torch.linalg.cholesky(covariance)
 
 
-def of_standard_moments(values):
-    """The same particles (L, N), moved and mixed to mean zero and unit covariance."""
-    off = values - values.mean(dim=0)
-    root = torch.linalg.cholesky(off.T @ off / len(off))
-    return torch.linalg.solve_triangular(root, off.T, upper=False).T
+def standardised(values):
+    """Transform particles (L, N) linearly to zero sample mean and unit sample covariance."""
+    centred = values - values.mean(dim=0)
+    root = torch.linalg.cholesky(centred.T @ centred / len(centred))
+    return torch.linalg.solve_triangular(root, centred.T, upper=False).T
 
 
 class TestDirection:
-    def test_particles_with_the_gaussians_moments_stand_still(self):
+    def test_direction_is_zero_for_particles_with_the_target_moments(self):
         mean, factor = gaussian(3, 4)
-        white = torch.stack([of_standard_moments(normal(9, 4, seed=s)) for s in range(3)], dim=1)
+        white = torch.stack([standardised(normal(9, 4, seed=s)) for s in range(3)], dim=1)
         values = mean + torch.einsum("gij,lgj->lgi", factor, white)
         assert moment_direction(values, mean, factor).abs().max() < 1e-12
         assert moment_direction(values + 0.1, mean, factor).abs().max() > 0.01
         assert moment_direction(mean + 1.1 * (values - mean), mean, factor).abs().max() > 0.01
 
     @pytest.mark.parametrize("size", [0.2, 1.0, 30.0])
-    def test_it_is_steins_sum_by_definition(self, size):
-        """``k(u, v) = 1 + u . v / c`` in whitened values; c is their mean square where that is above one."""
+    def test_direction_equals_the_stein_sum_by_autograd(self, size):
+        """The kernel of whitened values is ``1 + u . v / c``; c is the larger of their mean square and one."""
         mean, factor = gaussian(2, 3, seed=4)
         values = mean + size * normal(5, 2, 3, seed=6)
-        ours = moment_direction(values, mean, factor)
+        direction = moment_direction(values, mean, factor)
         for g in range(2):
             white = torch.linalg.solve(factor[g], (values[:, g] - mean[g]).T).T
             width = max(float((white**2).mean()), 1.0)
             assert (width > 1.0) == (size > 0.2)
-            for own in range(5):
+            for particle in range(5):
                 total = torch.zeros(3, dtype=torch.float64)
                 for other in white:
                     u = other.clone().requires_grad_()
-                    kernel = 1.0 + u @ white[own] / width
+                    kernel = 1.0 + u @ white[particle] / width
                     (by_kernel,) = torch.autograd.grad(kernel, u)
                     (score,) = torch.autograd.grad(-0.5 * u @ u, u)
                     total += (kernel.detach() * score + by_kernel) / 5
-                assert torch.allclose(ours[own, g], factor[g] @ total, rtol=1e-9, atol=1e-12)
+                assert torch.allclose(direction[particle, g], factor[g] @ total, rtol=1e-9, atol=1e-12)
 
-    def test_following_it_particles_come_to_mean_and_covariance(self):
-        """From far away, where no step may be too long."""
+    def test_iterated_direction_reaches_mean_and_covariance_from_far_away(self):
+        """Steps stay bounded although the particles start far from the target."""
         mean, factor = gaussian(2, 3, seed=8)
         values = 50.0 + 20.0 * normal(12, 2, 3, seed=9)
         for _ in range(300):
             values = values + 0.2 * moment_direction(values, mean, factor)
         for g in range(2):
-            off = values[:, g] - values[:, g].mean(dim=0)
+            centred = values[:, g] - values[:, g].mean(dim=0)
             assert torch.allclose(values[:, g].mean(dim=0), mean[g], atol=1e-6)
-            assert torch.allclose(off.T @ off / 12, factor[g] @ factor[g].T, atol=1e-6)
+            assert torch.allclose(centred.T @ centred / 12, factor[g] @ factor[g].T, atol=1e-6)
 
 
 def constant(*heights, hidden=(4,)):
-    """Parameters of particles whose normalised values are ``heights`` (L, O) everywhere."""
+    """Return parameters of particles whose normalised outputs are the constants ``heights`` (L, O)."""
     network = Network(1, len(heights[0]), hidden)
     numbers = torch.zeros(len(heights), network.parameters)
     network.split(numbers)[-1][1][:, 0] = torch.tensor(heights)
@@ -128,12 +128,12 @@ def constant(*heights, hidden=(4,)):
 
 
 class TestTrend:
-    """What all particles have in common, before a step is taken."""
+    """The linear trend shared by all particles, before the first step."""
 
     settings = DistillationSettings(hidden=(4,), steps=0)
 
-    def test_it_is_weighted_least_squares(self):
-        """In numpy, weighted by the predictive variance; an input that never changes has no slope."""
+    def test_trend_is_weighted_least_squares(self):
+        """numpy fits the same line with predictive-variance weights; a constant input gets no slope."""
         units = Normaliser(torch.tensor([0.5, 7.0]), torch.tensor([1.5, 1.0]), UNITS.output_mean, UNITS.output_std)
         x, points = (torch.cat([v, torch.full_like(v, 7.5)], dim=1) for v in (X, torch.linspace(-3, 4, 64)[:, None]))
         target = infer(None, x, Y, units, NOISE)
@@ -144,9 +144,8 @@ class TestTrend:
         assert np.allclose(found.predict(at).mean[:, 0], slope * at[:, 0].numpy() + offset, atol=2e-3)
         assert abs(slope) > 0.3
 
-    def test_a_linear_target_is_met_by_it_alone(self):
-        """A simulator of one line."""
-        target = infer(OneLine(), EMPTY, EMPTY, UNITS, NOISE, with_discrepancy=False)
+    def test_trend_alone_reproduces_a_linear_target(self):
+        target = infer(FixedLine(), EMPTY, EMPTY, UNITS, NOISE, with_discrepancy=False)
         points = torch.linspace(-3, 4, 16)[:, None]
         found = distil(target, points, self.settings, start=constant((0.0,), (0.0,)))
         assert np.allclose(found.predict(points).mean, 0.7 * points - 1.2, atol=1e-3)
@@ -154,27 +153,27 @@ class TestTrend:
 
 @pytest.fixture
 def no_trend(monkeypatch):
-    """Particles without one."""
+    """Replace the linear trend by zero."""
     flat = lambda inputs, mean, weight: torch.zeros(1 + inputs.shape[2], mean.shape[1])  # noqa: E731
     monkeypatch.setattr(distillation, "_trend", flat)
 
 
-def test_particles_count_inputs_as_far_out_as_they_were_led():
-    """Nine units here; farther out is as at that edge."""
+def test_inputs_are_clipped_at_the_edge_of_the_training_inputs():
+    """The training inputs end at 9; the prediction at 30 equals the one at 9."""
     rng = np.random.default_rng(0)
     x = torch.from_numpy(rng.uniform(-9.0, 9.0, (60, 1))).float()
     units = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
     target = infer(None, x, 0.5 * x + 0.05 * torch.from_numpy(rng.normal(size=(60, 1))).float(), units, torch.ones(1))
     found = distil(target, torch.linspace(-9.0, 9.0, 400)[:, None], DistillationSettings(steps=200, hidden=(16,)))
     at = torch.tensor([[-8.5], [8.5], [9.0], [30.0]])
-    said = found.predict(at).mean[:, 0]
-    assert said[:2].tolist() == pytest.approx([-4.25, 4.25], abs=0.2)
-    assert said[3] == pytest.approx(float(said[2]), abs=0.05)
+    predicted = found.predict(at).mean[:, 0]
+    assert predicted[:2].tolist() == pytest.approx([-4.25, 4.25], abs=0.2)
+    assert predicted[3] == pytest.approx(float(predicted[2]), abs=0.05)
 
 
 @pytest.mark.usefixtures("no_trend")
 class TestNoise:
-    """Of constant particles without a step taken, under a target that is known, with two outputs."""
+    """Fitted noise of constant particles without a step, for a known target with two outputs."""
 
     points = torch.linspace(-3, 4, 16)[:, None]
     settings = DistillationSettings(hidden=(4,), steps=0)
@@ -184,22 +183,22 @@ class TestNoise:
     )
 
     @pytest.mark.parametrize("heights", [[(0.2, 0.0)] * 2, [(-0.3, 0.1)] * 3, [(0.05, 0.2), (-0.05, -0.2)]])
-    def test_it_is_what_measurements_and_particles_do_not_say(self, heights):
-        """Per point: the noise, the mean's error, and the target's variance beyond that of the particles."""
+    def test_noise_is_the_predictive_variance_not_covered_by_the_particles(self, heights):
+        """Per point it sums measurement noise, squared error of the mean and target variance beyond the particles'."""
         found = distil(self.target, self.points, self.settings, start=constant(*heights))
         x = (self.points[:, 0].double().numpy() - 0.5) / 1.5
         for k, (noise, discrepancy) in enumerate(((0.1, 0.15), (0.4, 0.2))):
-            own = discrepancy**2 * (
-                2.0 + x**2
-            )  # Smooth part, offset and slope of the discrepancy, all of the prior size.
-            weight = 1.0 / (own + noise**2)
-            at = np.array(heights)[:, k]
-            missed = (weight * (np.mean(at) ** 2 + own - np.var(at))).sum() / weight.sum()
+            # Smooth part, offset and slope of the discrepancy have the prior size.
+            discrepancy_variance = discrepancy**2 * (2.0 + x**2)
+            weight = 1.0 / (discrepancy_variance + noise**2)
+            values = np.array(heights)[:, k]
+            uncovered = values.mean() ** 2 + discrepancy_variance - values.var()
+            missed = (weight * uncovered).sum() / weight.sum()
             assert float(found.noise_std[k]) == pytest.approx(np.sqrt(noise**2 + missed), rel=1e-4)
 
     @pytest.mark.parametrize(("rows", "at_data"), [(39, False), (40, True)])
-    def test_with_data_it_is_what_is_missed_there(self, rows, at_data):
-        """Particles about 0.3 under a target that is nearly so at the data and not elsewhere; one row is far away."""
+    def test_noise_is_fitted_at_the_data_from_40_rows_on(self, rows, at_data):
+        """The particles lie near 0.3; the target is near 0.3 at the data only; one row is far away."""
         heights = ((0.25, 0.4), (0.3, 0.3), (0.35, 0.2))
         x = torch.cat([torch.linspace(8.0, 12.0, rows - 1), torch.tensor([40.0])])[:, None]
         y = torch.tensor([[1.0 + 2.0 * 0.3, -3.0 + 0.5 * 0.3]]).expand(rows, 2)
@@ -209,38 +208,38 @@ class TestNoise:
         mean, std = target.predict(x if at_data else self.points)
         missed = ((mean - self.units.raw_outputs(torch.tensor([0.3, 0.3]))) / self.units.output_std) ** 2
         noise = target.noise_std**2
-        own = (std / self.units.output_std) ** 2 - noise - torch.tensor(heights).var(dim=0, correction=0)
-        weight = torch.ones_like(own) if at_data else (std / self.units.output_std) ** -2
-        theirs = (noise + (weight * (missed + own)).sum(dim=0) / weight.sum(dim=0)).sqrt()
-        assert np.allclose(found.noise_std, theirs, rtol=2e-3)
+        function_variance = (std / self.units.output_std) ** 2 - noise - torch.tensor(heights).var(dim=0, correction=0)
+        weight = torch.ones_like(function_variance) if at_data else (std / self.units.output_std) ** -2
+        expected = (noise + (weight * (missed + function_variance)).sum(dim=0) / weight.sum(dim=0)).sqrt()
+        assert np.allclose(found.noise_std, expected, rtol=2e-3)
         assert (bool((found.noise_std < 1.5 * target.noise_std).all())) is at_data
 
-    @pytest.mark.parametrize("far", [5.0, 50.0])
-    def test_one_row_that_is_missed_by_far_says_little_of_the_noise(self, far):
-        """Sixty rows at 0.3, which the particles meet, and one of great moment far from all others."""
+    @pytest.mark.parametrize("outlier_error", [5.0, 50.0])
+    def test_one_row_with_a_large_error_hardly_changes_the_noise(self, outlier_error):
+        """The particles fit sixty rows at 0.3 and miss one distant row of high leverage."""
         x = torch.cat([torch.linspace(8.0, 12.0, 60), torch.tensor([60.0])])[:, None]
         y = torch.tensor([[1.0 + 2.0 * 0.3, -3.0 + 0.5 * 0.3]]).repeat(61, 1)
         y = y + torch.tensor([[0.2, 0.2]]) * torch.randn((61, 2), generator=generator(4))
-        y[-1] += far
+        y[-1] += outlier_error
         target = infer(None, x, y, self.units, torch.tensor([0.2, 0.2]), discrepancy_std=torch.tensor([0.6, 0.6]))
         found = distil(target, self.points, self.settings, start=constant(*[(0.3, 0.3)] * 2))
         missed = (target.predict(x[-1:])[0] - self.units.raw_outputs(torch.tensor([0.3, 0.3]))) / self.units.output_std
         assert (missed[0] > 4.0 * target.noise_std).any()
         assert torch.allclose(found.noise_std, target.noise_std, rtol=0.25)
 
-    def test_half_of_the_measurements_variance_is_left_at_least(self):
+    def test_noise_variance_is_at_least_half_of_the_measurement_variance(self):
         found = distil(self.target, self.points, self.settings, start=constant((2.0, 2.0), (-2.0, -2.0)))
         assert np.allclose(found.noise_std, [0.1 * np.sqrt(0.5), 0.4 * np.sqrt(0.5)], rtol=1e-5)
 
-    def test_it_has_the_targets_tails(self):
-        """Three particles in one place: a Student distribution of their noise."""
+    def test_prediction_has_the_degrees_of_freedom_of_the_target(self):
+        """Three equal particles predict a Student-t distribution with the scale of their noise."""
         target = infer(None, EMPTY, EMPTY, UNITS, NOISE)
         found = distil(replace(target, dof=4.0), self.points, self.settings, start=constant(*[(0.0,)] * 3))
         at = np.array([-3.0, 0.0, 0.9, 1.0, 1.3, 4.0])
         prediction = found.predict(torch.zeros(len(at), 1))
-        theirs = student(4.0, loc=1.0, scale=2.0 * float(found.noise_std)).logpdf(at)
+        expected = student(4.0, loc=1.0, scale=2.0 * float(found.noise_std)).logpdf(at)
         density = prediction.log_density(torch.tensor(at, dtype=torch.float32)[:, None])
-        assert np.allclose(density, theirs, atol=1e-4)
+        assert np.allclose(density, expected, atol=1e-4)
 
 
 X = torch.linspace(-2.5, 1.0, 8)[:, None]
@@ -250,13 +249,13 @@ SETTINGS = DistillationSettings(hidden=(32, 32), steps=1500)
 
 @pytest.fixture(scope="module")
 def target():
-    """What eight rows of a line with a wave say, from the left half of the domain."""
-    return infer(Lines(), X, Y, UNITS, NOISE, discrepancy_std=torch.tensor([0.4]))
+    """Posterior of eight rows of a line plus a sine, all in the left half of the domain."""
+    return infer(RandomLine(), X, Y, UNITS, NOISE, discrepancy_std=torch.tensor([0.4]))
 
 
 @pytest.fixture(scope="module")
 def points():
-    return measurement_points(Lines(), X, UNITS, generator(1), count=1024)
+    return measurement_points(RandomLine(), X, UNITS, generator(1), count=1024)
 
 
 @pytest.fixture(scope="module")
@@ -265,42 +264,43 @@ def steps_done():
 
 
 @pytest.fixture(scope="module")
-def found(target, points, steps_done):
+def particles(target, points, steps_done):
     return distil(target, points, SETTINGS, steps_done.append)
 
 
 class TestFit:
     at = torch.linspace(-2.9, 3.9, 60)[:, None]
 
-    def test_particles_have_the_targets_mean_and_spread(self, target, found):
+    def test_particles_have_the_mean_and_standard_deviation_of_the_target(self, target, particles):
         mean, std = target.predict(self.at)
-        function = (std**2 - (target.noise_std * UNITS.output_std) ** 2).sqrt()
-        prediction = found.predict(self.at)
-        assert float(function.max()) > 4.0 * float(function.min())
+        function_std = (std**2 - (target.noise_std * UNITS.output_std) ** 2).sqrt()
+        prediction = particles.predict(self.at)
+        assert float(function_std.max()) > 4.0 * float(function_std.min())
         assert ((prediction.mean - mean).abs() < 0.25 * std).all()
-        assert torch.allclose(prediction.epistemic_std, function, rtol=0.2, atol=0.02)
+        assert torch.allclose(prediction.epistemic_std, function_std, rtol=0.2, atol=0.02)
         assert torch.allclose(prediction.std, std, rtol=0.2)
 
-    def test_particles_vary_together_as_the_target_does(self, target, found):
+    def test_particles_have_the_correlation_of_the_target_between_inputs(self, target, particles):
         pairs = torch.stack([self.at[:-9], self.at[9:]], dim=1)
         _, covariance = target.marginals(pairs)
         exact = covariance[:, 0, 0, 1] / (covariance[:, 0, 0, 0] * covariance[:, 0, 1, 1]).sqrt()
-        values = found.predict(pairs.flatten(0, 1)).means[:, :, 0].view(-1, len(pairs), 2)
+        values = particles.predict(pairs.flatten(0, 1)).means[:, :, 0].view(-1, len(pairs), 2)
         correlation = [np.corrcoef(values[:, k].T)[0, 1] for k in range(len(pairs))]
         assert np.allclose(correlation, exact, atol=0.25)
 
-    def test_the_noise_is_nearly_that_of_the_measurements(self, target, found):
-        assert torch.allclose(found.noise_std, target.noise_std, rtol=0.3)
-        assert (found.noise_std**2 >= 0.4999 * target.noise_std**2).all()
+    def test_noise_is_close_to_the_measurement_noise(self, target, particles):
+        assert torch.allclose(particles.noise_std, target.noise_std, rtol=0.3)
+        assert (particles.noise_std**2 >= 0.4999 * target.noise_std**2).all()
 
-    def test_progress_is_called_every_two_hundred_steps(self, found, steps_done):
+    @pytest.mark.usefixtures("particles")
+    def test_progress_is_called_every_two_hundred_steps(self, steps_done):
         assert steps_done == [200, 400, 600, 800, 1000, 1200, 1400]
 
-    def test_each_output_has_a_mean_spread_and_noise_of_its_own(self):
-        """One is a wave with little noise, the other a line with ten times as much."""
+    def test_outputs_have_separate_means_standard_deviations_and_noise(self):
+        """The first output is a sine with little noise, the second a line with 100 times as much."""
         units = Normaliser(UNITS.input_mean, UNITS.input_std, torch.tensor([0.0, 5.0]), torch.tensor([1.0, 10.0]))
-        off = torch.randn(8, 2, generator=generator(4)) * torch.tensor([0.05, 5.0])
-        y = torch.cat([torch.sin(X), 20.0 - 3.0 * X], dim=1) + off
+        noise = torch.randn(8, 2, generator=generator(4)) * torch.tensor([0.05, 5.0])
+        y = torch.cat([torch.sin(X), 20.0 - 3.0 * X], dim=1) + noise
         target = infer(None, X, y, units, torch.tensor([0.05, 5.0]))
         points = self.at.repeat(10, 1)
         found = distil(target, points, replace(SETTINGS, steps=800))
@@ -310,17 +310,17 @@ class TestFit:
         assert torch.allclose(prediction.std, std, rtol=0.25)
         assert torch.allclose(found.noise_std, target.noise_std, rtol=0.4)
 
-    def test_from_earlier_particles_it_is_there_at_once(self, target, points, found):
-        again = distil(target, points, replace(SETTINGS, steps=20, learning_rate=1e-4), start=found.parameters)
+    def test_warm_start_from_fitted_particles_converges_within_20_steps(self, target, points, particles):
+        warm = distil(target, points, replace(SETTINGS, steps=20, learning_rate=1e-4), start=particles.parameters)
         fresh = distil(target, points, replace(SETTINGS, steps=20, learning_rate=1e-4))
         mean, std = target.predict(self.at)
-        assert ((again.predict(self.at).mean - mean).abs() < 0.25 * std).all()
+        assert ((warm.predict(self.at).mean - mean).abs() < 0.25 * std).all()
         assert ((fresh.predict(self.at).mean - mean).abs() > 0.25 * std).any()
 
-    def test_the_start_is_left_as_it_was(self, target, points, found):
-        start = found.parameters.clone()
+    def test_start_parameters_are_not_modified(self, target, points, particles):
+        start = particles.parameters.clone()
         moved = distil(target, points, replace(SETTINGS, steps=5), start=start)
-        assert torch.equal(start, found.parameters)
+        assert torch.equal(start, particles.parameters)
         assert not torch.equal(start, moved.parameters)
 
     def test_the_same_seed_gives_the_same_particles(self, target, points):
@@ -330,7 +330,7 @@ class TestFit:
         assert not torch.equal(first, other)
 
     @pytest.mark.parametrize("broken", ["rate", "start"])
-    def test_divergence_is_said(self, target, points, broken):
+    def test_divergence_is_reported(self, target, points, broken):
         settings = replace(SETTINGS, steps=30, learning_rate=1e12 if broken == "rate" else 1e-3)
         start = constant((0.0,), (float("nan"),), hidden=(32, 32)) if broken == "start" else None
         with pytest.raises(DataError, match="smaller learning rate"):
@@ -338,38 +338,38 @@ class TestFit:
 
 
 class TestMeasurementPoints:
-    """Rows of data near 100, far from the domain; one normalised unit of inputs is 1.5."""
+    """The data lie near 100, far from the domain; one normalised input unit is 1.5."""
 
     rows = 100.0 + normal(30, 1).float()
 
-    def test_half_are_near_the_data_and_half_in_the_domain(self):
-        found = measurement_points(Lines(), self.rows, UNITS, generator(), count=1001)
+    def test_half_of_the_points_are_near_the_data_and_half_in_the_domain(self):
+        found = measurement_points(RandomLine(), self.rows, UNITS, generator(), count=1001)
         near = found[:, 0] > 50.0
         assert found.shape == (1001, 1)
         assert int(near.sum()) == 500
-        away = (found[near] - self.rows.T).abs().min(dim=1).values
-        assert 0.0 < float(away.max()) < 5.0 * MAX_NEIGHBOUR_DISTANCE * 1.5
+        distance = (found[near] - self.rows.T).abs().min(dim=1).values
+        assert 0.0 < float(distance.max()) < 5.0 * MAX_NEIGHBOUR_DISTANCE * 1.5
         assert found[~near].min() >= -3.0
         assert found[~near].max() <= 4.0
         assert float(found[~near].std()) == pytest.approx(7.0 / np.sqrt(12.0), rel=0.1)
 
-    def test_rows_are_moved_in_units_of_their_inputs(self):
-        """Uniform shares of half a unit, times standard normal numbers: a standard deviation of ``0.5 / sqrt(3)``."""
+    def test_points_near_data_have_offsets_in_normalised_units(self):
+        """Offsets are normal with a uniform scale up to 0.5: their standard deviation is 0.5 / sqrt(3)."""
         units = Normaliser(torch.zeros(2), torch.tensor([1.0, 100.0]), torch.zeros(1), torch.ones(1))
         row = torch.tensor([[3.0, -70.0]])
         found = measurement_points(None, row.repeat(25, 1), units, generator(), count=8000, domain=row)
-        moved = ((found - row) / units.input_std)[:4000]
-        assert torch.allclose(moved.mean(dim=0), torch.zeros(2), atol=0.02)
-        assert torch.allclose(moved.std(dim=0), torch.full((2,), MAX_NEIGHBOUR_DISTANCE / 3.0**0.5), rtol=0.05)
+        offsets = ((found - row) / units.input_std)[:4000]
+        assert torch.allclose(offsets.mean(dim=0), torch.zeros(2), atol=0.02)
+        assert torch.allclose(offsets.std(dim=0), torch.full((2,), MAX_NEIGHBOUR_DISTANCE / 3.0**0.5), rtol=0.05)
 
     @pytest.mark.parametrize("count", [0, 19])
-    def test_few_rows_leave_all_to_the_domain(self, count):
-        found = measurement_points(Lines(), self.rows[:count], UNITS, generator(), count=64)
+    def test_all_points_are_in_the_domain_with_fewer_than_20_rows(self, count):
+        found = measurement_points(RandomLine(), self.rows[:count], UNITS, generator(), count=64)
         assert found.shape == (64, 1)
         assert found.max() <= 4.0
 
     @pytest.mark.parametrize(("count", "near"), [(0, 0), (30, 32)])
-    def test_without_a_simulator_the_domain_is_what_is_given(self, count, near):
+    def test_domain_points_are_the_given_ones_without_a_simulator(self, count, near):
         others = torch.tensor([[-1.0], [0.5], [2.0]])
         found = measurement_points(None, self.rows[:count], UNITS, generator(), count=64, domain=others)
         assert found.shape == (64, 1)

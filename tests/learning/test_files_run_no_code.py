@@ -1,4 +1,4 @@
-"""Files of a model folder that a stranger may have written: nothing in them runs, and one sentence says what to do."""
+"""Test that loading an untrusted model file runs no code and gives a one-sentence error with the remedy."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from learning.world.car_fit import load_car, save_car
 
 
 class Payload:
-    """Makes a folder when it is unpickled."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, made: Path) -> None:
         self._made = made
@@ -34,7 +34,7 @@ class Payload:
 
 
 def write_stable_baselines(path: Path, payload: Payload) -> None:
-    """A file as ``stable_baselines3`` saves an agent."""
+    """Write a payload in the file format of a ``stable_baselines3`` agent."""
     data = {"policy_class": {":type:": "type", ":serialized:": base64.b64encode(pickle.dumps(payload)).decode()}}
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("data", json.dumps(data))
@@ -42,7 +42,9 @@ def write_stable_baselines(path: Path, payload: Payload) -> None:
 
 
 def write_pickle(path: Path, payload: Payload) -> None:
-    path.write_bytes(pickle.dumps(payload, protocol=2))  # torch's own; of others it warns before it refuses
+    path.write_bytes(
+        pickle.dumps(payload, protocol=2)
+    )  # torch's protocol; torch warns about others before it refuses them
 
 
 def write_torch(path: Path, payload: Payload) -> None:
@@ -59,7 +61,7 @@ WRITERS = [write_stable_baselines, write_pickle, write_torch, write_object_array
 
 @pytest.mark.parametrize("write", WRITERS)
 @pytest.mark.parametrize("name", ["agent.zip", "policy.npz", "dynamics.pt"])
-def test_a_payload_in_a_model_folder_does_not_run(
+def test_payload_in_a_model_file_does_not_run(
     tmp_path: Path, name: str, write: Callable[[Path, Payload], None]
 ) -> None:
     made = tmp_path / "made"
@@ -74,8 +76,8 @@ def test_a_payload_in_a_model_folder_does_not_run(
     assert str(folder) in str(error.value)
 
 
-def test_the_payload_would_have_run(tmp_path: Path) -> None:
-    """Each file is dangerous where it is read in the usual way."""
+def test_payload_runs_with_unsafe_readers(tmp_path: Path) -> None:
+    """The unsafe reader of each format runs the payload, so the test above is meaningful."""
     from stable_baselines3 import SAC
 
     readers: dict[Callable[[Path, Payload], None], Callable[[Path], object]] = {
@@ -123,9 +125,7 @@ WIDTH = 3 + 2 * 2
     ],
     ids=lambda changed: next(iter(changed)),
 )
-def test_parts_of_a_learned_car_that_do_not_fit_are_refused_in_a_sentence(
-    tmp_path: Path, changed: dict[str, object]
-) -> None:
+def test_inconsistent_car_file_is_refused_in_one_sentence(tmp_path: Path, changed: dict[str, object]) -> None:
     network = Network(WIDTH, 6, (4,))
     units = Normaliser(torch.zeros(WIDTH), torch.ones(WIDTH), torch.zeros(6), torch.ones(6))
     parameters = network.initial(2, torch.Generator().manual_seed(0))
@@ -138,8 +138,8 @@ def test_parts_of_a_learned_car_that_do_not_fit_are_refused_in_a_sentence(
     assert "\n" not in str(error.value)
 
 
-def test_the_source_has_no_other_unpickler() -> None:
-    """Every reader of files in the packages reads data only."""
+def test_sources_use_no_unsafe_reader() -> None:
+    """No package uses a file reader that can run code."""
     root = Path(__file__).parents[2]
     readers = ("pickle.load", "allow_pickle=True", "weights_only=False", "joblib", "yaml.load", "SAC.load", "Sac.load")
     found = [

@@ -1,4 +1,4 @@
-"""Fitting particles: to a prior alone, to data alone, and to both where the posterior is known."""
+"""Test FSVGD on a prior alone, on data alone, and on both with a known posterior."""
 
 import math
 
@@ -21,12 +21,12 @@ def generator(seed=0):
 
 
 def lines(x, count=400, seed=0):
-    """Draws a x + b, a ~ N(1, 0.5^2), b ~ N(0, 0.3^2)."""
+    """Draw functions ``a x + b`` with a ~ N(1, 0.5^2), b ~ N(0, 0.3^2)."""
     drawn = torch.randn(count, 2, generator=generator(seed)) * torch.tensor([0.5, 0.3]) + torch.tensor([1.0, 0.0])
     return (drawn[:, :1] * x[:, 0] + drawn[:, 1:])[:, :, None]
 
 
-def test_fitted_to_a_simulator_alone_it_predicts_like_its_draws():
+def test_fit_to_a_simulator_alone_has_the_moments_of_its_draws():
     pool = torch.linspace(-2, 2, 64)[:, None]
     prior = SimulatorPrior(lines(pool), pool)
     settings = FsvgdSettings(steps=1500, hidden=(32, 32), fit_noise=False, noise_std=0.05)
@@ -36,8 +36,8 @@ def test_fitted_to_a_simulator_alone_it_predicts_like_its_draws():
     assert torch.allclose(prediction.epistemic_std[:, 0], exact, rtol=0.4, atol=0.05)
 
 
-def test_with_data_it_comes_near_the_conjugate_posterior():
-    """Two points on a line of unknown slope and height: Bayesian linear regression in closed form."""
+def test_fit_to_data_is_close_to_the_conjugate_posterior():
+    """Bayesian linear regression with two rows has a closed form."""
     pool = torch.linspace(-2, 2, 64)[:, None]
     x, y = torch.tensor([[-1.0], [0.5]]), torch.tensor([[-1.6], [0.9]])
     noise = 0.2
@@ -53,8 +53,8 @@ def test_with_data_it_comes_near_the_conjugate_posterior():
     assert torch.allclose(prediction.epistemic_std[:, 0], exact_std, rtol=0.5, atol=0.04)
 
 
-def test_one_particle_finds_the_most_probable_function():
-    """With a Gaussian-process prior that is kernel ridge regression at the data."""
+def test_one_particle_converges_to_the_maximum_a_posteriori_function():
+    """With a Gaussian-process prior it is kernel ridge regression at the data."""
     x = torch.linspace(-1, 1, 9)[:, None]
     y = torch.sin(3 * x)
     covariance = RbfCovariance((1.0,), (0.7,))
@@ -74,7 +74,7 @@ def test_one_particle_finds_the_most_probable_function():
     assert torch.allclose(found, ridge, atol=0.02)
 
 
-def test_the_noise_of_the_data_is_found():
+def test_noise_of_the_data_is_estimated():
     x = 2.0 * torch.rand(400, 1, generator=generator()) - 1.0
     y = 0.5 * x + 0.15 * torch.randn(400, 1, generator=generator(1))
     settings = FsvgdSettings(steps=1500, hidden=(16,), noise_std=0.6, particles=5)
@@ -85,20 +85,20 @@ def test_the_noise_of_the_data_is_found():
     assert negative_log_likelihood(posterior.predict(x), y) < -0.4
 
 
-def test_expected_noise_counts_for_its_rows():
-    """Three rows met exactly: the most probable variance is the expected one times its rows over all rows."""
+def test_expected_noise_has_the_weight_of_its_prior_rows():
+    """With three rows fitted exactly, the variance is the expected one times prior rows over all rows."""
     x = torch.tensor([[-1.0], [0.0], [1.0]])
     settings = FsvgdSettings(steps=3000, hidden=(32,), noise_std=0.1, noise_rows=2.0, particles=3, weight_decay=0.0)
     found = deep_ensemble(x, torch.sin(3 * x), UNIT, settings).networks
     assert float(found.noise_std) == pytest.approx(0.1 * math.sqrt(2.0 / 5.0), rel=0.05)
 
 
-def test_members_of_an_ensemble_do_not_feel_each_other():
-    """The first member of three is what it is alone; Adam makes its step free of the number of members."""
+def test_ensemble_members_are_trained_independently():
+    """The first of three members equals the same network trained alone with AdamW."""
     x = torch.linspace(-1, 1, 20)[:, None]
     y = torch.sin(3 * x)
     settings = FsvgdSettings(particles=3, steps=300, hidden=(8,), fit_noise=False)
-    found = deep_ensemble(x, y, UNIT, settings).networks  # Three are too few to leave rows out.
+    found = deep_ensemble(x, y, UNIT, settings).networks  # Three members leave out no rows.
     three, network = found.parameters, found.network
     start = network.initial(3, generator(), "cpu")
     alone = start[:1].clone().requires_grad_()
@@ -112,32 +112,32 @@ def test_members_of_an_ensemble_do_not_feel_each_other():
     assert not torch.allclose(three[0], three[1], atol=1e-2)
 
 
-def test_each_member_of_an_ensemble_leaves_out_another_fifth():
-    """A row that is changed changes all members but a fifth, and these by nothing."""
+def test_ensemble_members_leave_out_one_fifth_of_the_rows_each():
+    """A changed row changes four fifths of the members and leaves the others equal."""
     x = torch.linspace(-1, 1, 20)[:, None]
     y = torch.sin(3 * x)
     settings = FsvgdSettings(particles=10, steps=30, hidden=(8,), fit_noise=False)
     before = deep_ensemble(x, y, UNIT, settings).networks.parameters
-    blind = torch.zeros(10)
+    n_left_out = torch.zeros(10)
     for row in range(20):
-        spoilt = y.clone()
-        spoilt[row] += 5.0
-        after = deep_ensemble(x, spoilt, UNIT, settings).networks.parameters
+        changed = y.clone()
+        changed[row] += 5.0
+        after = deep_ensemble(x, changed, UNIT, settings).networks.parameters
         same = (after == before).all(dim=1)
         assert int(same.sum()) == 2
-        blind += same
-    assert blind.tolist() == [4.0] * 10
+        n_left_out += same
+    assert n_left_out.tolist() == [4.0] * 10
 
 
-def test_noise_of_an_ensemble_is_that_of_rows_that_were_not_seen():
-    """Networks wide enough to follow every row: in the sample they leave next to nothing."""
+def test_ensemble_noise_is_estimated_from_left_out_rows():
+    """Wide networks interpolate their training rows, so training residuals underestimate the noise."""
     x = torch.linspace(-1, 1, 40)[:, None]
     clean = torch.sin(3 * x)
     y = clean + 0.2 * torch.randn(x.shape, generator=generator(3))
     settings = FsvgdSettings(particles=10, steps=4000, hidden=(64, 64), weight_decay=0.0, noise_std=0.05)
     found = deep_ensemble(x, y, UNIT, settings)
-    seen = float((found.networks.predict(x).mean - y).std())
-    assert seen < 0.15
+    training_rms = float((found.networks.predict(x).mean - y).std())
+    assert training_rms < 0.15
     new = clean + 0.2 * torch.randn(x.shape, generator=generator(4))
     assert calibration_error(found.predict(x), new) < 0.1
     assert (
@@ -145,7 +145,7 @@ def test_noise_of_an_ensemble_is_that_of_rows_that_were_not_seen():
     )
 
 
-def test_the_same_seed_gives_the_same_model():
+def test_equal_seeds_give_equal_models():
     pool = torch.linspace(-2, 2, 16)[:, None]
     settings = FsvgdSettings(steps=50, hidden=(8,))
     first, second = (fit_fsvgd(EMPTY, EMPTY, pool, SimulatorPrior(lines(pool), pool), UNIT, settings) for _ in range(2))
@@ -153,19 +153,19 @@ def test_the_same_seed_gives_the_same_model():
 
 
 @pytest.mark.parametrize(
-    ("inputs", "outputs", "prior", "said"),
+    ("inputs", "outputs", "prior", "message"),
     [
         (EMPTY, EMPTY, None, "neither data nor a prior"),
         (torch.ones(3, 1), torch.ones(2, 1), None, "3 rows of inputs and 2 of outputs"),
         (torch.tensor([[1.0], [float("nan")]]), torch.ones(2, 1), None, "missing or infinite"),
     ],
 )
-def test_what_cannot_be_fitted_is_said(inputs, outputs, prior, said):
-    with pytest.raises(DataError, match=said):
+def test_invalid_data_is_refused(inputs, outputs, prior, message):
+    with pytest.raises(DataError, match=message):
         fit_fsvgd(inputs, outputs, torch.ones(4, 1), prior, UNIT, FsvgdSettings(steps=1))
 
 
-def test_an_ensemble_refuses_rows_that_are_not_whole():
+def test_ensemble_refuses_incomplete_rows():
     x = torch.linspace(-1, 1, 20)[:, None]
     settings = FsvgdSettings(steps=5, hidden=(8,))
     with pytest.raises(DataError, match="missing or infinite"):

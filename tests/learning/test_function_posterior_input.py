@@ -1,4 +1,4 @@
-"""What the posterior over functions makes of simulators and data that are not as they should be."""
+"""Test the posterior over functions with defective simulators and data."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from learning.posterior.inference import infer
 
 
 @dataclass(frozen=True)
-class BreaksDown(Linear):
-    """The same, with no number for a share of its parameters."""
+class FailingSimulator(Linear):
+    """The linear simulator that returns NaN for parameters below a bound."""
 
     below: float = -2.0
 
@@ -26,20 +26,20 @@ class BreaksDown(Linear):
 
 
 @pytest.mark.parametrize("count", [0, 12, 60])
-def test_draws_for_which_the_simulator_breaks_down_have_no_say(count):
+def test_parameter_draws_with_nan_outputs_are_excluded(count):
     x, y = (v[:count] for v in rows(60))
     at, _ = rows(5, seed=1)
-    found = infer(BreaksDown(), x, y, UNITS, NOISE)
+    found = infer(FailingSimulator(), x, y, UNITS, NOISE)
     assert found.parameters[:, 0].min() >= -2.0
     mean, std = found.predict(at)
-    theirs, wide = infer(Linear(), x, y, UNITS, NOISE).predict(at)
-    assert np.allclose(mean, theirs, atol=0.4 * float(wide.max()))
-    assert np.allclose(std, wide, rtol=0.35)
+    expected_mean, expected_std = infer(Linear(), x, y, UNITS, NOISE).predict(at)
+    assert np.allclose(mean, expected_mean, atol=0.4 * float(expected_std.max()))
+    assert np.allclose(std, expected_std, rtol=0.35)
     with pytest.raises(DataError, match="narrow the ranges"):
-        infer(BreaksDown(below=50.0), x, y, UNITS, NOISE)
+        infer(FailingSimulator(below=50.0), x, y, UNITS, NOISE)
 
 
-def test_a_simulator_without_parameters_is_conditioned_as_it_is():
+def test_simulator_without_parameters_is_accepted():
     @dataclass(frozen=True)
     class Fixed(Linear):
         size: int = 0
@@ -49,11 +49,11 @@ def test_a_simulator_without_parameters_is_conditioned_as_it_is():
 
     x, y = rows(30)
     found = infer(Fixed(), x, y, UNITS, NOISE)
-    at, wanted = rows(50, seed=1, noise=torch.zeros(2))
-    assert float(((found.predict(at)[0] - wanted) / UNITS.output_std).abs().max()) < 0.5
+    at, expected = rows(50, seed=1, noise=torch.zeros(2))
+    assert float(((found.predict(at)[0] - expected) / UNITS.output_std).abs().max()) < 0.5
 
 
-def test_an_output_that_never_changes_keeps_a_share_of_the_expected_noise():
+def test_constant_output_keeps_one_percent_of_the_expected_noise():
     x, y = rows(60)
     y[:, 1] = UNITS.output_mean[1]
     found = infer(None, x, y, UNITS, NOISE)
@@ -63,7 +63,7 @@ def test_an_output_that_never_changes_keeps_a_share_of_the_expected_noise():
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"outputs": torch.zeros(5, 2)}, "10 rows of inputs and 5 of outputs"),
         ({"noise_std": torch.tensor([0.1, 0.0])}, "is not positive"),
@@ -71,13 +71,13 @@ def test_an_output_that_never_changes_keeps_a_share_of_the_expected_noise():
         ({"inputs": torch.full((10, 2), torch.nan)}, "missing or infinite"),
     ],
 )
-def test_what_cannot_be_conditioned_on_is_said(changed, said):
+def test_invalid_input_is_refused(changed, message):
     x, y = rows(10)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         infer(**{"model": None, "inputs": x, "outputs": y, "normaliser": UNITS, "noise_std": NOISE} | changed)
 
 
-def test_at_no_inputs_there_is_no_prediction():
+def test_prediction_is_empty_at_zero_inputs():
     found = infer(None, *rows(12), UNITS, NOISE)
     mean, std = found.predict(EMPTY)
     assert mean.shape == std.shape == (0, 2)

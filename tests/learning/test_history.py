@@ -1,4 +1,4 @@
-"""How many past commands the data ask for, on simulated cars whose delays are known."""
+"""Test the selection of the history length on simulated cars with known delays."""
 
 import math
 
@@ -16,7 +16,7 @@ NOISE = (0.0005, 0.0005, 0.001, 0.005, 0.005, 0.02)
 
 
 def drive(delay_s: float, rows: int, seed: int = 0) -> EpisodeData:
-    """A new command every tick, and as many rows with the longest history as required."""
+    """Simulate a new random command every tick; ``rows`` transitions have the longest history."""
     config = SimulatorConfig(command_delay_s=delay_s, control_period_s=PERIOD_S, mocap=MocapParameters(latency_s=0.0))
     rng = np.random.default_rng(seed)
     sent = rng.uniform([-1.0, 0.0], [1.0, 0.6], (rows + CANDIDATE_LENGTHS[-1], 2))
@@ -26,8 +26,8 @@ def drive(delay_s: float, rows: int, seed: int = 0) -> EpisodeData:
     return EpisodeData(np.arange(len(sent) + 1) * PERIOD_S, states, sent, sent, np.zeros(len(sent)))
 
 
-def test_a_longer_delay_asks_for_more_commands_and_for_no_fewer_than_it_needs() -> None:
-    """What moves the car during a step was sent up to its delay before."""
+def test_history_covers_the_command_delay() -> None:
+    """The commands that act during a step were sent up to one delay earlier."""
     chosen = []
     for delay_s in (0.02, 0.15):
         found = find_history([drive(delay_s, 80)])
@@ -37,15 +37,15 @@ def test_a_longer_delay_asks_for_more_commands_and_for_no_fewer_than_it_needs() 
         assert found.nll[max(h for h in CANDIDATE_LENGTHS if h < needed)] > found.nll[found.history] + 1.0
         assert f"supports {found.history} past commands" in found.message()
         chosen.append(found.history)
-    assert chosen[0] <= 4 < chosen[1], "five are needed by the longer delay, one by the shorter"
+    assert chosen[0] <= 4 < chosen[1], "the longer delay needs five commands, the shorter one"
 
 
 @pytest.mark.parametrize("rows", [(0,), (MIN_ROWS - 1,), (MIN_ROWS // 2, MIN_ROWS // 2 - 1)])
-def test_too_few_rows_say_nothing(rows: tuple[int, ...]) -> None:
+def test_too_few_rows_give_no_history(rows: tuple[int, ...]) -> None:
     assert find_history([drive(0.02, n, seed=n) for n in rows]) is None
 
 
-def test_rows_that_hold_no_numbers_do_not_count() -> None:
+def test_rows_with_nan_are_not_counted() -> None:
     episode = drive(0.02, MIN_ROWS)
     episode.states[30, 3] = np.nan
     assert find_history([episode]) is None

@@ -1,4 +1,4 @@
-"""The simulator as a one-step model, with effects: against the plain simulator that drives tick by tick."""
+"""Test the one-step simulator model with effects against the tick-by-tick simulator."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ QUIET = MocapParameters(latency_s=0.0)
 HISTORY = 8
 TICKS = 90
 OBSERVATIONS = ("marker_offset", "mocap_yaw_misalignment", "position_scale", "velocity_filter_lag", "mocap_latency")
-OF_THE_PLACE = {e.id for e in EFFECTS.values() if e.depends_on & {"place", "heading"}}
+POSE_DEPENDENT = {e.id for e in EFFECTS.values() if e.depends_on & {"place", "heading"}}
 MASS = {"vehicle.mass": (2.0, 2.0)}
 
 
@@ -32,15 +32,15 @@ def commands(seed=0):
     return sent
 
 
-def true_states(config, sent, dense=1):
-    """States (T * dense + 1, 6) of a drive on plain floats, one car, commands in queues."""
+def true_states(config, sent, substeps=1):
+    """Return states (T * substeps + 1, 6) of a drive of the single-car simulator."""
     plant, period = Plant(config), config.control_period_s
     plant.reset(CarState(0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 0.0)
     states = [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]]
     for tick, (steering, throttle) in enumerate(sent):
         plant.command(tick * period, Action(steering, throttle))
-        for k in range(dense):
-            s = plant.advance((tick + (k + 1) / dense) * period)
+        for k in range(substeps):
+            s = plant.advance((tick + (k + 1) / substeps) * period)
             states.append([s.x_m, s.y_m, s.yaw_rad, s.vx_mps, s.vy_mps, s.yaw_rate_radps])
     found = np.array(states)
     found[:, 2] = np.unwrap(found[:, 2])
@@ -52,7 +52,7 @@ def rows_of(states, sent, config, history=HISTORY):
     return transitions_of([EpisodeData(times, states, sent, sent, np.zeros(len(sent)))], history)
 
 
-def typical(name):
+def typical_parameters(name):
     return {p.name: p.typical for p in EFFECTS[name].parameters if not p.choices and p.name not in ("x", "y")}
 
 
@@ -66,11 +66,11 @@ def error(found, rows, first=3):
     return float(np.sqrt(np.mean((found - rows.targets)[:, first:] ** 2)))
 
 
-@pytest.mark.parametrize("name", sorted(set(EFFECTS) - set(OBSERVATIONS) - OF_THE_PLACE))
-def test_a_row_is_a_step_of_the_car_with_the_effect(name):
-    """Whatever the effect's hidden state, a row of a drive is predicted, and much better than without the effect."""
+@pytest.mark.parametrize("name", sorted(set(EFFECTS) - set(OBSERVATIONS) - POSE_DEPENDENT))
+def test_model_with_an_effect_predicts_rows_of_the_car_with_the_effect(name):
+    """The error is much smaller than without the effect, and zero for effects without hidden states."""
     plain = SimulatorConfig(mocap=QUIET)
-    config = replace(plain, effects={name: typical(name)})
+    config = replace(plain, effects={name: typical_parameters(name)})
     sent = commands()
     states = true_states(config, sent)
     rows = rows_of(states, sent, config)
@@ -85,26 +85,26 @@ def test_a_row_is_a_step_of_the_car_with_the_effect(name):
         assert np.allclose(predicted(config, rows), rows.targets, atol=2e-5)
 
 
-def test_effects_of_the_place_are_those_that_a_rotated_world_changes():
-    """Every effect whose step depends on where the car is or on its heading is ignored, and no other."""
+def test_pose_dependent_effects_are_ignored():
+    """The declared pose-dependent effects are exactly those whose step depends on position or heading."""
     from sim_backends.batch.rollout import rollout
 
     start = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.1, 0.4], [0.7, -0.4, 1.1, 1.5, 0.1, 0.4]], dtype=torch.float64)
     sent = torch.tensor([[[0.4, 0.5]]], dtype=torch.float64).expand(2, 1, 2)
     found = set()
     for name in EFFECTS:
-        config = SimulatorConfig(mocap=QUIET, effects={name: typical(name)})
+        config = SimulatorConfig(mocap=QUIET, effects={name: typical_parameters(name)})
         velocities = rollout(config, start, sent).states[:, 1, 3:]
         if not torch.allclose(velocities[0], velocities[1], atol=1e-9):
             found.add(name)
-    assert found == OF_THE_PLACE
+    assert found == POSE_DEPENDENT
     sloping = SimulatorConfig(mocap=QUIET, effects={"road_slope": {"angle": 0.05}})
     rows = rows_of(true_states(SimulatorConfig(mocap=QUIET), commands()), commands(), sloping)
     assert np.array_equal(predicted(sloping, rows), predicted(replace(sloping, effects={}), rows))
 
 
-def seen(states, ahead, left, angle, scale):
-    """What motion capture makes of states, written down from its definition."""
+def motion_capture_measurement(states, ahead, left, angle, scale):
+    """Apply marker offset, yaw misalignment and position scale to true states by their definitions."""
     x, y, yaw, vx, vy, rate = states.T
     along, across = vx - left * rate, vy + ahead * rate
     px = x + np.cos(yaw) * ahead - np.sin(yaw) * left
@@ -114,7 +114,7 @@ def seen(states, ahead, left, angle, scale):
     return np.stack([px, py, yaw + angle, *rotated, rate], axis=1)
 
 
-def test_what_motion_capture_adds_is_undone_and_done_again():
+def test_model_inverts_and_reapplies_motion_capture_effects():
     offset, angle, scale = {"ahead": 0.06, "left": -0.03}, 0.11, 0.04
     effects = {
         "position_scale": {"scale": scale},
@@ -122,14 +122,16 @@ def test_what_motion_capture_adds_is_undone_and_done_again():
         "mocap_yaw_misalignment": {"angle": angle},
     }
     sent, plain = commands(), SimulatorConfig(mocap=QUIET)
-    rows = rows_of(seen(true_states(plain, sent), **offset, angle=angle, scale=scale), sent, plain)
+    rows = rows_of(
+        motion_capture_measurement(true_states(plain, sent), **offset, angle=angle, scale=scale), sent, plain
+    )
     config = replace(plain, effects=effects)
     assert np.allclose(predicted(config, rows), rows.targets, atol=2e-5)
     assert error(predicted(plain, rows), rows, 0) > 0.01
 
 
-def test_draws_of_an_observation_are_the_models_of_their_own_numbers():
-    """Each draw has its own misalignment and marker: as many models in one as one at a time."""
+def test_batched_observation_draws_equal_single_models():
+    """Each draw has its own misalignment, marker offset and filter."""
     effects = {"marker_offset": {}, "mocap_yaw_misalignment": {}, "velocity_filter_lag": {"time_constant": 0.03}}
     ranges = {
         "effects.marker_offset.ahead": (-0.1, 0.1),
@@ -142,19 +144,19 @@ def test_draws_of_an_observation_are_the_models_of_their_own_numbers():
     draws = draw_parameters(model, 3, torch.Generator().manual_seed(1)).double()
     together = model(torch.from_numpy(rows.inputs), draws).numpy()
     for k in range(3):
-        own = config.with_values(dict(zip(ranges, draws[k].tolist(), strict=True)))
-        assert np.allclose(together[k], predicted(own, rows), atol=1e-9)
+        single = config.with_values(dict(zip(ranges, draws[k].tolist(), strict=True)))
+        assert np.allclose(together[k], predicted(single, rows), atol=1e-9)
     assert not np.allclose(together[0], together[1], atol=1e-4)
 
 
 @pytest.mark.parametrize("as_effect", [True, False])
-def test_old_measurements_are_commands_that_act_later(as_effect):
-    """What is 1.5 periods old, as the car file says or as an effect: the last rows of held commands are exact."""
+def test_latency_delays_the_commands_in_the_model(as_effect):
+    """A latency of 1.5 periods, from the car file or as an effect, is predicted exactly."""
     plain, sent = SimulatorConfig(mocap=QUIET), commands()
     latency = 1.5 * plain.control_period_s
-    states = true_states(plain, sent, dense=2)
-    old = np.concatenate([np.repeat(states[:1], 3, axis=0), states])[: len(states)]
-    rows = rows_of(old[::2], sent, plain)
+    states = true_states(plain, sent, substeps=2)
+    delayed = np.concatenate([np.repeat(states[:1], 3, axis=0), states])[: len(states)]
+    rows = rows_of(delayed[::2], sent, plain)
     late = rows.take(rows.tick > HISTORY + 4)
     effect = {"mocap_latency": {"latency": latency}}
     config = replace(plain, effects=effect) if as_effect else replace(plain, mocap=replace(QUIET, latency_s=latency))
@@ -162,21 +164,21 @@ def test_old_measurements_are_commands_that_act_later(as_effect):
     assert error(predicted(plain, late), late) > 0.05
 
 
-def test_filtered_velocities_are_predicted():
-    """A first-order filter on the velocities, by its differential equation on a fine grid."""
-    plain, sent, lag_s, dense = SimulatorConfig(mocap=QUIET), commands(), 0.04, 40
-    states = true_states(plain, sent, dense)
-    step, shown = plain.control_period_s / dense, states.copy()
+def test_model_predicts_filtered_velocities():
+    """The reference integrates the first-order velocity filter on a fine grid."""
+    plain, sent, lag_s, substeps = SimulatorConfig(mocap=QUIET), commands(), 0.04, 40
+    states = true_states(plain, sent, substeps)
+    step, filtered = plain.control_period_s / substeps, states.copy()
     for k in range(1, len(states)):
         decay = np.exp(-step / lag_s)
-        shown[k, 3:] = decay * shown[k - 1, 3:] + (1 - decay) * 0.5 * (states[k - 1, 3:] + states[k, 3:])
-    rows = rows_of(shown[::dense], sent, plain)
+        filtered[k, 3:] = decay * filtered[k - 1, 3:] + (1 - decay) * 0.5 * (states[k - 1, 3:] + states[k, 3:])
+    rows = rows_of(filtered[::substeps], sent, plain)
     config = replace(plain, effects={"velocity_filter_lag": {"time_constant": lag_s}})
     assert error(predicted(config, rows), rows) < 0.35 * error(predicted(plain, rows), rows)
     assert error(predicted(config, rows), rows, 0) < 0.35 * error(predicted(plain, rows), rows, 0)
 
 
-def test_velocities_by_backward_differences_are_half_a_row_late():
+def test_backward_difference_velocities_have_a_delay_of_half_a_period():
     plain, sent = SimulatorConfig(mocap=QUIET), commands()
     states = true_states(plain, sent)
     rate = np.diff(states[:, :3], axis=0) / plain.control_period_s
@@ -194,7 +196,7 @@ def test_velocities_by_backward_differences_are_half_a_row_late():
     assert along[0] < 0.4 * along[1]
 
 
-def test_delays_that_add_up_to_less_than_nothing_are_none():
+def test_negative_total_delay_is_zero():
     ranges = {"effects.command_delay.extra_delay": (-0.2, -0.1)}
     config = SimulatorConfig(mocap=QUIET, effects={"command_delay": {"extra_delay": -0.05}})
     rows = rows_of(true_states(replace(config, command_delay_s=0.0, effects={}), commands()), commands(), config)
@@ -203,8 +205,8 @@ def test_delays_that_add_up_to_less_than_nothing_are_none():
     assert np.allclose(found, rows.targets, atol=2e-5)
 
 
-def test_a_diagnosed_number_is_cauchys_within_what_is_possible():
-    """Quantiles of scipy's distribution, cut off at the range; a number with a range alone is uniform."""
+def test_diagnosed_parameter_has_a_truncated_cauchy_prior():
+    """The reference is scipy's Cauchy distribution truncated to the range; without a std the prior is uniform."""
     config = SimulatorConfig(
         effects={"motor_lag": {"time_constant": 0.06}},
         priors={"motor.drive_gain": (6.0, 9.0), "motor.damping": (1.0, 2.0)},
@@ -217,13 +219,13 @@ def test_a_diagnosed_number_is_cauchys_within_what_is_possible():
     assert set(drawn) == set(config.parameter_std) | set(config.priors)
     assert np.allclose(drawn["motor.damping"], 1.0 + shares)
     spread = {"motor.drive_gain": (8.2, 0.6, 6.0, 9.0), "effects.motor_lag.time_constant": (0.06, 0.02, 0.0, 0.26)}
-    for name, (middle, scale, low, high) in spread.items():
-        ends = cauchy.cdf([low, high], middle, scale)
-        assert np.allclose(drawn[name], cauchy.ppf(ends[0] + (ends[1] - ends[0]) * shares, middle, scale), rtol=1e-6)
-    assert np.ptp(drawn["vehicle.yaw_inertia"]) > 0.02 * 0.06, "nothing is known better than to some per cent"
+    for name, (median, scale, low, high) in spread.items():
+        ends = cauchy.cdf([low, high], median, scale)
+        assert np.allclose(drawn[name], cauchy.ppf(ends[0] + (ends[1] - ends[0]) * shares, median, scale), rtol=1e-6)
+    assert np.ptp(drawn["vehicle.yaw_inertia"]) > 0.02 * 0.06, "no prior is narrower than some percent"
 
 
-def test_a_choice_has_no_range():
+def test_range_of_a_choice_parameter_is_refused():
     config = SimulatorConfig(effects={"traction_limit": {}})
     with pytest.raises(ConfigError, match=r"'effects\.traction_limit\.axle' is one of rear, .*; remove its range"):
         CarModel(config, 3, {"effects.traction_limit.axle": (0.0, 1.0)})

@@ -1,4 +1,4 @@
-"""Outliers: leaving rows out by hand, and Student distributions by scipy."""
+"""Test robust statistics against refits without each row and scipy's Student-t distributions."""
 
 import math
 
@@ -30,15 +30,15 @@ def discrepancy(n, seed=0):
     return np.stack([shape, 0.3 * shape**4])
 
 
-@pytest.mark.parametrize("weighted_alike", [True, False])
-def test_leave_one_out_errors_are_those_of_a_fit_without_the_row(weighted_alike):
-    """The other rows have their weights; the row itself has the noise of a row of weight 1."""
+@pytest.mark.parametrize("equal_weights", [True, False])
+def test_leave_one_out_errors_equal_a_fit_without_the_row(equal_weights):
+    """The other rows keep their weights; the left-out row has the noise of weight 1."""
     n, noise = 12, np.array([0.2, 0.5])
     rng = np.random.default_rng(1)
-    row_weights = np.ones(n) if weighted_alike else rng.uniform(0.05, 1.0, n)
-    known, left = discrepancy(n), rng.normal(size=(n, 2))
+    row_weights = np.ones(n) if equal_weights else rng.uniform(0.05, 1.0, n)
+    known, residuals = discrepancy(n), rng.normal(size=(n, 2))
     covariance = known + np.stack([np.diag(s**2 / row_weights) for s in noise])
-    white, variance_of_row = leave_one_out(*(torch.tensor(v) for v in (left, covariance, noise, row_weights)))
+    white, variance_of_row = leave_one_out(*(torch.tensor(v) for v in (residuals, covariance, noise, row_weights)))
     assert white.shape == variance_of_row.shape == (n, 2)
     for k in range(2):
         for row in range(n):
@@ -46,25 +46,25 @@ def test_leave_one_out_errors_are_those_of_a_fit_without_the_row(weighted_alike)
             gain = np.linalg.solve(covariance[k][np.ix_(others, others)], known[k][others, row])
             variance = known[k][row, row] - gain @ known[k][others, row] + noise[k] ** 2
             assert float(variance_of_row[row, k]) == pytest.approx(variance, rel=1e-9)
-            off = left[row, k] - gain @ left[others, k]
-            assert float(white[row, k]) == pytest.approx(off / np.sqrt(variance))
+            error = residuals[row, k] - gain @ residuals[others, k]
+            assert float(white[row, k]) == pytest.approx(error / np.sqrt(variance))
 
 
-@pytest.mark.parametrize(("dof", "lost"), [(4.0, 0.02), (math.inf, 0.05)])
-def test_the_leave_one_out_density_is_close_to_the_true_one(dof, lost):
-    """Correlation, sizes and tails are fitted to the rows; scipy has the true ones.
+@pytest.mark.parametrize(("dof", "tolerance"), [(4.0, 0.02), (math.inf, 0.05)])
+def test_leave_one_out_density_is_close_to_the_true_density(dof, tolerance):
+    """The density uses fitted correlation, scales and degrees of freedom; scipy uses the true ones.
 
-    Sizes that bear outliers are too small for a Gaussian, whose tails then look heavier than they are.
+    Robust scales are too small for Gaussian errors, so that the fitted tails are slightly too heavy.
     """
     shape = np.array([[1.0, 0.8, 0.0], [0.8, 1.0, 0.0], [0.0, 0.0, 1.0]])
     size = np.array([0.5, 2.0, 1.0])
     rng = np.random.default_rng(5)
     true = multivariate_t(np.zeros(3), size[:, None] * shape * size, df=dof)
     drawn, variance_of_row = true.rvs(4000, random_state=rng), rng.uniform(0.1, 10.0, (4000, 3))
-    theirs = true.logpdf(drawn) - 0.5 * np.log(variance_of_row).sum(axis=1)
+    expected = true.logpdf(drawn) - 0.5 * np.log(variance_of_row).sum(axis=1)
     found = leave_one_out_log_density(torch.tensor(drawn), torch.tensor(variance_of_row)).numpy()
-    assert found.mean() == pytest.approx(theirs.mean(), abs=lost)
-    assert np.corrcoef(found, theirs)[0, 1] > 0.99
+    assert found.mean() == pytest.approx(expected.mean(), abs=tolerance)
+    assert np.corrcoef(found, expected)[0, 1] > 0.99
 
 
 class TestCorrelation:
@@ -72,35 +72,35 @@ class TestCorrelation:
     SIZE = np.array([0.5, 2.0, 1.0])
 
     def drawn(self, rows, dof):
-        """Of a multivariate Student distribution."""
+        """Draw rows of a multivariate Student-t distribution."""
         draws = multivariate_t(np.zeros(3), self.TRUE, df=dof).rvs(rows, random_state=3)
         return torch.tensor(draws * self.SIZE)
 
     @pytest.mark.parametrize("dof", [2.5, 5.0, 500.0])
-    def test_it_is_found_whatever_the_tails_and_the_scales(self, dof):
+    def test_correlation_is_estimated_for_any_degrees_of_freedom(self, dof):
         assert np.allclose(output_correlation(self.drawn(20_000, dof))[0], self.TRUE, atol=0.02)
 
-    def test_a_few_outliers_have_little_say(self):
+    def test_correlation_is_robust_to_one_percent_of_outliers(self):
         white = self.drawn(2000, 500.0)
         white[:20] = torch.tensor([50.0, -200.0, 100.0])
         assert np.allclose(output_correlation(white)[0], self.TRUE, atol=0.08)
         assert np.corrcoef(white.numpy().T)[0, 1] < -0.5
 
-    def test_errors_that_are_independent_stay_so(self):
-        """Of fifteen pairs one in eighty is beyond two and a half standard errors by chance."""
-        apart = torch.tensor(np.random.default_rng(6).normal(size=(50, 80, 6)))
-        pairs = sum(int((output_correlation(white)[0] != 0).sum()) - 6 for white in apart) / 2
+    def test_independent_errors_get_almost_no_correlation(self):
+        """By chance one pair of eighty exceeds two and a half standard errors."""
+        independent = torch.tensor(np.random.default_rng(6).normal(size=(50, 80, 6)))
+        pairs = sum(int((output_correlation(white)[0] != 0).sum()) - 6 for white in independent) / 2
         assert pairs < 0.03 * 50 * 15
 
     @pytest.mark.parametrize("rows", [1, 2, 5])
-    def test_few_rows_give_no_correlation(self, rows):
+    def test_correlation_is_zero_with_few_rows(self, rows):
         assert torch.equal(output_correlation(torch.ones(rows, 3).double())[0], torch.eye(3).double())
 
-    def test_without_errors_there_is_none(self):
+    def test_correlation_is_zero_for_zero_errors(self):
         assert torch.equal(output_correlation(torch.zeros(50, 3).double())[0], torch.eye(3).double())
 
-    def test_what_is_left_out_leaves_a_correlation(self):
-        """Without the weak tie of a chain's ends, which 200 rows cannot show, its strong ones are impossible."""
+    def test_correlation_is_positive_definite_after_dropping_weak_pairs(self):
+        """Dropping the weak pair, insignificant with 200 rows, would make the matrix indefinite."""
         chain = np.array([[1.0, 0.75, 0.14], [0.75, 1.0, 0.75], [0.14, 0.75, 1.0]])
         draws = np.random.default_rng(7).normal(size=(200, 3))
         draws = np.linalg.solve(np.linalg.cholesky(np.cov(draws.T)), draws.T).T @ np.linalg.cholesky(chain).T
@@ -108,25 +108,25 @@ class TestCorrelation:
         assert torch.linalg.eigvalsh(found).min() > 0.0
         assert np.allclose(found, chain, atol=0.1)
 
-    def test_decorrelated_errors_keep_their_size(self):
+    def test_decorrelated_errors_keep_their_variances(self):
         size = torch.tensor(self.SIZE)
         decorrelation = decorrelation_of(torch.tensor(self.TRUE), size).numpy()
         shape = self.SIZE[:, None] * self.TRUE * self.SIZE
         assert np.allclose(decorrelation @ shape @ decorrelation.T, np.diag(self.SIZE**2), atol=1e-12)
-        # The largest error is itself still.
+        # The output with the largest error stays unchanged.
         assert np.allclose(decorrelation[1], [0.0, 1.0, 0.0])
 
 
 @pytest.mark.parametrize("dof", [2.5, 6.0, 20.0])
 @pytest.mark.parametrize("outputs", [1, 3])
-def test_the_density_is_scipys_multivariate_t(outputs, dof):
+def test_density_equals_scipys_multivariate_t(outputs, dof):
     draws = 3.0 * np.random.default_rng(2).normal(size=(9, outputs))
-    theirs = multivariate_t(np.zeros(outputs), np.eye(outputs), df=dof).logpdf(draws)
+    expected = multivariate_t(np.zeros(outputs), np.eye(outputs), df=dof).logpdf(draws)
     found = log_student(torch.tensor((draws**2).sum(axis=1)), outputs, dof)
-    assert np.allclose(found, theirs, atol=1e-12)
+    assert np.allclose(found, expected, atol=1e-12)
 
 
-def test_with_infinite_freedom_the_density_is_a_gaussian():
+def test_density_is_gaussian_for_infinite_degrees_of_freedom():
     draws = 3.0 * np.random.default_rng(2).normal(size=(9, 3))
     found = log_student(torch.tensor((draws**2).sum(axis=1)), 3, math.inf)
     assert np.allclose(found, norm.logpdf(draws).sum(axis=1), atol=1e-12)
@@ -140,7 +140,7 @@ class TestWeights:
         assert torch.equal(weights, torch.ones(2000, dtype=torch.float64))
 
     @pytest.mark.parametrize("true", [3.0, 6.0])
-    def test_the_degrees_of_freedom_of_student_errors_are_found(self, true):
+    def test_degrees_of_freedom_of_student_errors_are_estimated(self, true):
         draws = multivariate_t(np.zeros(3), np.eye(3), df=true).rvs(2000, random_state=4)
         dof, _ = student_weights(torch.tensor((draws**2).sum(axis=1)), 3)
         assert 0.6 * true < dof < 1.7 * true
@@ -161,13 +161,13 @@ class TestWeights:
 
 class TestTails:
     @pytest.mark.parametrize("dof", [2.5, 4.0, 20.0])
-    def test_the_even_mixture_is_nearly_a_student_distribution(self, dof):
+    def test_equal_mixture_of_tail_scales_approximates_a_student_distribution(self, dof):
         scales = tail_scales(dof, 200).double().numpy()
         at = np.array([-8.0, -3.0, -1.0, 0.0, 0.5, 2.0, 5.0])
         mixture = norm.cdf(at[:, None] / scales).mean(axis=1)
         assert np.allclose(mixture, student.cdf(at, dof), atol=0.002)
 
-    def test_of_a_gaussian_they_are_one(self):
+    def test_tail_scales_of_a_gaussian_are_one(self):
         assert torch.equal(tail_scales(math.inf, 7), torch.ones(7))
 
 
@@ -182,29 +182,29 @@ class TestMedianScale:
 
     @staticmethod
     def unshrunk(found, rows):
-        """What ``found`` would be of endless rows: a normal prior and a normal median, in logarithms."""
+        """Undo the shrinkage of a normal prior and a normal median on the logarithmic scale."""
         return found ** (1.0 + LOG_MEDIAN_VARIANCE / rows / SCALE_LOG_STD**2)
 
-    def test_the_error_of_a_median_is_the_textbooks(self):
-        """The square of half of |z|'s relative error, times the rows: from a half-normal's density at its median."""
-        middle = norm.ppf(0.75)
-        assert 1.0 / (4.0 * (2.0 * norm.pdf(middle)) ** 2 * middle**2) == pytest.approx(LOG_MEDIAN_VARIANCE, rel=1e-3)
+    def test_variance_of_the_log_median_equals_its_asymptotic_formula(self):
+        """The asymptotic variance of a sample median follows from the half-normal density at its median."""
+        median = norm.ppf(0.75)
+        assert 1.0 / (4.0 * (2.0 * norm.pdf(median)) ** 2 * median**2) == pytest.approx(LOG_MEDIAN_VARIANCE, rel=1e-3)
 
-    def test_with_few_rows_the_shrinkage_is_calibrated(self):
+    def test_shrinkage_is_calibrated_with_few_rows(self):
         """With scales wrong by a tenth, the regression of the truth on the estimate from 51 rows has slope one."""
         rng = np.random.default_rng(8)
         truth = 0.1 * rng.normal(size=4000)
         draws = np.exp(truth) * rng.normal(size=(51, 4000))
         found = np.log(median_scale(torch.tensor(draws**2), math.inf).numpy())
         assert np.polyfit(found, truth, 1)[0] == pytest.approx(1.0, abs=0.1)
-        half = np.log(np.median(np.abs(draws), axis=0) / norm.ppf(0.75))
-        assert ((found - truth) ** 2).mean() < 0.4 * ((half - truth) ** 2).mean()
+        unshrunk = np.log(np.median(np.abs(draws), axis=0) / norm.ppf(0.75))
+        assert ((found - truth) ** 2).mean() < 0.4 * ((unshrunk - truth) ** 2).mean()
 
-    def test_a_few_wild_rows_do_not_count(self):
+    def test_median_scale_is_robust_to_two_percent_of_outliers(self):
         draws = np.random.default_rng(7).normal(size=(1001, 1))
         draws[:20] = 1e4
         assert float(median_scale(torch.tensor(draws**2), math.inf)) == pytest.approx(1.0, rel=0.1)
 
-    def test_it_stays_within_bounds(self):
+    def test_median_scale_stays_within_its_range(self):
         found = median_scale(torch.tensor([[1e-9, 1e9]] * 500, dtype=torch.float64), 4.0)
         assert np.allclose(self.unshrunk(found.numpy(), 500), SCALE_RANGE, rtol=1e-6, atol=0.0)

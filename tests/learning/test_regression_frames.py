@@ -1,4 +1,4 @@
-"""Rows of a car in its own frame, and recordings as a case of the regression study."""
+"""Test rows in the body frame, and recordings as a case of the regression study."""
 
 from __future__ import annotations
 
@@ -25,42 +25,42 @@ def generator(seed: int = 0) -> torch.Generator:
 def test_rotated_rows_match_complex_arithmetic() -> None:
     rng = np.random.default_rng(1)
     yaw, rotated = rng.uniform(-3.0, 3.0, 50), rng.uniform(-0.3, 0.3, 50)
-    place, velocity, moved, faster = (rng.normal(size=50) + 1j * rng.normal(size=50) for _ in range(4))
+    position, velocity, displacement, acceleration = (rng.normal(size=50) + 1j * rng.normal(size=50) for _ in range(4))
     others = rng.normal(size=(50, 3))
 
     def row(p: np.ndarray, angle: np.ndarray, v: np.ndarray, rate: np.ndarray) -> np.ndarray:
         return np.stack([p.real, p.imag, np.sin(angle), np.cos(angle), v.real, v.imag, rate], axis=1)
 
-    before = np.hstack([row(place, yaw, velocity, others[:, 0]), others[:, 1:]])
-    after = row(place + moved, yaw + rotated, velocity + faster, others[:, 0] + 1.0)
+    before = np.hstack([row(position, yaw, velocity, others[:, 0]), others[:, 1:]])
+    after = row(position + displacement, yaw + rotated, velocity + acceleration, others[:, 0] + 1.0)
     inputs, outputs = (t.numpy() for t in in_body_frame(torch.tensor(before), torch.tensor(after)))
     back = np.exp(-1j * yaw)
     assert np.allclose(inputs[:, 4] + 1j * inputs[:, 5], back * velocity)
-    assert np.allclose(outputs[:, 0] + 1j * outputs[:, 1], back * moved)
-    assert np.allclose(outputs[:, 4] + 1j * outputs[:, 5], back * faster)
+    assert np.allclose(outputs[:, 0] + 1j * outputs[:, 1], back * displacement)
+    assert np.allclose(outputs[:, 4] + 1j * outputs[:, 5], back * acceleration)
     assert np.allclose(outputs[:, 2:4], np.stack([np.sin(rotated), np.cos(rotated) - 1.0], axis=1))
     assert np.allclose(outputs[:, 6], 1.0)
     assert np.allclose(inputs[:, :4], [0.0, 0.0, 0.0, 1.0])
 
 
-def test_the_kinematic_car_is_the_same_from_where_it_is() -> None:
-    """Its changes seen from the car are the changes of the car at the origin: so the study may rotate its rows."""
+def test_kinematic_car_in_the_body_frame_equals_the_one_at_the_origin() -> None:
+    """State changes in the body frame do not depend on the pose, so the study may rotate its rows."""
     model = KinematicCar()
     rows = model.inputs(200, generator()).double()
     parameters = draw_parameters(model, 5, generator(1)).double()
-    there = model(rows, parameters)
+    changes = model(rows, parameters)
     for k in range(5):
-        inputs, outputs = in_body_frame(rows, rows[:, :7] + there[k])
+        inputs, outputs = in_body_frame(rows, rows[:, :7] + changes[k])
         assert torch.allclose(BodyFrame(model)(inputs, parameters)[k], outputs, atol=1e-6)
 
 
-def test_the_likelihood_of_a_gaussian_is_the_same_in_both_frames(shared: Path) -> None:
+def test_output_norms_are_equal_in_the_world_and_body_frames(shared: Path) -> None:
     data = shared / "data" / "regression"
     world, body = CASES["racecar"].recorded(data, 20, 0), CASES["racecar"].ours.recorded(data, 20, 0)
     assert torch.allclose(world.outputs.square().sum(dim=1), body.outputs.square().sum(dim=1), rtol=1e-4)
 
 
-def drives(seed: int, ticks: int = 400) -> EpisodeData:
+def driven_episode(seed: int, ticks: int = 400) -> EpisodeData:
     rng = np.random.default_rng(seed)
     config = SimulatorConfig()
     commands = np.repeat(rng.uniform(-1.0, 1.0, (ticks // 8, 2)), 8, axis=0)
@@ -72,8 +72,8 @@ def drives(seed: int, ticks: int = 400) -> EpisodeData:
     return EpisodeData(times_s, noisy, commands, commands, np.zeros(ticks))
 
 
-def test_the_last_recording_is_held_out_and_the_prior_is_the_cars() -> None:
-    first, last = drives(0), drives(1)
+def test_last_recording_is_held_out_and_the_simulator_is_the_prior() -> None:
+    first, last = driven_episode(0), driven_episode(1)
     case = recorded_case([[first], [last]], Path("rc_car"), 3)
     data = case.recorded(Path(), 40, 0)
     assert len(data.inputs) == 40
@@ -82,15 +82,15 @@ def test_the_last_recording_is_held_out_and_the_prior_is_the_cars() -> None:
     for row in data.test_inputs[:20, 3:].double().numpy():
         assert np.abs(of_last - row).max(axis=1).min() < 1e-6
     simulator, ridge = run_study(case, rows=(40,), seeds=1, methods=("SysID", "ridge"), data=Path())
-    # The simulator that made the data is its own prior: forty rows identify it better than they do a linear model.
+    # The data come from the prior's simulator: 40 rows identify it better than a linear model.
     assert simulator.nll < ridge.nll - 0.5
 
 
-def test_too_little_is_said() -> None:
+def test_too_few_recordings_or_rows_are_reported() -> None:
     with pytest.raises(DataError, match="two recordings"):
-        recorded_case([[drives(0)]], Path("rc_car"), 3)
+        recorded_case([[driven_episode(0)]], Path("rc_car"), 3)
     with pytest.raises(DataError, match="give --history"):
-        recorded_case([[drives(0, 40)], [drives(1)]], Path("rc_car"), None)
-    case = recorded_case([[drives(0)], [drives(1)]], Path("rc_car"), 3)
+        recorded_case([[driven_episode(0, 40)], [driven_episode(1)]], Path("rc_car"), None)
+    case = recorded_case([[driven_episode(0)], [driven_episode(1)]], Path("rc_car"), 3)
     with pytest.raises(DataError, match="give fewer"):
         case.recorded(Path(), 4000, 0)

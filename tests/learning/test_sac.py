@@ -1,4 +1,4 @@
-"""The written-out gradient step of SAC against the one of stable-baselines3, which takes the same by autograd."""
+"""Test the explicit gradient step of SAC against stable-baselines3, which uses autograd."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from learning.policy.sac import FastSac
 WIDTH, BATCH = 5, 32
 
 
-class Room(gym.Env[np.ndarray, np.ndarray]):
-    """Only its spaces are used."""
+class LinearRewardEnv(gym.Env[np.ndarray, np.ndarray]):
+    """An environment whose reward is the first action."""
 
     def __init__(self) -> None:
         self.observation_space = gym.spaces.Box(-5.0, 5.0, (WIDTH,), np.float32)
@@ -30,8 +30,8 @@ class Room(gym.Env[np.ndarray, np.ndarray]):
         return np.full(WIDTH, action.sum(), np.float32), float(action[0]), False, False, {}
 
 
-def batches(count: int, *, several: bool = False) -> list[ReplayBufferSamples]:
-    """Batches; where several rewards are summed before a critic is asked, each row has a discount of its own."""
+def batches(count: int, *, n_step_returns: bool = False) -> list[ReplayBufferSamples]:
+    """Return replay batches; with ``n_step_returns`` each row has its own discount."""
     generator = torch.Generator().manual_seed(3)
     found = []
     for _ in range(count):
@@ -39,20 +39,20 @@ def batches(count: int, *, several: bool = False) -> list[ReplayBufferSamples]:
         action = torch.rand((BATCH, 2), generator=generator) * 2.0 - 1.0
         done = (torch.rand((BATCH, 1), generator=generator) < 0.2).float()
         reward = torch.randn((BATCH, 1), generator=generator)
-        discounts = 0.9 ** torch.randint(1, 6, (BATCH, 1), generator=generator) if several else None
+        discounts = 0.9 ** torch.randint(1, 6, (BATCH, 1), generator=generator) if n_step_returns else None
         found.append(ReplayBufferSamples(seen, action, after, done, reward, discounts))
     return found
 
 
 def agent(kind: type[SAC], **others: object) -> SAC:
     return kind(
-        "MlpPolicy", Room(), policy_kwargs={"net_arch": [16, 24]}, ent_coef="auto_0.3", learning_rate=1e-3, tau=0.05,
-        gamma=0.9, seed=5, device="cpu", **others,
+        "MlpPolicy", LinearRewardEnv(), policy_kwargs={"net_arch": [16, 24]}, ent_coef="auto_0.3", learning_rate=1e-3,
+        tau=0.05, gamma=0.9, seed=5, device="cpu", **others,
     )  # fmt: skip
 
 
-def deal(learner: SAC, material: list[ReplayBufferSamples]) -> None:
-    """Its replay gives these batches one after the other, or as many at once as are asked for."""
+def replace_replay(learner: SAC, material: list[ReplayBufferSamples]) -> None:
+    """Make the replay buffer return these batches in order."""
     rows = iter(material)
 
     def sample(batch_size: int, env: object = None) -> ReplayBufferSamples:
@@ -65,9 +65,9 @@ def deal(learner: SAC, material: list[ReplayBufferSamples]) -> None:
 
 def trained(kind: type[SAC], material: list[ReplayBufferSamples]) -> SAC:
     found = agent(kind)
-    with torch.no_grad():  # Some standard deviations beyond the bound, where the gradient stops.
+    with torch.no_grad():  # Beyond the bound of the log standard deviation the gradient is zero.
         found.actor.log_std.bias.copy_(torch.tensor([1.9, -0.5]))
-    deal(found, material)
+    replace_replay(found, material)
     found.set_logger(_quiet())
     torch.manual_seed(11)
     found.train(len(material), BATCH)
@@ -80,10 +80,10 @@ def _quiet() -> object:
     return Logger(None, [])
 
 
-@pytest.mark.parametrize("several", [False, True])
+@pytest.mark.parametrize("n_step_returns", [False, True])
 @pytest.mark.parametrize("steps", [1, 40])
-def test_steps_are_those_of_stable_baselines(steps: int, several: bool) -> None:
-    stock, fast = (trained(kind, batches(steps, several=several)) for kind in (SAC, FastSac))
+def test_training_steps_equal_stable_baselines(steps: int, n_step_returns: bool) -> None:
+    stock, fast = (trained(kind, batches(steps, n_step_returns=n_step_returns)) for kind in (SAC, FastSac))
     fresh = agent(SAC).policy.state_dict()
     for name, wanted in stock.policy.state_dict().items():
         found = fast.policy.state_dict()[name]
@@ -95,32 +95,35 @@ def test_steps_are_those_of_stable_baselines(steps: int, several: bool) -> None:
         assert fast.logger.name_to_value[name] == pytest.approx(stock.logger.name_to_value[name], rel=1e-3), name
 
 
-def test_an_agent_with_the_learned_state_of_another_acts_and_trains_alike() -> None:
+def test_agent_with_a_loaded_state_acts_and_trains_identically() -> None:
     material = batches(20)
     first = trained(FastSac, material)
-    again = agent(FastSac)
-    again.load_learned_state(first.learned_state())
+    restored = agent(FastSac)
+    restored.load_learned_state(first.learned_state())
     seen = np.random.default_rng(0).normal(size=(7, WIDTH)).astype(np.float32)
-    theirs, ours = (a.predict(seen, deterministic=True)[0] for a in (first, again))
-    np.testing.assert_array_equal(theirs, ours)
-    for a in (first, again):
-        deal(a, batches(5))
+    original_result, restored_result = (a.predict(seen, deterministic=True)[0] for a in (first, restored))
+    np.testing.assert_array_equal(original_result, restored_result)
+    for a in (first, restored):
+        replace_replay(a, batches(5))
         a.set_logger(_quiet())
         torch.manual_seed(1)
         a.train(5, BATCH)
-    theirs, ours = (a.predict(seen, deterministic=True)[0] for a in (first, again))
-    np.testing.assert_array_equal(theirs, ours)
-    theirs, ours = (a.learned_state() for a in (first, again))
-    assert all(torch.equal(torch.as_tensor(theirs[name]), torch.as_tensor(ours[name])) for name in theirs)
+    original_result, restored_result = (a.predict(seen, deterministic=True)[0] for a in (first, restored))
+    np.testing.assert_array_equal(original_result, restored_result)
+    original_result, restored_result = (a.learned_state() for a in (first, restored))
+    assert all(
+        torch.equal(torch.as_tensor(original_result[name]), torch.as_tensor(restored_result[name]))
+        for name in original_result
+    )
 
 
-def test_it_learns_by_the_interface_of_stable_baselines() -> None:
-    """The reward is the first action, so that is what it must learn."""
+def test_learn_maximises_the_reward() -> None:
+    """The reward is the first action, so the trained policy chooses it near one."""
     made = agent(FastSac, learning_starts=50, batch_size=BATCH)
     made.learn(600)
     assert made.predict(np.zeros(WIDTH, np.float32), deterministic=True)[0][0] > 0.8
 
 
-def test_other_networks_are_refused() -> None:
+def test_unsupported_network_is_refused() -> None:
     with pytest.raises(ConfigError, match="use stable_baselines3"):
-        FastSac("MlpPolicy", Room(), policy_kwargs={"activation_fn": torch.nn.Tanh}, device="cpu")
+        FastSac("MlpPolicy", LinearRewardEnv(), policy_kwargs={"activation_fn": torch.nn.Tanh}, device="cpu")

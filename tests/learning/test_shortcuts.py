@@ -1,4 +1,4 @@
-"""What it costs in likelihood that draws and measurement points of a fit are taken once, and not fresh at each step."""
+"""Test the likelihood loss of drawing simulator parameters and measurement points once per fit."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ ROWS, SEEDS = 100, (0, 1, 2)
 
 
 def held_out_nll(seed: int, draws: int, points: int) -> float:
-    """Of other rows of the simulated race car, where so many draws and points are banked."""
+    """Return the held-out NLL of a simulated race car with this many fixed draws and points."""
     case = CASES["car"].ours or CASES["car"]
     data, units = case.data(ROWS, seed), case.normaliser
     noise, discrepancy = torch.tensor(case.prior_noise_std), case.prior_discrepancy * units.output_std
@@ -22,17 +22,17 @@ def held_out_nll(seed: int, draws: int, points: int) -> float:
         patch.setattr(inference, "PARAMETER_DRAWS", draws)
         target = infer(case.prior, data.inputs, data.outputs, units, noise, discrepancy_std=discrepancy, seed=seed)
     generator = torch.Generator().manual_seed(30_000 + seed)
-    held_at = measurement_points(case.prior, data.inputs, units, generator, count=points)
-    found = distil(target, held_at, DistillationSettings(seed=seed))
+    fixed_points = measurement_points(case.prior, data.inputs, units, generator, count=points)
+    found = distil(target, fixed_points, DistillationSettings(seed=seed))
     return negative_log_likelihood(found.predict(data.test_inputs).smoothed(), data.test_outputs)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("draws", "points"), [(1024, 8192), (128, 48_000)])
-def test_banks_cost_next_to_nothing(draws: int, points: int) -> None:
-    """3000 steps of 64 points see each of 48 000 four times; those are as good as fresh ones."""
-    banked, fresh = (np.array([held_out_nll(s, *n) for s in SEEDS]) for n in ((128, 8192), (draws, points)))
+def test_fixed_draws_and_points_lose_little_likelihood(draws: int, points: int) -> None:
+    """3000 steps of 64 points use each of 48 000 points four times, nearly as good as fresh ones."""
+    few, many = (np.array([held_out_nll(s, *n) for s in SEEDS]) for n in ((128, 8192), (draws, points)))
     print(
-        f"\n{draws} draws, {points} points: {banked.round(2)} with banks of 128 and 8192, {fresh.round(2)} with these"
+        f"\nheld-out NLL [nats]: {few.round(2)} with 128 draws and 8192 points, {many.round(2)} with {draws}, {points}"
     )
-    assert abs(banked.mean() - fresh.mean()) < 0.1
+    assert abs(few.mean() - many.mean()) < 0.1

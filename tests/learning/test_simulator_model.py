@@ -1,4 +1,4 @@
-"""The simulator as a one-step model against whole drives of it, and the rows that are learned from them."""
+"""Test the one-step simulator model against rows of simulated drives."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ HISTORY = 4
 
 
 def drive(config: SimulatorConfig, ticks: int = 60, seed: int = 0, *, measured: bool = False) -> EpisodeData:
-    """A random drive without noise."""
+    """Simulate a drive with random commands and without noise."""
     rng = np.random.default_rng(seed)
     sent = np.repeat(rng.uniform(-1, 1, size=(ticks // 6, 2)), 6, axis=0)
     sent[:, 1] = np.abs(sent[:, 1])
@@ -31,7 +31,7 @@ def drive(config: SimulatorConfig, ticks: int = 60, seed: int = 0, *, measured: 
 
 
 @pytest.mark.parametrize("kind", ["dynamic", "kinematic"])
-def test_every_row_of_a_drive_is_one_step_of_the_model(kind):
+def test_model_reproduces_every_row_of_a_simulated_drive(kind):
     config = SimulatorConfig(kind=kind, mocap=QUIET)
     rows = transitions_of([drive(config)], HISTORY)
     model = CarModel(config, HISTORY, {"vehicle.mass": (2.0, 2.0)})
@@ -40,21 +40,21 @@ def test_every_row_of_a_drive_is_one_step_of_the_model(kind):
     assert np.allclose(found, rows.targets, atol=1e-9)
 
 
-def test_commands_act_later_as_seen_from_old_measurements():
-    """States that are 20 ms old: the prior must predict the measured rows of steady stretches' ends as well."""
+def test_measurement_latency_delays_the_commands_in_the_model():
+    """The model with the 20 ms latency predicts measured velocities better than the model without it."""
     config = SimulatorConfig(mocap=MocapParameters(latency_s=0.02))
     rows = transitions_of([drive(config, measured=True)], HISTORY)
     right = CarModel(config, HISTORY, {"vehicle.mass": (2.0, 2.0)})
     wrong = CarModel(replace(config, mocap=QUIET), HISTORY, {"vehicle.mass": (2.0, 2.0)})
     given = torch.tensor([[config.values()["vehicle.mass"]]], dtype=torch.float64)
-    error, other = (
+    right_error, wrong_error = (
         np.sqrt(np.mean((m(torch.from_numpy(rows.inputs), given)[0].numpy() - rows.targets)[:, 3:] ** 2))
         for m in (right, wrong)
     )
-    assert error < 0.3 * other
+    assert right_error < 0.3 * wrong_error
 
 
-def test_draws_are_within_their_ranges_and_inputs_are_drives():
+def test_draws_fill_their_ranges_and_inputs_have_held_commands():
     ranges = {"motor.drive_gain": (6.0, 10.0), "tyre.front.mu": (0.5, 1.0)}
     model = CarModel(SimulatorConfig(mocap=QUIET), HISTORY, ranges)
     generator = torch.Generator().manual_seed(0)
@@ -70,7 +70,7 @@ def test_draws_are_within_their_ranges_and_inputs_are_drives():
     assert float(held) == pytest.approx(1 - 1 / 8, abs=0.06)
 
 
-def test_identification_finds_the_car_that_drove():
+def test_identification_recovers_the_true_parameters():
     truth = SimulatorConfig(mocap=QUIET).with_values({"motor.drive_gain": 9.1, "tyre.rear.mu": 0.62})
     rows = transitions_of([drive(truth, 240)], HISTORY)
     ranges = {"motor.drive_gain": (6.0, 11.0), "tyre.rear.mu": (0.3, 1.2)}
@@ -79,6 +79,6 @@ def test_identification_finds_the_car_that_drove():
     assert found.parameters.tolist() == pytest.approx([9.1, 0.62], rel=1e-2)
 
 
-def test_a_range_for_nothing_is_refused():
+def test_range_of_an_unknown_parameter_is_refused():
     with pytest.raises(ConfigError, match=r"'motor\.gain' is not a parameter"):
         CarModel(SimulatorConfig(), 3, {"motor.gain": (1.0, 2.0)})
