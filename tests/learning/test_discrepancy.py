@@ -1,4 +1,4 @@
-"""The discrepancy's covariance against its formula, and its fit against scipy and known processes."""
+"""Test the discrepancy covariance against its formula, and its fit against scipy and known processes."""
 
 import math
 
@@ -42,7 +42,7 @@ COVARIANCE = DiscrepancyCovariance(
 
 
 def kernel(discrepancy, output, first, second):
-    """The formula entry by entry (N, M)."""
+    """Evaluate the covariance formula entry by entry (N, M)."""
     s, length, w, c = (
         v[output].numpy()
         for v in (discrepancy.scales, discrepancy.lengthscales, discrepancy.slopes, discrepancy.offsets)
@@ -55,13 +55,13 @@ def kernel(discrepancy, output, first, second):
 
 
 def smooth(x, scale, lengthscales):
-    """Squared-exponential covariance in numpy (N, N)."""
-    off = (x[:, None] - x[None]) / lengthscales
-    return scale**2 * np.exp(-0.5 * (off**2).sum(axis=2))
+    """Evaluate a squared-exponential covariance in numpy (N, N)."""
+    distance = (x[:, None] - x[None]) / lengthscales
+    return scale**2 * np.exp(-0.5 * (distance**2).sum(axis=2))
 
 
-def share(discrepancy, output, first, second):
-    """The term of the simulator's own outputs, entry by entry (N, M), for inputs (N, 3 + 2)."""
+def multiplicative_kernel(discrepancy, output, first, second):
+    """Evaluate the multiplicative term entry by entry (N, M); inputs (N, 3 + 2) end with simulator outputs."""
     d, length = (v[output].numpy() for v in (discrepancy.multiplier_stds, discrepancy.multiplier_lengthscales))
 
     def entry(a, b):
@@ -71,13 +71,13 @@ def share(discrepancy, output, first, second):
 
 
 class TestCovariance:
-    def test_it_matches_its_formula(self):
+    def test_covariance_equals_its_formula(self):
         first, second = normal(5, 3, seed=4), normal(4, 3, seed=5)
         for output in range(2):
             assert np.allclose(COVARIANCE(first, second)[output], kernel(COVARIANCE, output, first, second), atol=1e-12)
             assert np.allclose(COVARIANCE(first)[output], kernel(COVARIANCE, output, first, first), atol=1e-12)
 
-    def test_inputs_may_come_in_batches(self):
+    def test_batched_inputs_equal_single_inputs(self):
         first, second = normal(6, 5, 3, seed=4), normal(6, 4, 3, seed=5)
         found, alone = COVARIANCE(first, second), COVARIANCE(first)
         assert found.shape == (2, 6, 5, 4)
@@ -86,15 +86,19 @@ class TestCovariance:
                 assert np.allclose(found[output, b], kernel(COVARIANCE, output, first[b], second[b]), atol=1e-12)
                 assert np.allclose(alone[output, b], kernel(COVARIANCE, output, first[b], first[b]), atol=1e-12)
 
-    def test_the_multiplicative_part_matches_its_formula(self):
+    def test_multiplicative_part_equals_its_formula(self):
         first, second = normal(6, 5, 5, seed=4), normal(6, 4, 5, seed=5)
         found = COVARIANCE(first, second)
         for output in range(2):
             for b in range(6):
-                own = kernel(COVARIANCE, output, first[b, :, :3], second[b, :, :3])
-                assert np.allclose(found[output, b], own + share(COVARIANCE, output, first[b], second[b]), atol=1e-12)
+                additive = kernel(COVARIANCE, output, first[b, :, :3], second[b, :, :3])
+                assert np.allclose(
+                    found[output, b],
+                    additive + multiplicative_kernel(COVARIANCE, output, first[b], second[b]),
+                    atol=1e-12,
+                )
 
-    def test_at_the_prior_median_all_parts_have_the_prior_size(self):
+    def test_all_parts_have_the_prior_size_at_the_prior_median(self):
         found = DiscrepancyCovariance.at_prior_median(3, torch.tensor([0.5, 2.0]))
         a, b = normal(3, seed=6), normal(3, seed=7)
         shape = np.exp(-0.5 * float(((a - b) ** 2).sum()) / PRIOR_LENGTHSCALE**2) + float(a @ b) / 3 + 1.0
@@ -102,40 +106,40 @@ class TestCovariance:
 
 
 @pytest.mark.parametrize("with_simulator", [False, True])
-def test_the_pullback_matches_finite_differences(with_simulator):
-    """Along a symmetric way, by the logarithms of all six parts, with central differences."""
-    inputs, way = normal(7, 3 + 2 * with_simulator), normal(2, 7, 7, seed=1)
-    way = way + way.transpose(1, 2)
+def test_pullback_equals_finite_differences(with_simulator):
+    """Central differences in the logarithms of all six parts, for a symmetric direction."""
+    inputs, direction = normal(7, 3 + 2 * with_simulator), normal(2, 7, 7, seed=1)
+    direction = direction + direction.transpose(1, 2)
     logs = [0.3 * normal(*size, seed=2) for size in [(2,), (2, 3), (2, 3), (2,), (2,), (2, 3)]]
     found, pullback = DiscrepancyCovariance(*(v.exp() for v in logs)).with_pullback(inputs)
     assert np.allclose(found, DiscrepancyCovariance(*(v.exp() for v in logs))(inputs), atol=1e-12)
-    for part, own in enumerate(pullback(way)):
-        for place in np.ndindex(own.shape):
-            both = []
+    for part, gradient in enumerate(pullback(direction)):
+        for index in np.ndindex(gradient.shape):
+            values = []
             for step in (1e-5, -1e-5):
-                moved = [v.clone() for v in logs]
-                moved[part][place] += step
-                both.append(float((DiscrepancyCovariance(*(v.exp() for v in moved))(inputs) * way).sum()))
-            assert float(own[place]) == pytest.approx((both[0] - both[1]) / 2e-5, abs=1e-6)
+                shifted = [v.clone() for v in logs]
+                shifted[part][index] += step
+                values.append(float((DiscrepancyCovariance(*(v.exp() for v in shifted))(inputs) * direction).sum()))
+            assert float(gradient[index]) == pytest.approx((values[0] - values[1]) / 2e-5, abs=1e-6)
 
 
-def test_the_evidence_gradient_matches_scipy():
-    """Along symmetric ways, by central differences."""
-    residual, roots, way = normal(6, 2), normal(2, 6, 6, seed=1), normal(2, 6, 6, seed=2)
+def test_evidence_gradient_equals_finite_differences_of_scipy():
+    """Central differences along symmetric directions."""
+    residual, roots, direction = normal(6, 2), normal(2, 6, 6, seed=1), normal(2, 6, 6, seed=2)
     covariance = roots @ roots.transpose(1, 2) + 0.1 * torch.eye(6)
-    way = way + way.transpose(1, 2)
+    direction = direction + direction.transpose(1, 2)
     found = evidence_gradient(residual, covariance)
     for k in range(2):
 
-        def nll(share, k=k):
-            return -multivariate_normal(np.zeros(6), covariance[k] + share * way[k]).logpdf(residual[:, k])
+        def nll(step, k=k):
+            return -multivariate_normal(np.zeros(6), covariance[k] + step * direction[k]).logpdf(residual[:, k])
 
-        theirs = (nll(1e-5) - nll(-1e-5)) / 2e-5
-        assert float((found[k] * way[k]).sum()) == pytest.approx(theirs, rel=1e-6)
+        expected = (nll(1e-5) - nll(-1e-5)) / 2e-5
+        assert float((found[k] * direction[k]).sum()) == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_fit_is_close_to_the_maximum_a_posteriori():
-    """Against scipy's minimum of the same negative log posterior, with one output and one input."""
+def test_fit_is_close_to_the_maximum_a_posteriori():
+    """The reference is scipy's minimum of the same negative log posterior (one output, one input)."""
     rng = np.random.default_rng(0)
     x = rng.uniform(-2, 2, (30, 1))
     y = np.sin(2 * x[:, 0]) + 0.2 * rng.normal(size=30)
@@ -154,13 +158,13 @@ def test_the_fit_is_close_to_the_maximum_a_posteriori():
         ]
     )
 
-    def together(logs):
-        """Of sizes, length and noise with the factors on all sizes and lengths."""
-        scale, length, slope, offset, noise, size, reach = logs
-        return np.array([scale + size, length + reach, slope + size, offset + size, noise])
+    def combined(logs):
+        """Apply the common factors to all sizes and lengthscales."""
+        scale, length, slope, offset, noise, size_factor, length_factor = logs
+        return np.array([scale + size_factor, length + length_factor, slope + size_factor, offset + size_factor, noise])
 
     def nll(logs):
-        s, length, w, c, noise = np.exp(together(logs))
+        s, length, w, c, noise = np.exp(combined(logs))
         covariance = (
             smooth(x, s, length)
             + w**2 * x @ x.T
@@ -182,14 +186,14 @@ def test_the_fit_is_close_to_the_maximum_a_posteriori():
     )
     best = minimize(nll, medians, method="L-BFGS-B")
     assert nll(medians) > best.fun + 10.0
-    assert np.allclose(found, together(best.x), atol=0.15)
+    assert np.allclose(found, combined(best.x), atol=0.15)
 
 
 @pytest.fixture(scope="module")
 def process():
-    """150 rows and 60 more of two outputs; the first does not depend on the second input, the second not on the first.
+    """Fit 150 rows of a known process; 60 more rows are held out. Each output depends on one input only.
 
-    Of lengths 0.8 and 1.2, noises 0.1 and 0.25, and expected to have noises 0.2 and 0.2.
+    The true lengthscales are 0.8 and 1.2, the noise is 0.1 and 0.25, the expected noise is 0.2.
     """
     rng = np.random.default_rng(1)
     x = rng.uniform(-2, 2, (210, 2))
@@ -203,23 +207,23 @@ def process():
     return x, y, discrepancy, noise
 
 
-class TestOfAKnownProcess:
-    def test_the_noise_is_found(self, process):
+class TestKnownProcess:
+    def test_noise_is_estimated(self, process):
         assert np.allclose(process[3], [0.1, 0.25], rtol=0.3)
 
-    def test_an_irrelevant_input_has_the_longer_lengthscale(self, process):
-        """Although the outputs share a factor on their lengths, and another input counts for each."""
+    def test_irrelevant_input_has_the_longer_lengthscale(self, process):
+        """The outputs share a lengthscale factor, although each depends on another input."""
         lengthscales = process[2].lengthscales
         assert lengthscales[0, 1] > 2.5 * lengthscales[0, 0]
         assert lengthscales[1, 0] > 1.7 * lengthscales[1, 1]
         assert float(lengthscales[0, 0]) == pytest.approx(0.8, rel=0.5)
         assert float(lengthscales[1, 1]) == pytest.approx(1.2, rel=0.5)
 
-    def test_held_out_rows_have_a_higher_density_than_before(self, process):
+    def test_fit_raises_the_held_out_density(self, process):
         x, y, discrepancy, noise = process
 
-        def of_others(covariance, stds):
-            """Log density of the last 60 rows given the first 150."""
+        def held_out_log_density(covariance, stds):
+            """Return the log density of the last 60 rows given the first 150."""
             total = 0.0
             for k in range(2):
                 full = kernel(covariance, k, x, x) + float(stds[k]) ** 2 * np.eye(210)
@@ -227,12 +231,12 @@ class TestOfAKnownProcess:
                 total -= multivariate_normal(np.zeros(150), full[:150, :150]).logpdf(y[:150, k])
             return total
 
-        before = of_others(DiscrepancyCovariance.at_prior_median(2, torch.tensor([0.3, 0.3])), [0.2, 0.2])
-        assert of_others(discrepancy, noise) > before + 15.0
+        before = held_out_log_density(DiscrepancyCovariance.at_prior_median(2, torch.tensor([0.3, 0.3])), [0.2, 0.2])
+        assert held_out_log_density(discrepancy, noise) > before + 15.0
 
 
 def test_minibatches_use_all_rows(monkeypatch):
-    """Half of the rows are three times as noisy: steps of 60 of 240 rows find the noise of all, whatever is drawn."""
+    """Half of the rows have three times the noise: batches of 60 rows find the common noise of all 240."""
     monkeypatch.setattr(discrepancy_module, "BATCH_ROWS", 60)
     rng = np.random.default_rng(5)
     x = rng.uniform(-2, 2, (240, 1))
@@ -242,14 +246,14 @@ def test_minibatches_use_all_rows(monkeypatch):
     settings = (torch.tensor([0.2]), torch.tensor([0.5]))
     noises = [float(fit_discrepancy(*tensors, None, *settings, torch.ones(240), seed=k)[1]) for k in range(3)]
     first = float(fit_discrepancy(*(v[:60] for v in tensors), None, *settings, torch.ones(60))[1])
-    # One noise for two halves with each its own.
-    together = math.sqrt(0.5 * (0.1**2 + 0.3**2))
-    assert np.allclose(noises, together, rtol=0.15)
-    assert abs(first - together) > 0.3 * together
+    # The common noise is the root mean square of both halves.
+    common_noise = math.sqrt(0.5 * (0.1**2 + 0.3**2))
+    assert np.allclose(noises, common_noise, rtol=0.15)
+    assert abs(first - common_noise) > 0.3 * common_noise
 
 
 def test_parameter_uncertainty_is_not_attributed_to_the_discrepancy():
-    """A residual that is a line of unknown slope is a discrepancy only where the simulator's slope is exact."""
+    """A linear residual is a discrepancy only if the simulator's slope is exact."""
     rng = np.random.default_rng(2)
     x = rng.uniform(-2, 2, (40, 1))
     y = torch.tensor(1.5 * x + 0.05 * rng.normal(size=(40, 1)))
@@ -264,7 +268,7 @@ def test_parameter_uncertainty_is_not_attributed_to_the_discrepancy():
 
 
 def test_rows_of_low_weight_do_not_change_the_noise():
-    """One row in five is twenty times as noisy, and known to be: its variance is divided by 1/400."""
+    """One row in five has twenty times the noise and the weight 1/400."""
     rng = np.random.default_rng(3)
     x = torch.tensor(rng.uniform(-2, 2, (100, 1)))
     row_weights = torch.ones(100, dtype=torch.float64)
@@ -275,8 +279,8 @@ def test_rows_of_low_weight_do_not_change_the_noise():
     assert float(fit_discrepancy(x, y, None, *expected, torch.ones(100))[1]) > 0.4
 
 
-def test_a_simulator_that_is_right_in_one_half_keeps_its_mean_there():
-    """It says sin(3 a), which is so where a < 0; beyond, the truth is another wave of the same size."""
+def test_discrepancy_is_zero_where_the_simulator_is_correct():
+    """The simulator is sin(3 a); the truth equals it for a < 0 and is cos(5 a) elsewhere."""
     rng = np.random.default_rng(4)
     x = rng.uniform(-2, 2, (80, 1))
     simulated = np.sin(3.0 * x)
@@ -286,7 +290,7 @@ def test_a_simulator_that_is_right_in_one_half_keeps_its_mean_there():
     discrepancy, noise = fit_discrepancy(tensors[0], tensors[1], None, *settings, torch.tensor(simulated))
     rows = torch.tensor(np.concatenate([x, simulated], axis=1))
     at = np.linspace(-1.8, -0.3, 40)[:, None]
-    there = torch.tensor(np.concatenate([at, np.sin(3.0 * at)], axis=1))
+    query = torch.tensor(np.concatenate([at, np.sin(3.0 * at)], axis=1))
     covariance = discrepancy(rows)[0] + float(noise) ** 2 * torch.eye(80)
-    mean = discrepancy(there, rows)[0] @ torch.linalg.solve(covariance, tensors[1])
+    mean = discrepancy(query, rows)[0] @ torch.linalg.solve(covariance, tensors[1])
     assert float(mean.abs().max()) < 0.1

@@ -1,4 +1,4 @@
-"""A learned car as an environment, against the same drives by hand, the scalar safety gate and the task's formulas."""
+"""Test the learned car as an environment against explicit steps, the scalar safety gate and the task's formulas."""
 
 from __future__ import annotations
 
@@ -25,36 +25,38 @@ TASK = replace(ParkingTask(), history_length=HISTORY, max_ticks=10**9)
 
 
 @dataclass
-class Rolling(StepInBody):
-    """A deterministic car: throttle pushes it and steering turns it, one command late."""
+class DelayedCar(StepInBody):
+    """A deterministic learned car with a command delay of one step."""
 
     history: int = HISTORY
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
-        v, late = inputs[:, 0], inputs[:, 5:7]
+        v, delayed_command = inputs[:, 0], inputs[:, 5:7]
         zero = torch.zeros_like(v)
-        turn = 0.1 * v * late[:, 0]
-        return torch.stack([v * PERIOD_S, 0.1 * turn, turn, 0.2 * late[:, 1] - 0.05 * v, zero, zero], dim=1)
+        yaw_change = 0.1 * v * delayed_command[:, 0]
+        return torch.stack(
+            [v * PERIOD_S, 0.1 * yaw_change, yaw_change, 0.2 * delayed_command[:, 1] - 0.05 * v, zero, zero], dim=1
+        )
 
 
-def by_hand(state: np.ndarray, late: np.ndarray) -> np.ndarray:
-    """Where ``Rolling`` takes one car in the room."""
+def reference_step(state: np.ndarray, delayed_command: np.ndarray) -> np.ndarray:
+    """Compute one step of ``DelayedCar`` in the world frame."""
     x, y, yaw, v, *sideways = state
-    turn = 0.1 * v * late[0]
-    ahead, left = v * PERIOD_S, 0.1 * turn
+    yaw_change = 0.1 * v * delayed_command[0]
+    ahead, left = v * PERIOD_S, 0.1 * yaw_change
     x, y = x + math.cos(yaw) * ahead - math.sin(yaw) * left, y + math.sin(yaw) * ahead + math.cos(yaw) * left
-    return np.array([x, y, yaw + turn, v + 0.2 * late[1] - 0.05 * v, *sideways])
+    return np.array([x, y, yaw + yaw_change, v + 0.2 * delayed_command[1] - 0.05 * v, *sideways])
 
 
 def parking_reward(state: np.ndarray, action: np.ndarray) -> float:
-    """The formula of the paper: tolerance of distance and yaw error less the cost of the action."""
+    """Compute the reward of the paper: tolerance of distance and yaw error minus action cost."""
     yaw_error = (state[2] + math.pi) % (2 * math.pi) - math.pi
-    beyond = max(math.sqrt(state[0] ** 2 + state[1] ** 2 + yaw_error**2) - 0.1, 0.0) / 2.0
-    return 1.0 / (1.0 + 9.0 * beyond**2) - 0.005 * float(action @ action)
+    excess_distance = max(math.sqrt(state[0] ** 2 + state[1] ** 2 + yaw_error**2) - 0.1, 0.0) / 2.0
+    return 1.0 / (1.0 + 9.0 * excess_distance**2) - 0.005 * float(action @ action)
 
 
-class Still(StepInBody):
-    """A car that never moves."""
+class StationaryCar(StepInBody):
+    """A learned car that never moves."""
 
     history = HISTORY
 
@@ -63,7 +65,7 @@ class Still(StepInBody):
 
 
 def rows_of(states: np.ndarray, past: np.ndarray | None = None) -> np.ndarray:
-    """Features of states (N, 6), after commands (N, 2 H) or none."""
+    """Return features of states (N, 6) after past commands (N, 2 H); None means zero commands."""
     past = np.zeros((len(states), 2 * HISTORY)) if past is None else past
     yaw = states[:, 2:3]
     return np.hstack([states[:, :2], np.sin(yaw), np.cos(yaw), states[:, 3:], past])
@@ -73,8 +75,8 @@ def state_of(features: np.ndarray) -> np.ndarray:
     return np.array([*features[:2], math.atan2(features[2], features[3]), *features[4:7]])
 
 
-def test_steps_and_rewards_are_those_by_hand() -> None:
-    env = ModelEnv(Rolling(), TASK, 6, seed=1)
+def test_steps_and_rewards_are_those_reference_step() -> None:
+    env = ModelEnv(DelayedCar(), TASK, 6, seed=1)
     env.reset()
     rng = np.random.default_rng(0)
     before = env.features.numpy().astype(np.float64)
@@ -84,32 +86,35 @@ def test_steps_and_rewards_are_those_by_hand() -> None:
         commands = rng.uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
         seen, rewards, done, _ = env.step(commands)
         assert not done.any()
-        states = [by_hand(s, p[-1]) for s, p in zip(states, past, strict=True)]
+        states = [reference_step(s, p[-1]) for s, p in zip(states, past, strict=True)]
         past = np.concatenate([past[:, 1:], commands[:, None]], axis=1)
-        wanted = rows_of(np.array(states), past.reshape(6, -1))
-        np.testing.assert_allclose(env.features.numpy(), wanted, atol=1e-5)
-        np.testing.assert_allclose(seen, wanted / [2, 2, 1, 1, 2, 1, 4, 1, 1, 1, 1], atol=1e-5)
+        expected = rows_of(np.array(states), past.reshape(6, -1))
+        np.testing.assert_allclose(env.features.numpy(), expected, atol=1e-5)
+        np.testing.assert_allclose(seen, expected / [2, 2, 1, 1, 2, 1, 4, 1, 1, 1, 1], atol=1e-5)
         by_formula = [parking_reward(s, a) for s, a in zip(states, commands, strict=True)]
         np.testing.assert_allclose(rewards, REWARD_SCALE * np.array(by_formula), atol=1e-4)
 
 
-def test_a_bonus_is_learned_from_and_not_counted() -> None:
-    """Of x: ten times as much of it in a step's reward, and nothing in what a policy's drive is worth."""
+def test_bonus_is_in_training_rewards_and_not_in_rollout_returns() -> None:
+    """The bonus is x: it is scaled into the step reward and absent from the return of a rollout."""
     task = replace(TASK, max_ticks=200)
-    plain, other = ModelEnv(Rolling(), task, 6, seed=1), ModelEnv(Rolling(), task, 6, bonus=lambda f: f[:, 0], seed=1)
-    for env in (plain, other):
+    plain, with_bonus = (
+        ModelEnv(DelayedCar(), task, 6, seed=1),
+        ModelEnv(DelayedCar(), task, 6, bonus=lambda f: f[:, 0], seed=1),
+    )
+    for env in (plain, with_bonus):
         env.reset()
     commands = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
-    (_, without, _, _), (_, rewards, _, _) = plain.step(commands), other.step(commands)
-    np.testing.assert_allclose(rewards - without, REWARD_SCALE * other.features[:, 0].numpy(), atol=1e-4)
-    totals = [env.roll_out(lambda seen: np.zeros((6, 2), np.float32))[0] for env in (plain, other)]
+    (_, plain_rewards, _, _), (_, rewards, _, _) = plain.step(commands), with_bonus.step(commands)
+    np.testing.assert_allclose(rewards - plain_rewards, REWARD_SCALE * with_bonus.features[:, 0].numpy(), atol=1e-4)
+    totals = [env.roll_out(lambda seen: np.zeros((6, 2), np.float32))[0] for env in (plain, with_bonus)]
     assert torch.equal(*totals)
 
 
-def test_commands_pass_the_gate_of_the_real_car() -> None:
-    """Limits and slew rates: what the features say was sent is what the scalar gate sends."""
+def test_commands_pass_the_safety_gate() -> None:
+    """The sent commands in the features equal those of the scalar safety gate (limits and slew rates)."""
     envelope = SafetyEnvelope(max_steering=0.9, max_throttle=0.5, steering_rate_per_s=12.0, throttle_rate_per_s=4.0)
-    env = ModelEnv(Still(), TASK, 50, envelope=envelope, period_s=PERIOD_S, seed=0)
+    env = ModelEnv(StationaryCar(), TASK, 50, envelope=envelope, period_s=PERIOD_S, seed=0)
     env.reset()
     rng = np.random.default_rng(0)
     sent = [Action(0.0, 0.0)] * 50
@@ -124,67 +129,69 @@ def test_commands_pass_the_gate_of_the_real_car() -> None:
     assert max(abs(a.throttle) for a in sent) > 0.3
 
 
-ROOM = ((-1.0, -1.5), (2.0, -1.5), (2.0, 0.5), (0.5, 0.5), (0.5, -0.5), (-1.0, -0.5))
-"""With a corner that is not part of it."""
+L_SHAPED_ARENA = ((-1.0, -1.5), (2.0, -1.5), (2.0, 0.5), (0.5, 0.5), (0.5, -0.5), (-1.0, -0.5))
+"""A rectangle without one corner."""
 
 
-@pytest.mark.parametrize("arena_m", [rectangle(-1.0, 2.0, -1.5, 0.5), ROOM])
-def test_a_car_ends_where_the_gate_would_stop_it(arena_m) -> None:
-    """For good, not cut off: there is nothing to be had from a car that was stopped."""
+@pytest.mark.parametrize("arena_m", [rectangle(-1.0, 2.0, -1.5, 0.5), L_SHAPED_ARENA])
+def test_episode_terminates_where_the_safety_gate_stops_the_car(arena_m) -> None:
+    """It is a termination, not a truncation: a stopped car earns no further reward."""
     envelope = SafetyEnvelope(max_speed_mps=2.5, arena_m=arena_m)
     rng = np.random.default_rng(0)
     states = rng.uniform([-1.0, -1.5, -math.pi, -3.0, -1.0, -4.0], [2.0, 0.5, math.pi, 3.0, 1.0, 4.0], (600, 6))
-    states[::10] = [2.1, 0.0, 0.3, 0.0, 0.0, 0.0]  # it stands outside
-    env = ModelEnv(Still(), TASK, 400, recorded=rows_of(states), from_recorded=1.0, envelope=envelope)
+    states[::10] = [2.1, 0.0, 0.3, 0.0, 0.0, 0.0]  # outside of the arena
+    env = ModelEnv(StationaryCar(), TASK, 400, recorded=rows_of(states), from_recorded=1.0, envelope=envelope)
     env.reset()
     now = [CarState.from_array(state_of(row)) for row in env.features.numpy().astype(np.float64)]
     _, _, done, infos = env.step(np.zeros((400, 2), np.float32))
-    wanted = [
+    expected = [
         s.speed_mps > 2.5 or not can_stop_inside(envelope.arena_m, s, envelope.reaction_s, envelope.deceleration_mps2)
         for s in now
     ]
-    assert done.tolist() == wanted
-    assert 50 < sum(wanted) < 350
+    assert done.tolist() == expected
+    assert 50 < sum(expected) < 350
     assert all(info["TimeLimit.truncated"] is False for info, ended in zip(infos, done, strict=True) if ended)
     assert all(info == {} for info, ended in zip(infos, done, strict=True) if not ended)
 
 
-def test_the_arena_is_that_of_the_task_where_the_car_has_none() -> None:
+def test_arena_of_the_task_applies_without_an_arena_of_the_car() -> None:
     outside, inside = np.array([[2.9, 0.0, 0, 0, 0, 0]]), np.array([[2.7, 0.0, 0, 0, 0, 0]])
-    for states, wanted in ((outside, True), (inside, False)):
-        env = ModelEnv(Still(), TASK, 1, recorded=rows_of(states), from_recorded=1.0)
+    for states, expected in ((outside, True), (inside, False)):
+        env = ModelEnv(StationaryCar(), TASK, 1, recorded=rows_of(states), from_recorded=1.0)
         env.reset()
-        assert bool(env.step(np.zeros((1, 2), np.float32))[2][0]) is wanted
+        assert bool(env.step(np.zeros((1, 2), np.float32))[2][0]) is expected
 
 
-def test_an_episode_is_cut_off_after_the_ticks_of_the_task() -> None:
+def test_episode_is_truncated_after_the_ticks_of_the_task() -> None:
     task = replace(TASK, max_ticks=7)
-    env = ModelEnv(Rolling(), task, 200, seed=0)
+    env = ModelEnv(DelayedCar(), task, 200, seed=0)
     env.reset()
     commands = np.full((200, 2), 0.3, np.float32)
     ended = np.zeros(200, dtype=int)
     for tick in range(14):
-        driven = [by_hand(state_of(f), f[9:11]) for f in env.features.numpy().astype(np.float64)]
+        driven = [reference_step(state_of(f), f[9:11]) for f in env.features.numpy().astype(np.float64)]
         past = np.hstack([env.features.numpy()[:, 9:11], commands])
         seen, _, done, infos = env.step(commands)
         ended += done
         if tick == 0:
-            assert 10 < done.sum() < 60, "episodes end at different ticks from the first"
+            assert 10 < done.sum() < 60, "initial episodes end at different ticks"
         if tick == 6:
             assert (ended == 1).all()
         final = policy_inputs(rows_of(np.array(driven), past))
         for k in np.flatnonzero(done):
             assert infos[k]["TimeLimit.truncated"] is True
             np.testing.assert_allclose(infos[k]["terminal_observation"], final[k], atol=1e-5)
-            assert np.all(seen[k][7:] == 0.0), "a new start has no command behind it"
+            assert np.all(seen[k][7:] == 0.0), "a new start has zero past commands"
             assert abs(seen[k][0] * 2 - 1.42) < 0.1 + 1e-6
     assert (ended == 2).all()
 
 
-def test_a_parked_car_ends_its_episode_where_the_task_says_so() -> None:
+def test_parked_car_terminates_the_episode_with_stop_when_parked() -> None:
     states = np.array([[0.05, 0.0, 0.1, 0.0, 0.0, 0.0]])
     for stop in (True, False):
-        env = ModelEnv(Still(), replace(TASK, stop_when_parked=stop), 1, recorded=rows_of(states), from_recorded=1.0)
+        env = ModelEnv(
+            StationaryCar(), replace(TASK, stop_when_parked=stop), 1, recorded=rows_of(states), from_recorded=1.0
+        )
         env.reset()
         _, _, done, infos = env.step(np.zeros((1, 2), np.float32))
         assert bool(done[0]) is stop
@@ -193,27 +200,27 @@ def test_a_parked_car_ends_its_episode_where_the_task_says_so() -> None:
             assert infos[0]["terminal_observation"][0] == pytest.approx(0.025)
 
 
-def test_the_last_tick_of_a_car_that_parks_is_no_cut() -> None:
+def test_parking_at_the_last_tick_is_not_a_truncation() -> None:
     task = replace(TASK, stop_when_parked=True, max_ticks=1)
-    env = ModelEnv(Still(), task, 1, recorded=rows_of(np.zeros((1, 6))), from_recorded=1.0)
+    env = ModelEnv(StationaryCar(), task, 1, recorded=rows_of(np.zeros((1, 6))), from_recorded=1.0)
     env.reset()
     assert env.step(np.zeros((1, 2), np.float32))[3][0]["TimeLimit.truncated"] is False
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_starts_are_recorded_ones_in_the_given_share(share: float) -> None:
+def test_given_share_of_starts_is_recorded(share: float) -> None:
     rng = np.random.default_rng(0)
     recorded = rng.uniform(-0.5, 0.5, (10, WIDTH))
-    env = ModelEnv(Still(), TASK, 4000, recorded=recorded, from_recorded=share, seed=3)
+    env = ModelEnv(StationaryCar(), TASK, 4000, recorded=recorded, from_recorded=share, seed=3)
     env.reset()
     rows = env.features.numpy()
-    near = np.abs(rows[:, None] - recorded[None]).max(axis=2)
-    again = near.min(axis=1) < 1e-6
-    assert again.mean() == pytest.approx(share, abs=4 * math.sqrt(share * (1 - share) / 4000))
+    distance = np.abs(rows[:, None] - recorded[None]).max(axis=2)
+    is_recorded = distance.min(axis=1) < 1e-6
+    assert is_recorded.mean() == pytest.approx(share, abs=4 * math.sqrt(share * (1 - share) / 4000))
     if share:
-        often = np.bincount(near.argmin(axis=1)[again], minlength=10)
-        assert often.min() > 0.6 * often.mean()
-    fresh = rows[~again]
+        counts = np.bincount(distance.argmin(axis=1)[is_recorded], minlength=10)
+        assert counts.min() > 0.6 * counts.mean()
+    fresh = rows[~is_recorded]
     if share < 1:
         assert np.all(fresh[:, 7:] == 0.0)
         assert np.ptp(fresh[:, 0]) == pytest.approx(0.2, abs=0.01)
@@ -222,19 +229,19 @@ def test_starts_are_recorded_ones_in_the_given_share(share: float) -> None:
         assert np.abs(yaw).max() == pytest.approx(0.1 * math.pi, abs=0.01)
 
 
-def test_without_recordings_every_start_is_the_tasks() -> None:
-    env = ModelEnv(Still(), TASK, 100, recorded=np.zeros((0, WIDTH)), from_recorded=1.0)
+def test_all_starts_are_those_of_the_task_without_recordings() -> None:
+    env = ModelEnv(StationaryCar(), TASK, 100, recorded=np.zeros((0, WIDTH)), from_recorded=1.0)
     env.reset()
     assert np.all(np.abs(env.features[:, 0].numpy() - 1.42) <= 0.1 + 1e-6)
 
 
-def test_a_rollout_counts_each_car_until_its_end() -> None:
-    """Cars that hold different throttles from one start; some leave the arena on the way."""
+def test_rollout_sums_rewards_of_each_car_until_its_episode_ends() -> None:
+    """The cars hold different throttles from one start; some leave the arena."""
     task = replace(TASK, start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=60)
     throttle = np.linspace(-0.5, 0.6, 12)
     envelope = SafetyEnvelope(arena_m=task.arena_m)
     recorded = rows_of(np.array([[0.1, 0.2, 0.3, 0.0, 0.0, 0.0]]))
-    env = ModelEnv(Rolling(), task, 12, recorded=recorded, from_recorded=1.0, envelope=envelope)
+    env = ModelEnv(DelayedCar(), task, 12, recorded=recorded, from_recorded=1.0, envelope=envelope)
     commands = np.stack([np.full(12, 0.3), throttle], axis=1).astype(np.float32)
     views: list[np.ndarray] = []
 
@@ -247,10 +254,10 @@ def test_a_rollout_counts_each_car_until_its_end() -> None:
     assert views[0].shape == (12, WIDTH)
     lengths = []
     for k in range(12):
-        state, late, reward, ticks = np.array([1.42, -1.04, math.pi, 0, 0, 0]), np.zeros(2), 0.0, 0
+        state, command, reward, ticks = np.array([1.42, -1.04, math.pi, 0, 0, 0]), np.zeros(2), 0.0, 0
         for _ in range(60):
-            state, late, ticks = by_hand(state, late), commands[k].astype(float), ticks + 1
-            reward += parking_reward(state, late)
+            state, command, ticks = reference_step(state, command), commands[k].astype(float), ticks + 1
+            reward += parking_reward(state, command)
             if not can_stop_inside(task.arena_m, CarState.from_array(state), 0.15, 3.0):
                 break
         lengths.append(ticks)
@@ -262,19 +269,19 @@ def test_a_rollout_counts_each_car_until_its_end() -> None:
     np.testing.assert_allclose(env.features.numpy(), np.repeat(recorded, 12, axis=0), atol=1e-6)
 
 
-def test_a_rollout_ends_a_car_that_has_parked() -> None:
+def test_rollout_ends_for_a_parked_car() -> None:
     task = replace(
         TASK, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9,
         stop_when_parked=True,
     )  # fmt: skip
-    total, _ = ModelEnv(Still(), task, 3).roll_out(lambda seen: np.zeros((3, 2), np.float32))
-    assert total.tolist() == pytest.approx([1.0] * 3), "one tick within the bound"
-    total, _ = ModelEnv(Still(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
+    total, _ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda seen: np.zeros((3, 2), np.float32))
+    assert total.tolist() == pytest.approx([1.0] * 3), "one rewarded tick"
+    total, _ = ModelEnv(StationaryCar(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
     assert total.tolist() == pytest.approx([9.0] * 3)
 
 
-def test_the_same_seed_gives_the_same_starts() -> None:
-    first, second, other = (ModelEnv(Rolling(), TASK, 30, seed=s) for s in (4, 4, 5))
+def test_equal_seeds_give_equal_starts() -> None:
+    first, second, other = (ModelEnv(DelayedCar(), TASK, 30, seed=s) for s in (4, 4, 5))
     assert np.array_equal(first.reset(), second.reset())
     assert not np.array_equal(first.reset(), other.reset())
     first.seed(8)
@@ -282,11 +289,11 @@ def test_the_same_seed_gives_the_same_starts() -> None:
     assert np.array_equal(first.reset(), second.reset())
 
 
-def test_soft_actor_critic_of_stable_baselines_can_be_trained_in_it() -> None:
-    """Its replay holds true ends: a car that stands is where it was, on the tick that ends its episode as well."""
+def test_sac_trains_in_the_environment_with_correct_terminal_observations() -> None:
+    """For a stationary car the replay's next observation equals the observation, also at episode ends."""
     rng = np.random.default_rng(0)
     states = rng.uniform([-1, -1, -3, 0, 0, 0], [1, 1, 3, 0, 0, 0], (500, 6))
-    env = ModelEnv(Still(), replace(TASK, max_ticks=5), 8, recorded=rows_of(states), from_recorded=1.0)
+    env = ModelEnv(StationaryCar(), replace(TASK, max_ticks=5), 8, recorded=rows_of(states), from_recorded=1.0)
     agent = FastSac(
         "MlpPolicy", env, policy_kwargs={"net_arch": [8]}, learning_starts=40, buffer_size=4000, batch_size=16,
         train_freq=(2, "step"), gradient_steps=3, seed=0, device="cpu",
@@ -302,12 +309,12 @@ def test_soft_actor_critic_of_stable_baselines_can_be_trained_in_it() -> None:
     np.testing.assert_allclose(replay.next_observations[:50, :, :7], replay.observations[:50, :, :7], atol=1e-6)
 
 
-def test_a_policy_sees_numbers_of_size_one_and_nothing_far_outside() -> None:
+def test_policy_inputs_are_scaled_and_clipped() -> None:
     features = np.array([[1.0, -3.0, 0.6, -0.8, 2.0, 0.5, 8.0, 0.1, -1.0], [500.0, -500.0, 0, 1, 100.0, 0, 0, 0, 0]])
-    kept = features.copy()
+    before = features.copy()
     seen = policy_inputs(features)
     assert seen.dtype == np.float32
     assert seen[0].tolist() == pytest.approx([0.5, -1.5, 0.6, -0.8, 1.0, 0.5, 2.0, 0.1, -1.0])
     assert seen[1].tolist() == [10.0, -10.0, 0.0, 1.0, 10.0, 0.0, 0.0, 0.0, 0.0]
-    assert np.array_equal(features, kept), "the features themselves stay"
+    assert np.array_equal(features, before), "policy_inputs must not modify its argument"
     assert np.array_equal(policy_inputs(features[0]), seen[0])

@@ -1,4 +1,4 @@
-"""The pendulum that loses energy behind a lagging motor, against scipy and the laws of energy."""
+"""Test the pendulum with losses and motor lag against scipy and energy conservation."""
 
 import math
 
@@ -19,8 +19,8 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def changed(row, drawn):
-    """Change over 50 ms by scipy, the torque being a third state."""
+def state_change(row, drawn):
+    """Integrate the state change over 50 ms by scipy, with the torque as third state."""
     sin, cos, rate, past, command = row
     m, length, g, nu, drag, dry, lag, linear, odd, even, sliding, of_command, of_past = drawn
 
@@ -38,15 +38,15 @@ def changed(row, drawn):
 
 
 @pytest.mark.parametrize("discrepancy", [{}, {"rate_discrepancy": (0.8, 0.3, 0.3, 0.7), "command_discrepancy": 0.5}])
-def test_it_follows_its_equations_with_the_torque_as_a_state(discrepancy):
+def test_motor_pendulum_equals_scipy_with_torque_state(discrepancy):
     model = MotorPendulum(**LOSSES, **discrepancy)
     x, parameters = model.inputs(12, generator()).double(), draw_parameters(model, 4, generator(1)).double()
-    ours = model(x, parameters).numpy()
-    theirs = [[changed(row, drawn) for row in x.tolist()] for drawn in parameters.tolist()]
-    assert np.allclose(ours, theirs, atol=2e-5)
+    changes = model(x, parameters).numpy()
+    expected = [[state_change(row, drawn) for row in x.tolist()] for drawn in parameters.tolist()]
+    assert np.allclose(changes, expected, atol=2e-5)
 
 
-def test_without_lag_the_past_command_changes_nothing_and_with_it_something():
+def test_past_command_matters_with_motor_lag_only():
     x = MotorPendulum().inputs(6, generator())
     other = x.clone()
     other[:, 3] = -other[:, 3]
@@ -57,39 +57,39 @@ def test_without_lag_the_past_command_changes_nothing_and_with_it_something():
 
 
 def energies(model, commands, steps=60):
-    """Energy by m l^2 of free pendulums after each step: (steps + 1, P * N)."""
+    """Return the energy over m l^2 of free pendulums after each step (steps + 1, P * N)."""
     parameters = draw_parameters(model, 6, generator(2)).double()
     states = MotorPendulum().inputs(16, generator(3)).double()[:, :3]
     found = []
     for drawn in parameters:
         state, pull = states, drawn[2] / drawn[1]
-        own = []
+        trajectory_energies = []
         for _ in range(steps + 1):
-            own.append(0.5 * state[:, 2] ** 2 + pull * state[:, 1])
+            trajectory_energies.append(0.5 * state[:, 2] ** 2 + pull * state[:, 1])
             after = state + model(torch.cat([state, torch.zeros((len(state), commands))], dim=1), drawn[None])[0]
             state = torch.cat([after[:, :2] / after[:, :2].norm(dim=1, keepdim=True), after[:, 2:]], dim=1)
-        found.append(torch.stack(own))
+        found.append(torch.stack(trajectory_energies))
     return torch.cat(found, dim=1)
 
 
-def test_energy_without_torque_stays_without_losses_and_never_grows_with_them():
-    kept = energies(MotorPendulum(), 2)
-    assert torch.allclose(kept, kept[:1].expand_as(kept), atol=1e-5)
-    lost = energies(MotorPendulum(**LOSSES), 2)
-    assert float(lost.diff(dim=0).max()) < 1e-7
-    assert bool((lost[-1] < lost[0] - 0.1).all())
+def test_energy_is_constant_without_losses_and_decreases_with_losses():
+    conserved = energies(MotorPendulum(), 2)
+    assert torch.allclose(conserved, conserved[:1].expand_as(conserved), atol=1e-5)
+    dissipated = energies(MotorPendulum(**LOSSES), 2)
+    assert float(dissipated.diff(dim=0).max()) < 1e-7
+    assert bool((dissipated[-1] < dissipated[0] - 0.1).all())
 
 
-def test_drag_by_the_square_of_the_rate_alone_can_feed_energy():
-    """The drag of the authors' code, alone: a pendulum that turns backwards gains from it, soon without bounds."""
+def test_quadratic_drag_without_sign_can_add_energy():
+    """The drag of the authors' code adds energy to a pendulum that rotates backwards."""
     fine = {"substeps": 200, "drags": (0.4, 0.6)}
     assert float(energies(Pendulum(**fine), 1, steps=2).diff(dim=0).max()) > 0.1
     assert float(energies(Pendulum(**fine, dissipative=True), 1, steps=2).diff(dim=0).max()) < 0.02
 
 
 @pytest.mark.parametrize("lag", [0.02, 0.06])
-def test_a_gap_in_the_dynamics_finds_what_the_motor_does(lag):
-    """Over a step the past command has the share ``lag / T (1 - exp(-T / lag))`` of the mean torque."""
+def test_command_discrepancy_identifies_the_motor_lag(lag):
+    """The past command contributes the share ``lag / T (1 - exp(-T / lag))`` of the mean torque of a step."""
     truth = MotorPendulum(lags=(lag, lag), dry=(0.2, 0.2), drags=(0.5, 0.5))
     inputs = truth.inputs(60, generator(4))
     outputs = truth(inputs, draw_parameters(truth, 1, generator(5)))[0]

@@ -1,4 +1,4 @@
-"""Draws of a simulator's parameters against conjugate posteriors and quadrature."""
+"""Test posterior draws of simulator parameters against conjugate posteriors and quadrature."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def generator(seed=0):
 
 
 def features(x):
-    """Of two outputs, in numpy (O, N, 3)."""
+    """Return the features of two outputs in numpy (O, N, 3)."""
     x = np.asarray(x)[:, 0]
     return np.stack([np.stack([x, np.ones_like(x), x**2], axis=1), np.stack([np.sin(x), x, 0 * x], axis=1)])
 
 
 @dataclass(frozen=True)
 class Linear:
-    """Two outputs, linear in three parameters that are normal and independent."""
+    """Simulator with two outputs, linear in three independent normal parameters."""
 
     size: int = 3
 
@@ -45,8 +45,8 @@ class Linear:
 
 
 @dataclass(frozen=True)
-class Curve:
-    """A function of one standard normal parameter, the same at all inputs."""
+class ConstantOutput:
+    """Simulator whose output is a function of one standard normal parameter, constant in the input."""
 
     shape: Callable[[Tensor], Tensor]
     size: int = 1
@@ -66,7 +66,7 @@ PLAIN = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
 
 
 def conjugate(x, y, covariance):
-    """Mean and covariance of the linear model's parameters; ``covariance`` (O, n, n) in normalised outputs."""
+    """Return posterior mean and covariance of the linear model; ``covariance`` (O, n, n) is in normalised outputs."""
     prior = np.diag(1.0 / PRIOR_STD.double().numpy() ** 2)
     precision, weighted = prior, prior @ PRIOR_MEAN.double().numpy()
     for k, std in enumerate(UNITS.output_std.double().numpy()):
@@ -77,34 +77,34 @@ def conjugate(x, y, covariance):
     return found @ weighted, found
 
 
-def material(rows, noise, seed=0):
-    """Rows of the linear model with a smooth error and noise, and their covariance in normalised outputs."""
+def linear_data(rows, noise, seed=0):
+    """Return rows of the linear model with correlated errors, and the error covariance in normalised outputs."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(-2, 2, (rows, 1))
     smooth = noise**2 * np.exp(-0.5 * (x - x.T) ** 2)
     covariance = np.stack([smooth, 4.0 * smooth]) + noise**2 * np.eye(rows)
-    off = [np.linalg.cholesky(c) @ rng.normal(size=rows) for c in covariance]
+    errors = [np.linalg.cholesky(c) @ rng.normal(size=rows) for c in covariance]
     truth = features(x) @ np.array([1.3, 1.0, -0.4])
-    y = truth.T + np.stack(off, axis=1) * UNITS.output_std.numpy()
+    y = truth.T + np.stack(errors, axis=1) * UNITS.output_std.numpy()
     return torch.tensor(x).float(), torch.tensor(y).float(), covariance
 
 
 @pytest.mark.parametrize(("rows", "noise"), [(1, 0.5), (6, 0.3), (60, 0.1), (100, 0.003)])
-def test_a_linear_simulator_has_its_conjugate_posterior(rows, noise):
-    """From a single row, which leaves the prior in two directions, to parameters known to a thousandth of it."""
-    x, y, covariance = material(rows, noise)
+def test_linear_simulator_has_the_conjugate_posterior(rows, noise):
+    """The cases range from one row to parameters known to a thousandth of the prior width."""
+    x, y, covariance = linear_data(rows, noise)
     factor = torch.linalg.cholesky(torch.tensor(covariance))
     draws = posterior_parameters(Linear(), x, y, factor, UNITS, 2000, generator()).double().numpy()
     mean, exact = conjugate(x, y, covariance)
     root = np.linalg.cholesky(exact)
-    # In units in which the posterior is standard normal: 2000 draws know their mean to 0.02.
+    # In these units the posterior is standard normal; the mean of 2000 draws has an error of 0.02.
     white = np.linalg.solve(root, (draws - mean).T)
     assert np.allclose(white.mean(axis=1), 0.0, atol=0.1)
     assert np.allclose(np.cov(white), np.eye(3), atol=0.15)
 
 
-def test_draws_are_mostly_different_from_each_other():
-    x, y, covariance = material(60, 0.1)
+def test_draws_are_mostly_distinct():
+    x, y, covariance = linear_data(60, 0.1)
     draws = posterior_parameters(
         Linear(), x, y, torch.linalg.cholesky(torch.tensor(covariance)), UNITS, 128, generator()
     )
@@ -112,24 +112,24 @@ def test_draws_are_mostly_different_from_each_other():
     assert len(torch.unique(draws, dim=0)) > 115
 
 
-def test_without_data_it_is_the_prior():
-    none = torch.zeros((2, 0, 0), dtype=torch.float64)
-    draws = posterior_parameters(Linear(), torch.zeros(0, 1), torch.zeros(0, 2), none, UNITS, 4000, generator())
+def test_draws_without_data_have_the_prior_distribution():
+    empty_factor = torch.zeros((2, 0, 0), dtype=torch.float64)
+    draws = posterior_parameters(Linear(), torch.zeros(0, 1), torch.zeros(0, 2), empty_factor, UNITS, 4000, generator())
     assert draws.dtype == torch.float32
     assert torch.allclose(draws.mean(dim=0), PRIOR_MEAN, atol=0.1)
     assert torch.allclose(torch.cov(draws.T), torch.diag(PRIOR_STD**2), atol=0.15)
 
 
-def of_one(shape, seen, noise, count=2000):
-    """Draws (count,) of a curve's parameter given values ``seen``."""
-    y = torch.tensor(seen)[:, None]
+def draws_of_one_parameter(shape, observed, noise, count=2000):
+    """Draw the parameter (count,) of a constant output given ``observed`` values."""
+    y = torch.tensor(observed)[:, None]
     factor = noise * torch.eye(len(y), dtype=torch.float64)[None]
-    found = posterior_parameters(Curve(shape), torch.zeros(len(y), 1), y, factor, PLAIN, count, generator(1))
+    found = posterior_parameters(ConstantOutput(shape), torch.zeros(len(y), 1), y, factor, PLAIN, count, generator(1))
     return found[:, 0].double().numpy()
 
 
-def by_quadrature(log_likelihood):
-    """Places and weights of a posterior with a standard normal prior."""
+def posterior_by_quadrature(log_likelihood):
+    """Return grid points and weights of the posterior with a standard normal prior."""
     at = np.linspace(-6.0, 6.0, 24_001)
     with np.errstate(invalid="ignore"):
         logs = np.nan_to_num(log_likelihood(at), nan=-np.inf) - 0.5 * at**2
@@ -137,15 +137,17 @@ def by_quadrature(log_likelihood):
     return at, weight / weight.sum()
 
 
-def test_both_of_two_answers_are_found():
-    """A narrow one that fits, and a wide one that fits worse: their order changes while data gains weight."""
+def test_both_modes_of_a_bimodal_posterior_are_sampled():
+    """The narrow mode fits better; the wide mode dominates at first during tempering."""
 
     def shape(t):
         return torch.where(t < 0.3, (t - 0.3) ** 2, ((t - 0.3) ** 2).clamp_max(1.3))
 
-    seen = [1.4, 1.45, 1.45, 1.5]
-    draws = of_one(shape, seen, 0.15)
-    at, weight = by_quadrature(lambda t: -0.5 * sum((s - shape(torch.tensor(t)).numpy()) ** 2 for s in seen) / 0.15**2)
+    observed = [1.4, 1.45, 1.45, 1.5]
+    draws = draws_of_one_parameter(shape, observed, 0.15)
+    at, weight = posterior_by_quadrature(
+        lambda t: -0.5 * sum((s - shape(torch.tensor(t)).numpy()) ** 2 for s in observed) / 0.15**2
+    )
     below = at < 0.3
     assert 0.3 < weight[below].sum() < 0.7
     assert (draws < 0.3).mean() == pytest.approx(weight[below].sum(), abs=0.06)
@@ -157,14 +159,14 @@ def test_both_of_two_answers_are_found():
 
 
 @pytest.mark.parametrize("broken", [float("nan"), float("inf")])
-def test_where_the_simulator_breaks_down_there_are_no_draws(broken):
-    """It does so for three quarters of the prior."""
+def test_draws_avoid_parameters_with_invalid_outputs(broken):
+    """Three quarters of the prior mass give invalid outputs."""
 
     def shape(t):
         return torch.where(t > 0.7, t, torch.full_like(t, broken))
 
-    draws = of_one(shape, [0.5], 0.5)
-    at, weight = by_quadrature(lambda t: np.where(t > 0.7, -0.5 * ((0.5 - t) / 0.5) ** 2, np.nan))
+    draws = draws_of_one_parameter(shape, [0.5], 0.5)
+    at, weight = posterior_by_quadrature(lambda t: np.where(t > 0.7, -0.5 * ((0.5 - t) / 0.5) ** 2, np.nan))
     mean = (weight * at).sum()
     std = np.sqrt((weight * (at - mean) ** 2).sum())
     assert draws.min() > 0.7
@@ -172,13 +174,13 @@ def test_where_the_simulator_breaks_down_there_are_no_draws(broken):
     assert draws.std() == pytest.approx(std, rel=0.1)
 
 
-def test_a_simulator_that_breaks_down_everywhere_is_refused():
+def test_simulator_with_invalid_outputs_everywhere_is_refused():
     with pytest.raises(DataError, match="narrow the ranges"):
-        of_one(lambda t: torch.full_like(t, float("nan")), [0.5], 0.5)
+        draws_of_one_parameter(lambda t: torch.full_like(t, float("nan")), [0.5], 0.5)
 
 
-def test_the_same_seed_gives_the_same_draws():
-    x, y, covariance = material(6, 0.3)
+def test_equal_seeds_give_equal_draws():
+    x, y, covariance = linear_data(6, 0.3)
     factor = torch.linalg.cholesky(torch.tensor(covariance))
     first, second, other = (
         posterior_parameters(Linear(), x, y, factor, UNITS, 64, generator(seed)) for seed in (3, 3, 4)

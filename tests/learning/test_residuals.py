@@ -1,4 +1,4 @@
-"""Residual distributions against scipy, and with few rows."""
+"""Test residual distributions against scipy, and with few rows."""
 
 import math
 
@@ -21,7 +21,7 @@ def drawn(rows, dof, seed=0):
 
 
 @pytest.mark.parametrize("dof", [3.0, 1e9])
-def test_the_distribution_is_the_one_that_errors_were_drawn_from(dof):
+def test_fit_recovers_the_true_distribution(dof):
     found = fit_residuals(drawn(4000, dof))
     assert found.scale.numpy() == pytest.approx(SIZE, rel=0.07)
     size = SIZE[:, None] * SIZE
@@ -29,47 +29,50 @@ def test_the_distribution_is_the_one_that_errors_were_drawn_from(dof):
     assert found.dof == 3.0 if dof == 3.0 else found.dof >= 20.0
 
 
-def test_its_likelihood_about_a_mean_is_scipys():
+def test_likelihood_around_a_mean_equals_scipy():
     found = fit_residuals(drawn(200, 4.0))
     means, targets = torch.randn((1, 50, 3), generator=torch.Generator().manual_seed(0)).double(), drawn(50, 4.0, 1)
-    theirs = multivariate_t(np.zeros(3), (found.factor @ found.factor.T).numpy(), df=found.dof)
-    ours = negative_log_likelihood(found.centred_at(means), targets)
-    assert ours == pytest.approx(-theirs.logpdf((targets - means[0]).numpy()).mean(), rel=1e-9)
+    expected = multivariate_t(np.zeros(3), (found.factor @ found.factor.T).numpy(), df=found.dof)
+    nll = negative_log_likelihood(found.centred_at(means), targets)
+    assert nll == pytest.approx(-expected.logpdf((targets - means[0]).numpy()).mean(), rel=1e-9)
     assert float(found.mahalanobis_sq(targets)[0]) == pytest.approx(
         float(targets[0] @ torch.linalg.inv(found.factor @ found.factor.T) @ targets[0])
     )
 
 
 @pytest.mark.parametrize("rows", [30, 200])
-def test_new_errors_lose_little_density_against_the_truth(rows):
-    """And with a far higher density than under independent normal errors of the same rows."""
-    new, lost, gained = drawn(20_000, 3.0, 99), [], []
-    truth = -multivariate_t(np.zeros(3), TRUE, df=3.0).logpdf(new.numpy()).mean()
+def test_fit_loses_little_held_out_density_against_the_truth(rows):
+    """The fit also has a much higher density than independent normal errors."""
+    held_out, losses, gains = drawn(20_000, 3.0, 99), [], []
+    truth = -multivariate_t(np.zeros(3), TRUE, df=3.0).logpdf(held_out.numpy()).mean()
     for seed in range(4):
-        seen = drawn(rows, 3.0, seed)
-        ours = negative_log_likelihood(fit_residuals(seen).centred_at(torch.zeros((1, len(new), 3)).double()), new)
-        lost.append(ours - truth)
-        gained.append(-norm(0.0, seen.numpy().std(axis=0)).logpdf(new.numpy()).sum(axis=1).mean() - ours)
-    assert 0.0 < np.mean(lost) < (0.4 if rows == 30 else 0.04)
-    assert np.mean(gained) > 0.8
+        errors = drawn(rows, 3.0, seed)
+        centred = fit_residuals(errors).centred_at(torch.zeros((1, len(held_out), 3)).double())
+        nll = negative_log_likelihood(centred, held_out)
+        losses.append(nll - truth)
+        gains.append(-norm(0.0, errors.numpy().std(axis=0)).logpdf(held_out.numpy()).sum(axis=1).mean() - nll)
+    assert 0.0 < np.mean(losses) < (0.4 if rows == 30 else 0.04)
+    assert np.mean(gains) > 0.8
 
 
 def test_few_rows_keep_the_prior_scale():
-    """Two rows that a model meets exactly: the expected noise stands, with tails."""
-    none = torch.zeros((2, 3)).double()
-    found = fit_residuals(none, torch.tensor([0.1, 0.2, 0.3]), 1.0)
+    """Two rows with zero residuals keep the expected noise, with heavy tails."""
+    zero_residuals = torch.zeros((2, 3)).double()
+    found = fit_residuals(zero_residuals, torch.tensor([0.1, 0.2, 0.3]), 1.0)
     assert 2.5 <= found.dof <= 3.0
     assert found.scale.numpy() == pytest.approx(np.array([0.1, 0.2, 0.3]) / math.sqrt(3.0), rel=0.35)
-    assert (fit_residuals(none, torch.tensor([0.1, 0.2, 0.3]), 1.0, fitted_rows=1.0).scale > found.scale).all()
+    assert (
+        fit_residuals(zero_residuals, torch.tensor([0.1, 0.2, 0.3]), 1.0, fitted_rows=1.0).scale > found.scale
+    ).all()
 
 
-def test_nothing_and_numbers_that_are_missing_are_refused():
-    for bad in (torch.zeros((0, 2)), torch.full((4, 2), math.nan)):
+def test_empty_and_nan_residuals_are_refused():
+    for invalid in (torch.zeros((0, 2)), torch.full((4, 2), math.nan)):
         with pytest.raises(DataError, match="empty or not finite"):
-            fit_residuals(bad)
+            fit_residuals(invalid)
 
 
-def test_an_output_that_is_constant_keeps_a_width():
+def test_constant_output_has_a_positive_scale():
     errors = torch.cat([drawn(50, 1e9), torch.zeros((50, 1)).double()], dim=1)
     for found in (fit_residuals(errors), fit_residuals(torch.zeros((5, 2)).double())):
         assert torch.isfinite(found.whitening).all()

@@ -1,4 +1,4 @@
-"""A policy that is trained in a world whose best commands are evident; kept, judged, saved and driven with."""
+"""Test the SAC agent in an environment with a known optimal policy: training, selection, files, driving."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ X_M = np.array([-1.2, -0.6, 0.6, 1.2])
 
 
 @dataclass
-class Still(StepInBody):
-    """A car that changes by this number in everything; by default it stands."""
+class ConstantChange(StepInBody):
+    """A learned car whose state changes by a constant per step; zero means standstill."""
 
     history: int = HISTORY
     change: float = 0.0
@@ -38,8 +38,8 @@ class Still(StepInBody):
 
 
 @dataclass(frozen=True)
-class Sides(ParkingTask):
-    """Steer right always; push to the side that the car stands on."""
+class SignTask(ParkingTask):
+    """The optimum is steering -1 and throttle equal to the sign of x."""
 
     start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_spread: tuple[float, float, float] = (1.4, 0.3, 0.1)
@@ -51,7 +51,7 @@ class Sides(ParkingTask):
 
 
 def world(cars: int = 32, seed: int = 0, change: float = 0.0) -> ModelEnv:
-    return ModelEnv(Still(change=change), Sides(), cars, seed=seed)
+    return ModelEnv(ConstantChange(change=change), SignTask(), cars, seed=seed)
 
 
 def features(x_m: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def features(x_m: np.ndarray) -> np.ndarray:
     return found
 
 
-def answers(agent: SacAgent) -> np.ndarray:
+def actions_of(agent: SacAgent) -> np.ndarray:
     return agent.act(policy_inputs(features(X_M)))
 
 
@@ -71,86 +71,88 @@ def trained() -> SacAgent:
     return agent
 
 
-def test_it_learns_what_is_evident(trained: SacAgent) -> None:
-    steering, throttle = answers(trained).T
+def test_training_finds_the_known_optimal_policy(trained: SacAgent) -> None:
+    steering, throttle = actions_of(trained).T
     assert np.all(steering < -0.8)
     assert np.all(throttle * np.sign(X_M) > 0.3)
     total, _ = world(64, seed=3).roll_out(trained.act)
-    assert float(total.mean()) > 15.0, "20 are to be had in ten ticks"
+    assert float(total.mean()) > 15.0, "the maximum return of ten ticks is 20"
 
 
-def test_worlds_of_other_seeds_are_other_worlds() -> None:
-    ends = []
+def test_environments_with_different_seeds_differ() -> None:
+    final_features = []
     for seed in (1, 2):
         env = world(16, seed)
         SacAgent(SMALL, 0).train(env, 32)
-        ends.append(env.features.numpy())
-    assert not np.array_equal(*ends)
+        final_features.append(env.features.numpy())
+    assert not np.array_equal(*final_features)
 
 
-def test_training_makes_as_many_steps_as_it_was_told_and_tells_them() -> None:
-    told: list[int] = []
-    figures = SacAgent(SMALL, 0).train(world(16), 160, told.append)
+def test_training_makes_the_requested_steps_and_reports_progress() -> None:
+    reported_steps: list[int] = []
+    figures = SacAgent(SMALL, 0).train(world(16), 160, reported_steps.append)
     assert figures["train/n_updates"] == 160
-    assert told[0] == 0
-    assert told[-1] == 160
-    assert told == sorted(told)
+    assert reported_steps[0] == 0
+    assert reported_steps[-1] == 160
+    assert reported_steps == sorted(reported_steps)
     assert all(np.isfinite(v) for v in figures.values())
 
 
-def test_a_policy_that_was_read_acts_alike_and_learns_on_from_there(trained: SacAgent, tmp_path: Path) -> None:
+def test_loaded_agent_acts_identically_and_continues_learning(trained: SacAgent, tmp_path: Path) -> None:
     trained.save(tmp_path)
-    again = SacAgent.load(tmp_path, SETTINGS, seed=1)
-    np.testing.assert_array_equal(answers(again), answers(trained))
-    again.train(world(seed=5), 32)
-    assert not np.array_equal(answers(again), answers(trained))
+    loaded = SacAgent.load(tmp_path, SETTINGS, seed=1)
+    np.testing.assert_array_equal(actions_of(loaded), actions_of(trained))
+    loaded.train(world(seed=5), 32)
+    assert not np.array_equal(actions_of(loaded), actions_of(trained))
     fresh = SacAgent(SETTINGS, seed=1)
     fresh.train(world(seed=5), 32)
-    learned, new = (float(world(64, seed=3).roll_out(a.act)[0].mean()) for a in (again, fresh))
-    assert learned > 15.0 > new + 3.0
+    loaded_return, fresh_return = (float(world(64, seed=3).roll_out(a.act)[0].mean()) for a in (loaded, fresh))
+    assert loaded_return > 15.0 > fresh_return + 3.0
 
 
-@pytest.mark.parametrize(("values", "kept"), [((5, 4, 3, 2), 0), ((1, 2, 3, 4), 3), ((0, 7, 2, 7), 1)])
-def test_the_best_judged_policy_is_kept_whole(values: tuple[float, ...], kept: int, tmp_path: Path) -> None:
-    judged: list[np.ndarray] = []
+@pytest.mark.parametrize(("values", "best_index"), [((5, 4, 3, 2), 0), ((1, 2, 3, 4), 3), ((0, 7, 2, 7), 1)])
+def test_policy_with_the_best_evaluation_is_restored(
+    values: tuple[float, ...], best_index: int, tmp_path: Path
+) -> None:
+    evaluated: list[np.ndarray] = []
     folders = [tmp_path / str(k) for k in range(5)]
 
-    def judge(agent: SacAgent) -> float:
-        folders[len(judged)].mkdir()
-        agent.save(folders[len(judged)])
-        judged.append(answers(agent))
-        return values[len(judged) - 1]
+    def evaluate(agent: SacAgent) -> float:
+        folders[len(evaluated)].mkdir()
+        agent.save(folders[len(evaluated)])
+        evaluated.append(actions_of(agent))
+        return values[len(evaluated) - 1]
 
     agent = SacAgent(SMALL, 0)
-    agent.train(world(16), 256, evaluate=judge, n_evaluations=4)
-    assert len(judged) == 4
-    assert all(not np.array_equal(a, b) for a, b in pairwise(judged))
-    np.testing.assert_array_equal(answers(agent), judged[kept])
+    agent.train(world(16), 256, evaluate=evaluate, n_evaluations=4)
+    assert len(evaluated) == 4
+    assert all(not np.array_equal(a, b) for a, b in pairwise(evaluated))
+    np.testing.assert_array_equal(actions_of(agent), evaluated[best_index])
     folders[4].mkdir()
     agent.save(folders[4])
-    found, then = (dict(np.load(folders[k] / AGENT_FILE)) for k in (4, kept))
-    assert {"log_temperature", "actor/square", "critics/steps"} < found.keys()
-    for name, value in then.items():
-        np.testing.assert_array_equal(found[name], value)
+    restored, best = (dict(np.load(folders[k] / AGENT_FILE)) for k in (4, best_index))
+    assert {"log_temperature", "actor/square", "critics/steps"} < restored.keys()
+    for name, value in best.items():
+        np.testing.assert_array_equal(restored[name], value)
 
 
-def test_a_policy_that_was_saved_and_read_trains_on_bit_for_bit_alike(tmp_path: Path) -> None:
+def test_loaded_agent_trains_bit_identically(tmp_path: Path) -> None:
     agent = SacAgent(SMALL, 3)
     agent.train(world(16), 64)
     agent.save(tmp_path)
-    read = SacAgent.load(tmp_path, SMALL, 3)
+    loaded = SacAgent.load(tmp_path, SMALL, 3)
     states = []
-    for trained_on in (agent, read):
-        trained_on.train(world(16, seed=2), 64)
-        assert trained_on._sac is not None
-        states.append(trained_on._sac.learned_state())
+    for trained_agent in (agent, loaded):
+        trained_agent.train(world(16, seed=2), 64)
+        assert trained_agent._sac is not None
+        states.append(trained_agent._sac.learned_state())
     assert int(states[0]["actor/steps"]) == 128
     for name, value in states[0].items():
         np.testing.assert_array_equal(states[1][name], value, err_msg=name)
 
 
-def test_where_the_policy_was_judged_no_tick_of_the_world_is_lost() -> None:
-    """A car that gains as much in each tick has gained as much in each row of the replay."""
+def test_evaluation_loses_no_step_of_the_replay() -> None:
+    """A constant speed change per tick appears in each row of the replay."""
     agent = SacAgent(SMALL, 0)
     agent.train(world(16, change=0.01), 256, evaluate=lambda agent: 0.0, n_evaluations=4)
     assert agent._sac is not None
@@ -158,51 +160,51 @@ def test_where_the_policy_was_judged_no_tick_of_the_world_is_lost() -> None:
     assert replay is not None
     rows, speed = replay.pos, 4
     assert rows > 30
-    gained = replay.next_observations[:rows, :, speed] - replay.observations[:rows, :, speed]
-    np.testing.assert_allclose(gained, gained[0, 0], atol=1e-5)
-    assert gained[0, 0] > 1e-3
+    speed_change = replay.next_observations[:rows, :, speed] - replay.observations[:rows, :, speed]
+    np.testing.assert_allclose(speed_change, speed_change[0, 0], atol=1e-5)
+    assert speed_change[0, 0] > 1e-3
 
 
-@pytest.mark.parametrize("how", ["a rate far too large", "a world that is no number"])
-def test_a_policy_that_diverges_is_told_and_the_earlier_one_kept(how: str) -> None:
+@pytest.mark.parametrize("cause", ["learning rate too large", "NaN dynamics"])
+def test_diverged_training_is_reported_and_keeps_the_earlier_policy(cause: str) -> None:
     agent = SacAgent(SMALL, 0)
     agent.train(world(16), 64)
-    before = answers(agent)
-    env = world(16, change=float("nan") if how == "a world that is no number" else 0.0)
-    if how == "a rate far too large":
+    before = actions_of(agent)
+    env = world(16, change=float("nan") if cause == "NaN dynamics" else 0.0)
+    if cause == "learning rate too large":
         agent._settings = replace(SMALL, learning_rate=1e20)
     with pytest.raises(DivergedError, match="diverged") as error:
         agent.train(env, 256)
     assert "\n" not in str(error.value)
-    np.testing.assert_array_equal(answers(agent), before)
+    np.testing.assert_array_equal(actions_of(agent), before)
 
 
-def test_whatever_stops_the_training_the_earlier_policy_is_kept() -> None:
+def test_interrupted_training_keeps_the_earlier_policy() -> None:
     def stop(agent: SacAgent) -> float:
         raise KeyboardInterrupt
 
     agent = SacAgent(SMALL, 0)
     agent.train(world(16), 64)
-    before = answers(agent)
+    before = actions_of(agent)
     with pytest.raises(KeyboardInterrupt):
         agent.train(world(16), 64, evaluate=stop)
-    np.testing.assert_array_equal(answers(agent), before)
+    np.testing.assert_array_equal(actions_of(agent), before)
 
 
 def view(row: np.ndarray) -> PolicyInput:
-    seen = Observation(CarState(), 0.0, 0.0, 0)
-    return PolicyInput(row, seen, 0, 0.0)
+    observation = Observation(CarState(), 0.0, 0.0, 0)
+    return PolicyInput(row, observation, 0, 0.0)
 
 
-def test_on_the_car_it_drives_by_its_mean_action_within_the_limits(trained: SacAgent) -> None:
+def test_policy_on_the_car_uses_the_mean_action_within_limits(trained: SacAgent) -> None:
     policy = trained.policy()
     assert isinstance(policy, SacPolicy)
     assert isinstance(policy, Policy)
     policy.reset()
-    for row, wanted in zip(features(X_M), answers(trained), strict=True):
-        np.testing.assert_allclose(policy.act(view(row)).to_array(), wanted, atol=1e-6)  # one row, many rows
-    wild = np.random.default_rng(0).normal(size=(40, 7 + 2 * HISTORY)) * 1e4
-    actions = np.array([policy.act(view(row)).to_array() for row in wild])
+    for row, expected in zip(features(X_M), actions_of(trained), strict=True):
+        np.testing.assert_allclose(policy.act(view(row)).to_array(), expected, atol=1e-6)  # one row, many rows
+    extreme_features = np.random.default_rng(0).normal(size=(40, 7 + 2 * HISTORY)) * 1e4
+    actions = np.array([policy.act(view(row)).to_array() for row in extreme_features])
     assert np.abs(actions).max() <= 1.0
     assert np.ptp(actions) > 0.5
 
@@ -217,7 +219,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["not there", "empty", "cut short", "text", "a folder"])
-def test_broken_files_are_refused_with_what_to_do(saved: Path, tmp_path: Path, kind: str) -> None:
+def test_invalid_agent_file_is_refused_with_the_remedy(saved: Path, tmp_path: Path, kind: str) -> None:
     whole, path = (saved / AGENT_FILE).read_bytes(), tmp_path / AGENT_FILE
     if kind == "a folder":
         path.mkdir()
@@ -232,7 +234,7 @@ WEIGHT = "policy/actor.mu.weight"
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
+    ("changed", "message"),
     [
         ({WEIGHT: None}, "actor.mu.weight is missing"),
         ({WEIGHT: np.zeros((3, 8), np.float32)}, r"shape \(3, 8\), not float32 of shape \(2, 8\)"),
@@ -250,20 +252,20 @@ WEIGHT = "policy/actor.mu.weight"
     ],
     ids=lambda v: None if isinstance(v, str) else next(iter(v)),
 )
-def test_arrays_that_do_not_fit_are_refused_in_a_sentence(
-    saved: Path, tmp_path: Path, changed: dict[str, Any], words: str
+def test_inconsistent_agent_file_is_refused_in_one_sentence(
+    saved: Path, tmp_path: Path, changed: dict[str, Any], message: str
 ) -> None:
     content = dict(np.load(saved / AGENT_FILE)) | changed
     np.savez_compressed(tmp_path / AGENT_FILE, **{k: v for k, v in content.items() if v is not None})
-    with pytest.raises(DataError, match=rf"{words}.*to train again\.$") as error:
+    with pytest.raises(DataError, match=rf"{message}.*to train again\.$") as error:
         SacAgent.load(tmp_path, SMALL, 0)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("kind", ["other layers", "another history"])
-def test_an_agent_of_another_shape_is_refused(saved: Path, kind: str) -> None:
-    """Where it is read, or at the latest where it is to go on learning."""
+def test_agent_of_another_shape_is_refused(saved: Path, kind: str) -> None:
+    """Either loading or further training refuses it."""
     settings, history = (replace(SMALL, hidden=(12,)), HISTORY) if kind == "other layers" else (SMALL, HISTORY + 2)
-    env = ModelEnv(Still(history), Sides(history_length=history), 16)
+    env = ModelEnv(ConstantChange(history), SignTask(history_length=history), 16)
     with pytest.raises(DataError, match="to train again"):
         SacAgent.load(saved, settings, 0).train(env, 32)

@@ -1,4 +1,4 @@
-"""Attributes of stable-baselines3 that carlab uses and that its documentation does not promise."""
+"""Test that stable-baselines3 has the undocumented attributes that carlab uses."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from stable_baselines3.sac import policies
 from learning.policy.sac import FastSac
 
 
-class Room(gym.Env[np.ndarray, np.ndarray]):
-    """Only its spaces are used."""
+class SpacesOnlyEnv(gym.Env[np.ndarray, np.ndarray]):
+    """An environment with spaces and without dynamics."""
 
     observation_space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
     action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -22,7 +22,9 @@ class Room(gym.Env[np.ndarray, np.ndarray]):
 
 @pytest.fixture(scope="module")
 def owners() -> dict[str, object]:
-    agent = FastSac("MlpPolicy", Room(), policy_kwargs={"net_arch": [4]}, n_steps=2, buffer_size=8, device="cpu")
+    agent = FastSac(
+        "MlpPolicy", SpacesOnlyEnv(), policy_kwargs={"net_arch": [4]}, n_steps=2, buffer_size=8, device="cpu"
+    )
     return {
         "SAC": agent,
         "SAC.policy": agent.policy,
@@ -53,7 +55,7 @@ def owners() -> dict[str, object]:
         ("sac.policies", "LOG_STD_MAX LOG_STD_MIN"),
     ],
 )
-def test_stable_baselines_still_has_what_is_used(owners: dict[str, object], owner: str, names: str) -> None:
+def test_stable_baselines_has_each_attribute_used(owners: dict[str, object], owner: str, names: str) -> None:
     missing = [name for name in names.split() if not hasattr(owners[owner], name)]
     assert not missing, (
         f"stable-baselines3 {stable_baselines3.__version__} has no {owner}.{', '.join(missing)}, which learning/policy "

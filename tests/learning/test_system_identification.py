@@ -1,4 +1,4 @@
-"""Identified parameters against least squares by scipy and against the truth that made the data."""
+"""Test identified parameters against scipy's least squares and the true parameters."""
 
 import math
 
@@ -29,13 +29,13 @@ def pendulum(count, noise, seed=0, **friction):
     return inputs, outputs + noise * torch.randn(outputs.shape, generator=generator(seed + 2)), truth[0]
 
 
-def test_parameters_of_a_pendulum_are_those_of_nonlinear_least_squares():
+def test_pendulum_parameters_equal_nonlinear_least_squares():
     inputs, outputs, truth = pendulum(60, 0.02)
     found = identify(Pendulum(), inputs, outputs, torch.full((3,), 0.02))
     identifiable = found.parameters[2] / found.parameters[1], 1.0 / (found.parameters[0] * found.parameters[1] ** 2)
 
     def residual(x):
-        """In the two numbers that the motion depends on: g / l and 1 / (m l^2)."""
+        """Return residuals as a function of the identifiable g / l and 1 / (m l^2)."""
         length = 1.0
         parameters = torch.tensor([[1.0 / (x[1] * length**2), length, x[0] * length, *[0.0] * 5]], dtype=torch.float64)
         return (Pendulum()(inputs.double(), parameters)[0] - outputs.double()).numpy().ravel()
@@ -46,7 +46,7 @@ def test_parameters_of_a_pendulum_are_those_of_nonlinear_least_squares():
     assert float(truth[2] / truth[1]) == pytest.approx(exact[0], rel=0.1)
 
 
-def test_several_starts_find_the_frequency():
+def test_restarts_find_the_global_optimum_of_a_sinusoid():
     """A sinusoid's likelihood has many local maxima."""
     model = Sinusoids()
     x = torch.linspace(-5, 5, 40)[:, None]
@@ -55,16 +55,16 @@ def test_several_starts_find_the_frequency():
     assert torch.allclose(found.parameters, truth[0], atol=1e-2)
 
 
-def test_outliers_do_not_move_the_parameters():
-    """One row of eight is off by forty noises: least squares follow them, a likelihood with tails does not."""
+def test_identified_parameters_are_robust_to_outliers():
+    """One row of eight has an error of 40 noise standard deviations."""
     inputs, outputs, truth = pendulum(80, 0.02)
-    spoilt = outputs.clone()
-    spoilt[::8] += 0.8
-    found = identify(Pendulum(), inputs, spoilt, torch.full((3,), 0.02))
+    with_outliers = outputs.clone()
+    with_outliers[::8] += 0.8
+    found = identify(Pendulum(), inputs, with_outliers, torch.full((3,), 0.02))
     clean = identify(Pendulum(), inputs, outputs, torch.full((3,), 0.02))
 
-    def frequency(of):
-        return math.sqrt(float(of[2] / of[1]))
+    def frequency(parameters):
+        return math.sqrt(float(parameters[2] / parameters[1]))
 
     assert frequency(found.parameters) == pytest.approx(frequency(clean.parameters), rel=0.01)
     assert frequency(found.parameters) == pytest.approx(frequency(truth), rel=0.02)
@@ -72,8 +72,8 @@ def test_outliers_do_not_move_the_parameters():
     assert float(found.residuals.scale.max()) < 0.03
 
 
-class Edged:
-    """A line through nothing whose simulator breaks down beyond a slope of one."""
+class FailingLine:
+    """A line through the origin that returns NaN for slopes above one."""
 
     size = 1
 
@@ -85,30 +85,30 @@ class Edged:
         return torch.where(slope > 1.0, torch.nan, slope * inputs[None])
 
 
-def test_a_way_down_that_ends_where_the_simulator_breaks_down_takes_nothing_away():
-    """Rows that were spoilt hold least squares back from the edge; errors with tails lead over it."""
+def test_refinement_towards_invalid_parameters_keeps_a_valid_estimate():
+    """Outliers keep least squares below the invalid slopes; the robust refinement moves towards them."""
     x = torch.linspace(-1, 1, 60)[:, None]
     y = 1.02 * x + 0.02 * torch.randn(x.shape, generator=generator(2))
     y[::8] -= 0.8 * x[::8].sign()
-    found = identify(Edged(), x, y, torch.tensor([0.02]))
+    found = identify(FailingLine(), x, y, torch.tensor([0.02]))
     assert 0.8 < float(found.parameters) <= 1.0
     assert torch.isfinite(found.residuals.factor).all()
 
 
-def test_correlated_errors_are_identified():
-    """The second output's noise is nine tenths of the first's: what a likelihood gains by it is the closed form's."""
+def test_correlated_errors_gain_likelihood_by_the_closed_form():
+    """The noise of two outputs has the correlation 0.9; the gain is their mutual information."""
     inputs, outputs, _ = pendulum(800, 0.0)
     noise = 0.02 * torch.randn(outputs.shape, generator=generator(4))
     noise[:, 1] = 0.9 * noise[:, 0] + math.sqrt(1.0 - 0.9**2) * noise[:, 1]
-    given = outputs + noise
-    simulator = identify(Pendulum(), inputs[:400], given[:400], torch.full((3,), 0.02))
-    nll = negative_log_likelihood(simulator.predict(inputs[400:]), given[400:])
-    off = (given[400:] - simulator.mean(inputs[400:])).double().numpy()
-    apart = -norm(0.0, off.std(axis=0)).logpdf(off).sum(axis=1).mean()
-    assert apart - nll == pytest.approx(-0.5 * math.log(1.0 - 0.9**2), abs=0.15)
+    noisy = outputs + noise
+    simulator = identify(Pendulum(), inputs[:400], noisy[:400], torch.full((3,), 0.02))
+    nll = negative_log_likelihood(simulator.predict(inputs[400:]), noisy[400:])
+    residuals = (noisy[400:] - simulator.mean(inputs[400:])).double().numpy()
+    independent_nll = -norm(0.0, residuals.std(axis=0)).logpdf(residuals).sum(axis=1).mean()
+    assert independent_nll - nll == pytest.approx(-0.5 * math.log(1.0 - 0.9**2), abs=0.15)
 
 
-def test_grey_box_learns_the_simulators_error():
+def test_grey_box_improves_on_the_simulator_with_missing_friction():
     inputs, outputs, _ = pendulum(300, 0.02, frictions=(0.5, 0.5), drags=(0.5, 0.5))
     noise = torch.full((3,), 0.02)
     simulator = identify(Pendulum(), inputs[:200], outputs[:200], noise)
@@ -118,11 +118,13 @@ def test_grey_box_learns_the_simulators_error():
     covariance = RbfCovariance((1.0, 1.0, 1.0), (1.0,))
     pool = Pendulum().inputs(256, generator(9))
     model = grey_box(simulator, inputs[:200], outputs[:200], pool, covariance, normaliser, settings)
-    held = inputs[200:], outputs[200:]
-    alone, together = (negative_log_likelihood(m.predict(held[0]), held[1]) for m in (simulator, model))
-    assert together < alone - 0.5
+    test_inputs, test_outputs = inputs[200:], outputs[200:]
+    simulator_nll, grey_box_nll = (
+        negative_log_likelihood(m.predict(test_inputs), test_outputs) for m in (simulator, model)
+    )
+    assert grey_box_nll < simulator_nll - 0.5
 
 
-def test_nothing_can_be_identified_without_data():
+def test_identification_without_data_is_refused():
     with pytest.raises(DataError, match="record an episode"):
         identify(Sinusoids(), torch.zeros(0, 1), torch.zeros(0, 1), torch.ones(1))
