@@ -1,4 +1,4 @@
-"""Shared fixtures: seeded randomness, the folder of reference material, and a check for threads left behind."""
+"""Shared fixtures: seeded random generator, folder of reference data, CUDA stand-in, check for leaked threads."""
 
 import importlib.util
 import os
@@ -36,15 +36,15 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of reference material beside the repository; tests that need it are skipped where it is absent."""
+    """Return the folder of reference data next to the repository; skip the test if it is absent."""
     if not SHARED.is_dir():
-        pytest.skip("the folder 'shared' with reference captures and recordings is not beside the repository")
+        pytest.skip("the folder 'shared' with reference captures and recordings is not next to the repository")
     return SHARED
 
 
 @pytest.fixture(scope="session")
 def stand_in_device() -> ModuleType:
-    """The module beside this one; importing it imports torch."""
+    """Return the module ``stand_in_device``, imported on demand because it imports torch."""
     spec = importlib.util.spec_from_file_location("stand_in_device", Path(__file__).with_name("stand_in_device.py"))
     assert spec is not None
     assert spec.loader is not None
@@ -57,7 +57,7 @@ def stand_in_device() -> ModuleType:
 def device(
     request: pytest.FixtureRequest, stand_in_device: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[str]:
-    """``cuda``: its stand-in always, and the real one where there is one."""
+    """Return ``cuda``: once as the stand-in, and once as the real device if present."""
     import stable_baselines3.common.utils as sb3
     import torch
 
@@ -66,9 +66,9 @@ def device(
             pytest.skip("needs a CUDA device")
         yield "cuda"
         return
-    falls_back = sb3.get_device  # to the CPU, in silence
+    sb3_get_device = sb3.get_device  # falls back to the CPU without an error
     for module in list(sys.modules.values()):
-        if vars(module).get("get_device") is falls_back:
+        if vars(module).get("get_device") is sb3_get_device:
             monkeypatch.setattr(module, "get_device", torch.device)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
     with stand_in_device.stand_in() as operations:
@@ -77,16 +77,16 @@ def device(
 
 
 @pytest.fixture(autouse=True)
-def no_thread_left_behind() -> Iterator[None]:
-    """Every thread is owned by an object whose close() joins it; a test that leaks one fails."""
+def no_leaked_threads() -> Iterator[None]:
+    """Fail a test that leaves a thread running; each thread has an owner whose close() joins it."""
     before = set(threading.enumerate())
     yield
-    left = [t for t in threading.enumerate() if t not in before and t.is_alive() and not _belongs_to_a_library(t)]
-    for thread in left:
+    leaked = [t for t in threading.enumerate() if t not in before and t.is_alive() and not _is_library_thread(t)]
+    for thread in leaked:
         thread.join(timeout=2.0)
-    still = [t.name for t in left if t.is_alive()]
-    assert not still, f"threads left behind: {still}"
+    names = [t.name for t in leaked if t.is_alive()]
+    assert not names, f"threads still running: {names}"
 
 
-def _belongs_to_a_library(thread: threading.Thread) -> bool:
+def _is_library_thread(thread: threading.Thread) -> bool:
     return thread.name.startswith(("pytest_timeout", "rerun", "QueueFeederThread", "tqdm"))

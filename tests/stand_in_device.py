@@ -1,10 +1,10 @@
-"""A stand-in for CUDA: tensors that say that they are there, and are refused where real ones would be.
+"""A stand-in for CUDA: tensors that report the device ``cuda`` and raise the errors of real CUDA tensors.
 
-Inside ``stand_in()`` whatever is made on or moved to ``cuda`` is an ``Elsewhere``. It holds ordinary numbers, so that
-whole fits run with the values and the branches of the CPU, but it meets no tensor of the CPU in an operation (plain
-scalars excepted, as on CUDA), becomes no NumPy array, is drawn by no generator of the CPU and is not written to a file.
-An index must be there, too, though CUDA would move it. Crossing copies, so that nothing is seen from both sides. The
-operations that were used are kept, and torch's own list says which of them CUDA has.
+Inside ``stand_in()`` each tensor created on or moved to ``cuda`` is a ``StandInTensor``. It wraps a CPU tensor, so fits
+run with the values of the CPU. Like a CUDA tensor it raises an error in an operation with a CPU tensor (scalars
+excepted), on conversion to NumPy and with a CPU generator. In addition it refuses to be saved, and an index must be on
+the stand-in too, although CUDA would move it. A transfer copies. The operations used are recorded; torch's operator
+list states which of them CUDA supports.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 CUDA = torch.device("cuda", 0)
-UNDER = torch.device("meta")
-"""What torch's own code takes these tensors to be: a device that needs no driver, and that nothing else here uses."""
+INTERNAL_DEVICE = torch.device("meta")
+"""The device that torch assigns internally: it needs no driver and is not used elsewhere in the tests."""
 CPU = torch.device("cpu")
 _aten = torch.ops.aten
 _NO_SCALARS = {_aten.cat.default, _aten.stack.default, _aten.index.Tensor}
 
 
-class Elsewhere(Tensor):
-    """A tensor on the stand-in; ``inner`` has its numbers."""
+class StandInTensor(Tensor):
+    """A tensor on the stand-in; ``inner`` is the CPU tensor with its values."""
 
     inner: Tensor
     __torch_function__ = torch._C._disabled_torch_function_impl
 
     @staticmethod
-    def __new__(cls, inner: Tensor) -> Elsewhere:
+    def __new__(cls, inner: Tensor) -> StandInTensor:
         return Tensor._make_wrapper_subclass(
             cls, inner.shape, strides=inner.stride(), storage_offset=inner.storage_offset(), dtype=inner.dtype,
-            device=UNDER,
+            device=INTERNAL_DEVICE,
         )  # fmt: skip
 
     def __init__(self, inner: Tensor) -> None:
@@ -50,15 +50,15 @@ class Elsewhere(Tensor):
     def device(self) -> torch.device:
         return CUDA
 
-    is_cuda, is_cpu, is_meta = (property(lambda self, told=told: told) for told in (True, False, False))
+    is_cuda, is_cpu, is_meta = (property(lambda self, value=value: value) for value in (True, False, False))
 
     @property
     def data(self) -> Tensor:
-        return Elsewhere(self.inner)
+        return StandInTensor(self.inner)
 
     @data.setter
     def data(self, other: Tensor) -> None:
-        assert isinstance(other, Elsewhere), "torch refuses data of another device"
+        assert isinstance(other, StandInTensor), "torch refuses data of another device"
         Tensor.data.__set__(self, other)
         self.inner = other.inner
 
@@ -70,18 +70,18 @@ class Elsewhere(Tensor):
 
     __array__ = numpy
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Elsewhere:
-        return Elsewhere(self.inner.clone())
+    def __deepcopy__(self, memo: dict[int, Any]) -> StandInTensor:
+        return StandInTensor(self.inner.clone())
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        raise AssertionError("a tensor that is not on the CPU is being written")
+        raise AssertionError("a tensor that is not on the CPU must not be saved")
 
     def __repr__(self, **kwargs: Any) -> str:
-        return f"Elsewhere({self.inner})"
+        return f"StandInTensor({self.inner})"
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        raise AssertionError("a tensor of the stand-in outlives it")
+        raise AssertionError("a tensor of the stand-in is used outside of stand_in()")
 
 
 class _Operations(TorchDispatchMode):
@@ -92,9 +92,9 @@ class _Operations(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         tensors = [*_tensors(args), *_tensors(kwargs.values())]
-        ours = any(isinstance(t, Elsewhere) for t in tensors)
+        on_stand_in = any(isinstance(t, StandInTensor) for t in tensors)
         to = kwargs.get("device")
-        if not ours and to != UNDER:
+        if not on_stand_in and to != INTERNAL_DEVICE:
             return func(*args, **kwargs)
         self.used.add(func._schema.name.removeprefix("aten::") + f".{func._schema.overload_name}".rstrip("."))
         if func is _aten.copy_.default:
@@ -103,16 +103,16 @@ class _Operations(TorchDispatchMode):
         if to is not None:
             kwargs["device"] = CPU
         if func is _aten._to_copy.default:
-            found = func(*_inner(args), **kwargs)
-            return Elsewhere(found) if (to == UNDER if to is not None else ours) else found
-        if ours:
-            _refuse_mixtures(func, tensors)
+            result = func(*_inner(args), **kwargs)
+            return StandInTensor(result) if (to == INTERNAL_DEVICE if to is not None else on_stand_in) else result
+        if on_stand_in:
+            _refuse_mixed_devices(func, tensors)
         if any(isinstance(v, torch.Generator) for v in (*args, *kwargs.values())):
             raise RuntimeError("Expected a 'cuda' device type for generator but found 'cpu'")
-        found = func(*_inner(args), **{name: _inner(value) for name, value in kwargs.items()})
-        if ours and func._schema.is_mutable:
-            return args[0] if isinstance(found, Tensor) else found
-        return found if to == CPU else _outer(found)
+        result = func(*_inner(args), **{name: _inner(value) for name, value in kwargs.items()})
+        if on_stand_in and func._schema.is_mutable:
+            return args[0] if isinstance(result, Tensor) else result
+        return result if to == CPU else _outer(result)
 
 
 def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
@@ -126,37 +126,37 @@ def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
 def _inner(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return type(value)(map(_inner, value))
-    return value.inner if isinstance(value, Elsewhere) else value
+    return value.inner if isinstance(value, StandInTensor) else value
 
 
 def _outer(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return type(value)(map(_outer, value))
-    return Elsewhere(value) if isinstance(value, Tensor) else value
+    return StandInTensor(value) if isinstance(value, Tensor) else value
 
 
-def _refuse_mixtures(func: Any, tensors: list[Tensor]) -> None:
+def _refuse_mixed_devices(func: Any, tensors: list[Tensor]) -> None:
     for k, tensor in enumerate(tensors):
         written = k == 0 and func._schema.is_mutable
-        if not isinstance(tensor, Elsewhere) and (tensor.ndim or written or func in _NO_SCALARS):
+        if not isinstance(tensor, StandInTensor) and (tensor.ndim or written or func in _NO_SCALARS):
             raise RuntimeError(f"Expected all tensors to be on the same device, but found cpu and cuda:0! ({func})")
 
 
-class _Names(TorchFunctionMode):
-    """Makes the stand-in of the name ``cuda`` before torch looks for a driver."""
+class _DeviceNames(TorchFunctionMode):
+    """Replace the device name ``cuda`` by the stand-in before torch looks for a driver."""
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         if func is torch.device:
             return func(*args, **kwargs)
         if func is Tensor.cuda:
-            return args[0].to(UNDER)
+            return args[0].to(INTERNAL_DEVICE)
         if func in (torch.tensor, torch.as_tensor, torch.asarray) and _is_cuda(kwargs.get("device")):
             del kwargs["device"]
-            return func(*args, **kwargs).to(UNDER)
-        args = tuple(UNDER if isinstance(a, (torch.device, str)) and _is_cuda(a) else a for a in args)
+            return func(*args, **kwargs).to(INTERNAL_DEVICE)
+        args = tuple(INTERNAL_DEVICE if isinstance(a, (torch.device, str)) and _is_cuda(a) else a for a in args)
         if _is_cuda(kwargs.get("device")):
-            kwargs["device"] = UNDER
+            kwargs["device"] = INTERNAL_DEVICE
         return func(*args, **kwargs)
 
 
@@ -169,13 +169,13 @@ def _is_cuda(device: Any) -> bool:
 
 @cache
 def _kernels() -> dict[str, str]:
-    """What torch's list of operations says of each."""
+    """Return the entry of each operation in torch's operator list."""
     text = Path(torchgen.__file__).with_name("packaged").joinpath("ATen/native/native_functions.yaml").read_text()
     return {block.split("(")[0]: block for block in text.split("\n- func: ")[1:]}
 
 
 def without_cuda(used: Iterable[str]) -> list[str]:
-    """Those of some operations for which CUDA has nothing."""
+    """Return the operations that CUDA does not support."""
     return sorted(name for name in used if not _has_cuda(name))
 
 
@@ -183,12 +183,12 @@ def _has_cuda(name: str) -> bool:
     block = _kernels()[name]
     if delegate := re.search(r"structured_delegate: (\S+)", block):
         return _has_cuda(delegate[1])
-    everywhere = "ufunc_inner_loop" in block or "\n  dispatch:" not in block
-    return everywhere or re.search(r"\n    [\w, ]*(\bCUDA\b|Composite)[\w, ]*:", block) is not None
+    has_generic_kernel = "ufunc_inner_loop" in block or "\n  dispatch:" not in block
+    return has_generic_kernel or re.search(r"\n    [\w, ]*(\bCUDA\b|Composite)[\w, ]*:", block) is not None
 
 
 @contextmanager
 def stand_in() -> Iterator[_Operations]:
-    """``cuda`` is there inside, and is the stand-in."""
-    with _Operations() as operations, _Names():
+    """Make ``cuda`` available inside the context, as the stand-in."""
+    with _Operations() as operations, _DeviceNames():
         yield operations

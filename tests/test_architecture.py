@@ -1,4 +1,4 @@
-"""The structure, proven: layers, who may print, who may ask for the time, and light package roots."""
+"""Test the architecture: layers, import cycles, prints, wall-clock reads, imports of package roots, sizes."""
 
 import ast
 import graphlib
@@ -23,7 +23,7 @@ def test_layers_point_down() -> None:
 
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
-    """Modules that each module imports, at its head, inside functions or for type checking."""
+    """Return the modules that each module imports, including imports in functions and for type checking."""
     graph = grimp.build_graph(*PACKAGES, cache_dir=None)
     return {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
 
@@ -34,14 +34,14 @@ def test_modules_do_not_import_each_other_in_a_cycle(imports: dict[str, set[str]
 
 
 def test_packages_do_not_import_each_other_in_a_cycle(imports: dict[str, set[str]]) -> None:
-    """In every package: its modules and sub-packages, each taken as one."""
+    """In each package the import graph of its direct members has no cycle."""
     packages = {module.rpartition(".")[0] for module in imports} - {""}
     assert {"carlab", "carlab.diagnosis", "learning"} <= packages
     assert {package: cycle for package in packages if (cycle := _cycle(_members(imports, package)))} == {}
 
 
 def _members(imports: dict[str, set[str]], package: str) -> dict[str, set[str]]:
-    """Imports among the direct members of ``package``, without its ``__init__``."""
+    """Return the imports among the direct members of ``package``, without its ``__init__``."""
     depth = package.count(".") + 2
 
     def member(module: str) -> str:
@@ -69,14 +69,14 @@ def _cycle(imports: dict[str, set[str]]) -> list[str]:
     return []
 
 
-def test_a_cycle_is_found() -> None:
+def test_cycle_check_finds_a_cycle() -> None:
     imports = {"p.a.x": {"p.b.x"}, "p.b.x": set(), "p.b.y": {"p.a.y"}, "p.a.y": set(), "p.a": set(), "p.b": set()}
     assert _cycle(imports) == []
     assert set(_cycle(_members(imports, "p"))) == {"p.a", "p.b"}
 
 
 def test_every_package_has_a_layer(imports: dict[str, set[str]]) -> None:
-    """An exhaustive contract fails where a member of its package has no layer."""
+    """An exhaustive contract fails if a member of its package has no layer."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
         "contracts"
     ]
@@ -89,7 +89,7 @@ def test_every_package_has_a_layer(imports: dict[str, set[str]]) -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_importing_a_package_imports_nothing_heavy(package: str) -> None:
+def test_importing_a_package_imports_no_heavy_dependency(package: str) -> None:
     heavy = (
         "torch",
         "serial",
@@ -107,8 +107,8 @@ def test_importing_a_package_imports_nothing_heavy(package: str) -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_importing_carlab_loads_little_beside_the_standard_library() -> None:
-    """A bound on modules instead of seconds, which depend on what else the machine does; 0.2 s are some 400 modules."""
+def test_importing_carlab_loads_fewer_than_40_modules() -> None:
+    """The bound is on modules, because import seconds depend on machine load; 400 modules take about 0.2 s."""
     code = "import sys; before = set(sys.modules); import carlab; print(len(set(sys.modules) - before), *sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     count, *loaded = done.stdout.split()
@@ -116,7 +116,7 @@ def test_importing_carlab_loads_little_beside_the_standard_library() -> None:
     assert "numpy" not in loaded
 
 
-def test_only_the_command_line_and_processes_of_their_own_print() -> None:
+def test_only_the_command_line_prints() -> None:
     printing = {
         str(path.relative_to(ROOT))
         for path in SOURCES
@@ -126,8 +126,8 @@ def test_only_the_command_line_and_processes_of_their_own_print() -> None:
     assert {p for p in printing if not p.startswith("carlab/cli/")} == set()
 
 
-def test_wall_clock_time_is_asked_for_in_one_place() -> None:
-    asking = {
+def test_wall_clock_is_read_in_one_module() -> None:
+    reading = {
         str(path.relative_to(ROOT))
         for path in SOURCES
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -135,20 +135,20 @@ def test_wall_clock_time_is_asked_for_in_one_place() -> None:
         and isinstance(node.value, ast.Name)
         and (node.value.id, node.attr) in {("time", "time"), ("time", "time_ns"), ("datetime", "now")}
     }
-    assert asking == {"carlab/core/clock.py"}
+    assert reading == {"carlab/core/clock.py"}
 
 
 def test_every_package_is_typed() -> None:
     assert all((ROOT / package / "py.typed").is_file() for package in PACKAGES)
 
 
-def test_files_stay_readable() -> None:
+def test_files_have_at_most_400_lines() -> None:
     long = {str(p.relative_to(ROOT)): n for p in SOURCES if (n := len(p.read_text().splitlines())) > 400}
     assert long == {}
 
 
-def test_functions_stay_short() -> None:
-    """At most 60 lines; ruff counts their branches. ``reference_rates`` is one table of equations."""
+def test_functions_have_at_most_60_lines() -> None:
+    """``reference_rates`` is excepted: it is one table of equations. ruff limits branches."""
     sources = [*SOURCES, *(p for folder in ("tests", "docs", "examples") for p in (ROOT / folder).rglob("*.py"))]
     long = {
         f"{path.relative_to(ROOT)}: {node.name}"

@@ -1,4 +1,4 @@
-"""Each option of a verb is an argument of the call with the same name."""
+"""Test that options of verbs and arguments of API calls agree."""
 
 import dataclasses
 import inspect
@@ -31,7 +31,7 @@ CASES = [
 
 
 def options_of(verb: type) -> dict[str, object]:
-    """Option names of a verb with their defaults; the car's options are options of the verb."""
+    """Return the options of a verb with their defaults, including the car options."""
     found: dict[str, object] = {}
     for option in dataclasses.fields(verb):
         if option.name == "which_car":
@@ -42,7 +42,7 @@ def options_of(verb: type) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(("verb", "call", "only_in_the_verb"), CASES)
-def test_each_option_is_an_argument_with_the_same_name(
+def test_each_option_is_an_argument_of_the_call(
     verb: type, call: Callable[..., object], only_in_the_verb: set[str]
 ) -> None:
     arguments = inspect.signature(call).parameters
@@ -62,12 +62,12 @@ def test_each_option_of_import_is_an_option_of_load() -> None:
     mapping = {field.name for field in dataclasses.fields(ColumnMapping)}
     for name in set(options_of(Import)) - {"recording", "out", "mapping", "report", "verbose"}:
         channel, _, part = name.rpartition("_")
-        of_a_column = part in CHANNEL_OPTIONS and channel in CHANNELS
-        assert of_a_column or RENAMED_OPTIONS.get(name, name) in mapping, name
+        is_channel_option = part in CHANNEL_OPTIONS and channel in CHANNELS
+        assert is_channel_option or RENAMED_OPTIONS.get(name, name) in mapping, name
 
 
 @pytest.mark.parametrize("name", carlab.__all__)
-def test_each_public_name_is_there_and_documented(name: str) -> None:
+def test_each_public_name_exists_and_is_documented(name: str) -> None:
     value = getattr(carlab, name)
     if inspect.isfunction(value) or inspect.isclass(value):
         assert value.__doc__
@@ -81,7 +81,7 @@ def named_arguments(call: Callable[..., object]) -> list[str]:
     return [p.name for p in inspect.signature(call).parameters.values() if p.kind is not inspect.Parameter.VAR_KEYWORD]
 
 
-def test_a_simulated_car_is_ready_and_says_its_latency() -> None:
+def test_check_of_the_simulated_car_reports_ready() -> None:
     found = carlab.check("sim", seconds=0.2)
     assert found.is_ready
     assert found.problems == ()
@@ -89,9 +89,9 @@ def test_a_simulated_car_is_ready_and_says_its_latency() -> None:
     assert "<table>" in found._repr_html_()
 
 
-def test_recorded_actions_are_sent_again_and_lead_to_the_same_place(tmp_path: Path) -> None:
+def test_replay_of_recorded_actions_reaches_the_same_position(tmp_path: Path) -> None:
     driven = carlab.drive("sim", policy="slow_circle", ticks=40, out=tmp_path, rerun=False, picture=False)
-    episode, again = carlab.replay(driven.recordings[0], "sim", seconds=1.0, out=tmp_path)
-    assert again.folder.name.endswith("replay")
-    assert again.episodes[0].data.ticks == 30
-    assert again.episodes[0].data.states[-1, :2] == pytest.approx(episode.states[30, :2], abs=0.02)
+    episode, replayed = carlab.replay(driven.recordings[0], "sim", seconds=1.0, out=tmp_path)
+    assert replayed.folder.name.endswith("replay")
+    assert replayed.episodes[0].data.ticks == 30
+    assert replayed.episodes[0].data.states[-1, :2] == pytest.approx(episode.states[30, :2], abs=0.02)

@@ -22,7 +22,7 @@ MARKER = re.compile(r"^<!-- test: (?P<kind>run|parse|hardware|file|car file)(?P<
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page, and the marker in the line above it."""
+    """A fenced block of a page with the test marker in the line above it."""
 
     page: Path
     language: str
@@ -62,13 +62,13 @@ def _name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-def test_every_console_block_of_the_site_says_how_it_is_tested() -> None:
+def test_each_console_block_of_the_site_has_a_test_marker() -> None:
     unmarked = [f"{_name(b.page)}: {b.text}" for b in CONSOLE if (ROOT / "docs") in b.page.parents and not b.marker]
     assert unmarked == []
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c.startswith("carlab ")])
-def test_every_command_parses(command: str) -> None:
+def test_each_command_parses(command: str) -> None:
     import tyro
 
     arguments = shlex.split(command, comments=True)[1:]
@@ -77,20 +77,20 @@ def test_every_command_parses(command: str) -> None:
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if "pytest " in c])
-def test_every_pytest_command_names_tests_that_exist(command: str) -> None:
+def test_each_pytest_command_names_existing_tests(command: str) -> None:
     paths = [word for word in shlex.split(command, comments=True) if word.startswith("tests/")]
     assert paths
     assert [path for path in paths if not (ROOT / path.split("::")[0]).exists()] == []
 
 
-def test_every_make_target_exists() -> None:
+def test_each_make_target_exists() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = {match for command in COMMANDS for match in re.findall(r"^make (\w+)", command)}
     assert {"demo", "test", "docs"} <= targets
     assert [target for target in targets if not re.search(rf"^{target}:", makefile, flags=re.M)] == []
 
 
-def test_the_make_file_names_tests_that_exist() -> None:
+def test_makefile_names_existing_tests() -> None:
     printed = subprocess.run(["make", "-n", "test"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     paths = set(re.findall(r"tests/[\w/.]+", printed))
     assert len(paths) > 10
@@ -117,7 +117,7 @@ def test_commands_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", list(_verbs()))
-def test_every_verb_explains_itself(verb: str) -> None:
+def test_help_of_each_verb_has_its_summary(verb: str) -> None:
     done = subprocess.run([sys.executable, "-m", "carlab", verb, "--help"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     summary = (_verbs()[verb].__doc__ or "").split("\n")[0].rstrip(".")
@@ -125,13 +125,13 @@ def test_every_verb_explains_itself(verb: str) -> None:
     assert "--verbose" in done.stdout
 
 
-def test_readme_has_every_verb_and_nothing_else() -> None:
+def test_readme_lists_exactly_the_verbs() -> None:
     documented = re.findall(r"^\| `carlab (\w+)", README.read_text(encoding="utf-8"), flags=re.M)
     assert [verb for verb in documented if verb not in _verbs()] == []
     assert [verb for verb in _verbs() if verb not in documented] == []
 
 
-def test_readme_is_short() -> None:
+def test_readme_has_at_most_150_lines_and_short_paragraphs() -> None:
     lines = README.read_text(encoding="utf-8").split("\n")
     assert len(lines) <= 150
     paragraphs = re.split(r"\n\s*\n", re.sub(r"```.*?```", "", README.read_text(encoding="utf-8"), flags=re.S))
@@ -139,7 +139,7 @@ def test_readme_is_short() -> None:
     assert [p for p in prose if len(p.strip().split("\n")) > 4] == []
 
 
-def test_the_car_file_loads_and_is_a_real_car(tmp_path: Path) -> None:
+def test_documented_car_file_loads_as_a_real_car(tmp_path: Path) -> None:
     (block,) = [b for b in BLOCKS if b.marker == "car file"]
     path = tmp_path / "car.toml"
     path.write_text(block.text, encoding="utf-8")
@@ -159,7 +159,7 @@ def test_the_car_file_loads_and_is_a_real_car(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "python"], ids=lambda b: _name(b.page))
-def test_every_program_compiles(block: Block) -> None:
+def test_each_python_block_compiles(block: Block) -> None:
     compile(block.text, _name(block.page), "exec")
 
 
@@ -173,7 +173,7 @@ def test_links_between_files_of_the_repository_resolve() -> None:
     assert broken == []
 
 
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_site_builds_without_warnings(tmp_path: Path) -> None:
     mkdocs = Path(sys.executable).with_name("mkdocs")
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": str(ROOT)}
     done = subprocess.run(

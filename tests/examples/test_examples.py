@@ -1,4 +1,4 @@
-"""Each script in examples/ runs, with small settings, and says what it promises."""
+"""Test that each script in examples/ runs with small settings and prints its results."""
 
 import os
 import subprocess
@@ -28,30 +28,30 @@ def output_of(script: str, folder: Path) -> str:
     return done.stdout
 
 
-def test_every_example_is_run() -> None:
+def test_each_example_has_settings() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} == set(SCRIPTS)
 
 
-def test_a_policy_of_ones_own_holds_its_speed(tmp_path: Path) -> None:
+def test_own_policy_holds_its_target_speed(tmp_path: Path) -> None:
     text = output_of("own_policy.py", tmp_path)
     speed = float(text.partition("last second: ")[2].split()[0])
     assert speed == pytest.approx(0.8, abs=0.1)
 
 
-def test_a_task_of_ones_own_ends_where_it_says(tmp_path: Path) -> None:
+def test_own_task_ends_at_the_goal(tmp_path: Path) -> None:
     text = output_of("write_task.py", tmp_path)
     assert text.startswith("GOAL_REACHED")
 
 
 @pytest.mark.timeout(900)
-def test_an_effect_of_ones_own_is_found(tmp_path: Path) -> None:
+def test_own_effect_is_identified(tmp_path: Path) -> None:
     text = output_of("add_effect.py", tmp_path)
-    found = text.partition("a drag of ")[2].split()[0]
-    assert float(found) == pytest.approx(0.5, abs=0.1)
+    estimated = text.partition("a drag of ")[2].split()[0]
+    assert float(estimated) == pytest.approx(0.5, abs=0.1)
 
 
 @pytest.mark.timeout(900)
-def test_a_csv_is_diagnosed(tmp_path: Path) -> None:
+def test_csv_diagnosis_reduces_the_model_error(tmp_path: Path) -> None:
     text = output_of("diagnose_csv.py", tmp_path)
     assert "steering" in text
     assert (tmp_path / "runs" / "diagnosis" / "model.toml").is_file()
@@ -60,17 +60,17 @@ def test_a_csv_is_diagnosed(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(900)
-def test_a_policy_is_trained_in_the_learned_car(tmp_path: Path) -> None:
+def test_policy_training_in_the_learned_car_prints_returns(tmp_path: Path) -> None:
     text = output_of("train_in_learned_car.py", tmp_path)
     assert "Mean return" in text
     assert "from the goal" in text
 
 
 @pytest.mark.timeout(900)
-def test_the_demo_prints_what_was_concealed_beside_what_was_found(tmp_path: Path) -> None:
+def test_demo_prints_concealed_and_estimated_values(tmp_path: Path) -> None:
     text = output_of("demo.py", tmp_path)
     row = next(line for line in text.splitlines() if line.startswith("effects.steering_lag.time_constant [s]"))
-    said, concealed, found = row.split()[2:5]
-    assert (said, float(concealed)) == ("none", 0.07)
-    assert float(found) == pytest.approx(0.07, abs=0.02)
+    prior, concealed, estimated = row.split()[2:5]
+    assert (prior, float(concealed)) == ("none", 0.07)
+    assert float(estimated) == pytest.approx(0.07, abs=0.02)
     assert "Held-out position error" in text

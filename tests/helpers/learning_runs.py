@@ -1,4 +1,4 @@
-"""Small runs of learning and driving for tests: a short training plan, and recordings of a car that drives straight."""
+"""Short learning and driving runs for tests: a small training plan and recordings of straight drives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulator that is linear in its parameters, and rows with a discrepancy."""
+"""A simulator linear in its parameters, and data with a discrepancy from it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def features(x):
 
 @dataclass(frozen=True)
 class Linear:
-    """Two outputs, linear in three standard normal parameters: a Gaussian process."""
+    """Simulator with two outputs, linear in three standard normal parameters (a Gaussian process)."""
 
     size: int = 3
 

@@ -1,6 +1,6 @@
-"""Drives of a parking policy with random errors in every episode, as in ``carlab learn``.
+"""Drives of a parking policy with random errors, on the simulated car and on cars of the independent generator.
 
-The drives are on the simulated car, recorded like ``carlab learn``, and on cars of the independent generator.
+The recordings have the format of ``carlab learn``.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ class NoisyParkingPolicy:
     def command(self, state: CarState) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
         decay = np.exp(-1.0 / 30.0 / 0.25)
         self._noise = decay * self._noise + np.sqrt(1.0 - decay**2) * self._rng.normal(size=2) * self._size
-        wanted = self._parker.act(cast(Any, SimpleNamespace(observation=SimpleNamespace(state=state))))
-        assert wanted is not None
-        return np.clip(wanted.to_array() + self._noise, -1.0, 1.0)
+        action = self._parker.act(cast(Any, SimpleNamespace(observation=SimpleNamespace(state=state))))
+        assert action is not None
+        return np.clip(action.to_array() + self._noise, -1.0, 1.0)
 
 
 def drive_like_learning(
@@ -111,7 +111,7 @@ def concealed_drives(effect: str | None, size: float, seed: int, episodes: int =
     true = nominal.perturbed(draws, share)
     x, y = np.meshgrid(np.arange(0.5, 1.6, 0.25), np.arange(-1.2, 0.1, 0.25))
     drawn = Draw.from_rng(draws, true, np.stack([x.ravel(), y.ravel()], axis=1))
-    found, recordings, parameters = [], [], dict[str, float]()
+    episodes_data, recordings, parameters = [], [], dict[str, float]()
     for k in range(episodes):
         world = World(true)
         if effect is not None:
@@ -121,19 +121,19 @@ def concealed_drives(effect: str | None, size: float, seed: int, episodes: int =
         rng = np.random.default_rng((seed, 2, k))
         policy = NoisyParkingPolicy(rng, k / max(episodes, 1))
         start = TASK.sample_start(rng).to_array()
-        what = drive(
+        driven = drive(
             world,
             lambda t, state, policy=policy: tuple(policy.command(CarState.from_array(state))),
             TICKS / 30.0,
             start=(*map(float, start[:3]), 0.0, 0.0, 0.0),
         )
         noise = Noise(nominal.position_std, nominal.yaw_std)
-        seen = record(what, world, noise, np.random.default_rng((seed, 3, k)))
-        recordings.append(seen)
-        sent, nothing = seen.commands[:-1], np.full(len(seen.commands) - 1, np.nan)
-        found.append(EpisodeData(seen.t_s, seen.measured, sent, sent, nothing))
+        recording = record(driven, world, noise, np.random.default_rng((seed, 3, k)))
+        recordings.append(recording)
+        sent, no_latency = recording.commands[:-1], np.full(len(recording.commands) - 1, np.nan)
+        episodes_data.append(EpisodeData(recording.t_s, recording.measured, sent, sent, no_latency))
     return Concealed(
-        found, SimulatorConfig.from_tables(nominal.table()), parameters, _scores(recordings, nominal, true)
+        episodes_data, SimulatorConfig.from_tables(nominal.table()), parameters, _scores(recordings, nominal, true)
     )
 
 

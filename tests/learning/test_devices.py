@@ -1,6 +1,6 @@
-"""All of learning on another device gives what it gives on the CPU: on a stand-in for CUDA, and on CUDA where it is.
+"""Test that learning on CUDA gives the results of the CPU, on a stand-in for CUDA and on real CUDA if present.
 
-The stand-in (``tests/stand_in_device.py``) has the CPU's numbers and CUDA's refusals.
+The stand-in (``tests/stand_in_device.py``) computes on the CPU and raises the errors of CUDA.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ RANGES = {"motor.drive_gain": (6.0, 10.0), "steering.max_angle": (0.3, 0.7)}
 
 
 @pytest.fixture(autouse=True)
-def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The stand-in takes its time for an operation; nothing here is to be learned well."""
+def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reduce the numbers of steps, because operations on the stand-in are slow."""
     monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 10)
     monkeypatch.setattr("learning.baselines.system_identification.STEPS", 10)
     monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
@@ -64,15 +64,15 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("learning.posterior.parameter_posterior.RANDOM_WALK_STEPS", 2)
 
 
-def close(found: Any, wanted: Any, tolerance: float = 1e-4) -> None:
-    """Equal numbers, the first of which are not on the CPU."""
+def assert_close(found: Any, expected: Any, tolerance: float = 1e-4) -> None:
+    """Assert that ``found`` is on CUDA, ``expected`` on the CPU, and their values are close."""
     assert found.device.type == "cuda"
-    assert wanted.device.type == "cpu"
-    torch.testing.assert_close(found.cpu(), wanted, rtol=tolerance, atol=tolerance)
+    assert expected.device.type == "cpu"
+    torch.testing.assert_close(found.cpu(), expected, rtol=tolerance, atol=tolerance)
 
 
 def pendulum() -> tuple[Tensor, Tensor]:
-    """Rows of a pendulum with friction, two of them spoilt."""
+    """Return rows of a pendulum with friction and two outliers."""
     generator = torch.Generator().manual_seed(0)
     inputs = TRUE.inputs(ROWS, generator)
     outputs = TRUE(inputs, draw_parameters(TRUE, 1, generator))[0]
@@ -81,8 +81,8 @@ def pendulum() -> tuple[Tensor, Tensor]:
     return inputs, outputs
 
 
-def everywhere(work: Callable[[str], Any], device: str) -> tuple[Any, Any]:
-    """The same there and on the CPU."""
+def on_both(work: Callable[[str], Any], device: str) -> tuple[Any, Any]:
+    """Return the result on the device and on the CPU."""
     return work(device), work("cpu")
 
 
@@ -92,7 +92,7 @@ def inferred(model: DomainModel | None, device: str) -> FunctionPosterior:
 
 
 @pytest.mark.parametrize(
-    "what",
+    "operation",
     [
         lambda t: t + torch.zeros(3),
         lambda t: torch.zeros(3).add_(t),
@@ -104,55 +104,55 @@ def inferred(model: DomainModel | None, device: str) -> FunctionPosterior:
         lambda t: torch.randn(3, generator=torch.Generator(), device=t.device),
     ],
 )
-def test_what_does_not_work_on_a_device_is_refused(device: str, what: Callable[[Tensor], Any]) -> None:
-    """Of the stand-in, that it can fail."""
+def test_operations_that_cuda_refuses_raise_errors(device: str, operation: Callable[[Tensor], Any]) -> None:
+    """The stand-in must raise where CUDA raises."""
     with pytest.raises((RuntimeError, TypeError)):
-        what(torch.ones(3, device=device))
+        operation(torch.ones(3, device=device))
 
 
-def test_what_cuda_has_is_known(stand_in_device: ModuleType) -> None:
-    """Of the list that the stand-in's operations are held to."""
+def test_operations_without_a_cuda_kernel_are_listed(stand_in_device: ModuleType) -> None:
+    """torch's operator list decides which operations of the stand-in CUDA supports."""
     known = ("mul.Tensor", "add.Tensor", "linalg_cholesky_ex", "cov", "mkldnn_linear")
     assert stand_in_device.without_cuda(known) == ["mkldnn_linear"]
 
 
-def test_what_crosses_is_a_copy(device: str) -> None:
-    here = torch.ones(3)
-    there = here.to(device)
-    there.mul_(2.0)[1:].add_(1.0)
-    here.add_(10.0)
-    assert there.cpu().tolist() == [2.0, 3.0, 3.0]
-    assert here.tolist() == [11.0, 11.0, 11.0]
+def test_transfer_between_devices_copies(device: str) -> None:
+    on_cpu = torch.ones(3)
+    on_device = on_cpu.to(device)
+    on_device.mul_(2.0)[1:].add_(1.0)
+    on_cpu.add_(10.0)
+    assert on_device.cpu().tolist() == [2.0, 3.0, 3.0]
+    assert on_cpu.tolist() == [11.0, 11.0, 11.0]
     weight = torch.nn.Parameter(torch.zeros(3, device=device))
-    weight.data = there
-    there.add_(1.0)
+    weight.data = on_device
+    on_device.add_(1.0)
     assert weight.tolist() == [3.0, 4.0, 4.0]
     (slope,) = torch.autograd.grad((weight**2).sum(), weight)
     assert slope.tolist() == [6.0, 8.0, 8.0]
 
 
 @pytest.mark.parametrize("model", [Sinusoids(), Pendulum(), KinematicCar(), CarModel(SimulatorConfig(), 1, RANGES)])
-def test_simulators(device: str, model: DomainModel) -> None:
+def test_simulator_outputs_are_equal_on_the_device(device: str, model: DomainModel) -> None:
     generator = torch.Generator().manual_seed(0)
     inputs, drawn = model.inputs(6, generator), draw_parameters(model, 4, generator)
-    close(*everywhere(lambda at: model(inputs.to(at), drawn.to(at)), device))
+    assert_close(*on_both(lambda at: model(inputs.to(at), drawn.to(at)), device))
 
 
 @pytest.mark.parametrize("model", [None, Pendulum()])
-def test_what_data_and_simulator_say(device: str, model: DomainModel | None) -> None:
+def test_function_posterior_is_equal_on_the_device(device: str, model: DomainModel | None) -> None:
     at = TRUE.inputs(12, torch.Generator().manual_seed(3))
-    there, here = everywhere(lambda at: inferred(model, at), device)
-    assert there.dof == here.dof < 10.0, "the branch of outliers was taken"
-    close(there.noise_std, here.noise_std)
-    for found, wanted in zip(there.predict(at.to(device)), here.predict(at), strict=True):
-        close(found, wanted)
-    for found, wanted in zip(
-        there.marginals(at.view(4, 3, 4).to(device)), here.marginals(at.view(4, 3, 4)), strict=True
+    on_device, on_cpu = on_both(lambda at: inferred(model, at), device)
+    assert on_device.dof == on_cpu.dof < 10.0, "the branch with outliers must be used"
+    assert_close(on_device.noise_std, on_cpu.noise_std)
+    for found, expected in zip(on_device.predict(at.to(device)), on_cpu.predict(at), strict=True):
+        assert_close(found, expected)
+    for found, expected in zip(
+        on_device.marginals(at.view(4, 3, 4).to(device)), on_cpu.marginals(at.view(4, 3, 4)), strict=True
     ):
-        close(found, wanted)
+        assert_close(found, expected)
 
 
-def test_draws_of_parameters(device: str) -> None:
+def test_parameter_draws_are_equal_on_the_device(device: str) -> None:
     inputs, outputs = pendulum()
 
     def drawn(at: str) -> Tensor:
@@ -160,7 +160,7 @@ def test_draws_of_parameters(device: str) -> None:
         units, generator = PENDULUM_UNITS.to(at), torch.Generator().manual_seed(1)
         return posterior_parameters(TRUE, inputs.to(at), outputs.to(at), factor, units, 64, generator)
 
-    close(*everywhere(drawn, device))
+    assert_close(*on_both(drawn, device))
     prior = posterior_parameters(
         TRUE, inputs[:0].to(device), outputs[:0].to(device), torch.eye(0, device=device), PENDULUM_UNITS.to(device), 8,
         torch.Generator(),
@@ -168,22 +168,26 @@ def test_draws_of_parameters(device: str) -> None:
     assert prior.device.type == "cuda"
 
 
-def test_particles(device: str) -> None:
+def test_distilled_particles_are_equal_on_the_device(device: str) -> None:
     def fitted(at: str) -> ParticlePosterior:
         inputs = pendulum()[0].to(at)
         points = measurement_points(Pendulum(), inputs, PENDULUM_UNITS.to(at), torch.Generator().manual_seed(2), 256)
         settings = DistillationSettings(particles=6, hidden=(16, 16), steps=40, sets=4)
         return distil(inferred(None, at), points, settings)
 
-    there, here = everywhere(fitted, device)
-    close(there.parameters, here.parameters)
-    close(there.noise_scales, here.noise_scales)
-    close(there.to("cpu").to(device).predict(pendulum()[0].to(device)).means, here.predict(pendulum()[0]).means, 1e-3)
+    on_device, on_cpu = on_both(fitted, device)
+    assert_close(on_device.parameters, on_cpu.parameters)
+    assert_close(on_device.noise_scales, on_cpu.noise_scales)
+    assert_close(
+        on_device.to("cpu").to(device).predict(pendulum()[0].to(device)).means,
+        on_cpu.predict(pendulum()[0]).means,
+        1e-3,
+    )
 
 
 @pytest.mark.parametrize("natural", [True, False])
 @pytest.mark.parametrize("interacting", [True, False])
-def test_particles_as_the_authors_fit_them(device: str, natural: bool, interacting: bool) -> None:
+def test_fsvgd_particles_are_equal_on_the_device(device: str, natural: bool, interacting: bool) -> None:
     inputs, outputs = pendulum()
     pool = TRUE.inputs(40, torch.Generator().manual_seed(4))
     settings = FsvgdSettings(
@@ -193,49 +197,49 @@ def test_particles_as_the_authors_fit_them(device: str, natural: bool, interacti
 
     def fitted(at: str) -> ParticlePosterior:
         units = PENDULUM_UNITS.to(at)
-        everything = units.inputs(torch.cat([inputs, pool]).to(at))
-        prior = GaussianProcessPrior(everything, RbfCovariance((1.0,) * 3, (0.8,)))
+        all_inputs = units.inputs(torch.cat([inputs, pool]).to(at))
+        prior = GaussianProcessPrior(all_inputs, RbfCovariance((1.0,) * 3, (0.8,)))
         return fit_fsvgd(inputs.to(at), outputs.to(at), pool.to(at), prior, units, settings)
 
-    there, here = everywhere(fitted, device)
-    close(there.parameters, here.parameters, 1e-3)
-    close(there.noise_std, here.noise_std)
+    on_device, on_cpu = on_both(fitted, device)
+    assert_close(on_device.parameters, on_cpu.parameters, 1e-3)
+    assert_close(on_device.noise_std, on_cpu.noise_std)
 
 
-def test_identification(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_grey_box_predictions_are_equal_on_the_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("STEPS", "REFINEMENT_STEPS"):
         monkeypatch.setattr(system_identification, name, 50)
     inputs, outputs = pendulum()
     pool = TRUE.inputs(40, torch.Generator().manual_seed(4))
 
     def found(at: str) -> Mixture:
-        given = inputs.to(at), outputs.to(at)
-        simulator = identify(Pendulum(), *given, NOISE.to(at))
+        data = inputs.to(at), outputs.to(at)
+        simulator = identify(Pendulum(), *data, NOISE.to(at))
         settings = FsvgdSettings(particles=2, hidden=(8,), steps=5)
         box = grey_box(
-            simulator, *given, pool.to(at), RbfCovariance((1.0,) * 3, (0.8,)), PENDULUM_UNITS.to(at), settings
+            simulator, *data, pool.to(at), RbfCovariance((1.0,) * 3, (0.8,)), PENDULUM_UNITS.to(at), settings
         )
         return box.predict(inputs.to(at))
 
-    there, here = everywhere(found, device)
-    close(there.means, here.means, 1e-3)
-    close(there.stds, here.stds, 1e-3)
+    on_device, on_cpu = on_both(found, device)
+    assert_close(on_device.means, on_cpu.means, 1e-3)
+    assert_close(on_device.stds, on_cpu.stds, 1e-3)
 
 
-def test_figures_of_a_prediction(device: str) -> None:
+def test_figures_of_merit_are_equal_on_the_device(device: str) -> None:
     generator = torch.Generator().manual_seed(5)
     means, stds = torch.randn((4, 30, 3), generator=generator), 0.1 + torch.rand((4, 1, 3), generator=generator)
     targets = torch.randn((30, 3), generator=generator)
-    there = Mixture(means.to(device), stds.to(device), 3.0).smoothed()
-    here = Mixture(means, stds, 3.0).smoothed()
-    close(there.std, here.std)
+    on_device = Mixture(means.to(device), stds.to(device), 3.0).smoothed()
+    on_cpu = Mixture(means, stds, 3.0).smoothed()
+    assert_close(on_device.std, on_cpu.std)
     for figure in (negative_log_likelihood, calibration_error):
-        assert figure(there, targets.to(device)) == pytest.approx(figure(here, targets), rel=1e-5)
+        assert figure(on_device, targets.to(device)) == pytest.approx(figure(on_cpu, targets), rel=1e-5)
 
 
 @pytest.fixture(scope="module")
-def driven() -> Transitions:
-    """Rows of a simulated car."""
+def car_rows() -> Transitions:
+    """Return transitions of a simulated car."""
     generator = torch.Generator().manual_seed(0)
     car = CarModel(SimulatorConfig(), HISTORY, {"motor.drive_gain": (8.0, 9.0)})
     inputs = car.inputs(24, generator)
@@ -244,38 +248,40 @@ def driven() -> Transitions:
     return Transitions(inputs.double().numpy(), outputs.double().numpy(), np.zeros(24), np.arange(24), HISTORY)
 
 
-def test_a_car_is_learned_kept_and_learned_on(device: str, driven: Transitions, tmp_path: Path) -> None:
+def test_learned_car_is_equal_on_the_device_and_can_be_saved_and_refitted(
+    device: str, car_rows: Transitions, tmp_path: Path
+) -> None:
     model = CarModel(SimulatorConfig(kind="kinematic"), HISTORY, RANGES)
     settings = CarFitSettings(steps=20, particles=6)
-    here = fit_car(driven, model, settings)
-    there = fit_car(driven, model, settings, device=device)
-    close(there.posterior.parameters, here.posterior.parameters, 1e-3)
-    save_car(there, tmp_path / "car.pt")
-    kept = torch.load(tmp_path / "car.pt", weights_only=True)
-    assert kept["parameters"].device.type == kept["units"][0].device.type == "cpu"
-    read = load_car(tmp_path / "car.pt")
-    assert read.posterior.parameters.device.type == "cpu"
-    assert torch.equal(read.posterior.parameters, there.posterior.parameters.cpu())
-    close(load_car(tmp_path / "car.pt", device).posterior.noise_std, read.posterior.noise_std, 0.0)
-    on = fit_car(driven, model, settings, before=read, device=device)
-    back = fit_car(driven, model, settings, before=there)
-    close(on.posterior.parameters, back.posterior.parameters, 1e-3)
-    assert torch.equal(on.posterior.normaliser.output_std.cpu(), here.posterior.normaliser.output_std)
+    on_cpu = fit_car(car_rows, model, settings)
+    on_device = fit_car(car_rows, model, settings, device=device)
+    assert_close(on_device.posterior.parameters, on_cpu.posterior.parameters, 1e-3)
+    save_car(on_device, tmp_path / "car.pt")
+    content = torch.load(tmp_path / "car.pt", weights_only=True)
+    assert content["parameters"].device.type == content["units"][0].device.type == "cpu"
+    loaded = load_car(tmp_path / "car.pt")
+    assert loaded.posterior.parameters.device.type == "cpu"
+    assert torch.equal(loaded.posterior.parameters, on_device.posterior.parameters.cpu())
+    assert_close(load_car(tmp_path / "car.pt", device).posterior.noise_std, loaded.posterior.noise_std, 0.0)
+    refitted = fit_car(car_rows, model, settings, before=loaded, device=device)
+    refitted_on_cpu = fit_car(car_rows, model, settings, before=on_device)
+    assert_close(refitted.posterior.parameters, refitted_on_cpu.posterior.parameters, 1e-3)
+    assert torch.equal(refitted.posterior.normaliser.output_std.cpu(), on_cpu.posterior.normaliser.output_std)
 
 
-def test_a_car_is_learned_as_the_authors_do(device: str) -> None:
+def test_authors_fsvgd_is_equal_on_the_device(device: str) -> None:
     rng = np.random.default_rng(3)
     states, sent = 0.1 * rng.normal(size=(41, 6)).cumsum(axis=0), rng.uniform(-1, 1, (40, 2))
     episode = EpisodeData(np.arange(41) / 30.0, states, sent, sent, np.zeros(40))
-    there, here = everywhere(lambda at: fit_authors_fsvgd([episode], HISTORY, 30, device=at), device)
-    close(there.posterior.parameters, here.posterior.parameters, 1e-3)
-    assert there.score_episode(episode) == pytest.approx(here.score_episode(episode), rel=1e-3)
+    on_device, on_cpu = on_both(lambda at: fit_authors_fsvgd([episode], HISTORY, 30, device=at), device)
+    assert_close(on_device.posterior.parameters, on_cpu.posterior.parameters, 1e-3)
+    assert on_device.score_episode(episode) == pytest.approx(on_cpu.score_episode(episode), rel=1e-3)
     unfitted = fit_authors_fsvgd([], HISTORY, device=device)
     assert unfitted.posterior.parameters.device.type == "cuda"
 
 
-def learned(device: str) -> CarDynamics:
-    """Some particles of a car that moves a little."""
+def random_car(device: str) -> CarDynamics:
+    """Return a learned car with random particles and small state changes."""
     width = 3 + 2 * (HISTORY + 1)
     network = Network(width, 6, (16,))
     units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(6), torch.full((6,), 0.05))
@@ -287,82 +293,84 @@ TASKS = [ParkingTask(history_length=HISTORY, max_ticks=6), PathTask(history_leng
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda t: t.name)
-def test_a_world_of_learned_cars(device: str, task: ParkingTask | PathTask) -> None:
+def test_model_env_is_equal_on_the_device(device: str, task: ParkingTask | PathTask) -> None:
     recorded = np.random.default_rng(0).normal(size=(9, feature_size(HISTORY)))
     commands = np.random.default_rng(1).uniform(-1.0, 1.0, (12, 16, 2)).astype(np.float32)
-    there, here = (ModelEnv(learned(at), task, 16, recorded=recorded, device=at) for at in (device, "cpu"))
-    np.testing.assert_allclose(there.reset(), here.reset(), atol=1e-6)
+    on_device, on_cpu = (ModelEnv(random_car(at), task, 16, recorded=recorded, device=at) for at in (device, "cpu"))
+    np.testing.assert_allclose(on_device.reset(), on_cpu.reset(), atol=1e-6)
     ended = 0
     for action in commands:
-        found, wanted = there.step(action), here.step(action)
-        for a, b in zip(found[:3], wanted[:3], strict=True):
+        found, expected = on_device.step(action), on_cpu.step(action)
+        for a, b in zip(found[:3], expected[:3], strict=True):
             np.testing.assert_allclose(a, b, atol=1e-4)
-        assert [i.keys() for i in found[3]] == [i.keys() for i in wanted[3]]
+        assert [i.keys() for i in found[3]] == [i.keys() for i in expected[3]]
         ended += int(found[2].sum())
     assert ended > 10
-    close(there.features, here.features)
-    for a, b in zip(*(env.roll_out(lambda seen: -0.5 * seen[:, :2]) for env in (there, here)), strict=True):
+    assert_close(on_device.features, on_cpu.features)
+    for a, b in zip(*(env.roll_out(lambda seen: -0.5 * seen[:, :2]) for env in (on_device, on_cpu)), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
 SMALL = SacSettings(hidden=(16, 16), cars=16, warm_up=64, batch=32, updates=8, replay=4096)
 
 
-def test_a_policy_is_trained_kept_and_trained_on(device: str, tmp_path: Path) -> None:
+def test_agent_is_equal_on_the_device_and_can_be_saved_and_retrained(device: str, tmp_path: Path) -> None:
     agents = []
     for at in (device, "cpu"):
         agent = SacAgent(SMALL, 0, at)
         agent.train(
-            ModelEnv(learned(at), TASKS[0], SMALL.cars, device=at), 24, evaluate=lambda agent: 1.0, n_evaluations=2
+            ModelEnv(random_car(at), TASKS[0], SMALL.cars, device=at), 24, evaluate=lambda agent: 1.0, n_evaluations=2
         )
         agents.append(agent)
     seen = np.random.default_rng(2).normal(size=(50, feature_size(HISTORY))).astype(np.float32)
-    there, here = (agent.act(seen) for agent in agents)
-    if not torch.cuda.is_available():  # A real one draws its exploration from a generator of its own.
-        np.testing.assert_allclose(there, here, atol=1e-3)
+    on_device, on_cpu = (agent.act(seen) for agent in agents)
+    if not torch.cuda.is_available():  # Real CUDA draws exploration noise from its own generator.
+        np.testing.assert_allclose(on_device, on_cpu, atol=1e-3)
     agents[0].save(tmp_path)
-    again = SacAgent.load(tmp_path, SMALL, 0, device)
-    assert again.policy().sac.device.type == "cpu", "what drives a car does so on the CPU"
-    np.testing.assert_allclose(again.act(seen), there, atol=1e-6)
-    again.train(ModelEnv(learned(device), TASKS[0], SMALL.cars, device=device), 8)
-    assert next(again.policy().sac.policy.parameters()).device.type == "cuda"
-    assert not np.allclose(again.act(seen), there, atol=1e-6)
+    loaded = SacAgent.load(tmp_path, SMALL, 0, device)
+    assert loaded.policy().sac.device.type == "cpu", "a policy drives the car on the CPU"
+    np.testing.assert_allclose(loaded.act(seen), on_device, atol=1e-6)
+    loaded.train(ModelEnv(random_car(device), TASKS[0], SMALL.cars, device=device), 8)
+    assert next(loaded.policy().sac.policy.parameters()).device.type == "cuda"
+    assert not np.allclose(loaded.act(seen), on_device, atol=1e-6)
 
 
-def test_a_gradient_step_is_that_of_the_cpu(device: str) -> None:
-    """From the same networks, transitions and noise, forty times."""
+def test_sac_gradient_steps_are_equal_on_the_device(device: str) -> None:
+    """Both devices take forty steps from equal networks, transitions and noise."""
     agents = []
     for at in (device, "cpu"):
         agent = SacAgent(SMALL, 0, at)
-        agent.train(ModelEnv(learned(at), TASKS[0], SMALL.cars, device=at), 0)
+        agent.train(ModelEnv(random_car(at), TASKS[0], SMALL.cars, device=at), 0)
         agents.append(agent.policy().sac)
-    there, here = agents
-    there.load_learned_state(here.learned_state())
-    there.replay_buffer = copy.copy(here.replay_buffer)
-    there.replay_buffer.device = there.device
+    on_device, on_cpu = agents
+    on_device.load_learned_state(on_cpu.learned_state())
+    on_device.replay_buffer = copy.copy(on_cpu.replay_buffer)
+    on_device.replay_buffer.device = on_device.device
     for agent in agents:
         agent.set_random_seed(0)
         agent.train(40, 32)
-    for (name, found), wanted in zip(there.policy.state_dict().items(), here.policy.state_dict().values(), strict=True):
+    for (name, found), expected in zip(
+        on_device.policy.state_dict().items(), on_cpu.policy.state_dict().values(), strict=True
+    ):
         assert found.device.type == "cuda", name
-        torch.testing.assert_close(found.cpu(), wanted, rtol=1e-3, atol=1e-3)
-    close(there.log_ent_coef, here.log_ent_coef)
+        torch.testing.assert_close(found.cpu(), expected, rtol=1e-3, atol=1e-3)
+    assert_close(on_device.log_ent_coef, on_cpu.log_ent_coef)
 
 
 @pytest.mark.parametrize("way", ["ours", "authors"])
-def test_a_regression_study(device: str, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_regression_study_is_equal_on_the_device(device: str, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("STEPS", "REFINEMENT_STEPS"):
         monkeypatch.setattr(system_identification, name, 20)
-    there = None
-    for there, here in zip(
+    on_device = None
+    for on_device, on_cpu in zip(
         *(run_study("pendulum", rows=(5,), seeds=1, way=way, steps=10, device=at) for at in (device, "cpu")),
         strict=True,
     ):
-        assert there.method == here.method
-        assert (there.nll, there.rmse, there.calibration) == pytest.approx(
-            (here.nll, here.rmse, here.calibration), rel=2e-2
-        ), there.method
-    assert there.method == list(METHODS)[-1]
+        assert on_device.method == on_cpu.method
+        assert (on_device.nll, on_device.rmse, on_device.calibration) == pytest.approx(
+            (on_cpu.nll, on_cpu.rmse, on_cpu.calibration), rel=2e-2
+        ), on_device.method
+    assert on_device.method == list(METHODS)[-1]
 
 
 def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
