@@ -7,14 +7,19 @@ from pathlib import Path
 
 arguments = sys.argv[1:]
 out = Path(arguments[arguments.index("--out") + 1])
-told = arguments[arguments.index("--effects") + 1 :] if "--effects" in arguments else []
+given_effects = arguments[arguments.index("--effects") + 1 :] if "--effects" in arguments else []
 out.mkdir()
-held_out = {"refit": {"score": 3.0}, "with_effects": {"score": 1.2 if told else 1.6}}
+held_out = {"refit": {"score": 3.0}, "with_effects": {"score": 1.2 if given_effects else 1.6}}
 report = {
     "schema": "carlab.diagnosis/1",
     "verdict": "mismatch",
     "effects": [
-        {"id": told[0] if told else "steering_lag", "parameters": {}, "indistinguishable_from": [], "where": {}}
+        {
+            "id": given_effects[0] if given_effects else "steering_lag",
+            "parameters": {},
+            "indistinguishable_from": [],
+            "where": {},
+        }
     ],
     "fit": {"held_out": held_out},
     "data_faults": [],

@@ -1,4 +1,4 @@
-"""Baselines name strong effects, have no false alarm on a null case, and correct predictions as stated."""
+"""Test that baselines name strong effects, raise no false alarm on a null case and correct predictions."""
 
 from __future__ import annotations
 
@@ -31,74 +31,74 @@ def floors(made: Case) -> dict[str, float]:
     return dict(zip(CHANNELS, made.floor, strict=True))
 
 
-def nothing(steps: Steps) -> FloatArray:
+def zero_correction(steps: Steps) -> FloatArray:
     return np.zeros((len(steps.starts), 3))
 
 
 @pytest.fixture(scope="module")
-def quiet() -> Case:
+def null_case() -> Case:
     return case("null", 11)
 
 
 @pytest.fixture(scope="module")
-def late() -> Case:
+def steering_delay_case() -> Case:
     return case("single", 12, "steering_delay", excess=4.0)
 
 
 @pytest.fixture(scope="module")
-def askew() -> Case:
+def steering_offset_case() -> Case:
     return case("single", 17, "steering_offset", excess=4.0)
 
 
-def test_no_effect_is_named_in_a_null_case(quiet: Case) -> None:
+def test_baselines_name_no_effect_in_a_null_case(null_case: Case) -> None:
     pytest.importorskip("pysindy")
-    said = run_baselines(quiet.fit, quiet.hold, quiet.nominal, floors(quiet))
-    assert tuple(said) == BASELINES
-    assert [entry["named"] for entry in said.values()] == [None] * len(BASELINES)
-    assert said["PySINDy"]["score"] == said["stepwise BIC"]["score"] == said["refit only"]["score"]
+    results = run_baselines(null_case.fit, null_case.hold, null_case.nominal, floors(null_case))
+    assert tuple(results) == BASELINES
+    assert [entry["named"] for entry in results.values()] == [None] * len(BASELINES)
+    assert results["PySINDy"]["score"] == results["stepwise BIC"]["score"] == results["refit only"]["score"]
 
 
-def test_an_easy_effect_is_named_and_corrected() -> None:
+def test_baselines_name_and_correct_a_strong_effect() -> None:
     pytest.importorskip("pysindy")
-    dead = case("single", 16, "throttle_deadband", excess=4.0)
-    said = run_baselines(dead.fit, dead.hold, dead.nominal, floors(dead))
-    assert said["stepwise BIC"]["named"] == said["PySINDy"]["named"] == "throttle_deadband"
+    deadband_case = case("single", 16, "throttle_deadband", excess=4.0)
+    results = run_baselines(deadband_case.fit, deadband_case.hold, deadband_case.nominal, floors(deadband_case))
+    assert results["stepwise BIC"]["named"] == results["PySINDy"]["named"] == "throttle_deadband"
     for name in ("stepwise BIC", "PySINDy"):
-        assert 1.0 < said[name]["score"] < 0.7 * said["refit only"]["score"]
-    assert said["refit only"]["named"] is None
-    assert said["GP residual"]["named"] is None
+        assert 1.0 < results[name]["score"] < 0.7 * results["refit only"]["score"]
+    assert results["refit only"]["named"] is None
+    assert results["GP residual"]["named"] is None
 
 
-def test_regression_on_one_term_finds_the_concealed_angle(askew: Case) -> None:
-    data = prepared(askew)
+def test_regression_on_one_term_estimates_the_concealed_angle(steering_offset_case: Case) -> None:
+    data = prepared(steering_offset_case)
     system = System.of(data)
     column = system.fit_x[:, list(system.terms).index("steering_offset")]
     angle = 0.02 * float(column @ system.fit_y) / float(column @ column)  # a term is 0.02 rad
-    assert angle == pytest.approx(askew.concealed[0].parameters["angle"], rel=0.25)
+    assert angle == pytest.approx(steering_offset_case.concealed[0].parameters["angle"], rel=0.25)
 
 
-def test_a_late_command_is_the_largest_cross_correlation(late: Case) -> None:
-    assert largest_correlation(prepared(late)) == "steering_delay"
+def test_steering_delay_has_the_largest_cross_correlation(steering_delay_case: Case) -> None:
+    assert largest_correlation(prepared(steering_delay_case)) == "steering_delay"
 
 
-def test_without_a_correction_the_score_is_that_of_the_refit(late: Case) -> None:
-    data = prepared(late)
-    assert held_out_score(data, nothing) == pytest.approx(score(data.windows, data.car.free()), rel=1e-9)
+def test_zero_correction_has_the_score_of_the_refit(steering_delay_case: Case) -> None:
+    data = prepared(steering_delay_case)
+    assert held_out_score(data, zero_correction) == pytest.approx(score(data.windows, data.car.free()), rel=1e-9)
     system = System.of(data)
     assert corrected_score(data, system, np.zeros(len(system.terms))) == pytest.approx(data.refit_score, rel=1e-9)
 
 
-def test_terms_belong_to_effects_and_cover_nearly_all_of_them(quiet: Case) -> None:
-    data = prepared(quiet)
+def test_terms_belong_to_effects_and_cover_all_but_four(null_case: Case) -> None:
+    data = prepared(null_case)
     named = {effect_of(term) for term in library(data)}
     assert named <= set(EFFECT_IDS)
-    without = {"mocap_latency", "traction_limit", "roll_dynamics", "tyre_saturation"}  # the last: linear tyres only
-    assert set(EFFECT_IDS) - named == without
+    uncovered = {"mocap_latency", "traction_limit", "roll_dynamics", "tyre_saturation"}  # the last: linear tyres only
+    assert set(EFFECT_IDS) - named == uncovered
 
 
-def test_terms_against_closed_forms(quiet: Case) -> None:
-    """Force terms are F / m; a term of the commands is the lost acceleration."""
-    data = prepared(quiet)
+def test_terms_equal_closed_forms(null_case: Case) -> None:
+    """A force term is F / m; a command term is the lost acceleration."""
+    data = prepared(null_case)
     terms, steps = library(data), data.steps
     drag = terms["aerodynamic_drag"](steps)
     assert drag[:, 0] == pytest.approx(-steps.middle[:, 3] * np.abs(steps.middle[:, 3]) / steps.car.mass)
@@ -111,25 +111,25 @@ def test_terms_against_closed_forms(quiet: Case) -> None:
     assert 0.75 < float(sag @ lost) / float(lost @ lost) < 1.0
 
 
-def test_gaps_and_jumps_are_repaired_for_baselines(quiet: Case) -> None:
-    whole = as_table(quiet.recordings[0])
-    broken = {name: np.delete(column, [50, 51, 200]) for name, column in whole.items()}
+def test_gaps_and_jumps_are_repaired_for_baselines(null_case: Case) -> None:
+    complete = as_table(null_case.recordings[0])
+    broken = {name: np.delete(column, [50, 51, 200]) for name, column in complete.items()}
     broken["x"][120] += 0.4
-    mended = clean(broken, quiet.nominal, np.array(quiet.floor))
-    assert mended.t_s == pytest.approx(whole["t"] - whole["t"][0], abs=1e-4)
-    assert mended.measured[:, 0] == pytest.approx(whole["x"], abs=0.05)
+    repaired = clean(broken, null_case.nominal, np.array(null_case.floor))
+    assert repaired.t_s == pytest.approx(complete["t"] - complete["t"][0], abs=1e-4)
+    assert repaired.measured[:, 0] == pytest.approx(complete["x"], abs=0.05)
 
 
-def test_an_unusable_recording_raises_data_error(quiet: Case) -> None:
-    milliseconds = {**quiet.fit, "t": quiet.fit["t"] * 1000.0}
-    said = run_baselines(milliseconds, quiet.hold, quiet.nominal, floors(quiet))
-    assert "control period" in said["failed"]
+def test_an_unusable_recording_raises_data_error(null_case: Case) -> None:
+    milliseconds = {**null_case.fit, "t": null_case.fit["t"] * 1000.0}
+    results = run_baselines(milliseconds, null_case.hold, null_case.nominal, floors(null_case))
+    assert "control period" in results["failed"]
 
 
-def test_the_car_of_a_case_is_not_changed(quiet: Case) -> None:
-    before = BaseCar(**quiet.nominal.__dict__)
-    prepared(quiet)
-    assert quiet.nominal == before
+def test_preparation_does_not_modify_the_car_of_the_case(null_case: Case) -> None:
+    before = BaseCar(**null_case.nominal.__dict__)
+    prepared(null_case)
+    assert null_case.nominal == before
 
 
 def test_diagnosis_and_baselines_are_scored_on_the_same_cases() -> None:
@@ -142,14 +142,14 @@ def test_diagnosis_and_baselines_are_scored_on_the_same_cases() -> None:
         "c": row("null", [], ["motor_lag"], 0.0),
         "d": row("single", ["yaw_damping"], ["yaw_damping"], 2.0),  # no baseline result
     }
-    one = {"named": "battery_sag", "score": 2.0, "refit_score": 3.0, "seconds": 0.1}
-    said = {"a": dict.fromkeys(BASELINES, one), "b": dict.fromkeys(BASELINES, one), "c": {"failed": "why"}}
-    figures = {entry["figure"]: entry for entry in compare(rows, said)}
+    result = {"named": "battery_sag", "score": 2.0, "refit_score": 3.0, "seconds": 0.1}
+    results = {"a": dict.fromkeys(BASELINES, result), "b": dict.fromkeys(BASELINES, result), "c": {"failed": "why"}}
+    figures = {entry["figure"]: entry for entry in compare(rows, results)}
     strong = figures["correct effect first, strictly, excess >= 1"]
     assert (strong["tool"], strong["PySINDy"]) == ({"hits": 1, "count": 1}, {"hits": 0, "count": 1})
     assert strong["refit only"] is None
-    every = figures["correct effect first, strictly, all strengths"]
-    assert (every["tool"], every["PySINDy"]) == ({"hits": 1, "count": 2}, {"hits": 1, "count": 2})
+    all_strengths = figures["correct effect first, strictly, all strengths"]
+    assert (all_strengths["tool"], all_strengths["PySINDy"]) == ({"hits": 1, "count": 2}, {"hits": 1, "count": 2})
     alarms = figures["false alarms, null and parameters"]
     assert (alarms["tool"]["hits"], alarms["PySINDy"]["hits"]) == (1, 0)
     ratio = figures["floor ratio, singles, median"]

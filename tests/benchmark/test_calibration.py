@@ -1,4 +1,4 @@
-"""Calibration repeats recorded decisions at other thresholds and counts false and missed names."""
+"""Test that calibration repeats recorded decisions at other thresholds and counts false and missed names."""
 
 import json
 from pathlib import Path
@@ -39,12 +39,12 @@ def test_a_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed
     }
     assert counts[0.5] == (1, 2, 0, 1), "a name in the null case"
     assert counts[1.0] == (0, 2, 0, 1)
-    assert counts[1.5] == (0, 2, 0, 1), "only the first that passes is accepted"
+    assert counts[1.5] == (0, 2, 0, 1), "only the first candidate that passes is accepted"
     assert counts[2.0] == (0, 2, 1, 1), "no candidate passes"
     assert [r.is_present_value for r in calibrate(ANSWERS, DECISIONS) if r.value == 20.0] == [True]
 
 
-def test_individual_decisions_count_individually() -> None:
+def test_decisions_of_the_keep_stage_are_counted_separately() -> None:
     kept = {"a": content(decision("keep", "steering_lag", 25.0), decision("keep", "motor_lag", 25.0))}
     by_value = {r.value / 20.0: (r.false, r.missed) for r in calibrate(ANSWERS, kept) if r.setting == CHI2}
     assert by_value[1.0] == (1, 0)

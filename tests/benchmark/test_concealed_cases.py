@@ -1,4 +1,4 @@
-"""Cases: score of the true car, strengths, reproducibility by seed, data faults."""
+"""Test concealed cases: score of the true car, strengths, reproducibility by seed, data faults."""
 
 from __future__ import annotations
 
@@ -86,11 +86,11 @@ def test_strength_is_reached(name: str, form: str, excess: float) -> None:
 
 
 def test_a_case_is_reproducible_by_its_seed() -> None:
-    one, two = (make_case("parameters", 31, fit_s=8.0, hold_s=5.0) for _ in range(2))
+    first, second = (make_case("parameters", 31, fit_s=8.0, hold_s=5.0) for _ in range(2))
     for name in COLUMNS:
-        np.testing.assert_array_equal(one.fit[name], two.fit[name])
+        np.testing.assert_array_equal(first.fit[name], second.fit[name])
     other = make_case("parameters", 32, fit_s=8.0, hold_s=5.0)
-    assert not np.array_equal(one.fit["steering"], other.fit["steering"])
+    assert not np.array_equal(first.fit["steering"], other.fit["steering"])
 
 
 def test_the_simulator_reads_car_file_and_csv(tmp_path: Path, parameters_only: Case) -> None:
@@ -110,7 +110,7 @@ def test_the_simulator_reads_car_file_and_csv(tmp_path: Path, parameters_only: C
     assert np.abs([float(r["yaw"]) for r in rows]).max() <= np.pi + 1e-6
 
 
-def test_local_polynomial_is_exact_for_polynomials_ends_included() -> None:
+def test_local_polynomial_is_exact_for_polynomials_including_the_ends() -> None:
     t = np.arange(40) * 0.01
     values = np.stack([2 + 3 * t - t**2, t**2], axis=1)
     fitted, slope = local_fit(values, 9, 2, 0.01)
@@ -132,7 +132,7 @@ def test_faults_change_only_the_reported_columns(name: str, parameters_only: Cas
     assert 0 < fault.rows <= len(table["t"])
 
 
-def test_the_full_set_has_the_counts_of_the_protocol() -> None:
+def test_full_set_has_the_counts_of_the_protocol() -> None:
     known = all_forms()
     for purpose in ("development", "test"):
         specs = full_set(purpose)  # type: ignore[arg-type]
@@ -144,10 +144,10 @@ def test_the_full_set_has_the_counts_of_the_protocol() -> None:
         )
         assert kinds.count("null") == 50
         for name in EFFECT_IDS:
-            mine = [s for s in specs if s.kind == "single" and s.effects == (name,)]
-            assert sorted(s.excess for s in mine) == [0.5, 1.0, 2.0, 4.0]
+            effect_specs = [s for s in specs if s.kind == "single" and s.effects == (name,)]
+            assert sorted(s.excess for s in effect_specs) == [0.5, 1.0, 2.0, 4.0]
             if (name, "other") in known and (name, "catalogue") in known:
-                assert sum(s.form == "other" for s in mine) == 2
+                assert sum(s.form == "other" for s in effect_specs) == 2
         assert len({s.seed for s in specs}) == len(specs)
     seeds = [{s.seed for s in full_set(p)} for p in ("development", "test")]  # type: ignore[arg-type]
     assert not seeds[0] & seeds[1]
@@ -179,18 +179,18 @@ def test_invalid_arguments_raise_errors() -> None:
 
 
 @pytest.mark.slow
-def test_the_refit_distinguishes_effects_of_commands() -> None:
+def test_refit_distinguishes_steering_delay_from_throttle_delay() -> None:
     case = make_case("single", 51, effects=["steering_delay"], excess=4.0, **SHORT)
-    told = (case.nominal, case.fit, case.hold, np.array(case.floor))
-    assert indistinguishable("steering_delay", "throttle_delay", *told) is False
-    assert indistinguishable("steering_delay", "steering_delay", *told) is True
-    assert indistinguishable("steering_delay", "tyre_relaxation", *told) is None
+    data = (case.nominal, case.fit, case.hold, np.array(case.floor))
+    assert indistinguishable("steering_delay", "throttle_delay", *data) is False
+    assert indistinguishable("steering_delay", "steering_delay", *data) is True
+    assert indistinguishable("steering_delay", "tyre_relaxation", *data) is None
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_most_forms_reach_a_strength_and_all_have_an_influence() -> None:
-    """Some forms cannot be weak (wheel slip) or strong; a spin changes the strength. Each form has an influence."""
+    """Some forms cannot be weak (wheel slip) or strong, and a spin changes the strength."""
     excesses = {}
     for form in all_forms().values():
         kind = "outside" if form.form == "outside" else "single"
@@ -201,7 +201,7 @@ def test_most_forms_reach_a_strength_and_all_have_an_influence() -> None:
     assert min(excesses.values()) > 0.3, excesses
 
 
-def test_hundred_hertz_recordings() -> None:
+def test_case_with_recordings_at_100_hz() -> None:
     case = make_case("null", 41, period_s=0.01, fit_s=6.0, hold_s=5.0)
     assert np.diff(case.fit["t"]) == pytest.approx(0.01)
     assert dataclasses.replace(case.nominal, kind="blend").kind == "blend"

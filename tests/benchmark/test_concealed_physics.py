@@ -1,4 +1,4 @@
-"""Physics of the generator against the independent simulator and against closed forms of mechanics."""
+"""Test the physics of the generator against the independent simulator and closed forms of mechanics."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive, drive
 from sim_backends import EFFECTS, SimulatorConfig, rollout
 
-# 0.6 mm and 2 mrad of motion capture, and what differentiating makes of them.
+# Noise of motion capture (0.6 mm, 2 mrad) and of velocities differentiated from it.
 NOISE_FLOOR = np.array([6e-4, 6e-4, 2e-3, 0.01, 0.01, 0.03])
 FORMS = all_forms()
 CAR = BaseCar()
-# Large enough to move the car by many noise floors within a second, whatever the effect.
+# Sizes whose influence is many noise floors within a second.
 STRONG = {"battery_sag": 0.3, "friction_drift": 0.4, "longitudinal_slip": 2.0, "tyre_saturation": 0.8}
 
 
@@ -38,17 +38,19 @@ def scripted(table: np.ndarray, period_s: float) -> Any:
     return lambda t, state: tuple(table[round(t / period_s)])
 
 
-def drive_here(world: World, table: np.ndarray, start: tuple[float, ...]) -> Drive:
+def generator_drive(world: World, table: np.ndarray, start: tuple[float, ...]) -> Drive:
     period = world.car.control_period
     return drive(world, scripted(table, period), (len(table) - 1) * period, start=start)
 
 
-def drive_there(car: BaseCar, effects: dict[str, dict[str, float]], table: np.ndarray, start: tuple[float, ...]) -> Any:
+def simulator_rollout(
+    car: BaseCar, effects: dict[str, dict[str, float]], table: np.ndarray, start: tuple[float, ...]
+) -> Any:
     tables = car.table() | {"effects": effects}
     config = SimulatorConfig.from_tables(tables)
     begin = torch.tensor([start], dtype=torch.float64)
-    acts = torch.tensor(table[None, :-1], dtype=torch.float64)
-    return rollout(config, begin, acts, measured=True, max_step_s=0.002)
+    acting_commands = torch.tensor(table[None, :-1], dtype=torch.float64)
+    return rollout(config, begin, acting_commands, measured=True, max_step_s=0.002)
 
 
 def draw_of(car: BaseCar) -> Draw:
@@ -61,10 +63,10 @@ def test_base_model_equals_the_simulator(kind: Kind, start: tuple[float, ...]) -
     car = dataclasses.replace(CAR, kind=kind, latency=0.0)
     for seed in range(3):
         table = commands(seed)
-        ours = drive_here(World(car), table, start).rows
-        theirs = drive_there(car, {}, table, start).states[0].numpy()
-        assert np.abs(ours[-1] - ours[0]).max() > 0.3
-        assert (np.abs(ours - theirs).max(axis=0) < 0.1 * NOISE_FLOOR).all()
+        generated = generator_drive(World(car), table, start).rows
+        simulated = simulator_rollout(car, {}, table, start).states[0].numpy()
+        assert np.abs(generated[-1] - generated[0]).max() > 0.3
+        assert (np.abs(generated - simulated).max(axis=0) < 0.1 * NOISE_FLOOR).all()
 
 
 def comparable() -> list[Form]:
@@ -81,16 +83,16 @@ def test_catalogue_forms_equal_the_effects_of_the_simulator(form: Form) -> None:
     table = commands(5)
     world = World(car)
     form.attach(world, parameters)
-    ours = drive_here(world, table, start).rows
-    told = {k: v for k, v in parameters.items() if k != "all_axles"}
-    theirs = drive_there(car, {form.id: told}, table, start).states[0].numpy()
-    null = drive_here(World(car), table, start).rows
-    moved = np.abs(ours - null).max(axis=0) / NOISE_FLOOR
-    apart = np.abs(ours - theirs).max(axis=0) / NOISE_FLOOR
-    assert moved.max() > 2.0, "the effect must be seen, or the comparison says nothing"
-    # Fixed steps pass the edge of a patch; adaptive steps resolve it.
+    generated = generator_drive(world, table, start).rows
+    simulator_parameters = {k: v for k, v in parameters.items() if k != "all_axles"}
+    simulated = simulator_rollout(car, {form.id: simulator_parameters}, table, start).states[0].numpy()
+    null = generator_drive(World(car), table, start).rows
+    influence = np.abs(generated - null).max(axis=0) / NOISE_FLOOR
+    difference = np.abs(generated - simulated).max(axis=0) / NOISE_FLOOR
+    assert influence.max() > 2.0, "the effect must have an influence, or the comparison is meaningless"
+    # Fixed steps do not resolve the edge of a patch; adaptive steps do.
     share = 0.05 if form.id == "low_friction_patch" else 0.02
-    assert apart.max() < max(0.2, share * moved.max())
+    assert difference.max() < max(0.2, share * influence.max())
 
 
 @pytest.mark.parametrize(
@@ -107,9 +109,9 @@ def test_observation_effects_equal_those_of_the_simulator(name: str, parameters:
     world = World(CAR)
     FORMS[(name, "catalogue")].attach(world, parameters)
     quiet = Noise(0.0, 0.0)
-    ours = record(drive_here(world, table, start), world, quiet, np.random.default_rng(0)).measured
-    theirs = drive_there(CAR, {name: parameters}, table, start).measured[0].numpy()
-    assert (np.abs(ours - theirs).max(axis=0)[:3] < 0.1 * NOISE_FLOOR[:3]).all()
+    generated = record(generator_drive(world, table, start), world, quiet, np.random.default_rng(0)).measured
+    simulated = simulator_rollout(CAR, {name: parameters}, table, start).measured[0].numpy()
+    assert (np.abs(generated - simulated).max(axis=0)[:3] < 0.1 * NOISE_FLOOR[:3]).all()
 
 
 def identities() -> list[Form]:
@@ -117,7 +119,7 @@ def identities() -> list[Form]:
 
 
 @pytest.mark.parametrize("form", identities(), ids=lambda f: f"{f.id}-{f.form}")
-def test_every_form_at_size_zero_is_the_base_model(form: Form) -> None:
+def test_each_form_at_size_zero_equals_the_base_model(form: Form) -> None:
     car = dataclasses.replace(CAR, kind=form.nominal_kind)
     table = commands(3, 46)
     start = (0.0,) * 6
@@ -125,27 +127,27 @@ def test_every_form_at_size_zero_is_the_base_model(form: Form) -> None:
     form.attach(world, form.sized(0.0, draw_of(car)))
     quiet = Noise(0.0, 0.0)
     changed, plain = (
-        record(drive_here(one, table, start), one, quiet, np.random.default_rng(0)).measured
+        record(generator_drive(one, table, start), one, quiet, np.random.default_rng(0)).measured
         for one in (world, World(car))
     )
-    apart = np.abs(changed - plain).max(axis=0)
-    assert (apart < 0.02 * NOISE_FLOOR).all()
+    difference = np.abs(changed - plain).max(axis=0)
+    assert (difference < 0.02 * NOISE_FLOOR).all()
 
 
-def test_signs_and_energy() -> None:
+def test_steering_signs_and_energy_dissipation() -> None:
     held = np.tile([0.5, 0.4], (60, 1))
-    rows = drive_here(World(CAR), held, (0.0,) * 6).rows
+    rows = generator_drive(World(CAR), held, (0.0,) * 6).rows
     assert rows[-1, 2] > 0.5  # positive steering turns left
     assert (np.diff(np.hypot(rows[:, 3], rows[:, 4])) > -0.05).all()
-    back = drive_here(World(CAR), held * [1.0, -1.0], (0.0,) * 6).rows
+    back = generator_drive(World(CAR), held * [1.0, -1.0], (0.0,) * 6).rows
     assert back[-1, 2] < -0.3  # opposite in reverse
-    rolling = drive_here(World(CAR), np.zeros((60, 2)), (0.0, 0.0, 0.0, 2.0, 0.6, 3.0)).rows
+    rolling = generator_drive(World(CAR), np.zeros((60, 2)), (0.0, 0.0, 0.0, 2.0, 0.6, 3.0)).rows
     energy = 0.5 * CAR.mass * (rolling[:, 3] ** 2 + rolling[:, 4] ** 2) + 0.5 * CAR.yaw_inertia * rolling[:, 5] ** 2
     assert (np.diff(energy) <= 1e-9).all()
 
 
 def test_straight_coasting_is_exponential() -> None:
-    rows = drive_here(World(CAR), np.zeros((61, 2)), (0.0, 0.0, 0.0, 2.0, 0.0, 0.0)).rows
+    rows = generator_drive(World(CAR), np.zeros((61, 2)), (0.0, 0.0, 0.0, 2.0, 0.0, 0.0)).rows
     t = np.maximum(np.arange(61) * CAR.control_period - CAR.latency, 0.0)
     np.testing.assert_allclose(rows[1:, 3], 2.0 * np.exp(-CAR.damping / CAR.mass * t[1:]), rtol=1e-7)
 
@@ -156,15 +158,15 @@ def test_every_resistance_dissipates_energy() -> None:
         world = World(CAR)
         form.attach(world, form.sized(form.largest / 4, draw_of(CAR)))
         table = np.tile([0.1, 0.0], (31, 1))
-        slowed, free = (drive_here(w, table, (0.0, 0.0, 0.0, 2.0, 0.0, 0.0)).rows[20] for w in (world, World(CAR)))
+        slowed, free = (generator_drive(w, table, (0.0, 0.0, 0.0, 2.0, 0.0, 0.0)).rows[20] for w in (world, World(CAR)))
         energies = [CAR.mass * (r[3] ** 2 + r[4] ** 2) + CAR.yaw_inertia * r[5] ** 2 for r in (slowed, free)]
         assert energies[0] < energies[1]
 
 
-def test_slope_pulls_down_hill_in_the_world_frame() -> None:
+def test_slope_accelerates_downhill_in_the_world_frame() -> None:
     world = World(CAR)
     FORMS[("road_slope", "catalogue")].attach(world, {"angle": 0.05, "direction": math.pi / 2})
-    rows = drive_here(world, np.zeros((31, 2)), (0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0)).rows
+    rows = generator_drive(world, np.zeros((31, 2)), (0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.0)).rows
     assert rows[-1, 1] < -0.05  # the floor rises towards +y, so the car rolls back
     assert abs(rows[-1, 0]) < 1e-6
 

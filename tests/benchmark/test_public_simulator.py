@@ -1,4 +1,4 @@
-"""The public simulator is scaled correctly; the study has the correct input files and page."""
+"""Test the scaling of the public simulator, and the input files and page of the study."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def settled(car: PublicCar, speed: float, steering: float, seconds: float, throt
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_scaled_car_is_dynamically_similar_to_the_original(model: Model) -> None:
+def test_scaled_car_is_dynamically_similar_to_the_original(model: Model) -> None:
     car = PublicCar(model)
     full = PublicCar(model)
     full.p = parameters(1.0)
@@ -68,8 +68,8 @@ def test_acceleration_includes_the_wheel_inertia(model: Model, wheels: int) -> N
     car = PublicCar(model)
     p = car.p
     speed = settled(car, 1.0, 0.0, 0.5, throttle_mps2=1.0)[3, -1]
-    gained = 0.5 / (1.0 + wheels * p.I_y_w / (p.m * p.R_w**2))
-    assert speed - 1.0 == pytest.approx(gained, rel=0.02)
+    expected_gain = 0.5 / (1.0 + wheels * p.I_y_w / (p.m * p.R_w**2))
+    assert speed - 1.0 == pytest.approx(expected_gain, rel=0.02)
 
 
 def test_steady_cornering_equals_that_of_a_neutral_car() -> None:
@@ -85,14 +85,14 @@ def test_steady_cornering_equals_that_of_a_neutral_car() -> None:
 
 
 def test_roll_angle_of_the_multi_body_car() -> None:
-    # Body roll over the axles, K_phi phi = m_s a_y h_s (roll axes at the ground) + m_s g h_s phi, beside the tyres'.
+    # Body roll over the axles (roll axes at the ground), without the tyres: K_phi phi = m_s a_y h_s + m_s g h_s phi.
     car = PublicCar("multi_body")
     p = car.p
     state = settled(car, 2.0, 0.08, 2.0)[:, -1]
     push = p.m_s * state[3] * state[5]
     stiffness = 0.5 * (p.K_sf * p.T_f**2 + p.K_sr * p.T_r**2) - p.K_tsf - p.K_tsr
-    lean = abs(state[6] - 0.5 * (state[13] + state[18]))
-    assert lean == pytest.approx((push + p.m_s * 9.81 * abs(state[6])) * p.h_s / stiffness, rel=0.15)
+    body_roll = abs(state[6] - 0.5 * (state[13] + state[18]))
+    assert body_roll == pytest.approx((push + p.m_s * 9.81 * abs(state[6])) * p.h_s / stiffness, rel=0.15)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -116,28 +116,28 @@ def test_noise_rates_and_bounds_of_a_recording() -> None:
     std = made.recording.error[:, :3].std(axis=0)
     assert std == pytest.approx([0.0006, 0.0006, 0.002], rel=4.0 / math.sqrt(2 * rows))
     assert made.recording.clean[:, :3] == pytest.approx(made.drive.rows[:, :3], abs=1e-9)
-    seen = np.abs(np.gradient(made.states[:, 2], made.drive.capture_s)).max()
-    assert seen <= 0.4 / math.sqrt(SCALE) * (1.0 + 1e-6)
+    max_steering_rate = np.abs(np.gradient(made.states[:, 2], made.drive.capture_s)).max()
+    assert max_steering_rate <= 0.4 / math.sqrt(SCALE) * (1.0 + 1e-6)
     # Distance travelled is the integral of the package's speed.
     step = np.hypot(*np.diff(made.drive.captures[:, :2], axis=0).T).sum()
     speed = np.hypot(made.drive.captures[:, 3], made.drive.captures[:, 4])
     assert step == pytest.approx(np.trapezoid(speed, made.drive.capture_s), rel=2e-3)
-    again = drive_public(PublicCar("drift"), 3, 0, 5.0)
-    assert np.array_equal(again.recording.measured, made.recording.measured)
+    repeated = drive_public(PublicCar("drift"), 3, 0, 5.0)
+    assert np.array_equal(repeated.recording.measured, made.recording.measured)
 
 
 def test_commands_reach_the_wheels_after_the_delay() -> None:
     car = PublicCar("drift")
     made = drive_public(car, 3, 0, 5.0)
-    issued, acts = made.drive.row_s, made.drive.switch_s[1:]
-    assert acts == pytest.approx(issued[: len(acts)] + 0.05, abs=1e-9)
-    assert made.drive.switch_values[1:, 0] == pytest.approx(0.5 * made.recording.commands[: len(acts), 0])
+    issued_s, acting_s = made.drive.row_s, made.drive.switch_s[1:]
+    assert acting_s == pytest.approx(issued_s[: len(acting_s)] + 0.05, abs=1e-9)
+    assert made.drive.switch_values[1:, 0] == pytest.approx(0.5 * made.recording.commands[: len(acting_s), 0])
     seconds, angle = made.drive.capture_s, made.states[:, 2]
-    assert np.abs(angle[seconds < acts[0] - 1e-6]).max() < 1e-12
-    assert np.abs(angle[(seconds > acts[0] + 0.01) & (seconds < acts[1])]).min() > 1e-6
+    assert np.abs(angle[seconds < acting_s[0] - 1e-6]).max() < 1e-12
+    assert np.abs(angle[(seconds > acting_s[0] + 0.01) & (seconds < acting_s[1])]).min() > 1e-6
 
 
-def test_the_nominal_file_loads_with_measured_values(tmp_path: Path) -> None:
+def test_nominal_car_file_contains_the_measured_values(tmp_path: Path) -> None:
     for model in MODELS:
         path = tmp_path / f"{model}.toml"
         car = PublicCar(model)
@@ -150,24 +150,24 @@ def test_the_nominal_file_loads_with_measured_values(tmp_path: Path) -> None:
             assert f"{given} = {{ value" in text
 
 
-def test_every_effect_has_a_presence_in_both_models() -> None:
+def test_each_effect_has_a_statement_for_both_models() -> None:
     assert set(PHYSICS) == set(EFFECT_IDS)
-    for effect, said in PHYSICS.items():
-        assert sorted(m for s in said for m in s.models) == sorted(MODELS), effect
+    for effect, statements in PHYSICS.items():
+        assert sorted(m for s in statements for m in s.models) == sorted(MODELS), effect
     assert physics_of("roll_dynamics", "multi_body").stance == "yes"
     assert physics_of("roll_dynamics", "drift").stance == "no"
 
 
-def test_a_study_from_drive_to_page(tmp_path: Path) -> None:
+def test_study_writes_results_and_page(tmp_path: Path) -> None:
     rows = study(tmp_path / "study", "drift", [0], command=FAKE_DIAGNOSIS, lengths_s=(4.0, 2.0))
     assert rows[0]["ratio"] == pytest.approx(1.5 / 4.0)
-    seen = json.loads((tmp_path / "study" / "seed_0" / "report.json").read_text())["seen"]
-    assert seen["files"] == ["car.toml", "fit.csv", "hold.csv", "out"]
-    assert str(tmp_path) not in " ".join(seen["arguments"])
+    inputs = json.loads((tmp_path / "study" / "seed_0" / "report.json").read_text())["seen"]
+    assert inputs["files"] == ["car.toml", "fit.csv", "hold.csv", "out"]
+    assert str(tmp_path) not in " ".join(inputs["arguments"])
     assert len(read_csv(tmp_path / "study" / "seed_0" / "fit.csv")["t"]) == 121
-    kept = json.loads((tmp_path / "study" / "study.json").read_text())["seeds"]
-    assert kept == json.loads(json.dumps(rows))
-    assert [(e["id"], e["in_equations"]) for e in kept[0]["named"]] == [
+    seed_rows = json.loads((tmp_path / "study" / "study.json").read_text())["seeds"]
+    assert seed_rows == json.loads(json.dumps(rows))
+    assert [(e["id"], e["in_equations"]) for e in seed_rows[0]["named"]] == [
         ("steering_rate_limit", "yes"), ("battery_sag", "no"),
     ]  # fmt: skip
     page = (tmp_path / "study" / "study.md").read_text()
@@ -177,8 +177,8 @@ def test_a_study_from_drive_to_page(tmp_path: Path) -> None:
 
 
 def test_a_study_states_a_missing_report(tmp_path: Path) -> None:
-    gone = (sys.executable, "-c", "raise SystemExit('no idea')")
-    rows = study(tmp_path, "drift", [0], command=gone, lengths_s=(3.0, 2.0))
+    failing_diagnosis = (sys.executable, "-c", "raise SystemExit('no idea')")
+    rows = study(tmp_path, "drift", [0], command=failing_diagnosis, lengths_s=(3.0, 2.0))
     assert rows[0]["verdict"] is None
     page = (tmp_path / "study.md").read_text()
     assert "Met for 0 of 1 seeds" in page
@@ -190,14 +190,14 @@ def test_a_stopped_study_writes_its_present_results(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "study.json").read_text())["seeds"] == []
 
 
-def test_activity_of_a_drive_that_steers_hard(tmp_path: Path) -> None:
+def test_activity_of_a_drive_at_the_steering_rate_limit(tmp_path: Path) -> None:
     car = PublicCar("multi_body")
-    said = activity(car, hand_over(car, 1, tmp_path, (2.0, 1.0)))
-    assert 0.0 <= said["share of time at the steering-rate limit"] <= 1.0
-    assert said["speed [m/s], 95th percentile"] > 0.7
+    shares = activity(car, hand_over(car, 1, tmp_path, (2.0, 1.0)))
+    assert 0.0 <= shares["share of time at the steering-rate limit"] <= 1.0
+    assert shares["speed [m/s], 95th percentile"] > 0.7
 
 
-def test_a_missing_package_raises_config_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_raises_config_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(public_simulator, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"pip install 'carlab\[studies\]'") as caught:
         parameters()

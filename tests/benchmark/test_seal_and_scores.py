@@ -1,4 +1,4 @@
-"""Seal, resumed proof, and scores of correct and wrong reports."""
+"""Test the seal, resumed proofs, and scores of correct and wrong reports."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def report(*named: str, others: tuple[str, ...] = (), verdict: str | None = None
     }
 
 
-def test_a_correct_name_counts() -> None:
+def test_correct_name_is_a_hit() -> None:
     row = score_case(answer(), report("steering_lag"), oracle=report("steering_lag"))
     assert row["strict_top1"]
     assert row["set_top1"]
@@ -75,12 +75,12 @@ def test_a_correct_name_counts() -> None:
     assert row["oracle_ratio"] == pytest.approx(1.0)
 
 
-def test_wrong_name_and_second_place_do_not_count() -> None:
+def test_wrong_name_and_second_place_are_misses() -> None:
     assert not score_case(answer(), report("motor_lag"))["set_top1"]
     assert not score_case(answer(), report("motor_lag", "steering_lag"))["set_top1"]
 
 
-def test_a_set_counts_only_with_confusable_effects() -> None:
+def test_set_is_a_hit_only_with_confusable_effects() -> None:
     in_set = score_case(answer(name="tyre_relaxation"), report("steering_lag", others=("tyre_relaxation",)))
     assert in_set["set_top1"]
     assert not in_set["strict_top1"]
@@ -96,9 +96,12 @@ def test_a_set_counts_only_with_confusable_effects() -> None:
 
 def test_false_alarms_in_null_cases() -> None:
     for kind, verdict in (("null", "none"), ("parameters", "parameters")):
-        quiet, loud = score_case(answer(kind), report(verdict=verdict)), score_case(answer(kind), report("battery_sag"))
-        assert (quiet["false_alarm"], quiet["verdict_right"]) == (False, True)
-        assert (loud["false_alarm"], loud["verdict_right"]) == (True, False)
+        correct, false_alarm = (
+            score_case(answer(kind), report(verdict=verdict)),
+            score_case(answer(kind), report("battery_sag")),
+        )
+        assert (correct["false_alarm"], correct["verdict_right"]) == (False, True)
+        assert (false_alarm["false_alarm"], false_alarm["verdict_right"]) == (True, False)
 
 
 def test_pairs_require_both_effects() -> None:
@@ -109,30 +112,30 @@ def test_pairs_require_both_effects() -> None:
 
 
 def test_outside_requires_channel_and_class_without_a_name() -> None:
-    rest = {"channels": ["yaw_rate"], "class": "odd in steering, acts on yaw_rate", "regime": "", "share": 0.5}
-    good = score_case(answer("outside", "camber"), report(verdict="unexplained", unexplained=rest))
+    unexplained = {"channels": ["yaw_rate"], "class": "odd in steering, acts on yaw_rate", "regime": "", "share": 0.5}
+    good = score_case(answer("outside", "camber"), report(verdict="unexplained", unexplained=unexplained))
     assert (good["is_spurious"], good["main_channel_right"], good["class_right"]) == (False, True, True)
     bad = score_case(answer("outside", "camber"), report("steering_offset"))
     assert (bad["is_spurious"], bad["main_channel_right"], bad["class_right"]) == (True, False, False)
 
 
-def test_place_time_and_turns() -> None:
+def test_scores_of_place_time_and_wrapped_direction() -> None:
     truth = answer(name="low_friction_patch")
     truth["effects"][0] |= {"place": {"x": 1.0, "y": 2.0, "radius": 0.5}, "lag_s": None, "time": "drift"}
     truth["effects"][0]["parameters"] = {"direction": math.pi - 0.05}
-    said = report("low_friction_patch")
-    said["effects"][0]["where"] |= {"place": {"x": 1.3, "y": 2.2}, "time": "drift over the run"}
-    said["effects"][0]["parameters"] = {"direction": {"value": -math.pi + 0.05, "low90": -3.3, "high90": -3.0}}
-    row = score_case(truth, said)
+    case_report = report("low_friction_patch")
+    case_report["effects"][0]["where"] |= {"place": {"x": 1.3, "y": 2.2}, "time": "drift over the run"}
+    case_report["effects"][0]["parameters"] = {"direction": {"value": -math.pi + 0.05, "low90": -3.3, "high90": -3.0}}
+    row = score_case(truth, case_report)
     assert row["place_right"]
     assert row["time_right"]
     assert row["parameters"]["direction"]["relative_error"] == pytest.approx(0.1 / (math.pi - 0.05))
     assert row["parameters"]["direction"]["covered"]
-    said["effects"][0]["where"]["place"] = {"x": 1.6, "y": 2.2}
-    assert not score_case(truth, said)["place_right"]
+    case_report["effects"][0]["where"]["place"] = {"x": 1.6, "y": 2.2}
+    assert not score_case(truth, case_report)["place_right"]
 
 
-def test_a_missing_report_is_a_miss_and_a_wrong_schema_an_error() -> None:
+def test_missing_report_is_a_miss_and_wrong_schema_an_error() -> None:
     row = score_case(answer(), None)
     assert not row["set_top1"]
     assert not row["reported"]
@@ -140,7 +143,7 @@ def test_a_missing_report_is_a_miss_and_a_wrong_schema_an_error() -> None:
         score_case(answer(), report("steering_lag") | {"schema": "carlab.diagnosis/9"})
 
 
-def test_wilson_against_published_values() -> None:
+def test_wilson_interval_equals_published_values() -> None:
     # Newcombe (1998), Statistics in Medicine 17, table I: 81/263, 15/148, 0/20, 1/29 at 95 %.
     for hits, count, low, high in (
         (81, 263, 0.2553, 0.3662),
@@ -163,12 +166,12 @@ def test_summary_table_and_pictures(tmp_path: Path) -> None:
     assert shares["false alarms, null and parameters"] == 0.0
     assert shares["90 % intervals cover"] == 1.0
     assert any(row[0].startswith("seconds") and row[1].startswith("40") for row in table_rows(summary))
-    trues, said, counts = confusion(rows.values())
-    assert trues == ["steering_lag", "null"]
+    true_names, reported_names, counts = confusion(rows.values())
+    assert true_names == ["steering_lag", "null"]
     assert (
-        counts[0, said.index("steering_lag")]
-        == counts[0, said.index("motor_lag")]
-        == counts[1, said.index("none")]
+        counts[0, reported_names.index("steering_lag")]
+        == counts[0, reported_names.index("motor_lag")]
+        == counts[1, reported_names.index("none")]
         == 1
     )
     draw_confusion(tmp_path / "confusion.png", rows.values())
@@ -177,7 +180,7 @@ def test_summary_table_and_pictures(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "scores.json").read_text())["summary"]["cases"] == 3
 
 
-def test_any_change_breaks_the_seal() -> None:
+def test_seal_detects_any_change() -> None:
     answers = {"aa": answer(), "bb": answer("null")}
     nonce = new_nonce()
     sealed = digest(answers, nonce)
@@ -189,37 +192,37 @@ def test_any_change_breaks_the_seal() -> None:
             check(wrong, key, sealed)
 
 
-def test_a_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
+def test_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
     root = tmp_path / "proof"
-    told: list[tuple[str, int, int, str]] = []
+    progress_steps: list[tuple[str, int, int, str]] = []
     stops = iter([False, True])
     first = Proof(root, SPECS, command=FAKE_DIAGNOSIS, stop_requested=lambda: next(stops))
     assert first.make() is None
-    made = {p.name: p.stat().st_mtime_ns for p in (root / "answers").glob("*.json")}
-    assert len(made) == 2  # the plan and one answer
+    answer_times = {p.name: p.stat().st_mtime_ns for p in (root / "answers").glob("*.json")}
+    assert len(answer_times) == 2  # the plan and one answer
     with pytest.raises(DataError, match="Seal"):
         first.diagnose()
-    again = Proof(root, SPECS, command=FAKE_DIAGNOSIS, progress=lambda *step: told.append(step))
-    sealed = again.make()
+    resumed = Proof(root, SPECS, command=FAKE_DIAGNOSIS, progress=lambda *step: progress_steps.append(step))
+    sealed = resumed.make()
     assert sealed is not None
-    assert ("seal", 2, 2, sealed) in told
-    assert all((root / "answers" / name).stat().st_mtime_ns == when for name, when in made.items())
+    assert ("seal", 2, 2, sealed) in progress_steps
+    assert all((root / "answers" / name).stat().st_mtime_ns == when for name, when in answer_times.items())
 
     stops = iter([False, True])
     assert not Proof(root, SPECS, command=FAKE_DIAGNOSIS, stop_requested=lambda: next(stops)).diagnose()
-    done = {p: p.stat().st_mtime_ns for p in (root / "reports").glob("*/run.json")}
-    assert len(done) == 1
-    assert again.make() == sealed
-    assert again.diagnose()
-    assert again.diagnose(oracle=True)
-    assert all(p.stat().st_mtime_ns == when for p, when in done.items())
+    run_times = {p: p.stat().st_mtime_ns for p in (root / "reports").glob("*/run.json")}
+    assert len(run_times) == 1
+    assert resumed.make() == sealed
+    assert resumed.diagnose()
+    assert resumed.diagnose(oracle=True)
+    assert all(p.stat().st_mtime_ns == when for p, when in run_times.items())
 
-    answers = again.open_seal()
-    reports = again.reports()
+    answers = resumed.open_seal()
+    reports = resumed.reports()
     seen = [run["report"]["seen"] for run in reports.values()]
     assert all(s["files"] == ["car.toml", "fit.csv", "hold.csv", "out"] for s in seen)
     assert all(str(root) not in json.dumps(s) for s in seen)
-    rows = score_cases(answers, reports, again.reports(oracle=True), again.same)
+    rows = score_cases(answers, reports, resumed.reports(oracle=True), resumed.same)
     by_kind = {row["kind"]: row for row in rows.values()}
     assert by_kind["single"]["strict_top1"]
     assert by_kind["single"]["oracle_ratio"] == pytest.approx(1.4 / 1.8)
@@ -231,7 +234,7 @@ def test_a_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
     handed = next((root / "handed").glob("*/fit.csv"))
     handed.write_bytes(handed.read_bytes() + b"\n")
     with pytest.raises(DataError, match="seal is broken"):
-        again.open_seal()
+        resumed.open_seal()
 
 
 def test_a_failed_or_hung_diagnosis_is_recorded(tmp_path: Path) -> None:

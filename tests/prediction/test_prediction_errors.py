@@ -1,4 +1,4 @@
-"""Prediction errors against an integrator that shares nothing with the simulator: scipy on the equations."""
+"""Test prediction errors against scipy's integration of the equations, independent of the simulator."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -27,7 +27,7 @@ CONFIG = SimulatorConfig(
 
 
 def derivative(s, u, p):
-    """The base model as its authors write it: single track, Pacejka, slip in each wheel's frame, drive at the rear."""
+    """Evaluate the single-track model with Pacejka tyres, slip in wheel frames and rear-wheel drive."""
     psi, vx, vy, r = s[2:]
     d = p.max_angle_rad * u[0]
     length = p.front_axle_m + p.rear_axle_m
@@ -51,7 +51,7 @@ def derivative(s, u, p):
 
 
 def integrate(state, start_s, moments_s, issued_s, commands, p, delay_s=DELAY_S):
-    """States at ``moments_s`` from ``state`` at ``start_s``, with each command acting from issue + delay on."""
+    """Integrate from ``state`` at ``start_s`` to ``moments_s``; each command acts from issue plus delay."""
     switches = issued_s + delay_s
     edges = np.unique(
         np.concatenate([[start_s], moments_s, switches[(switches > start_s) & (switches < moments_s[-1])]])
@@ -59,7 +59,7 @@ def integrate(state, start_s, moments_s, issued_s, commands, p, delay_s=DELAY_S)
     found = {start_s: np.asarray(state, dtype=float)}
     for a, b in pairwise(edges.tolist()):
         k = np.searchsorted(switches, 0.5 * (a + b)) - 1
-        # Before the first recorded command acts, the first one is taken to have been held.
+        # Before the first recorded command acts, the first command is assumed to be held.
         u = commands[max(k, 0)]
         found[b] = solve_ivp(lambda _, s, u=u: derivative(s, u, p), (a, b), found[a], rtol=1e-9, atol=1e-11).y[:, -1]
     return np.array([found[t] for t in moments_s])
@@ -89,7 +89,7 @@ def uneven():
 
 
 def recorded_windows(episode, horizon_s=1.0, stride_s=0.25):
-    """Windows whose initial states are the recorded ones."""
+    """Cut windows with the recorded states as initial states."""
     return as_recorded(cut_windows(tracks_of([episode]), horizon_s, stride_s))
 
 
@@ -97,7 +97,7 @@ def rms_of(config, windows):
     return np.sqrt(np.mean(final_errors(SimulatorModel(config), windows) ** 2, axis=0))
 
 
-def test_the_right_simulator_predicts_to_integration_accuracy(even):
+def test_true_simulator_predicts_to_integration_accuracy(even):
     windows = recorded_windows(even, 1.0, 0.3)
     assert len(windows) == 22  # from 0.6 s on, with 0.6 s of commands before each
     assert windows.horizon_s == pytest.approx(1.0)
@@ -105,8 +105,8 @@ def test_the_right_simulator_predicts_to_integration_accuracy(even):
     assert np.sqrt(np.mean(final_errors(ConstantVelocity(), windows)[:, :2] ** 2)) > 0.1
 
 
-def test_uneven_stamps_are_put_onto_an_even_grid(uneven):
-    """Commands that change every 10 ms, as means over 30 ms: some millimetres in a second, no centimetres."""
+def test_uneven_stamps_are_resampled_to_an_even_grid(uneven):
+    """Averaging commands of 10 ms over 30 ms causes errors of millimetres after a second."""
     windows = recorded_windows(uneven, 1.0, 0.3)
     assert windows.period_s == pytest.approx(0.03, rel=0.02)
     rms = rms_of(CONFIG, windows)
@@ -115,32 +115,32 @@ def test_uneven_stamps_are_put_onto_an_even_grid(uneven):
     assert np.all(10 * rms < steady)
 
 
-def test_a_wrong_parameter_gives_the_error_that_scipy_computes(even):
+def test_error_of_a_wrong_parameter_equals_scipy(even):
     wrong = replace(PARAMETERS, front_mu=0.3, drive_gain_n=9.5)
     windows = recorded_windows(even, 1.0, 1.7)
     found = final_errors(SimulatorModel(replace(CONFIG, parameters=wrong)), windows)
-    wanted = []
+    expected = []
     for t0 in windows.t0_s:
         row = round(30 * t0)
         start, truth = even.states[row], even.states[row + 30]
         (end,) = integrate(start, t0, np.array([t0 + 1.0]), even.times_s[:-1], even.sent, wrong)
         dx, dy = end[:2] - truth[:2]
         c, s = np.cos(start[2]), np.sin(start[2])
-        turned = (end[2] - truth[2] + np.pi) % (2 * np.pi) - np.pi
-        wanted.append([c * dx + s * dy, c * dy - s * dx, turned, *(end[3:] - truth[3:])])
-    wanted = np.array(wanted)
-    assert np.abs(wanted[:, 0]).max() > 0.1
-    np.testing.assert_allclose(found, wanted, atol=5e-4)
+        yaw_error = (end[2] - truth[2] + np.pi) % (2 * np.pi) - np.pi
+        expected.append([c * dx + s * dy, c * dy - s * dx, yaw_error, *(end[3:] - truth[3:])])
+    expected = np.array(expected)
+    assert np.abs(expected[:, 0]).max() > 0.1
+    np.testing.assert_allclose(found, expected, atol=5e-4)
     for k, row in enumerate(channel_errors(found)):
-        assert row.rms == pytest.approx(np.sqrt(np.mean(wanted[:, k] ** 2)), abs=5e-4)
-        assert row.median == pytest.approx(np.median(np.abs(wanted[:, k])), abs=5e-4)
-        assert row.bias == pytest.approx(np.mean(wanted[:, k]), abs=5e-4)
+        assert row.rms == pytest.approx(np.sqrt(np.mean(expected[:, k] ** 2)), abs=5e-4)
+        assert row.median == pytest.approx(np.median(np.abs(expected[:, k])), abs=5e-4)
+        assert row.bias == pytest.approx(np.mean(expected[:, k]), abs=5e-4)
         assert row.rms >= abs(row.bias)
     assert [row.channel for row in channel_errors(found)] == ["x", "y", "yaw", "vx", "vy", "yaw_rate"]
 
 
 def test_commands_before_a_window_act_through_the_delay(even):
-    """With the delay left out the same recording is predicted worse by far."""
+    """Without the delay the same recording has a much larger error."""
     windows = recorded_windows(even)
     assert rms_of(replace(CONFIG, command_delay_s=0.0), windows)[5] > 50 * rms_of(CONFIG, windows)[5]
 
@@ -153,20 +153,20 @@ def test_smoothed_initial_states_are_close_to_the_recorded_ones_without_noise(ev
     assert np.all(after < 0.5 * before + 1e-4)
 
 
-def test_baselines_in_closed_form():
-    """A car on a circle of 2 m at 1 m/s: constant velocity is right, no change is one chord and half a radian off."""
+def test_baseline_predictors_have_closed_form_errors():
+    """On a circle of 2 m at 1 m/s constant velocity is exact; no change errs by a chord and 0.5 rad."""
     t = np.arange(121) / 30.0
     a = 0.5 * t
     states = np.column_stack([2 * np.sin(a), 2 - 2 * np.cos(a), a, np.ones(121), np.zeros(121), np.full(121, 0.5)])
     episode = EpisodeData(t, states, np.zeros((120, 2)), np.zeros((120, 2)), np.full(120, np.nan))
     windows = recorded_windows(episode)
-    whole = prediction_errors(ConstantVelocity().predict(windows), windows)
-    assert whole.shape == (len(windows), 31, 6)
-    np.testing.assert_allclose(whole, 0.0, atol=1e-9)
-    still = final_errors(NoChange(), windows)
-    np.testing.assert_allclose(np.hypot(still[:, 0], still[:, 1]), 4 * np.sin(0.25), atol=1e-9)
-    np.testing.assert_allclose(still[:, 0], -2 * np.sin(0.5), atol=1e-9)
-    np.testing.assert_allclose(still[:, 2], -0.5, atol=1e-9)
+    constant_velocity = prediction_errors(ConstantVelocity().predict(windows), windows)
+    assert constant_velocity.shape == (len(windows), 31, 6)
+    np.testing.assert_allclose(constant_velocity, 0.0, atol=1e-9)
+    no_change = final_errors(NoChange(), windows)
+    np.testing.assert_allclose(np.hypot(no_change[:, 0], no_change[:, 1]), 4 * np.sin(0.25), atol=1e-9)
+    np.testing.assert_allclose(no_change[:, 0], -2 * np.sin(0.5), atol=1e-9)
+    np.testing.assert_allclose(no_change[:, 2], -0.5, atol=1e-9)
 
 
 def test_predictions_at_stamps_restart_every_horizon(even):
@@ -177,12 +177,12 @@ def test_predictions_at_stamps_restart_every_horizon(even):
     starts = np.round(30 * windows.t0_s).astype(int)
     assert np.isnan(overlay[: starts[0]]).all()
     assert np.isfinite(overlay[starts[0] : starts[-1] + 30]).all()
-    away = np.hypot(*(overlay - even.states)[:, :2].T)
-    np.testing.assert_allclose(away[starts], 0.0, atol=1e-6)
-    assert away[starts + 29].min() > 0.02
+    position_error = np.hypot(*(overlay - even.states)[:, :2].T)
+    np.testing.assert_allclose(position_error[starts], 0.0, atol=1e-6)
+    assert position_error[starts + 29].min() > 0.02
 
 
-def test_no_window_spans_a_break_or_a_parked_car(even):
+def test_no_window_contains_a_break_or_standstill(even):
     states = even.states.copy()
     states[100, 0] = np.nan
     segment = (np.arange(241) >= 180).astype(float)
@@ -202,7 +202,7 @@ def test_gap_in_time_ends_a_window(even):
     assert not np.any((windows.t0_s < times[120]) & (windows.t0_s + 0.5 > times[119] + 1e-3))
 
 
-def test_the_last_share_is_split_off_with_a_guard(even):
+def test_last_share_is_split_off_with_a_guard_interval(even):
     tracks = tracks_of([even])
     early, late = split_tracks(tracks, 0.3, 1.5)
     assert late[0].t_s[0] == pytest.approx(0.7 * 8.0, abs=0.04)
@@ -210,7 +210,7 @@ def test_the_last_share_is_split_off_with_a_guard(even):
     assert len(late[0].t_s) + len(early[0].t_s) == len(tracks[0].t_s) - 45
 
 
-def test_what_cannot_be_predicted_is_said(even):
+def test_recordings_without_windows_are_refused(even):
     with pytest.raises(DataError, match="shorter horizon"):
         recorded_windows(even, 60.0)
     single = EpisodeData(np.zeros(1), np.zeros((1, 6)), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
@@ -218,12 +218,12 @@ def test_what_cannot_be_predicted_is_said(even):
         tracks_of([single])
 
 
-def test_the_latency_of_motion_capture_delays_commands_in_the_recording(even):
-    """Commands that act 80 ms later in the recording: by the delay alone, or 50 ms by it and 30 ms by the latency."""
+def test_mocap_latency_acts_like_command_delay(even):
+    """A delay of 80 ms and a delay of 50 ms plus a latency of 30 ms give equal predictions."""
     windows = recorded_windows(even)
     split = replace(CONFIG, command_delay_s=0.05, mocap=MocapParameters(latency_s=0.03))
-    alike = SimulatorModel(split).predict(windows) - SimulatorModel(CONFIG).predict(windows)
-    np.testing.assert_allclose(alike, 0.0, atol=1e-5)
+    difference = SimulatorModel(split).predict(windows) - SimulatorModel(CONFIG).predict(windows)
+    np.testing.assert_allclose(difference, 0.0, atol=1e-5)
 
 
 class SteadyCar:
@@ -236,15 +236,15 @@ class SteadyCar:
         noise = 0.01 * torch.randn(len(state), generator=generator)
         x, y, yaw, vx, vy, rate = state.unbind(dim=1)
         dx, dy = vx / 30, vy / 30
-        moved = torch.stack(
+        next_state = torch.stack(
             [x + yaw.cos() * dx - yaw.sin() * dy, y + yaw.sin() * dx + yaw.cos() * dy, yaw + rate / 30,
              vx + noise, vy, rate], dim=1,
         )  # fmt: skip
-        return torch.from_numpy(encode(moved.numpy(), np.zeros((len(state), 2, 2)))).float()
+        return torch.from_numpy(encode(next_state.numpy(), np.zeros((len(state), 2, 2)))).float()
 
 
-def test_a_learned_car_predicts_by_the_mean_of_its_paths():
-    """Four turns, whose yaw counts on: as constant velocity predicts, to the noise over the root of the paths."""
+def test_learned_car_predicts_the_mean_of_sampled_paths():
+    """The mean equals constant velocity within the Monte Carlo error; yaw stays unwrapped over four turns."""
     t = np.arange(301) / 30.0
     a = 2.5 * t
     states = np.column_stack(

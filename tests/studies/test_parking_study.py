@@ -1,4 +1,4 @@
-"""Runs of learning as curves: first parked episodes, means and their errors, against numbers made by hand."""
+"""Test learning curves of parking runs (first parked episode, means, standard errors) against known values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def figures(episode: int, reward: float, *, parked: bool) -> dict[str, object]:
     ).to_dict()  # fmt: skip
 
 
-def made(runs: Path, method: str, seed: int, rewards: list[float], parked: set[int]) -> Path:
+def write_run(runs: Path, method: str, seed: int, rewards: list[float], parked: set[int]) -> Path:
     folder = runs / f"2026-01-01_00000{seed}_{method}-seed{seed}"
     folder.mkdir(parents=True)
     plan = {"method": method, "seed": seed, "updates": 1000}
@@ -34,50 +34,50 @@ def made(runs: Path, method: str, seed: int, rewards: list[float], parked: set[i
 @pytest.fixture
 def runs(tmp_path: Path) -> list[Path]:
     return [
-        made(tmp_path, "sim-fsvgd", 0, [10.0, 20.0, 30.0], {2, 3}),
-        made(tmp_path, "sim-fsvgd", 1, [14.0, 26.0, 30.0], {3}),
-        made(tmp_path, "sim-fsvgd", 2, [12.0, 26.0, 30.0, 99.0], {1, 2, 3, 4}),
-        made(tmp_path, "fsvgd-authors", 0, [1.0, 2.0, 3.0], set()),
-        made(tmp_path, "fsvgd-authors", 1, [3.0, 2.0, 1.0], {3}),
+        write_run(tmp_path, "sim-fsvgd", 0, [10.0, 20.0, 30.0], {2, 3}),
+        write_run(tmp_path, "sim-fsvgd", 1, [14.0, 26.0, 30.0], {3}),
+        write_run(tmp_path, "sim-fsvgd", 2, [12.0, 26.0, 30.0, 99.0], {1, 2, 3, 4}),
+        write_run(tmp_path, "fsvgd-authors", 0, [1.0, 2.0, 3.0], set()),
+        write_run(tmp_path, "fsvgd-authors", 1, [3.0, 2.0, 1.0], {3}),
     ]
 
 
-def test_figures_are_those_by_hand(runs: list[Path]) -> None:
-    ours, theirs = summarised([read_curve(r) for r in runs])
-    assert (ours.method, ours.seeds, ours.episodes) == ("sim-fsvgd", 3, 3)
-    assert ours.first_parked == (2, 3, 1)
-    assert ours.median_first_parked == 2.0
-    assert theirs.first_parked == (None, 3)
-    assert theirs.median_first_parked == math.inf
-    assert np.allclose(ours.mean_return, [12.0, 24.0, 30.0])
-    assert np.allclose(ours.return_standard_error, [2.0 / math.sqrt(3.0), 2.0, 0.0])
-    assert ours.parked_at_last == pytest.approx((2 / 3 + 1 / 3 + 1.0) / 3.0)
-    assert ours.seconds_an_episode == pytest.approx(60.0)
-    assert theirs.minutes == pytest.approx(3.0)
+def test_summary_equals_hand_computed_values(runs: list[Path]) -> None:
+    sim_fsvgd, authors = summarised([read_curve(r) for r in runs])
+    assert (sim_fsvgd.method, sim_fsvgd.seeds, sim_fsvgd.episodes) == ("sim-fsvgd", 3, 3)
+    assert sim_fsvgd.first_parked == (2, 3, 1)
+    assert sim_fsvgd.median_first_parked == 2.0
+    assert authors.first_parked == (None, 3)
+    assert authors.median_first_parked == math.inf
+    assert np.allclose(sim_fsvgd.mean_return, [12.0, 24.0, 30.0])
+    assert np.allclose(sim_fsvgd.return_standard_error, [2.0 / math.sqrt(3.0), 2.0, 0.0])
+    assert sim_fsvgd.parked_at_last == pytest.approx((2 / 3 + 1 / 3 + 1.0) / 3.0)
+    assert sim_fsvgd.seconds_an_episode == pytest.approx(60.0)
+    assert authors.minutes == pytest.approx(3.0)
 
 
-def test_an_episode_without_a_row_shifts_no_other(tmp_path: Path) -> None:
-    folder = made(tmp_path, "sim-fsvgd", 0, [10.0, 20.0, 30.0], {3})
-    whole = json.loads((folder / "learn.json").read_text())
-    left = [row for row in whole["episodes"] if row["episode"] != 2]
-    (folder / "learn.json").write_text(json.dumps({**whole, "episodes": left}))
-    other = made(tmp_path, "sim-fsvgd", 1, [14.0, 22.0, 34.0], {3})
+def test_missing_episode_row_does_not_shift_other_episodes(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, "sim-fsvgd", 0, [10.0, 20.0, 30.0], {3})
+    content = json.loads((folder / "learn.json").read_text())
+    kept_rows = [row for row in content["episodes"] if row["episode"] != 2]
+    (folder / "learn.json").write_text(json.dumps({**content, "episodes": kept_rows}))
+    other = write_run(tmp_path, "sim-fsvgd", 1, [14.0, 22.0, 34.0], {3})
     curves = [read_curve(r) for r in (folder, other)]
     (found,) = summarised(curves)
     assert found.episodes == 3
     assert np.allclose(found.mean_return, [12.0, 22.0, 32.0])
-    assert math.isnan(found.return_standard_error[1]), "of one run there is none in episode 2"
-    # Of 10 and 14, and of 30 and 34: a standard deviation of the square root of 8, of two runs.
+    assert math.isnan(found.return_standard_error[1]), "episode 2 has one run, so no standard error"
+    # The values 10 and 14 (30 and 34) have the standard deviation sqrt(8); two runs give the error 2.
     assert np.allclose([found.return_standard_error[k] for k in (0, 2)], 2.0)
     draw(curves, tmp_path / "parking.png")
 
 
-def test_an_episode_that_no_run_has_is_left_out(tmp_path: Path) -> None:
-    folders = [made(tmp_path, "sim-fsvgd", seed, [10.0, 20.0, 30.0], {3}) for seed in (0, 1)]
+def test_episode_without_any_row_has_no_mean(tmp_path: Path) -> None:
+    folders = [write_run(tmp_path, "sim-fsvgd", seed, [10.0, 20.0, 30.0], {3}) for seed in (0, 1)]
     for folder in folders:
-        whole = json.loads((folder / "learn.json").read_text())
-        left = [row for row in whole["episodes"] if row["episode"] != 2]
-        (folder / "learn.json").write_text(json.dumps({**whole, "episodes": left}))
+        content = json.loads((folder / "learn.json").read_text())
+        kept_rows = [row for row in content["episodes"] if row["episode"] != 2]
+        (folder / "learn.json").write_text(json.dumps({**content, "episodes": kept_rows}))
     curves = [read_curve(folder) for folder in folders]
     (found,) = summarised(curves)
     assert found.mean_return[0] == 10.0
@@ -86,7 +86,7 @@ def test_an_episode_that_no_run_has_is_left_out(tmp_path: Path) -> None:
     draw(curves, tmp_path / "parking.png")
 
 
-def test_the_file_is_plain_json_and_the_picture_is_drawn(runs: list[Path], tmp_path: Path) -> None:
+def test_result_is_valid_json_and_picture_is_drawn(runs: list[Path], tmp_path: Path) -> None:
     curves = [read_curve(r) for r in runs]
     text = json.dumps(as_json(curves, "carlab bench parking"), allow_nan=False)
     assert json.loads(text)["methods"][1]["median_first_parked"] is None
@@ -94,7 +94,7 @@ def test_the_file_is_plain_json_and_the_picture_is_drawn(runs: list[Path], tmp_p
     assert (tmp_path / "study.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_run_is_found_by_its_name(runs: list[Path], tmp_path: Path) -> None:
+def test_run_folder_is_found_by_method_and_seed(runs: list[Path], tmp_path: Path) -> None:
     assert run_folder(tmp_path, "sim-fsvgd", 1) == runs[1]
     assert run_folder(tmp_path, "fsvgd", 1) is None
     (tmp_path / "2026-01-02_000000_sim-fsvgd-seed1").mkdir()

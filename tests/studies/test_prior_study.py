@@ -1,4 +1,4 @@
-"""What a diagnosed simulator is worth: the same rows for every prior, and none of those that are held out."""
+"""Test the study of priors: equal rows for each prior, and no influence of held-out rows."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ KNOWN = replace(
 
 
 def drive(seed: int, ticks: int = 240) -> EpisodeData:
-    """A recording of the true car, with a little noise."""
+    """Simulate a noisy recording of the true car."""
     rng = np.random.default_rng(seed)
     sent = np.repeat(rng.uniform(-1, 1, size=(ticks // 6, 2)), 6, axis=0)
     sent[:, 1] = 0.1 + 0.5 * np.abs(sent[:, 1])
     start = torch.tensor([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
-    seen = rollout(TRUTH, start, torch.from_numpy(sent[None]), measured=True).measured
-    assert seen is not None
-    states = seen[0].numpy() + rng.normal(size=(ticks + 1, 6)) * [3e-4, 3e-4, 1e-3, 5e-3, 5e-3, 0.02]
+    measured = rollout(TRUTH, start, torch.from_numpy(sent[None]), measured=True).measured
+    assert measured is not None
+    states = measured[0].numpy() + rng.normal(size=(ticks + 1, 6)) * [3e-4, 3e-4, 1e-3, 5e-3, 5e-3, 0.02]
     return EpisodeData(np.arange(ticks + 1) * TRUTH.control_period_s, states, sent, sent, np.zeros(ticks))
 
 
@@ -68,8 +68,8 @@ def case_of(held_out: EpisodeData, history: int | None = HISTORY) -> RecordedCas
     return recorded_case([[drive(1)], [held_out]], Path("rc_car"), history)
 
 
-def test_seven_outputs_in_the_world_are_scored_at_the_states_that_were_measured() -> None:
-    """Samples of a ridge's predictions, rotated by the recorded headings, against the recorded states of the world."""
+def test_world_nll_equals_monte_carlo_at_the_measured_states() -> None:
+    """The reference draws ridge predictions and rotates them by the recorded headings."""
     held_out = drive(2)
     case = case_of(held_out)
     (score,) = run_study(case, rows=(100,), seeds=1, methods=("ridge",), data=Path())
@@ -77,58 +77,58 @@ def test_seven_outputs_in_the_world_are_scored_at_the_states_that_were_measured(
     model = Ridge.fit(data.inputs.double().numpy(), data.outputs.double().numpy())
     mean = model(data.test_inputs.double().numpy())
     rows = np.arange(HISTORY, held_out.ticks)
-    assert len(mean) == len(rows)  # No row is missing: each is a tick.
+    assert len(mean) == len(rows)  # each tick has a row
     before, after = held_out.states[rows], held_out.states[rows + 1]
-    left_over = fit_residuals(torch.from_numpy(model.errors))
+    residuals = fit_residuals(torch.from_numpy(model.errors))
     rng, yaw = np.random.default_rng(0), before[:, 2:3]
 
     def seven_drawn(factor: FloatArray) -> FloatArray:
         drawn = mean[:, None] + rng.normal(size=(len(mean), 2000, 6)) @ factor.T
         ahead, left = drawn[..., 0], drawn[..., 1]
-        moved = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
+        displacement = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
         heading, vx, vy = yaw + drawn[..., 2], before[:, 3:4] + drawn[..., 3], before[:, 4:5] + drawn[..., 4]
         velocity = np.cos(heading) * vx - np.sin(heading) * vy, np.sin(heading) * vx + np.cos(heading) * vy
-        return np.stack([*moved, np.sin(heading), np.cos(heading), *velocity, drawn[..., 5]], axis=-1)
+        return np.stack([*displacement, np.sin(heading), np.cos(heading), *velocity, drawn[..., 5]], axis=-1)
 
     sin, cos = np.sin(after[:, 2]), np.cos(after[:, 2])
     truth = np.column_stack([
         *(after[:, :2] - before[:, :2]).T, sin, cos,
         cos * after[:, 3] - sin * after[:, 4], sin * after[:, 3] + cos * after[:, 4], after[:, 5] - before[:, 5],
     ])  # fmt: skip
-    # Student's distribution as twenty Gaussians.
-    each = []
-    for scale in tail_scales(left_over.dof, 20).numpy():
-        seven = seven_drawn(scale * left_over.factor.numpy())
-        each.append(norm.logpdf(truth, seven.mean(axis=1), seven.std(axis=1)).sum(axis=1))
-    theirs = math.log(20.0) - logsumexp(each, axis=0).mean()
-    assert score.nll_in_world == pytest.approx(theirs, abs=0.05)
+    # Approximate the Student-t distribution by twenty Gaussians.
+    log_densities = []
+    for scale in tail_scales(residuals.dof, 20).numpy():
+        seven = seven_drawn(scale * residuals.factor.numpy())
+        log_densities.append(norm.logpdf(truth, seven.mean(axis=1), seven.std(axis=1)).sum(axis=1))
+    expected = math.log(20.0) - logsumexp(log_densities, axis=0).mean()
+    assert score.nll_in_world == pytest.approx(expected, abs=0.05)
 
 
-def test_no_row_that_is_held_out_is_learned_from() -> None:
+def test_training_rows_exclude_held_out_rows() -> None:
     case = case_of(drive(2))
     for count, seed in ((20, 0), (200, 1)):
         data = case.recorded(Path(), count, seed)
-        learned = {row.tobytes() for row in data.inputs.numpy()}
-        assert len(learned) == count == len(data.outputs)
-        assert not learned & {row.tobytes() for row in data.test_inputs.numpy()}
+        training_rows = {row.tobytes() for row in data.inputs.numpy()}
+        assert len(training_rows) == count == len(data.outputs)
+        assert not training_rows & {row.tobytes() for row in data.test_inputs.numpy()}
         assert {row.tobytes() for row in data.test_inputs.numpy()} == {
             row.astype(np.float32).tobytes()
             for row in case_of(drive(2)).held_out.inputs  # type: ignore[union-attr]
         }
 
 
-def test_few_rows_expect_little_of_the_gap_and_of_steps_less_than_of_velocities(
+def test_expected_discrepancy_is_smaller_with_few_rows_and_for_pose_outputs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     case: RecordedCase = recorded_case([[drive(1, 480)], [drive(2)]], Path("rc_car"), HISTORY)
     received: list[torch.Tensor] = []
 
-    def spied(*args: object, discrepancy_std: torch.Tensor, **options: object) -> None:
+    def recorded_call(*args: object, discrepancy_std: torch.Tensor, **options: object) -> None:
         received.append(discrepancy_std / torch.tensor(case.output_std))
         raise DataError("Enough.")
 
-    monkeypatch.setattr(regression_methods, "infer", spied)
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 10)  # of GreyBox; its numbers do not matter
+    monkeypatch.setattr(regression_methods, "infer", recorded_call)
+    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 10)  # faster GreyBox; its result is not used
     few, many = 100, 450
     list(run_study(case, rows=(few, many), seeds=1, methods=("Sim-FSVGD", "GreyBox"), data=Path()))
     assert [a.tolist() for a in received] == [pytest.approx([0.03] * 3 + [0.1] * 3)] * 2 + [
@@ -136,18 +136,18 @@ def test_few_rows_expect_little_of_the_gap_and_of_steps_less_than_of_velocities(
     ] * 2
 
 
-def test_nothing_but_the_scores_depends_on_what_is_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """History, units, ranges and delays are those of the other recordings, whatever is held out."""
+def test_only_scores_depend_on_the_held_out_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    """History, units, ranges and delays depend on the training recordings only."""
     received: list[int] = []
 
-    def spied(episodes: list[EpisodeData]) -> HistoryChoice:
+    def recorded_call(episodes: list[EpisodeData]) -> HistoryChoice:
         received.extend(id(e) for e in episodes)
         return HistoryChoice(3, {3: -1.0})
 
-    monkeypatch.setattr(regression_recordings, "find_history", spied)
-    first, wild = drive(1), drive(3)
-    wild = replace(wild, states=wild.states * 3.0, sent=-wild.sent)
-    one, other = (recorded_case([[first], [held]], Path("rc_car"), None) for held in (drive(2), wild))
+    monkeypatch.setattr(regression_recordings, "find_history", recorded_call)
+    first, different = drive(1), drive(3)
+    different = replace(different, states=different.states * 3.0, sent=-different.sent)
+    one, other = (recorded_case([[first], [held]], Path("rc_car"), None) for held in (drive(2), different))
     assert set(received) == {id(first)}
     assert (one.output_std, one.input_std, one.rows.history) == (other.output_std, other.input_std, other.rows.history)  # type: ignore[union-attr]
     models = [prior_models(case, SimulatorConfig.from_preset(), KNOWN) for case in (one, other)]
@@ -155,30 +155,30 @@ def test_nothing_but_the_scores_depends_on_what_is_held_out(monkeypatch: pytest.
     assert repr(models[0]) == repr(models[1])
 
 
-def test_priors_are_those_of_their_car_files() -> None:
+def test_priors_have_the_parameters_of_their_car_files() -> None:
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
     assert models[NONE] is None
-    nominal, rolling, better = models[NOMINAL], models[KINEMATIC], models[DIAGNOSED]
+    nominal, kinematic, diagnosed = models[NOMINAL], models[KINEMATIC], models[DIAGNOSED]
     assert isinstance(nominal, CarModel)
-    assert isinstance(rolling, InDomain)
-    assert isinstance(better, InDomain)
-    assert isinstance(rolling.model, CarModel)
-    assert isinstance(better.model, CarModel)
+    assert isinstance(kinematic, InDomain)
+    assert isinstance(diagnosed, InDomain)
+    assert isinstance(kinematic.model, CarModel)
+    assert isinstance(diagnosed.model, CarModel)
     preset = SimulatorConfig.from_preset()
-    assert rolling.model.config.kind == "kinematic"
-    assert rolling.model.ranges["motor.drive_gain"] == preset.priors.get(
+    assert kinematic.model.config.kind == "kinematic"
+    assert kinematic.model.ranges["motor.drive_gain"] == preset.priors.get(
         "motor.drive_gain", pytest.approx((0.7 * 8.2, 1.3 * 8.2))
     )
     assert not nominal.config.effects
-    assert set(better.model.config.effects) == {"motor_lag", "mocap_yaw_misalignment"}
-    assert "effects.motor_lag.time_constant" in better.model.ranges
-    assert rolling.domain is nominal is better.domain
+    assert set(diagnosed.model.config.effects) == {"motor_lag", "mocap_yaw_misalignment"}
+    assert "effects.motor_lag.time_constant" in diagnosed.model.ranges
+    assert kinematic.domain is nominal is diagnosed.domain
     assert nominal.at_s == pytest.approx(case.rows.tick.mean() * TRUTH.control_period_s)  # type: ignore[union-attr]
 
 
-def test_a_diagnosed_car_is_a_real_cars_prior_with_its_standard_deviations(tmp_path: Path) -> None:
-    """The same prior as in the study of priors: nothing that a diagnosis is unsure of is held exact."""
+def test_recorded_case_uses_the_standard_deviations_of_a_diagnosed_car(tmp_path: Path) -> None:
+    """The prior equals that of the study of priors; uncertain diagnosed parameters are not fixed."""
     path = tmp_path / "model.toml"
     path.write_text(tomli_w.dumps(KNOWN.to_tables()))
     case = recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
@@ -191,8 +191,8 @@ def test_a_diagnosed_car_is_a_real_cars_prior_with_its_standard_deviations(tmp_p
     assert 0.002 < float((lags - 0.09).abs().median()) < 0.02
 
 
-def test_a_nominal_cars_prior_is_uncertain_of_its_ranges_alone() -> None:
-    """As it was when the tables of the README were made: the file has neither deviations nor effects."""
+def test_nominal_car_prior_varies_only_parameters_with_ranges() -> None:
+    """The file has neither standard deviations nor effects, as in the published results."""
     car = load_car_file(Path("eth_rc_car")).simulator
     case = recorded_case([[drive(1)], [drive(2)]], Path("eth_rc_car"), HISTORY)
     assert isinstance(case.prior, CarModel)
@@ -207,7 +207,7 @@ def test_a_nominal_cars_prior_is_uncertain_of_its_ranges_alone() -> None:
     assert torch.equal(case.prior(inputs, draws), before(inputs, draws))
 
 
-def test_a_car_file_without_ranges_is_uncertain_of_what_is_rarely_known(tmp_path: Path) -> None:
+def test_car_file_without_ranges_gets_default_ranges(tmp_path: Path) -> None:
     bare = replace(SimulatorConfig.from_preset(), priors={})
     path = tmp_path / "bare.toml"
     path.write_text(tomli_w.dumps(bare.to_tables()))
@@ -217,14 +217,14 @@ def test_a_car_file_without_ranges_is_uncertain_of_what_is_rarely_known(tmp_path
     assert dict(case.prior.ranges) == {DELAY: DELAY_S, **known_ranges(case.prior.config)}
 
 
-def test_a_real_car_recorded_at_another_rate_is_told(tmp_path: Path) -> None:
+def test_recording_with_another_period_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "slow.toml"
     path.write_text(tomli_w.dumps(replace(SimulatorConfig.from_preset(), control_period_s=0.05).to_tables()))
     with pytest.raises(ConfigError, match=r"control_period of the prior is 0\.05 s, that of a recording is 0\.03333 s"):
         recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
 
 
-def test_the_study_has_a_score_for_every_prior() -> None:
+def test_study_has_a_score_for_each_prior() -> None:
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
     scores = list(run_prior_study(case, models, rows=(20,), seeds=1, steps=20))
@@ -234,7 +234,7 @@ def test_the_study_has_a_score_for_every_prior() -> None:
     assert len({s.nll for s in scores}) == 4
 
 
-def test_a_prior_that_cannot_be_fitted_keeps_no_other_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_fit_of_one_prior_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(task: object) -> object:
         raise DataError("The fit diverged; fit again with a smaller learning rate.")
 
@@ -246,8 +246,8 @@ def test_a_prior_that_cannot_be_fitted_keeps_no_other_from_it(monkeypatch: pytes
     assert "The fit diverged" in str(scores[0].failed)
 
 
-def test_knowing_the_effects_helps_where_there_is_little_data() -> None:
-    """What data and simulator say together, before particles are led there."""
+def test_diagnosed_prior_has_lower_nll_than_nominal_with_20_rows() -> None:
+    """The test uses the function posterior, before distillation into particles."""
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
     data, units = case.recorded(Path(), 20, 0), case.normaliser
@@ -262,7 +262,7 @@ def test_knowing_the_effects_helps_where_there_is_little_data() -> None:
     assert nll[DIAGNOSED] < nll[NOMINAL] - 0.4
 
 
-def test_what_does_not_fit_is_said() -> None:
+def test_invalid_rows_periods_and_pairs_are_refused() -> None:
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
     with pytest.raises(DataError, match="not 5000; give fewer with --rows"):

@@ -1,4 +1,4 @@
-"""`carlab bench speed`: the whole measurement, its parts replaced."""
+"""Test the measurement of ``carlab bench speed`` with replaced parts."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ ON_ONE_CORE = {
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system pins no process to a core")
-def test_one_thread_where_there_is_one_core(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two threads of torch that wait for each other on one core take a hundred times as long."""
+def test_measurement_on_one_core_uses_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two torch threads on one core are about a hundred times slower."""
 
     def measured(*_: object) -> dict[str, int]:
         return {"threads": torch.get_num_threads(), "cores": len(os.sched_getaffinity(0))}
