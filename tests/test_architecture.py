@@ -75,7 +75,7 @@ def test_cycle_check_finds_a_cycle() -> None:
     assert set(_cycle(_members(imports, "p"))) == {"p.a", "p.b"}
 
 
-def test_every_package_has_a_layer(imports: dict[str, set[str]]) -> None:
+def test_each_package_has_a_layer(imports: dict[str, set[str]]) -> None:
     """An exhaustive contract fails if a member of its package has no layer."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
         "contracts"
@@ -138,7 +138,7 @@ def test_wall_clock_is_read_in_one_module() -> None:
     assert reading == {"carlab/core/clock.py"}
 
 
-def test_every_package_is_typed() -> None:
+def test_each_package_is_typed() -> None:
     assert all((ROOT / package / "py.typed").is_file() for package in PACKAGES)
 
 

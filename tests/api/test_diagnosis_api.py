@@ -1,4 +1,4 @@
-"""The Python interface: recordings, cars and diagnoses, and that the command line is a thin layer over it."""
+"""Test the Python interface (recordings, cars, diagnoses) and its agreement with the command line."""
 
 import json
 import tomllib
@@ -17,7 +17,7 @@ from carlab.recording.mcap.sink import write_episode
 from sim_backends.car_parameters import SimulatorConfig
 
 
-def test_a_car_is_read_by_name_by_path_and_as_it_is(tmp_path: Path) -> None:
+def test_load_car_accepts_names_paths_and_cars(tmp_path: Path) -> None:
     car = carlab.load_car("eth_rc_car")
     copied = carlab.load_car(car.save(tmp_path / "copy.toml"))
     assert copied.simulator == car.simulator
@@ -39,15 +39,15 @@ def csv_file(path: Path, rows: int = 120) -> Path:
     return path
 
 
-def test_a_csv_is_loaded_with_its_audit_and_written_in_other_formats(tmp_path: Path) -> None:
+def test_csv_is_loaded_with_audit_and_saved_as_mcap(tmp_path: Path) -> None:
     recording = carlab.load(csv_file(tmp_path / "drive.csv"))
     assert recording.audit is not None
     assert recording.episode.ticks == 119
     assert recording.duration_s == pytest.approx(119 / 30.0)
     assert "119 commands" in repr(recording)
     assert "<p>" in recording._repr_html_()
-    again = carlab.load(recording.save(tmp_path / "drive.mcap"))
-    np.testing.assert_allclose(again.episode.states, recording.episode.states, atol=1e-6)
+    reloaded = carlab.load(recording.save(tmp_path / "drive.mcap"))
+    np.testing.assert_allclose(reloaded.episode.states, recording.episode.states, atol=1e-6)
     with pytest.raises(DataError, match="exists already"):
         recording.save(tmp_path / "drive.mcap")
     with pytest.raises(ConfigError, match="parquet"):
@@ -57,13 +57,13 @@ def test_a_csv_is_loaded_with_its_audit_and_written_in_other_formats(tmp_path: P
 def test_options_of_import_are_arguments_of_load(tmp_path: Path) -> None:
     path = csv_file(tmp_path / "drive.csv")
     plain = carlab.load(path).episode
-    turned = carlab.load(path, steering_sign=-1).episode
-    np.testing.assert_allclose(turned.sent[:, 0], -plain.sent[:, 0])
+    flipped = carlab.load(path, steering_sign=-1).episode
+    np.testing.assert_allclose(flipped.sent[:, 0], -plain.sent[:, 0])
     with pytest.raises(ConfigError, match="velocity_fram"):
         carlab.load(path, velocity_fram="world")
 
 
-def test_what_is_no_recording_is_said_in_a_sentence(tmp_path: Path) -> None:
+def test_load_refuses_missing_files_and_folders(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist"):
         carlab.load(tmp_path / "nothing.mcap")
     with pytest.raises(ConfigError, match="folder"):
@@ -71,7 +71,7 @@ def test_what_is_no_recording_is_said_in_a_sentence(tmp_path: Path) -> None:
 
 
 def drive_of(simulator: SimulatorConfig, seconds: float = 40.0, seed: int = 1) -> EpisodeData:
-    """A noisy chirp with changing throttle, simulated directly (T,)."""
+    """Simulate a noisy steering chirp with varying throttle."""
     from sim_backends.plant import Plant
 
     chirp = steering_chirp(duration_s=seconds, high_hz=2.0)
@@ -95,7 +95,7 @@ def drive_of(simulator: SimulatorConfig, seconds: float = 40.0, seed: int = 1) -
 
 @pytest.fixture(scope="module")
 def lagging(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, carlab.DiagnosisReport]:
-    """A recording of a car whose servo lags by 90 ms, and its diagnosis from a small catalogue."""
+    """Return a recording of a car with a servo lag of 90 ms, and its diagnosis with one candidate effect."""
     car = carlab.load_car("sim")
     simulator = car.simulator.with_values({"effects.steering_lag.time_constant": 0.09, "mocap.latency": 0.0})
     path = tmp_path_factory.mktemp("lagging") / "drive.mcap"
@@ -104,23 +104,21 @@ def lagging(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, carlab.Diag
     return path, report
 
 
-def test_a_diagnosis_names_the_lag_and_its_model_is_a_car(
+def test_diagnosis_names_the_lag_and_returns_a_loadable_model(
     lagging: tuple[Path, carlab.DiagnosisReport], tmp_path: Path
 ) -> None:
     report = lagging[1]
     assert report.is_conclusive
     assert set(report.effects) == {"steering_lag"}
-    found = report.effects["steering_lag"].parameters["time_constant"]
-    assert found.value == pytest.approx(0.09, abs=0.03)
+    estimate = report.effects["steering_lag"].parameters["time_constant"]
+    assert estimate.value == pytest.approx(0.09, abs=0.03)
     assert report.held_out["with_effects"].score < report.held_out["refit"].score
     model = carlab.load_car(report.model.save(tmp_path / "model.toml"))
     assert model.simulator == report.model.simulator
-    assert model.simulator.effects["steering_lag"]["time_constant"] == pytest.approx(found.value)
+    assert model.simulator.effects["steering_lag"]["time_constant"] == pytest.approx(estimate.value)
 
 
-def test_a_report_is_saved_and_shows_itself_in_a_notebook(
-    lagging: tuple[Path, carlab.DiagnosisReport], tmp_path: Path
-) -> None:
+def test_report_is_saved_and_has_notebook_html(lagging: tuple[Path, carlab.DiagnosisReport], tmp_path: Path) -> None:
     report = lagging[1]
     folder = report.save(tmp_path / "out")
     names = {path.name for path in folder.iterdir()}
@@ -132,20 +130,20 @@ def test_a_report_is_saved_and_shows_itself_in_a_notebook(
     assert "steering" in str(report)
 
 
-def test_the_verb_writes_what_the_call_returns(
+def test_verb_writes_the_report_of_the_call(
     lagging: tuple[Path, carlab.DiagnosisReport], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, report = lagging
     out = tmp_path / "out"
     assert run(["diagnose", str(path), "--effects", "steering_lag", "--out", str(out)]) == 0
     assert report.sentence.split(".")[0] in capsys.readouterr().out.replace("\n", " ")
-    written, own = json.loads((out / "report.json").read_text()), report.to_dict()
-    for changing in ("seconds",):
-        written.pop(changing), own.pop(changing)
-    assert written == json.loads(json.dumps(own))
+    written, returned = json.loads((out / "report.json").read_text()), report.to_dict()
+    for varying in ("seconds",):
+        written.pop(varying), returned.pop(varying)
+    assert written == json.loads(json.dumps(returned))
 
 
-def test_a_recording_that_is_too_short_gives_no_verdict_and_says_why(tmp_path: Path) -> None:
+def test_short_recording_is_inconclusive_with_a_reason(tmp_path: Path) -> None:
     report = carlab.diagnose(carlab.load(csv_file(tmp_path / "short.csv")), out=tmp_path / "out")
     assert not report.is_conclusive
     assert report.verdict == "inconclusive"
@@ -153,7 +151,7 @@ def test_a_recording_that_is_too_short_gives_no_verdict_and_says_why(tmp_path: P
     assert (tmp_path / "out" / "report.json").is_file()
 
 
-def test_arguments_that_make_no_sense_are_refused(tmp_path: Path) -> None:
+def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
     recording = carlab.load(csv_file(tmp_path / "drive.csv"))
     with pytest.raises(ConfigError, match="both fitted and held out"):
         carlab.diagnose(recording, held_out=tmp_path / "drive.csv")

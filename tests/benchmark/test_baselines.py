@@ -120,7 +120,7 @@ def test_gaps_and_jumps_are_repaired_for_baselines(null_case: Case) -> None:
     assert repaired.measured[:, 0] == pytest.approx(complete["x"], abs=0.05)
 
 
-def test_an_unusable_recording_raises_data_error(null_case: Case) -> None:
+def test_unusable_recording_raises_data_error(null_case: Case) -> None:
     milliseconds = {**null_case.fit, "t": null_case.fit["t"] * 1000.0}
     results = run_baselines(milliseconds, null_case.hold, null_case.nominal, floors(null_case))
     assert "control period" in results["failed"]

@@ -33,7 +33,7 @@ DECISIONS = {
 }
 
 
-def test_a_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_names() -> None:
+def test_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_names() -> None:
     counts = {
         r.value / 20.0: (r.false, r.wrong, r.missed, r.true) for r in calibrate(ANSWERS, DECISIONS) if r.setting == CHI2
     }
@@ -60,7 +60,7 @@ def test_one_alternative_is_sufficient_and_conditions_may_be_upper_bounds() -> N
     assert passes(made, "rivals.spurious_share", 0.3)
 
 
-def test_a_folder_without_decisions_raises_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_folder_without_decisions_raises_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert run(["prove", "--set", "development", "--calibrate", "--out", str(tmp_path / "proof")]) == 2
     assert "run the same command without --calibrate" in " ".join(capfd.readouterr().err.split())
 

@@ -29,7 +29,7 @@ def parameters_only() -> Case:
     return make_case("parameters", 11, **SHORT)
 
 
-def test_the_true_car_has_score_one(parameters_only: Case) -> None:
+def test_true_car_has_score_one(parameters_only: Case) -> None:
     case = parameters_only
     for recording in case.recordings:
         for true_starts in (False, True):
@@ -67,7 +67,7 @@ def test_driving_excites_the_car(parameters_only: Case) -> None:
     assert max(np.abs(table["x"]).max(), np.abs(table["y"]).max()) < 8.0
 
 
-def test_a_null_car_equals_the_nominal_car() -> None:
+def test_null_car_equals_the_nominal_car() -> None:
     case = make_case("null", 12, fit_s=15.0, hold_s=10.0)
     assert case.true_car == case.nominal
     assert case.refit.nominal_score == pytest.approx(1.0, abs=0.01)
@@ -85,7 +85,7 @@ def test_strength_is_reached(name: str, form: str, excess: float) -> None:
     assert main & (lateral | {"x"}) if name == "steering_lag" else main & {"x", "vx"}
 
 
-def test_a_case_is_reproducible_by_its_seed() -> None:
+def test_case_is_reproducible_by_its_seed() -> None:
     first, second = (make_case("parameters", 31, fit_s=8.0, hold_s=5.0) for _ in range(2))
     for name in COLUMNS:
         np.testing.assert_array_equal(first.fit[name], second.fit[name])
@@ -93,7 +93,7 @@ def test_a_case_is_reproducible_by_its_seed() -> None:
     assert not np.array_equal(first.fit["steering"], other.fit["steering"])
 
 
-def test_the_simulator_reads_car_file_and_csv(tmp_path: Path, parameters_only: Case) -> None:
+def test_simulator_reads_car_file_and_csv(tmp_path: Path, parameters_only: Case) -> None:
     import tomllib
 
     parameters_only.nominal.write(tmp_path / "car.toml")

@@ -152,7 +152,7 @@ def test_straight_coasting_is_exponential() -> None:
     np.testing.assert_allclose(rows[1:, 3], 2.0 * np.exp(-CAR.damping / CAR.mass * t[1:]), rtol=1e-7)
 
 
-def test_every_resistance_dissipates_energy() -> None:
+def test_each_resistance_dissipates_energy() -> None:
     names = ("rolling_resistance", "aerodynamic_drag", "cornering_drag")
     for form in (f for f in FORMS.values() if f.id in names):
         world = World(CAR)

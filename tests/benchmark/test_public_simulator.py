@@ -96,7 +96,7 @@ def test_roll_angle_of_the_multi_body_car() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_a_locked_wheel_rolls_again(model: Model) -> None:
+def test_locked_wheel_rolls_again(model: Model) -> None:
     from scipy.integrate import solve_ivp
 
     car = PublicCar(model)
@@ -176,7 +176,7 @@ def test_study_writes_results_and_page(tmp_path: Path) -> None:
         assert words in page
 
 
-def test_a_study_states_a_missing_report(tmp_path: Path) -> None:
+def test_study_states_a_missing_report(tmp_path: Path) -> None:
     failing_diagnosis = (sys.executable, "-c", "raise SystemExit('no idea')")
     rows = study(tmp_path, "drift", [0], command=failing_diagnosis, lengths_s=(3.0, 2.0))
     assert rows[0]["verdict"] is None
@@ -185,7 +185,7 @@ def test_a_study_states_a_missing_report(tmp_path: Path) -> None:
     assert "No report (exit status 1): no idea" in page
 
 
-def test_a_stopped_study_writes_its_present_results(tmp_path: Path) -> None:
+def test_stopped_study_writes_its_present_results(tmp_path: Path) -> None:
     assert study(tmp_path, "drift", [0, 1], command=FAKE_DIAGNOSIS, lengths_s=(3.0, 2.0), abandon=lambda: True) == []
     assert json.loads((tmp_path / "study.json").read_text())["seeds"] == []
 

@@ -237,7 +237,7 @@ def test_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
         resumed.open_seal()
 
 
-def test_a_failed_or_hung_diagnosis_is_recorded(tmp_path: Path) -> None:
+def test_failed_or_hung_diagnosis_is_recorded(tmp_path: Path) -> None:
     root = tmp_path / "proof"
     proof = Proof(root, SPECS[1:], command=(sys.executable, "-c", "import sys; sys.exit('no such verb')"))
     proof.make()

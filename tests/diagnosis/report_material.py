@@ -1,4 +1,4 @@
-"""Made-up diagnoses of every verdict, and material for their pictures: what the tests of the report read back."""
+"""Artificial diagnoses with each verdict and data for their figures, for the tests of the report."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,7 @@ def estimate(value: float, std: float, unit: str) -> Estimate:
 
 
 def drive(lag_s: float, seconds: float = 24.0, rate_hz: float = 30.0) -> tuple[NDArray, NDArray]:
-    """A kinematic car that weaves at changing speed with a lag in its steering: times (T,), states (T, 6)."""
+    """Simulate a weaving kinematic car with a steering lag; return times (T,) and states (T, 6)."""
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     return t, _weave(t, np.zeros(6), 0.0, lag_s)
 
@@ -36,8 +36,8 @@ def _weave(t: NDArray, start: NDArray, angle: float, lag_s: float) -> NDArray:
     states = [start]
     for k in range(len(t) - 1):
         dt = t[k + 1] - t[k]
-        wanted = 0.35 * np.sign(np.sin(2 * np.pi * t[k] / 3.1)) + 0.1 * np.sin(t[k])
-        angle += (wanted - angle) * (1.0 if lag_s <= 0 else -math.expm1(-dt / lag_s))
+        target_angle = 0.35 * np.sign(np.sin(2 * np.pi * t[k] / 3.1)) + 0.1 * np.sin(t[k])
+        angle += (target_angle - angle) * (1.0 if lag_s <= 0 else -math.expm1(-dt / lag_s))
         x, y, yaw = states[-1][:3]
         v = 1.6 + 0.5 * np.sin(0.5 * t[k])
         r = v * np.tan(angle) / 0.3

@@ -1,4 +1,4 @@
-"""Faults put on a drive by a car that is written here in ten lines: found, repaired; nothing claimed without one."""
+"""Test detection and repair of recording faults, and the absence of faults for unusual physics."""
 
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ X, Y, YAW, VX, VY, RATE = range(6)
 
 @dataclass
 class Car:
-    """A kinematic car whose yaw rate and drive answer late; 1 kHz Euler, then seen by noisy cameras at ``rate_hz``."""
+    """A kinematic car with delays and lags, integrated at 1 kHz and measured with noise at ``rate_hz``."""
 
     seed: int = 0
     seconds: float = 70.0
@@ -40,42 +40,43 @@ class Car:
         rng = np.random.default_rng(self.seed)
         step = 1e-3
         fine = np.arange(0.0, self.seconds, step)
-        every = round(1.0 / self.rate_hz / step)
+        steps_per_row = round(1.0 / self.rate_hz / step)
         count = len(fine)
 
         def wander(period_s: float) -> np.ndarray:
             knots = np.arange(0.0, self.seconds + 5.0, period_s)
             return np.interp(fine, knots, rng.uniform(-1, 1, len(knots)))
 
-        ticks = np.arange(count) // every * every
+        ticks = np.arange(count) // steps_per_row * steps_per_row
         steering = (self.turn + 0.5 * wander(0.7) + 0.3 * wander(2.5))[ticks]
         throttle = np.clip(0.35 + 0.35 * wander(0.9) + 0.15 * wander(3.0), -1, 1)[ticks]
 
-        def late(u: np.ndarray, delay_s: float) -> np.ndarray:
+        def delayed(u: np.ndarray, delay_s: float) -> np.ndarray:
             shift = round(delay_s / step)
             return np.concatenate([np.full(shift, u[0]), u[: count - shift]]) if shift else u
 
-        push = late(throttle, self.throttle_delay_s)
+        push = delayed(throttle, self.throttle_delay_s)
         if self.motor_lag_s:
             push = lfilter([step / self.motor_lag_s], [1, step / self.motor_lag_s - 1], push)
         speed = lfilter([step], [1.0, self.drag * step - 1.0], 5.0 * push)
-        wanted = speed * np.tan(0.4 * late(steering, self.steering_delay_s)) / 0.3
-        rate = lfilter([step / 0.06], [1.0, step / 0.06 - 1.0], wanted)
+        target_rate = speed * np.tan(0.4 * delayed(steering, self.steering_delay_s)) / 0.3
+        rate = lfilter([step / 0.06], [1.0, step / 0.06 - 1.0], target_rate)
         yaw = np.cumsum(rate) * step
         side = 0.02 * rate
         x = np.cumsum(speed * np.cos(yaw) - side * np.sin(yaw)) * step
         y = np.cumsum(speed * np.sin(yaw) + side * np.cos(yaw)) * step
-        seen = np.column_stack([x, y, yaw])[::every] + rng.normal(size=(len(fine[::every]), 3)) * [5e-4, 5e-4, 2e-3]
+        poses = np.column_stack([x, y, yaw])[::steps_per_row]
+        poses = poses + rng.normal(size=poses.shape) * [5e-4, 5e-4, 2e-3]
         measured = np.column_stack([speed, side, rate])
         if self.velocity_lag_s:
             share = step / self.velocity_lag_s
             measured = lfilter([share], [1, share - 1], measured, axis=0)
-        measured = measured[::every] + rng.normal(size=seen.shape) * [8e-3, 8e-3, 2e-2]
-        commands = np.column_stack([steering, throttle])[::every][:-1]
-        wrapped = (seen[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        measured = measured[::steps_per_row] + rng.normal(size=poses.shape) * [8e-3, 8e-3, 2e-2]
+        commands = np.column_stack([steering, throttle])[::steps_per_row][:-1]
+        wrapped = (poses[:, 2] + np.pi) % (2 * np.pi) - np.pi
         return EpisodeData(
-            times_s=fine[::every],
-            states=np.column_stack([seen[:, :2], wrapped, measured]),
+            times_s=fine[::steps_per_row],
+            states=np.column_stack([poses[:, :2], wrapped, measured]),
             requested=commands,
             sent=commands,
             rewards=np.full(len(commands), np.nan),
@@ -110,7 +111,7 @@ def with_sent(episode: EpisodeData, change) -> EpisodeData:
     return replace(episode, sent=sent)
 
 
-def left_out(episode: EpisodeData, rows: np.ndarray, states: np.ndarray | None = None) -> EpisodeData:
+def without_rows(episode: EpisodeData, rows: np.ndarray, states: np.ndarray | None = None) -> EpisodeData:
     sent = np.vstack([episode.sent, episode.sent[-1:]])[~rows][:-1]
     return replace(
         episode,
@@ -184,7 +185,7 @@ def test_velocities_in_the_world_frame_are_rotated_to_the_body_frame(clean):
 
 
 @pytest.mark.parametrize(("channel", "name"), [(0, "steering"), (1, "throttle")])
-def test_a_wrong_command_sign_is_repaired_in_every_recording(clean, held, channel, name):
+def test_wrong_command_sign_is_repaired_in_each_recording(clean, held, channel, name):
     def change(sent):
         sent[:, channel] *= -1
 
@@ -195,7 +196,7 @@ def test_a_wrong_command_sign_is_repaired_in_every_recording(clean, held, channe
 
 
 @pytest.mark.parametrize(("channel", "name"), [(0, "steering"), (1, "throttle")])
-def test_a_command_column_that_is_later_than_the_motion_is_shifted(clean, held, channel, name):
+def test_command_column_recorded_too_late_is_shifted(clean, held, channel, name):
     rows = 7
 
     def change(sent):
@@ -204,10 +205,10 @@ def test_a_command_column_that_is_later_than_the_motion_is_shifted(clean, held, 
     fit, _, faults = check([with_sent(clean, change)], [with_sent(held, change)], NOMINAL)
     assert [(f.id, f.channel) for f in faults] == [("column_shift", name)]
     assert f"{rows} rows" in faults[0].action
-    left = fit[0].ticks
-    assert clean.ticks - left <= rows + 1
-    np.testing.assert_allclose(fit[0].sent[:, channel], clean.sent[:left, channel], atol=1e-9)
-    np.testing.assert_array_equal(fit[0].states, clean.states[: left + 1])
+    n_ticks = fit[0].ticks
+    assert clean.ticks - n_ticks <= rows + 1
+    np.testing.assert_allclose(fit[0].sent[:, channel], clean.sent[:n_ticks, channel], atol=1e-9)
+    np.testing.assert_array_equal(fit[0].states, clean.states[: n_ticks + 1])
 
 
 @pytest.mark.parametrize("rate", [0.003, -0.002])
@@ -218,25 +219,25 @@ def test_commands_of_another_clock_are_converted(clean, held, rate):
 
     fit, out, faults = check([drifting(clean)], [drifting(held)], NOMINAL)
     assert [(f.id, f.channel) for f in faults] == [("clock_drift", "steering, throttle")]
-    for mended, true in ((fit[0], clean), (out[0], held)):
-        last = mended.ticks - 20
+    for repaired, true in ((fit[0], clean), (out[0], held)):
+        last = repaired.ticks - 20
         before = np.abs(drifting(true).sent[last - 300 : last] - true.sent[last - 300 : last]).mean()
-        after = np.abs(mended.sent[last - 300 : last] - true.sent[last - 300 : last]).mean()
+        after = np.abs(repaired.sent[last - 300 : last] - true.sent[last - 300 : last]).mean()
         assert after < 0.4 * before
 
 
 def test_spikes_of_a_wrapped_angle_are_replaced(circling):
     clean = circling
     raw = np.gradient(clean.states[:, YAW], clean.times_s)
-    wild = np.abs(raw) > 40.0
-    assert wild.sum() >= 8
+    is_spike = np.abs(raw) > 40.0
+    assert is_spike.sum() >= 8
 
     def change(states):
-        states[wild, RATE] = raw[wild]
+        states[is_spike, RATE] = raw[is_spike]
 
     (fit,), _, faults = check([with_states(clean, change)], [], NOMINAL)
     assert [(f.id, f.channel) for f in faults] == [("yaw_wrap_spikes", "yaw_rate")]
-    assert faults[0].rows >= wild.sum()
+    assert faults[0].rows >= is_spike.sum()
     np.testing.assert_allclose(fit.states[:, RATE], clean.states[:, RATE], atol=0.3)
 
 
@@ -283,20 +284,20 @@ def test_repeated_rows_are_interpolated(clean):
 def test_missing_rows_are_counted_and_long_gaps_cut(clean):
     keep = np.ones(len(clean.states), dtype=bool)
     keep[300:306] = keep[700] = keep[1200:1208] = False
-    (fit,), _, faults = check([left_out(clean, ~keep)], [], NOMINAL)
+    (fit,), _, faults = check([without_rows(clean, ~keep)], [], NOMINAL)
     assert [(f.id, f.rows) for f in faults] == [("dropouts", 15)]
     assert np.flatnonzero(np.diff(fit.extra["segment"])).tolist() == [299, 1192]
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("ns", 1e9)])
-def test_stamps_in_another_unit(clean, unit, factor):
+def test_stamps_in_another_unit_are_converted(clean, unit, factor):
     (fit,), _, faults = check([replace(clean, times_s=clean.times_s * factor)], [], NOMINAL)
     assert [(f.id, f.channel) for f in faults] == [("wrong_unit", "t")]
     assert f" {unit} " in faults[0].action
     np.testing.assert_allclose(fit.times_s, clean.times_s, rtol=1e-12)
 
 
-def test_yaw_in_degrees_and_positions_in_millimetres(clean):
+def test_yaw_in_degrees_and_positions_in_millimetres_are_converted(clean):
     def change(states):
         states[:, YAW] = np.rad2deg(states[:, YAW])
 
@@ -312,8 +313,8 @@ def test_yaw_in_degrees_and_positions_in_millimetres(clean):
     np.testing.assert_allclose(fit.states, clean.states, atol=1e-9)
 
 
-def test_backward_differences_by_a_jittering_clock_that_was_logged_as_an_even_one():
-    """Velocity columns as in a public data set: they determine the true periods."""
+def test_velocity_columns_reveal_clock_jitter_of_even_stamps():
+    """Backward-difference velocities, as in a public data set, determine the true periods."""
     fine = Car(seed=12, rate_hz=500.0, seconds=90.0).drive()
     rng = np.random.default_rng(2)
     steps = np.where(rng.random(2500) < 0.06, 20, 17)  # 34 or 40 ms
@@ -340,15 +341,15 @@ def test_backward_differences_by_a_jittering_clock_that_was_logged_as_an_even_on
     (fit,), _, faults = check([episode], [], NOMINAL)
     assert {(f.id, f.channel) for f in faults} == {("clock_drift", "t"), ("column_shift", "vx, vy, yaw_rate")}
     drift = (true_s - true_s[0]) - episode.times_s
-    left_over = (true_s - true_s[0]) - (fit.times_s - fit.times_s[0])
+    remaining_drift = (true_s - true_s[0]) - (fit.times_s - fit.times_s[0])
     assert np.abs(drift).max() > 0.5
-    assert np.abs(left_over).max() < 0.2 * np.abs(drift).max()
-    # Centred: without the delay of half a row.
+    assert np.abs(remaining_drift).max() < 0.2 * np.abs(drift).max()
+    # The repaired velocities are centred: they have no delay of half a row.
     np.testing.assert_allclose(fit.states[50:-50, VX], fine.states[rows, VX][50:-50], atol=0.25)
 
 
 def test_short_recordings_are_unchanged(clean):
-    short = left_out(clean, np.arange(len(clean.states)) >= 30)
+    short = without_rows(clean, np.arange(len(clean.states)) >= 30)
     parked = with_states(clean, lambda states: states.__setitem__(slice(None), states[0]))
     fit, _, faults = check([short, parked], [], NOMINAL)
     assert fit[0] is short
@@ -356,7 +357,7 @@ def test_short_recordings_are_unchanged(clean):
     assert faults == []
 
 
-def test_a_step_that_is_too_coarse_for_the_simulator_is_reported(clean):
+def test_too_coarse_integration_step_is_reported(clean):
     assert check_integration([clean], NOMINAL) == []
     # With a fifteenth of the yaw inertia the tyre dynamics take 1 ms, which steps of 33 ms cannot resolve.
     stiff = replace(NOMINAL, priors={}).with_values({"vehicle.yaw_inertia": 0.004})
@@ -381,7 +382,7 @@ class TestMendedImport:
         keep[500:520] = False
         states = clean.states[keep].copy()
         states[:, YAW] = np.rad2deg(states[:, YAW])
-        write_csv(left_out(clean, ~keep, states), tmp_path / "drive.csv")
+        write_csv(without_rows(clean, ~keep, states), tmp_path / "drive.csv")
         with pytest.raises(RefusedError):
             import_csv(tmp_path / "drive.csv")
         read = import_mended(tmp_path / "drive.csv")

@@ -1,4 +1,4 @@
-"""Diagnosis of drives by an independent generator: a concealed effect is named and estimated."""
+"""Test diagnoses of drives of an independent generator with a concealed effect."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from carlab.cli import run
 
 @pytest.fixture(scope="module")
 def concealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """A servo lag concealed in 60 s to fit and 30 s held out, with base parameters wrong by up to 10 %."""
+    """Write 60 s to fit and 30 s held out with a concealed servo lag and base parameters wrong by up to 10 %."""
     folder = tmp_path_factory.mktemp("concealed")
     case = make_case("single", 11, effects=("steering_lag",), excess=4.0, fit_s=60, hold_s=30)
     write_csv(folder / "fit.csv", case.fit)
@@ -29,14 +29,14 @@ def concealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 
 @pytest.fixture(scope="module")
 def diagnosed(concealed: tuple[Path, float]) -> Path:
-    """Folder of the report with the held-out recording."""
+    """Run the diagnosis with the held-out recording; return the folder of its report."""
     folder = concealed[0]
     arguments = [str(folder / "fit.csv"), "--car", str(folder / "car.toml"), "--holdout", str(folder / "hold.csv")]
     assert run(["diagnose", *arguments, "--out", str(folder / "out"), "--decisions"]) == 0
     return folder / "out"
 
 
-def test_a_concealed_servo_lag_is_named_first_and_sized(concealed: tuple[Path, float], diagnosed: Path) -> None:
+def test_concealed_servo_lag_is_named_first_and_estimated(concealed: tuple[Path, float], diagnosed: Path) -> None:
     report = json.loads((diagnosed / "report.json").read_text())
     assert report["verdict"] == "mismatch"
     first = report["effects"][0]
@@ -47,14 +47,14 @@ def test_a_concealed_servo_lag_is_named_first_and_sized(concealed: tuple[Path, f
     assert held_out["constant_velocity"]["score"] > held_out["refit"]["score"]
     for name in ("report.html", "report.rrd", "model.toml"):
         assert (diagnosed / name).stat().st_size > 0
-    made = json.loads((diagnosed / "decisions.json").read_text())["decisions"]
-    assert any(d["stage"] == "accept" and d["effect"] == "steering_lag" and d["passed"] for d in made)
-    for d in made:
+    decisions = json.loads((diagnosed / "decisions.json").read_text())["decisions"]
+    assert any(d["stage"] == "accept" and d["effect"] == "steering_lag" and d["passed"] for d in decisions)
+    for d in decisions:
         assert passes(d, "", 0.0) == d["passed"], f"the recorded statistics give another decision: {d}"
 
 
 def replayed(recording: Path, car: str, part: str, capfd: pytest.CaptureFixture[str]) -> dict[str, list[float]]:
-    """Errors and score by row that ``carlab replay`` prints for one part."""
+    """Return the errors and scores by row that ``carlab replay`` prints for one part."""
     capfd.readouterr()
     assert run(["replay", str(recording), "--car", car]) == 0
     text = capfd.readouterr().out
@@ -65,10 +65,10 @@ def replayed(recording: Path, car: str, part: str, capfd: pytest.CaptureFixture[
     return {row[1]: [float(v) for v in row[2].split()] for row in rows if row}
 
 
-def agree(row: list[float], errors: dict[str, float], digits: float = 6e-5) -> None:
-    """Equality within 1 % or the last printed digit."""
-    wanted = [errors[name] for name in ("position_m", "yaw_rad", "vx", "vy", "yaw_rate")]
-    assert row[:5] == pytest.approx(wanted, rel=0.01, abs=digits)
+def assert_agree(row: list[float], errors: dict[str, float], digits: float = 6e-5) -> None:
+    """Assert equality within 1 % or the last printed digit."""
+    expected = [errors[name] for name in ("position_m", "yaw_rad", "vx", "vy", "yaw_rate")]
+    assert row[:5] == pytest.approx(expected, rel=0.01, abs=digits)
 
 
 def test_replay_of_the_model_prints_the_error_of_the_report(
@@ -77,23 +77,23 @@ def test_replay_of_the_model_prints_the_error_of_the_report(
     held_out = json.loads((diagnosed / "report.json").read_text())["fit"]["held_out"]
     hold = concealed[0] / "hold.csv"
     rows = replayed(hold, str(diagnosed / "model.toml"), "whole recording", capfd)
-    # Here the model corrects the initial states, in the report the car file: they differ by some hundredths of a floor.
-    agree(rows["model"], held_out["with_effects"], 2e-4)
-    agree(rows["constant velocity"], held_out["constant_velocity"])
+    # The model corrects the initial states here, the car file in the report: scores differ by some hundredths.
+    assert_agree(rows["model"], held_out["with_effects"], 2e-4)
+    assert_agree(rows["constant velocity"], held_out["constant_velocity"])
     scores = [held_out[name]["score"] for name in ("with_effects", "constant_velocity")]
     assert [rows[name][5] for name in ("model", "constant velocity")] == pytest.approx(scores, rel=0.01, abs=0.03)
     rows = replayed(hold, str(concealed[0] / "car.toml"), "whole recording", capfd)
-    agree(rows["model"], held_out["nominal"])
+    assert_agree(rows["model"], held_out["nominal"])
 
 
-def test_replay_scores_the_last_part_as_a_diagnosis_holds_it_out(
+def test_replay_scores_the_held_out_share_of_a_diagnosis(
     concealed: tuple[Path, float], capfd: pytest.CaptureFixture[str]
 ) -> None:
     fit, car = concealed[0] / "fit.csv", str(concealed[0] / "car.toml")
     report = carlab.diagnose(fit, car, stop=lambda: True)
     rows = replayed(fit, car, "last 30 %", capfd)
-    agree(rows["model"], asdict(report.held_out["nominal"]))
-    agree(rows["constant velocity"], asdict(report.held_out["constant_velocity"]))
+    assert_agree(rows["model"], asdict(report.held_out["nominal"]))
+    assert_agree(rows["constant velocity"], asdict(report.held_out["constant_velocity"]))
 
 
 def test_replay_of_a_real_recording_prints_the_error_of_the_report(
@@ -103,11 +103,11 @@ def test_replay_of_a_real_recording_prints_the_error_of_the_report(
     recording = shared / "data" / "eth_rc_car" / "train_2.csv.gz"
     report = carlab.diagnose(recording, "eth_rc_car", stop=lambda: True)
     rows = replayed(recording, "eth_rc_car", "last 30 %", capfd)
-    agree(rows["model"], asdict(report.held_out["nominal"]))
-    agree(rows["constant velocity"], asdict(report.held_out["constant_velocity"]))
+    assert_agree(rows["model"], asdict(report.held_out["nominal"]))
+    assert_agree(rows["constant velocity"], asdict(report.held_out["constant_velocity"]))
 
 
-def test_a_parked_car_is_inconclusive_with_advice(
+def test_parked_car_is_inconclusive_with_advice(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rows = (concealed[0] / "fit.csv").read_text().splitlines()
@@ -121,7 +121,7 @@ def test_a_parked_car_is_inconclusive_with_advice(
 
 
 @pytest.mark.parametrize("held_out", [False, True])
-def test_a_recording_that_is_too_short_is_inconclusive(
+def test_short_recording_is_inconclusive(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], held_out: bool
 ) -> None:
     path = tmp_path / "short.csv"
@@ -134,7 +134,7 @@ def test_a_recording_that_is_too_short_is_inconclusive(
     assert report["effects"] == []
 
 
-def test_a_recording_with_frequently_lost_tracking_is_faulty(
+def test_recording_with_frequently_lost_tracking_is_faulty(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Motion capture takes another body for the car for a third of a second in each second."""
@@ -153,7 +153,7 @@ def test_a_recording_with_frequently_lost_tracking_is_faulty(
     assert "The recording is faulty" in " ".join(capfd.readouterr().err.split())
 
 
-def test_a_constant_command_is_inconclusive_and_names_the_drive_that_varies_it(
+def test_constant_command_is_inconclusive_and_suggests_a_drive(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rows = [r.split(",") for r in (concealed[0] / "fit.csv").read_text().splitlines()]
@@ -165,14 +165,14 @@ def test_a_constant_command_is_inconclusive_and_names_the_drive_that_varies_it(
     assert "--policy throttle_steps" in " ".join(capfd.readouterr().err.split())
 
 
-def test_a_fitted_recording_cannot_be_held_out(concealed: tuple[Path, float], tmp_path: Path) -> None:
+def test_fitted_recording_cannot_be_held_out(concealed: tuple[Path, float], tmp_path: Path) -> None:
     same = str(concealed[0] / "fit.csv")
     assert run(["diagnose", same, "--holdout", same, "--out", str(tmp_path / "out")]) == 2
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5])
-def test_the_held_out_share_is_not_fitted(
+def test_held_out_share_is_not_fitted(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float
 ) -> None:
     """The gap of 1.5 s before it, the history of held-out windows, is not fitted either."""
@@ -188,7 +188,7 @@ def test_the_held_out_share_is_not_fitted(
 
 
 @pytest.mark.parametrize("share", ["0", "0.6", "nan"])
-def test_a_held_out_share_out_of_range_raises_an_error(
+def test_held_out_share_out_of_range_raises_an_error(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], share: str
 ) -> None:
     path = str(concealed[0] / "fit.csv")
@@ -197,7 +197,7 @@ def test_a_held_out_share_out_of_range_raises_an_error(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_share_together_with_held_out_recordings_raises_an_error(
+def test_share_together_with_held_out_recordings_raises_an_error(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     paths = [str(concealed[0] / "fit.csv"), "--holdout", str(concealed[0] / "hold.csv")]
@@ -207,7 +207,7 @@ def test_a_share_together_with_held_out_recordings_raises_an_error(
 
 
 @pytest.mark.parametrize("stated", [False, True])
-def test_an_unknown_latency_is_a_parameter_and_not_an_effect(
+def test_unknown_latency_is_a_parameter_and_not_an_effect(
     concealed: tuple[Path, float], tmp_path: Path, stated: bool
 ) -> None:
     """Commands logged one row (33 ms) early and 12 ms of latency of the car give 45 ms."""

@@ -1,4 +1,4 @@
-"""Invariances of a diagnosis, physics that it must not name, and linear approximations against exact results."""
+"""Test invariances of a diagnosis, uncatalogued physics, and linear approximations against exact results."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -58,18 +58,18 @@ def drag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 
 @pytest.fixture(scope="module")
 def windows(drag: tuple[Path, float]) -> PredictionWindows:
-    """Prediction windows of that drive."""
+    """Return prediction windows of the drive with drag."""
     return cut_windows(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), 0.8, 0.5)
 
 
-def turned(table: Table, angle: float = 2.1, shift: tuple[float, float] = (3.0, -5.0)) -> Table:
+def rigidly_moved(table: Table, angle: float = 2.1, shift: tuple[float, float] = (3.0, -5.0)) -> Table:
     sin, cos = np.sin(angle), np.cos(angle)
     x, y = table["x"], table["y"]
     return {**table, "x": cos * x - sin * y + shift[0], "y": sin * x + cos * y + shift[1], "yaw": table["yaw"] + angle}
 
 
-def turned_and_mirrored(table: Table) -> Table:
-    table = turned(table)
+def moved_and_mirrored(table: Table) -> Table:
+    table = rigidly_moved(table)
     return table | {name: -table[name] for name in ("y", "yaw", "vy", "yaw_rate", "steering")}
 
 
@@ -77,8 +77,8 @@ CANDIDATES = ("aerodynamic_drag", "rolling_resistance", "motor_saturation", "ste
 NEAREST = ("lateral_bias", "marker_offset", "road_slope", "steering_asymmetry", "steering_offset", "yaw_damping")
 
 
-@pytest.mark.parametrize("change", [dict, turned_and_mirrored])
-def test_the_result_is_invariant_to_rotation_translation_and_mirroring(
+@pytest.mark.parametrize("change", [dict, moved_and_mirrored])
+def test_result_is_invariant_to_rotation_translation_and_mirroring(
     drag: tuple[Path, float], change: Callable[[Table], Table]
 ) -> None:
     folder, truth = drag
@@ -89,12 +89,12 @@ def test_the_result_is_invariant_to_rotation_translation_and_mirroring(
 
 
 @pytest.mark.slow
-def test_the_diagnosis_is_deterministic(drag: tuple[Path, float]) -> None:
-    one, other = (outcome(drag[0], effects=CANDIDATES).diagnosis for _ in range(2))
-    assert replace(one, seconds=0.0) == replace(other, seconds=0.0)
+def test_diagnosis_is_deterministic(drag: tuple[Path, float]) -> None:
+    first, second = (outcome(drag[0], effects=CANDIDATES).diagnosis for _ in range(2))
+    assert replace(first, seconds=0.0) == replace(second, seconds=0.0)
 
 
-def test_the_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -> None:
+def test_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -> None:
     folder = drag[0]
     table = read_csv(folder / "fit.csv")
     car = load_car_file(folder / "car.toml").simulator
@@ -106,9 +106,9 @@ def test_the_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Pat
         found = diagnose(episodes(tmp_path / "half.csv", half), hold, car, TEXTS, effects=CANDIDATES).diagnosis
         assert [e.id for e in found.effects] == ["aerodynamic_drag"]
         ranges.append(found.effects[0].parameters["coefficient"])
-    one, other = ranges
-    apart = abs(one.value - other.value)
-    assert apart < 3.0 * np.hypot(one.std, other.std)
+    first, second = ranges
+    difference = abs(first.value - second.value)
+    assert difference < 3.0 * np.hypot(first.std, second.std)
 
 
 def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path) -> None:
@@ -133,28 +133,30 @@ def test_uncatalogued_physics_is_described_without_a_name(tmp_path: Path, among:
 
 
 @pytest.mark.parametrize(
-    ("concealed", "taken_for", "said"),
+    ("concealed", "spurious", "description"),
     [
         ("locked_differential", "yaw_damping", "curvature"),
         ("camber", "steering_offset", "front wheels"),
     ],
 )
 @pytest.mark.slow
-def test_rival_physics_replaces_a_spurious_effect(concealed: str, taken_for: str, said: str, tmp_path: Path) -> None:
+def test_rival_physics_replaces_a_spurious_effect(
+    concealed: str, spurious: str, description: str, tmp_path: Path
+) -> None:
     """Without rivals the most similar effect of the catalogue is accepted."""
     case = make_case("outside", 43, effects=(concealed,), excess=1.5, fit_s=60, hold_s=30)
     folder = write(tmp_path, case)
-    whole = outcome(folder)
-    found = whole.diagnosis
+    result = outcome(folder)
+    found = result.diagnosis
     assert found.effects == ()
     assert found.unexplained is not None
-    assert said in found.unexplained.kind
-    assert {e for e in whole.model.effects if not EFFECTS[e].catalogued}
-    told = outcome(folder, effects=(taken_for,)).diagnosis
-    assert [e.id for e in told.effects] == [taken_for]
+    assert description in found.unexplained.kind
+    assert {e for e in result.model.effects if not EFFECTS[e].catalogued}
+    without_rivals = outcome(folder, effects=(spurious,)).diagnosis
+    assert [e.id for e in without_rivals.effects] == [spurious]
 
 
-def test_an_effect_without_gain_on_unseen_blocks_is_eliminated(
+def test_effect_without_gain_on_unseen_blocks_is_eliminated(
     drag: tuple[Path, float], windows: PredictionWindows
 ) -> None:
     car = load_car_file(drag[0] / "car.toml").simulator
@@ -170,7 +172,7 @@ def test_an_effect_without_gain_on_unseen_blocks_is_eliminated(
 
 
 def test_impulse_responses_sum_to_the_simulated_change(drag: tuple[Path, float], windows: PredictionWindows) -> None:
-    """Linear response to -c v|v| / m against a simulation with drag."""
+    """The reference is a simulation with the drag -c v|v| / m."""
     car = load_car_file(drag[0] / "car.toml").simulator
     scale = Scale(np.array([8, 16, 24]), np.ones((3, 6)))
     coefficient = 0.02
@@ -180,9 +182,9 @@ def test_impulse_responses_sum_to_the_simulated_change(drag: tuple[Path, float],
     term = next(t for t in TERMS if t.formula == "v |v|")
     linear = -coefficient / car.parameters.mass_kg * responses(windows, car, scale).of(term, 0)
     true = scale.white(dragged - plain)
-    tame = np.abs(true).max(axis=(1, 2)) < 1.0  # the response of a car at the edge of a spin is not linear
+    is_linear = np.abs(true).max(axis=(1, 2)) < 1.0  # the response of a car at the edge of a spin is not linear
     for channel in (0, 3):  # x and vx
-        a, b = linear[tame][..., channel].ravel(), true[tame][..., channel].ravel()
+        a, b = linear[is_linear][..., channel].ravel(), true[is_linear][..., channel].ravel()
         assert np.corrcoef(a, b)[0, 1] > 0.97
         assert a @ b / (b @ b) == pytest.approx(1.0, abs=0.1)
 
@@ -196,7 +198,7 @@ def test_one_step_without_a_fold_approximates_a_refit(drag: tuple[Path, float], 
     folds = (windows.block // 2) % 3
     quick = fitter.leave_fold_out_loss(fit, folds, 12.0)
     for fold in range(3):
-        own = folds == fold
-        apart = Fitter(windows.take(~own), fitter.scale).fit(fit.config, free, fit.z, iterations=30)
-        exact = Fitter(windows.take(own), fitter.scale).loss(car, free, apart.z, max_error=12.0).sum()
-        assert quick[own].sum() == pytest.approx(exact, rel=0.1)
+        is_held_out = folds == fold
+        refitted = Fitter(windows.take(~is_held_out), fitter.scale).fit(fit.config, free, fit.z, iterations=30)
+        exact = Fitter(windows.take(is_held_out), fitter.scale).loss(car, free, refitted.z, max_error=12.0).sum()
+        assert quick[is_held_out].sum() == pytest.approx(exact, rel=0.1)

@@ -1,6 +1,6 @@
-"""Estimates from a recording alone: noise, bias of initial states, velocity window, vibration.
+"""Test estimates from a recording: noise, bias of initial states, velocity window, vibration.
 
-The truth is the concealed generator's, which shares no code with the diagnosis and keeps what noise was added.
+The reference is the independent generator, which records the added noise.
 """
 
 import re
@@ -86,7 +86,7 @@ def test_estimated_noise_equals_the_added_noise(plain: Drive) -> None:
 
 
 def test_estimated_floor_equals_that_of_the_generator(plain: Drive) -> None:
-    """The floor after 1 s against that of the generator's true car and initial states."""
+    """The reference floor after 1 s uses the generator's true car and initial states."""
     windows = cut_windows(plain.tracks, 1.0, 0.25)
     floor = noise_floor(windows, estimate_noise(plain.tracks, windows.curvature_bias), plain.nominal)[-1]
     assert np.exp(np.mean(np.log(floor / np.array(plain.case.floor)))) == pytest.approx(1.0, abs=0.15)
@@ -109,24 +109,24 @@ def test_wrong_steering_commands_reduce_the_correction(plain: Drive) -> None:
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(len(windows))
     wrong = replace(windows, past_commands=windows.past_commands[shuffled], commands=windows.commands[shuffled])
-    moved = np.sqrt(
+    wrong_correction = np.sqrt(
         np.mean((without_curvature_bias(wrong, plain.nominal).initial_states - windows.initial_states) ** 2, axis=0)
     )
-    right = np.sqrt(
+    right_correction = np.sqrt(
         np.mean((without_curvature_bias(windows, plain.nominal).initial_states - windows.initial_states) ** 2, axis=0)
     )
-    assert moved[5] < 0.3 * right[5]
+    assert wrong_correction[5] < 0.3 * right_correction[5]
 
 
 @pytest.mark.parametrize("window_s", [0.06, 0.075, 0.09])
 def test_velocity_window_is_estimated(plain: Drive, tmp_path: Path, window_s: float) -> None:
-    """One drive, captured at 120 Hz and differentiated over windows of several widths (parabolas: width^2 / 20)."""
+    """A drive at 120 Hz is differentiated by parabolas over a window; the variance is width^2 / 20."""
     car = plain.case.true_car
     world, course = World(car), Course(np.random.default_rng(5))
     human = HumanDriver(car, course, np.random.default_rng(6))
-    what = simulated_drive(world, human, 60.0, start=human.start())
+    driven = simulated_drive(world, human, 60.0, start=human.start())
     noise = Noise(car.position_std, car.yaw_std, window_s)
-    write_csv(tmp_path / "drive.csv", as_table(record(what, world, noise, np.random.default_rng(7))))
+    write_csv(tmp_path / "drive.csv", as_table(record(driven, world, noise, np.random.default_rng(7))))
     windows = cut_windows(tracks_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
     assert np.sqrt(20.0 * velocity_window_variance_s2(windows, plain.nominal)) == pytest.approx(window_s, abs=0.025)
 
@@ -145,17 +145,17 @@ def test_vibration_of_a_wheel_is_found_with_its_radius(shaking: Drive, plain: Dr
     assert find_vibration(plain.tracks) is None
 
 
-@pytest.mark.parametrize(("of_time", "blamed"), [(True, False), (False, True)])
-def test_a_fixed_frequency_is_not_attributed_to_a_wheel(plain: Drive, of_time: bool, blamed: bool) -> None:
-    """The same vibration of the yaw rate at 6 Hz and at 4 periods per metre."""
-    made = []
+@pytest.mark.parametrize(("fixed_frequency", "is_found"), [(True, False), (False, True)])
+def test_fixed_frequency_is_not_attributed_to_a_wheel(plain: Drive, fixed_frequency: bool, is_found: bool) -> None:
+    """The yaw rate vibrates at 6 Hz or at 4 periods per metre."""
+    tracks = []
     for track in plain.tracks:
-        moved = 6.0 * np.arange(len(track.speed)) if of_time else 4.0 * np.cumsum(track.speed)
+        cycles = 6.0 * np.arange(len(track.speed)) if fixed_frequency else 4.0 * np.cumsum(track.speed)
         residual = track.residual.copy()
-        residual[:, 5] += 3.0 * np.std(residual[:, 5]) * np.sin(2.0 * np.pi * moved * track.sampled_s)
-        made.append(replace(track, residual=residual))
-    found = find_vibration(made)
-    assert (found is not None) == blamed
+        residual[:, 5] += 3.0 * np.std(residual[:, 5]) * np.sin(2.0 * np.pi * cycles * track.sampled_s)
+        tracks.append(replace(track, residual=residual))
+    found = find_vibration(tracks)
+    assert (found is not None) == is_found
     if found is not None:
         assert found.periods_per_m == pytest.approx(4.0, abs=0.05)
 

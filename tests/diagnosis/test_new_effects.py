@@ -1,6 +1,6 @@
-"""A registered effect is simulated, diagnosed, reported, saved and part of the prior of learning.
+"""Test that a registered effect is simulated, diagnosed, reported, saved and used as a prior of learning.
 
-Three effects, one of each kind, are written here and registered for the time of each test. Nothing else knows them.
+Three effects, one of each kind, are defined here and registered for these tests only.
 """
 
 import json
@@ -122,7 +122,7 @@ def _registered() -> Iterator[None]:
 
 
 def recording(seed: int, seconds: float = 16.0) -> EpisodeData:
-    """A drive of the car with all three effects, 30 rows a second, with the noise of motion capture."""
+    """Simulate a drive with all three effects at 30 Hz, with motion-capture noise."""
     rng = np.random.default_rng(seed)
     ticks = round(30 * seconds)
     sent = np.repeat(rng.uniform([-0.9, 0.1], [0.9, 0.4], (ticks // 10, 2)), 10, axis=0)
@@ -136,7 +136,7 @@ def recording(seed: int, seconds: float = 16.0) -> EpisodeData:
 
 @pytest.fixture(scope="module")
 def found(_registered: None) -> Outcome:
-    """Diagnosis of the nominal car with these three candidate effects."""
+    """Diagnose the nominal car with the three candidate effects."""
     texts = Texts(effect_sentence, separating_drive, confusable_effects())
     return diagnose([recording(1)], [recording(2, 8.0)], SimulatorConfig(), texts, effects=IDS)
 
@@ -149,7 +149,7 @@ def report(found: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", IDS)
-def test_all_engines_agree(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_engines_agree_on_a_new_effect(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sim_backends.plant.wrap", lambda yaw: yaw)
     config = SimulatorConfig(effects={name: TRUE[name]}, command_delay_s=0.0)
     start = torch.tensor([[0.2, 0.1, 0.3, 1.5, 0.1, 0.4]], dtype=torch.float64)
@@ -173,7 +173,7 @@ def test_all_engines_agree(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (arrays.measured - plain.measured).abs().max() > 1e-3
 
 
-def test_gradient_equals_finite_differences() -> None:
+def test_gradients_of_new_effects_equal_finite_differences() -> None:
     start = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.1, 0.4]], dtype=torch.float64)
     commands = torch.full((1, 6, 2), 0.5, dtype=torch.float64)
     for name, own in TRUE.items():
@@ -203,20 +203,20 @@ class ShiftedHeading(ObservationEffect):
         return (*state[:2], state[2] + values["angle"], *state[3:])
 
 
-def test_the_simulated_car_applies_observation_effects() -> None:
+def test_simulated_car_applies_observation_effects() -> None:
     effects = {"shifted_heading": {"angle": 0.2}, "speed_gain": {"gain": 0.25}}
     with registered(ShiftedHeading(), SpeedGain()):
         for more in ({}, {"velocity_filter_lag": {"time_constant": 0.01}}):
             config = SimulatorConfig(effects={**effects, **more})
             with SimulatedCar(config, start=CarState(vx_mps=2.0)) as car:
-                seen = car.observe().state
-            assert seen.yaw_rad == pytest.approx(0.2, abs=0.01)
+                measured = car.observe().state
+            assert measured.yaw_rad == pytest.approx(0.2, abs=0.01)
             # The estimator resolves the velocity along the shifted heading.
-            assert seen.vx_mps == pytest.approx(1.25 * 2.0 * np.cos(0.2), abs=0.02)
+            assert measured.vx_mps == pytest.approx(1.25 * 2.0 * np.cos(0.2), abs=0.02)
     assert "shifted_heading" not in EFFECTS
 
 
-def test_a_diagnosis_screens_fits_and_names_all_three(found: Outcome) -> None:
+def test_diagnosis_names_and_estimates_all_three_effects(found: Outcome) -> None:
     named = {e.id: e for e in found.diagnosis.effects}
     assert set(named) == set(IDS)
     for name, own in TRUE.items():
@@ -225,7 +225,7 @@ def test_a_diagnosis_screens_fits_and_names_all_three(found: Outcome) -> None:
     assert set(found.model.effects) == set(IDS)
 
 
-def test_the_report_has_its_texts(found: Outcome, report: Path) -> None:
+def test_report_contains_the_texts_of_new_effects(found: Outcome, report: Path) -> None:
     written = json.loads((report / "report.json").read_text())
     page = (report / "report.html").read_text()
     for effect in written["effects"]:
@@ -247,7 +247,7 @@ def test_confusable_effects_and_separating_drives_are_symmetric() -> None:
     assert "slow_circle" in MANOEUVRES
 
 
-def test_windows_of_an_effect_on_velocities_start_from_true_velocities() -> None:
+def test_windows_with_a_velocity_effect_start_from_true_velocities() -> None:
     """Velocities from poses are not inverted; recorded ones are."""
     with registered(SpeedGain()):
         config = SimulatorConfig(effects={"speed_gain": {"gain": 0.3}}, control_period_s=1.0 / 30.0)
@@ -258,8 +258,8 @@ def test_windows_of_an_effect_on_velocities_start_from_true_velocities() -> None
         assert measured is not None
         episode = EpisodeData(np.arange(ticks + 1) / 30.0, measured[0].numpy(), sent, sent, np.zeros(ticks))
         windows = cut_windows(tracks_of([episode]), 0.5, 0.5)
-        for these in (windows, as_recorded(windows)):
-            error = simulate_windows(these, config)[0, -2:] - these.measured[-2:]
+        for variant in (windows, as_recorded(windows)):
+            error = simulate_windows(variant, config)[0, -2:] - variant.measured[-2:]
             assert np.abs(error[..., :2]).max() < 2e-3
             assert np.abs(error[..., 3]).max() < 1e-2
 
@@ -275,15 +275,15 @@ def test_car_file_and_prior_contain_the_effects(found: Outcome, report: Path) ->
     model = CarModel(config, 6, {name: ranges[name] for name in sorted(numbers)})
     draws = draw_parameters(model, 4, torch.Generator().manual_seed(0)).double()
     rows = torch.tensor(np.random.default_rng(3).uniform(-0.5, 0.5, (5, 3 + 2 * 7))) + torch.eye(1, 17)[0] * 1.5
-    together = model(rows, draws)
-    assert torch.isfinite(together).all()
+    batched = model(rows, draws)
+    assert torch.isfinite(batched).all()
     for k in range(len(numbers)):  # each parameter has an influence
-        moved = draws.clone()
-        moved[:, k] *= 1.1
-        assert (model(rows, moved) - together).abs().max() > 1e-6, model.names[k]
+        changed = draws.clone()
+        changed[:, k] *= 1.1
+        assert (model(rows, changed) - batched).abs().max() > 1e-6, model.names[k]
 
 
-def test_the_prior_predicts_rows_of_a_recording_with_the_effects() -> None:
+def test_prior_with_the_effects_predicts_recorded_rows_better() -> None:
     from learning.transitions import transitions_of
 
     config = SimulatorConfig(effects=TRUE, control_period_s=1.0 / 30.0)
@@ -319,11 +319,11 @@ def test_temporary_registration_ends_and_duplicates_raise_an_error() -> None:
         pass
 
 
-def test_a_new_class_with_an_old_id_is_not_cached() -> None:
+def test_compiled_step_is_not_reused_for_a_new_class_with_the_same_id() -> None:
     start = torch.tensor([[0.0, 0.0, 0.0, 1.5, 0.0, 0.0]], dtype=torch.float64)
     commands = torch.zeros((1, 5, 2), dtype=torch.float64)
 
-    def turned(sign: float) -> float:
+    def yaw_after(sign: float) -> float:
         class Moment(SpinMoment):
             id = "moment"
 
@@ -335,5 +335,5 @@ def test_a_new_class_with_an_old_id_is_not_cached() -> None:
             config = SimulatorConfig(effects={"moment": {"coefficient": 0.1}})
             return float(rollout(config, start, commands).states[0, -1, 2])
 
-    assert turned(1.0) == pytest.approx(-turned(-1.0))
-    assert turned(1.0) > 0.01
+    assert yaw_after(1.0) == pytest.approx(-yaw_after(-1.0))
+    assert yaw_after(1.0) > 0.01

@@ -1,4 +1,4 @@
-"""The quick check on drives with known physics: verdict, location and causes."""
+"""Test the quick check on drives with known physics: verdict, location and causes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def recorded(folder: Path, true: SimulatorConfig, seed: int, episodes: int = 5) 
 
 
 @pytest.mark.parametrize("seed", [20, 21, 22])
-def test_the_true_simulator_explains_its_recordings(tmp_path: Path, seed: int) -> None:
+def test_true_simulator_explains_its_recordings(tmp_path: Path, seed: int) -> None:
     episodes = recorded(tmp_path, SIMULATOR, seed)
     for count in (1, 3, 5):
         check = quick_check(episodes[:count], SIMULATOR)
@@ -43,7 +43,7 @@ def test_the_true_simulator_explains_its_recordings(tmp_path: Path, seed: int) -
 @pytest.mark.parametrize(
     ("effect", "size"), [("motor_lag", 1.0), ("marker_offset", 1.0), ("road_slope", 2.0)]
 )  # fmt: skip
-def test_a_concealed_effect_of_an_independent_generator_is_located_and_named(effect: str, size: float) -> None:
+def test_concealed_effect_of_an_independent_generator_is_located_and_named(effect: str, size: float) -> None:
     case = drives.concealed_drives(effect, size, seed=23)
     check = quick_check(case.episodes, case.simulator)
     assert check.verdict == "left"
@@ -59,7 +59,7 @@ def test_a_concealed_effect_of_an_independent_generator_is_located_and_named(eff
     assert effect in short(check)
 
 
-def test_an_effect_is_named_with_wrong_base_parameters() -> None:
+def test_effect_is_named_with_wrong_base_parameters() -> None:
     case = drives.concealed_drives("motor_lag", 3.0, seed=24, share=0.1)
     check = quick_check(case.episodes, case.simulator)
     assert check.verdict == "left"
@@ -69,25 +69,25 @@ def test_an_effect_is_named_with_wrong_base_parameters() -> None:
     assert found.parameters["effects.motor_lag.time_constant"].value == pytest.approx(truth, rel=0.15)
 
 
-def test_a_wrong_parameter_and_a_changed_effect_are_distinguished_from_new_effects(tmp_path: Path) -> None:
+def test_wrong_parameter_and_a_changed_effect_are_distinguished_from_new_effects(tmp_path: Path) -> None:
     weaker = SIMULATOR.with_values({"motor.drive_gain": 7.4})
     check = quick_check(recorded(tmp_path, weaker, 25), SIMULATOR)
     assert (check.verdict, check.causes[0].id) == ("left", "motor.drive_gain")
-    number = check.causes[0].parameters["motor.drive_gain"]
-    assert number.value == pytest.approx(7.4, rel=0.01)
-    assert number.before == SIMULATOR.values()["motor.drive_gain"]
-    known, slower = (replace(SIMULATOR, effects={"steering_lag": {"time_constant": t}}) for t in (0.05, 0.09))
+    change = check.causes[0].parameters["motor.drive_gain"]
+    assert change.value == pytest.approx(7.4, rel=0.01)
+    assert change.before == SIMULATOR.values()["motor.drive_gain"]
+    diagnosed, slower = (replace(SIMULATOR, effects={"steering_lag": {"time_constant": t}}) for t in (0.05, 0.09))
     episodes = recorded(tmp_path, slower, 21)
-    assert quick_check(episodes, slower).verdict == "explains", "a diagnosed simulator is checked with its effects"
-    check = quick_check(episodes, known)
+    assert quick_check(episodes, slower).verdict == "explains", "a simulator must be checked with its effects"
+    check = quick_check(episodes, diagnosed)
     assert (check.verdict, check.causes[0].id) == ("left", "effects.steering_lag")
     assert check.causes[0].parameters["effects.steering_lag.time_constant"].value == pytest.approx(0.09, rel=0.1)
 
 
-def test_the_check_is_deterministic() -> None:
+def test_check_is_deterministic() -> None:
     case = drives.concealed_drives("rolling_resistance", 3.0, seed=27, episodes=2)
-    first, again = (quick_check(case.episodes, case.simulator).to_dict() for _ in range(2))
-    assert first == again
+    first, second = (quick_check(case.episodes, case.simulator).to_dict() for _ in range(2))
+    assert first == second
     assert first["verdict"] == "left"
 
 
@@ -99,9 +99,9 @@ def test_insufficient_recordings_are_undecided_with_a_reason() -> None:
         episode, times_s=episode.times_s[:20], states=episode.states[:20], sent=episode.sent[:19],
         requested=episode.requested[:19], rewards=episode.rewards[:19],
     )  # fmt: skip
-    lost = episode.states.copy()
-    lost[::4, 0] = np.nan
-    for episodes in ([], [replace(episode, states=standing)], [short_one], [replace(episode, states=lost)]):
+    with_nan = episode.states.copy()
+    with_nan[::4, 0] = np.nan
+    for episodes in ([], [replace(episode, states=standing)], [short_one], [replace(episode, states=with_nan)]):
         check = quick_check(episodes, case.simulator)
         assert check.verdict == "undecided"
         assert check.why
@@ -109,7 +109,7 @@ def test_insufficient_recordings_are_undecided_with_a_reason() -> None:
         assert check.why in sentence
 
 
-def test_an_outlier_in_one_episode_is_undecided(tmp_path: Path) -> None:
+def test_outlier_in_one_episode_is_undecided(tmp_path: Path) -> None:
     """A person pushes the car aside in one episode."""
     episodes = recorded(tmp_path, SIMULATOR, 21)
     index = next(k for k, e in enumerate(episodes) if e.ticks > 80)
@@ -162,7 +162,7 @@ def circle(t_s: np.ndarray) -> np.ndarray:
 
 
 def circle_episode(velocity_offset: float = 0.0) -> EpisodeData:
-    """Forty ticks of a control loop: the newest pose of 120 Hz, velocities of a line through six poses."""
+    """Return forty ticks with the newest of 120 Hz poses and velocities of line fits through six poses."""
     captures = np.arange(-30, 180) / 120.0 + 0.0021
     poses = np.column_stack([captures, circle(captures)[:, :3]])
     unwrapped = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
@@ -174,15 +174,15 @@ def circle_episode(velocity_offset: float = 0.0) -> EpisodeData:
         states.append([*poses[newest, 1:], line.vx_mps - velocity_offset, line.vy_mps, line.yaw_rate_radps])
         age.append(t - captures[newest])
         delay.append(captures[newest] - line.t_s)
-    nothing = np.zeros((40, 2))
+    zero_commands = np.zeros((40, 2))
     extra = {"pose_age_s": np.array(age), "velocity_delay_s": np.array(delay)}
-    return EpisodeData(times, np.array(states), nothing, nothing, np.zeros(40), poses, extra=extra)
+    return EpisodeData(times, np.array(states), zero_commands, zero_commands, np.zeros(40), poses, extra=extra)
 
 
 def test_aligned_states_have_the_stated_latency() -> None:
     episode, latency_s = circle_episode(), 0.008
     truth = circle(episode.times_s - latency_s)
-    assert np.abs(episode.states - truth)[:, 3:].max() > 0.01, "recorded velocities are too old"
+    assert np.abs(episode.states - truth)[:, 3:].max() > 0.01, "the recorded velocities must be delayed"
     aligned = align_states(episode, latency_s)
     rows = np.searchsorted(episode.times_s, aligned.times_s)
     assert aligned.ticks >= 38
@@ -193,7 +193,7 @@ def test_aligned_states_have_the_stated_latency() -> None:
     np.testing.assert_array_equal(aligned.sent, episode.sent[rows[:-1]])
 
 
-def test_the_influence_of_a_velocity_filter_is_kept() -> None:
+def test_alignment_keeps_the_influence_of_a_velocity_filter() -> None:
     aligned, filtered = (align_states(circle_episode(offset), 0.008) for offset in (0.0, 0.07))
     np.testing.assert_allclose(aligned.states[:, 3] - filtered.states[:, 3], 0.07, atol=1e-9)
 
@@ -211,14 +211,14 @@ def test_missing_poses_give_missing_states_and_foreign_recordings_are_unchanged(
     assert window_variance_s2([foreign]) is None
 
 
-def test_the_velocity_error_equals_the_window_variance() -> None:
-    """x = t^3: velocities of a symmetric window of variance s2 are 3 t^2 + 3 s2."""
+def test_velocity_error_of_a_cubic_equals_the_window_variance() -> None:
+    """For x = t^3 a symmetric window of variance s2 gives the velocity 3 t^2 + 3 s2."""
     t = np.arange(-60, 61) / 120.0
     poses = np.column_stack([t, t**3, np.zeros_like(t), np.zeros_like(t)])
     times = np.array([-0.2, 0.0, 0.2])
     ages = {"pose_age_s": np.full(3, 0.01), "velocity_delay_s": np.full(3, np.nan)}
-    nothing = np.zeros((2, 2))
-    episode = EpisodeData(times, np.zeros((3, 6)), nothing, nothing, np.zeros(2), poses, extra=ages)
+    zero_commands = np.zeros((2, 2))
+    episode = EpisodeData(times, np.zeros((3, 6)), zero_commands, zero_commands, np.zeros(2), poses, extra=ages)
     error = align_states(episode, 0.0).states[:, 3] - 3.0 * times**2
     variance = window_variance_s2([episode])
     assert variance is not None

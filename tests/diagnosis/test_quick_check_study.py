@@ -1,4 +1,4 @@
-"""How often a quick check is right: pytest -m slow -s tests/diagnosis/test_quick_check_study.py (minutes of CPU)."""
+"""Study of the quick check's error rates: pytest -m slow -s tests/diagnosis/test_quick_check_study.py (minutes)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SEEDS = (301, 302)
 NULL_SEEDS = range(310, 320)
 
 
-def test_false_alarms(tmp_path: Path) -> None:
+def test_false_alarms_without_an_effect(tmp_path: Path) -> None:
     simulator = SimulatorConfig.from_preset()
     alarms = 0
     for seed in NULL_SEEDS:
@@ -48,8 +48,8 @@ def test_false_alarms(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
-def test_concealed_effects(share: float) -> None:
-    """``share``: how far the base parameters of the true car are off, at most."""
+def test_hit_rates_with_concealed_effects(share: float) -> None:
+    """``share`` is the maximum relative error of the base parameters of the true car."""
     rows, seconds = [], []
     for effect, size in EFFECTS.items():
         for seed in SEEDS:

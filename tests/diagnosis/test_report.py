@@ -1,4 +1,4 @@
-"""The written report, read again: JSON by its schema, HTML by a parser, TOML as a car file, rerun by its tool."""
+"""Test the written report: JSON schema, HTML by a parser, TOML as a car file, rerun by its tool."""
 
 import importlib.util
 import json
@@ -89,8 +89,8 @@ def test_json_has_the_keys_of_the_schema_for_each_verdict(case: Diagnosis, tmp_p
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert report["schema"] == "carlab.diagnosis/1"
     assert report["verdict"] == case.verdict
-    wanted = {"schema", "verdict", "effects", "parameters", "fit", "unexplained", "data_faults", "recordings"}
-    assert set(report) == wanted | {"seed", "seconds", "sentence", "advice"}
+    expected = {"schema", "verdict", "effects", "parameters", "fit", "unexplained", "data_faults", "recordings"}
+    assert set(report) == expected | {"seed", "seconds", "sentence", "advice"}
     assert set(report["fit"]) == {"horizon_s", "held_out"}
     for errors in report["fit"]["held_out"].values():
         assert set(errors) == {"position_m", "yaw_rad", "vx", "vy", "yaw_rate", "score"}
@@ -128,7 +128,7 @@ def test_numbers_that_are_not_finite_become_null(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["seconds"] is None
 
 
-def test_page_is_one_file_without_scripts_or_references_to_elsewhere(case: Diagnosis, tmp_path: Path) -> None:
+def test_page_is_one_file_without_scripts_and_external_references(case: Diagnosis, tmp_path: Path) -> None:
     write_report(case, material.exhibits(), tmp_path, material.model())
     text, page = read_page(tmp_path)
     assert not {"script", "link", "img", "iframe", "object", "embed"} & set(page.tags)
@@ -140,7 +140,7 @@ def test_page_is_one_file_without_scripts_or_references_to_elsewhere(case: Diagn
 
 
 def _numbers_of(value: object) -> set[str]:
-    """All numbers in plain data in the formats of the page: value, magnitude, per cent, per minute."""
+    """Return all numbers in plain data in the formats of the page: value, magnitude, percent, per minute."""
     if isinstance(value, Mapping):
         return {n for v in value.values() for n in _numbers_of(v)}
     if isinstance(value, list | tuple):
@@ -154,7 +154,7 @@ def _numbers_of(value: object) -> set[str]:
     return shapes | {str(value)}
 
 
-def test_every_number_in_the_text_comes_from_the_data(case: Diagnosis, tmp_path: Path) -> None:
+def test_each_number_in_the_text_comes_from_the_data(case: Diagnosis, tmp_path: Path) -> None:
     pictures = material.exhibits()
     write_report(case, pictures, tmp_path, material.model())
     _, page = read_page(tmp_path)
@@ -185,7 +185,7 @@ def test_page_contains_effect_interval_set_and_next_drive(written: Path) -> None
     assert text.count("<svg") >= 12
 
 
-def test_a_report_without_a_verdict_states_why_and_what_to_record(tmp_path: Path) -> None:
+def test_report_without_a_verdict_states_why_and_what_to_record(tmp_path: Path) -> None:
     write_report(material.no_verdict(), Exhibits(), tmp_path, material.model())
     words = " ".join(read_page(tmp_path)[1].words)
     assert "No verdict. The car hardly moves in the recordings to fit" in words
@@ -256,14 +256,14 @@ def test_recordings_of_equal_names_have_different_entities(tmp_path: Path) -> No
     assert all(f"/{name}/map/recorded/trail" in printed for name in ("a_b", "a_b_2", "verdict_2"))
 
 
-def test_a_report_replaces_an_older_one_without_leftover_files(tmp_path: Path) -> None:
+def test_report_replaces_an_older_one_without_leftover_files(tmp_path: Path) -> None:
     write_report(material.mismatch(), material.exhibits(), tmp_path, material.model())
     write_report(material.nothing(), Exhibits(), tmp_path, material.model())
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["verdict"] == "none"
     assert {p.name for p in tmp_path.iterdir()} == {"report.json", "report.html", "report.rrd", "model.toml"}
 
 
-def test_a_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None:
+def test_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine", encoding="utf-8")
     with pytest.raises(DataError, match="a file has the path of its folder; choose another folder"):
         write_report(material.nothing(), Exhibits(), tmp_path / "taken", material.model())
@@ -271,7 +271,7 @@ def test_a_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", ["report.html", "report.rrd", "model.toml"])
-def test_a_file_that_cannot_be_written_leaves_no_report_json(tmp_path: Path, name: str) -> None:
+def test_file_that_cannot_be_written_leaves_no_report_json(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     with pytest.raises(DataError, match=re.escape(name)):
         write_report(material.nothing(), Exhibits(), tmp_path, material.model())
@@ -279,14 +279,14 @@ def test_a_file_that_cannot_be_written_leaves_no_report_json(tmp_path: Path, nam
     assert [p for p in tmp_path.iterdir() if "partial" in p.name] == []
 
 
-def test_restarts_are_where_the_predictions_were_started() -> None:
+def test_restarts_are_the_first_rows_of_predictions() -> None:
     made = material.trace()
     assert restarts(made.recorded, made.predicted["refit"]) == list(range(30, len(made.times_s) - 60, 30))
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "wanted"),
+    ("low", "high", "expected"),
     [(0.0, 1.0, [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]), (-3.0, 7.0, [-2.0, 0.0, 2.0, 4.0, 6.0]), (5.0, 5.0, [5.0])],
 )
-def test_ticks_are_round_numbers_inside_the_range(low: float, high: float, wanted: list[float]) -> None:
-    assert nice_ticks(low, high) == pytest.approx(wanted)
+def test_ticks_are_round_numbers_inside_the_range(low: float, high: float, expected: list[float]) -> None:
+    assert nice_ticks(low, high) == pytest.approx(expected)

@@ -1,4 +1,4 @@
-"""Texts of effects, confusable effects and verdicts state the numbers with their uncertainty."""
+"""Test the texts of effects, confusable effects and verdicts."""
 
 import math
 import re
@@ -57,7 +57,7 @@ def diagnosis(verdict: str, *effects: EffectFinding, refit: float = 4.0, with_ef
 
 
 @pytest.mark.parametrize("effect_id", CATALOGUE)
-def test_the_sentence_of_an_effect_contains_each_parameter_with_its_unit(effect_id: str) -> None:
+def test_sentence_of_an_effect_contains_each_parameter_with_its_unit(effect_id: str) -> None:
     parameters = {p.name: around(p.typical, p.unit) for p in CATALOGUE[effect_id].parameters}
     sentence = effect_sentence(effect_id, parameters)
     assert sentence.startswith("Left out: ")
@@ -75,35 +75,37 @@ def test_the_sentence_of_an_effect_contains_each_parameter_with_its_unit(effect_
 
 
 @pytest.mark.parametrize("effect_id", CATALOGUE)
-def test_every_effect_has_a_refutation(effect_id: str) -> None:
+def test_each_effect_has_a_refutation(effect_id: str) -> None:
     assert re.fullmatch(r"This would be wrong if .{20,}\.", refutation_sentence(effect_id))
 
 
 @pytest.mark.parametrize("effect_id", CATALOGUE)
-def test_a_sentence_allows_missing_and_infinite_numbers(effect_id: str) -> None:
+def test_sentence_allows_missing_and_infinite_numbers(effect_id: str) -> None:
     assert effect_sentence(effect_id, {}).startswith("Left out: ")
-    odd = {p.name: Estimate(math.inf, math.nan, math.nan, math.inf, p.unit) for p in CATALOGUE[effect_id].parameters}
-    assert "inf" not in effect_sentence(effect_id, odd).replace("infl", "")
+    nonfinite = {
+        p.name: Estimate(math.inf, math.nan, math.nan, math.inf, p.unit) for p in CATALOGUE[effect_id].parameters
+    }
+    assert "inf" not in effect_sentence(effect_id, nonfinite).replace("infl", "")
 
 
 def test_sentence_of_the_servo_lag() -> None:
     lag = Estimate(0.11, 0.0091, 0.095, 0.125, "s")
-    wanted = "Left out: the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)."
-    assert effect_sentence("steering_lag", {"time_constant": lag}) == wanted
+    expected = "Left out: the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)."
+    assert effect_sentence("steering_lag", {"time_constant": lag}) == expected
 
 
 @pytest.mark.parametrize(("angle", "side"), [(0.05, "left"), (-0.05, "right")])
-def test_a_sign_becomes_a_side_and_the_interval_is_mirrored(angle: float, side: str) -> None:
+def test_sign_becomes_a_side_and_the_interval_is_mirrored(angle: float, side: str) -> None:
     sentence = effect_sentence("steering_offset", {"angle": around(angle, "rad")})
     assert f"0.05 rad (0.04 to 0.06 at 90 %) to the {side}" in sentence
 
 
-def test_an_interval_across_zero_states_that_the_sign_is_not_certain() -> None:
+def test_interval_across_zero_states_that_the_sign_is_not_certain() -> None:
     sentence = effect_sentence("lateral_bias", {"force": Estimate(-0.2, 0.3, -0.7, 0.3, "N")})
     assert "0.2 N (−0.3 to 0.7 at 90 %; its sign is not certain) pushes the car to the right." in sentence
 
 
-def test_an_effect_outside_the_catalogue_is_named_by_its_id() -> None:
+def test_effect_outside_the_catalogue_is_named_by_its_id() -> None:
     assert "wind gust" in effect_sentence("wind_gust", {"force": around(1.0, "N")})
     assert refutation_sentence("wind_gust").startswith("This would be wrong if")
 
@@ -119,7 +121,7 @@ def test_confusable_effects_are_symmetric() -> None:
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_every_confusable_pair_has_a_separating_drive_or_states_that_none_exists(one: str, other: str) -> None:
+def test_each_confusable_pair_has_a_separating_drive_or_states_that_none_exists(one: str, other: str) -> None:
     drive = separating_drive(one, (other,))
     assert drive == separating_drive(other, (one,))
     assert len(separating_reason(one, (other,))) > 20
@@ -130,13 +132,13 @@ def test_every_confusable_pair_has_a_separating_drive_or_states_that_none_exists
         assert drive in MANOEUVRES
 
 
-def test_the_drive_that_separates_most_pairs_of_a_set_is_chosen() -> None:
+def test_drive_that_separates_most_pairs_of_a_set_is_chosen() -> None:
     assert separating_drive("throttle_nonlinearity", ("motor_saturation", "throttle_deadband")) == "throttle_ramp"
     assert separating_drive("motor_saturation", ("aerodynamic_drag", "throttle_nonlinearity")) in MANOEUVRES
     assert separating_drive("yaw_damping", ()) == ""
 
 
-def test_a_mismatch_names_its_effects_and_its_sets() -> None:
+def test_mismatch_names_its_effects_and_its_sets() -> None:
     text = verdict_sentence(diagnosis("mismatch", finding("motor_lag", ("throttle_delay",)), finding("yaw_damping")))
     assert (
         "leaves out two effects: a lag of the motor "
@@ -147,14 +149,14 @@ def test_a_mismatch_names_its_effects_and_its_sets() -> None:
     assert "distinguish" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
 
 
-def test_the_attained_share_of_the_error_above_the_noise() -> None:
+def test_attained_share_of_the_error_above_the_noise() -> None:
     assert attained(diagnosis("mismatch", refit=4.0, with_effects=1.0)) == pytest.approx(1.0)
     assert math.isnan(attained(diagnosis("none", refit=1.0, with_effects=1.0)))
     text = verdict_sentence(diagnosis("mismatch", finding("motor_lag"), refit=4.0, with_effects=0.97))
     assert "removes 100 % of the error above the noise" in text
 
 
-def test_a_simulator_that_is_worse_than_constant_velocity_has_a_warning() -> None:
+def test_simulator_that_is_worse_than_constant_velocity_has_a_warning() -> None:
     fitted = diagnosis("mismatch", finding("motor_lag"), refit=60.0, with_effects=47.8)
     held = fitted.held_out | {"nominal": replace(fitted.held_out["refit"], score=409.0)}
     for score, warns in ((35.8, True), (50.0, False)):
@@ -164,13 +166,13 @@ def test_a_simulator_that_is_worse_than_constant_velocity_has_a_warning() -> Non
 
 
 @pytest.mark.parametrize("verdict", ["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"])
-def test_every_verdict_has_a_sentence_without_scores(verdict: str) -> None:
-    bare = replace(diagnosis(verdict), held_out={})
-    assert verdict_sentence(bare)[0].isupper()
-    assert verdict_sentence(bare).endswith(".")
-    assert not re.search(r"nan|None|  ", verdict_sentence(bare))
-    assert len(verdict_title(bare)) > 10
-    drive, why = next_drive(bare)
+def test_each_verdict_has_a_sentence_without_scores(verdict: str) -> None:
+    without_scores = replace(diagnosis(verdict), held_out={})
+    assert verdict_sentence(without_scores)[0].isupper()
+    assert verdict_sentence(without_scores).endswith(".")
+    assert not re.search(r"nan|None|  ", verdict_sentence(without_scores))
+    assert len(verdict_title(without_scores)) > 10
+    drive, why = next_drive(without_scores)
     assert drive == "" or drive in MANOEUVRES
     assert why
 
@@ -178,18 +180,20 @@ def test_every_verdict_has_a_sentence_without_scores(verdict: str) -> None:
 def test_verdicts_state_faults_residuals_and_reasons() -> None:
     fault = DataFault("wrong_unit", "yaw", 3, "unusable")
     assert "(wrong unit)" in verdict_sentence(replace(diagnosis("data"), data_faults=(fault,)))
-    rest = Unexplained(0.7, ("vx",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
-    nameless = replace(diagnosis("unexplained"), unexplained=rest)
-    assert "longitudinal velocity, mostly where speed > 1 m/s. Class: even in steering." in verdict_sentence(nameless)
-    assert next_drive(nameless)[0] == "coast_down"
+    unexplained = Unexplained(0.7, ("vx",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
+    unexplained_diagnosis = replace(diagnosis("unexplained"), unexplained=unexplained)
+    assert "longitudinal velocity, mostly where speed > 1 m/s. Class: even in steering." in verdict_sentence(
+        unexplained_diagnosis
+    )
+    assert next_drive(unexplained_diagnosis)[0] == "coast_down"
     why = "Too short; drive throttle_ramp."
-    unsure = replace(diagnosis("inconclusive"), sentence=why, advice=why)
-    assert verdict_sentence(unsure) == f"No verdict. {why}"
-    assert next_drive(unsure)[0] == "throttle_ramp"
+    inconclusive = replace(diagnosis("inconclusive"), sentence=why, advice=why)
+    assert verdict_sentence(inconclusive) == f"No verdict. {why}"
+    assert next_drive(inconclusive)[0] == "throttle_ramp"
 
 
 @pytest.mark.parametrize(("verdict", "which"), [("none", "nominal"), ("parameters", "refit")])
-def test_an_error_above_the_noise_is_stated(verdict: str, which: str) -> None:
+def test_error_above_the_noise_is_stated(verdict: str, which: str) -> None:
     far, near = diagnosis(verdict), diagnosis(verdict)
     near = replace(near, held_out={k: replace(v, score=1.02) for k, v in near.held_out.items()})
     assert far.held_out[which].score > 3.0
@@ -197,7 +201,7 @@ def test_an_error_above_the_noise_is_stated(verdict: str, which: str) -> None:
     assert "lacks physics" not in verdict_sentence(near)
 
 
-def test_the_next_drive_separates_the_strongest_set() -> None:
+def test_next_drive_separates_the_strongest_set() -> None:
     drive, why = next_drive(diagnosis("mismatch", finding("yaw_damping"), finding("motor_lag", ("throttle_delay",))))
     assert drive == "throttle_steps"
     assert "a lag of the motor from a delay of the throttle" in why
@@ -215,7 +219,7 @@ def test_confidence_words_match_the_probability() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "wanted"),
+    ("value", "expected"),
     [
         (0.0, "0"),
         (0.11, "0.11"),
@@ -228,13 +232,13 @@ def test_confidence_words_match_the_probability() -> None:
         (math.nan, "unknown"),
     ],
 )
-def test_numbers_have_three_significant_digits(value: float, wanted: str) -> None:
-    assert number(value) == wanted
+def test_numbers_have_three_significant_digits(value: float, expected: str) -> None:
+    assert number(value) == expected
 
 
 @pytest.mark.parametrize(
-    ("share", "wanted"),
+    ("share", "expected"),
     [(0.31, "31 %"), (0.021, "2.1 %"), (0.0, "0 %"), (0.0002, "0.02 %"), (0.998, "more than 99 %"), (1.0, "100 %")],
 )
-def test_shares_are_not_rounded_to_0_or_100_per_cent(share: float, wanted: str) -> None:
-    assert percent(share) == wanted
+def test_shares_are_not_rounded_to_0_or_100_per_cent(share: float, expected: str) -> None:
+    assert percent(share) == expected

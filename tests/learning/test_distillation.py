@@ -293,7 +293,7 @@ class TestFit:
         assert (particles.noise_std**2 >= 0.4999 * target.noise_std**2).all()
 
     @pytest.mark.usefixtures("particles")
-    def test_progress_is_called_every_two_hundred_steps(self, steps_done):
+    def test_progress_is_called_each_two_hundred_steps(self, steps_done):
         assert steps_done == [200, 400, 600, 800, 1000, 1200, 1400]
 
     def test_outputs_have_separate_means_standard_deviations_and_noise(self):
@@ -323,7 +323,7 @@ class TestFit:
         assert torch.equal(start, particles.parameters)
         assert not torch.equal(start, moved.parameters)
 
-    def test_the_same_seed_gives_the_same_particles(self, target, points):
+    def test_same_seed_gives_the_same_particles(self, target, points):
         few = replace(SETTINGS, steps=20)
         first, second, other = (distil(target, points, replace(few, seed=s)).parameters for s in (2, 2, 3))
         assert torch.equal(first, second)

@@ -295,7 +295,7 @@ class TestRestarts:
         assert np.allclose(decorrelated + units.decorrelation_log_det, joint)
         assert UNITS.decorrelation_log_det == 0.0
 
-    def test_a_restart_without_a_computable_covariance_is_skipped(self):
+    def test_restart_without_a_computable_covariance_is_skipped(self):
         x, y = rows(50)
         at, _ = rows(5, seed=1)
         first, both = (infer(None, x, y, UNITS, NOISE, restart_scales=s).predict(at) for s in ((1.0,), (1.0, math.nan)))

@@ -31,7 +31,7 @@ def drive(config: SimulatorConfig, ticks: int = 60, seed: int = 0, *, measured: 
 
 
 @pytest.mark.parametrize("kind", ["dynamic", "kinematic"])
-def test_model_reproduces_every_row_of_a_simulated_drive(kind):
+def test_model_reproduces_each_row_of_a_simulated_drive(kind):
     config = SimulatorConfig(kind=kind, mocap=QUIET)
     rows = transitions_of([drive(config)], HISTORY)
     model = CarModel(config, HISTORY, {"vehicle.mass": (2.0, 2.0)})

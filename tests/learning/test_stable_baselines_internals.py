@@ -63,7 +63,7 @@ def test_stable_baselines_has_each_attribute_used(owners: dict[str, object], own
     )
 
 
-def test_an_n_step_sample_has_discounts() -> None:
+def test_n_step_sample_has_discounts() -> None:
     from stable_baselines3.common.type_aliases import ReplayBufferSamples
 
     fields = ("observations", "actions", "next_observations", "dones", "rewards", "discounts")

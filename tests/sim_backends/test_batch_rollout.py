@@ -1,4 +1,4 @@
-"""Batched rollouts against the reference loop, the single-car plant, finite differences and each other."""
+"""Test batched rollouts against a reference loop, the single-car plant and finite differences."""
 
 import math
 
@@ -31,7 +31,7 @@ def some(cars, ticks, seed=0, dtype=torch.float64):
 
 
 def by_plant(config, start, commands, history=None, latency_s=None):
-    """The same simulation with the single-car plant."""
+    """Run the same simulation with the single-car plant."""
     period_s = config.control_period_s
     plant = Plant(config)
     past = 0 if history is None else len(history)
@@ -55,9 +55,11 @@ def by_plant(config, start, commands, history=None, latency_s=None):
 
 def test_agrees_with_the_plain_numpy_loop():
     start, commands = some(5, 30)
-    ours = rollout(SimulatorConfig(), start, commands).states
-    assert ours.shape == (5, 31, 6)
-    assert np.allclose(ours.numpy(), rollout_one_by_one(SimulatorConfig(), start.numpy(), commands.numpy()), atol=1e-12)
+    batched = rollout(SimulatorConfig(), start, commands).states
+    assert batched.shape == (5, 31, 6)
+    assert np.allclose(
+        batched.numpy(), rollout_one_by_one(SimulatorConfig(), start.numpy(), commands.numpy()), atol=1e-12
+    )
 
 
 def test_float32_stays_close_to_float64():
@@ -93,7 +95,7 @@ def test_agrees_with_the_single_car_path_with_history(kind, effects):
     assert np.abs(fine - batch).max() < 5e-3
 
 
-def test_batch_equals_single_rollouts_for_every_chunk_size(monkeypatch):
+def test_batch_equals_single_rollouts_for_each_chunk_size(monkeypatch):
     config = SimulatorConfig(effects={"steering_lag": {"time_constant": 0.05}})
     start, commands = some(9, 12)
     together = rollout(config, start, commands).states
@@ -127,9 +129,11 @@ def test_per_car_parameters_equal_single_rollouts():
     }
     together = rollout(SimulatorConfig(), start, commands, values=values, max_step_s=0.001).states
     for i in range(4):
-        own = {k: float(v[i]) if isinstance(v, torch.Tensor) else v for k, v in values.items()}
-        alone = rollout(SimulatorConfig().with_values(own), start[i : i + 1], commands[i : i + 1], max_step_s=0.001)
-        assert torch.allclose(alone.states[0], together[i], atol=1e-6)
+        car_values = {k: float(v[i]) if isinstance(v, torch.Tensor) else v for k, v in values.items()}
+        single = rollout(
+            SimulatorConfig().with_values(car_values), start[i : i + 1], commands[i : i + 1], max_step_s=0.001
+        )
+        assert torch.allclose(single.states[0], together[i], atol=1e-6)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.005, 1 / 30, 0.05, 0.08, 0.1])
@@ -159,11 +163,11 @@ def test_longer_delay_shifts_the_response_by_the_difference():
 def test_history_carries_delays_and_lags_over_the_start():
     config = SimulatorConfig(effects={"motor_lag": {"time_constant": 0.1}})
     start, commands = torch.zeros(1, 6, dtype=torch.float64), torch.full((1, 20, 2), 0.3, dtype=torch.float64)
-    whole = rollout(config, start, commands, max_step_s=0.001).states
+    full = rollout(config, start, commands, max_step_s=0.001).states
     past = torch.cat([torch.zeros(1, 1, 2), commands[:, :10]], dim=1)  # before the first command it was neutral
-    second = rollout(config, whole[:, 10], commands[:, 10:], history=past, max_step_s=0.001).states
-    assert torch.allclose(second, whole[:, 10:], atol=1e-10)
-    assert not torch.allclose(rollout(config, whole[:, 10], commands[:, 10:]).states[:, -1], whole[:, -1], atol=1e-3)
+    second = rollout(config, full[:, 10], commands[:, 10:], history=past, max_step_s=0.001).states
+    assert torch.allclose(second, full[:, 10:], atol=1e-10)
+    assert not torch.allclose(rollout(config, full[:, 10], commands[:, 10:]).states[:, -1], full[:, -1], atol=1e-3)
 
 
 def test_no_autograd_graph_without_a_required_gradient():
@@ -181,8 +185,8 @@ def all_effects():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_gradients_equal_finite_differences_for_every_number(kind):
-    # Delays that do not end where the number of steps of a piece changes.
+def test_gradients_equal_finite_differences_for_each_number(kind):
+    # These delays do not coincide with changes of the number of steps.
     delays = {"steering_delay": {"delay": 0.0273}, "throttle_delay": {"delay": 0.0214}}
     config = SimulatorConfig(kind=kind, effects={**all_effects(), **delays})
     start, commands = some(2, 6, seed=7)
@@ -206,14 +210,14 @@ def test_gradients_equal_finite_differences_for_every_number(kind):
 
     leaves = [t.clone().requires_grad_() for t in inputs]
     losses(*leaves).sum().backward()
-    # One batch: car 0 with one number of one input moved up or down, for each input.
+    # Each pair of cars in the batch has one entry of one input increased or decreased.
     rng, step = np.random.default_rng(1), 1e-6
-    moved = [t[:1].repeat(2 * len(inputs), *[1] * (t.ndim - 1)) for t in inputs]
+    perturbed = [t[:1].repeat(2 * len(inputs), *[1] * (t.ndim - 1)) for t in inputs]
     places = [int(rng.integers(t[0].numel())) for t in inputs]
     for index, place in enumerate(places):
-        moved[index][2 * index].view(-1)[place] += step
-        moved[index][2 * index + 1].view(-1)[place] -= step
-    found = losses(*moved)
+        perturbed[index][2 * index].view(-1)[place] += step
+        perturbed[index][2 * index + 1].view(-1)[place] -= step
+    found = losses(*perturbed)
     for index, (leaf, place) in enumerate(zip(leaves, places, strict=True)):
         label = (["start", "commands", "history", *names])[index]
         difference = float(found[2 * index] - found[2 * index + 1]) / (2 * step)
@@ -275,13 +279,13 @@ def test_marker_offset_changes_position_and_velocity_consistently():
     )
     start, _ = some(1, 1)
     commands = torch.full((1, 400, 2), 0.4, dtype=torch.float64)
-    seen = rollout(config, start, commands, measured=True).measured[0].numpy()
-    world = (seen[2:, :2] - seen[:-2, :2]) / 0.002
-    yaw = seen[1:-1, 2]
+    measured_states = rollout(config, start, commands, measured=True).measured[0].numpy()
+    world = (measured_states[2:, :2] - measured_states[:-2, :2]) / 0.002
+    yaw = measured_states[1:-1, 2]
     vx = np.cos(yaw) * world[:, 0] + np.sin(yaw) * world[:, 1]
     vy = -np.sin(yaw) * world[:, 0] + np.cos(yaw) * world[:, 1]
-    assert np.abs(vx - seen[1:-1, 3]).max() < 2e-3
-    assert np.abs(vy - seen[1:-1, 4]).max() < 2e-3
+    assert np.abs(vx - measured_states[1:-1, 3]).max() < 2e-3
+    assert np.abs(vy - measured_states[1:-1, 4]).max() < 2e-3
 
 
 def test_velocity_filter_is_a_first_order_lag_on_velocities_only():
@@ -315,7 +319,7 @@ def test_steering_lag_is_the_exponential():
     assert np.abs(yaw_rate - solve_ivp(rates, (0, t[-1]), [0.0], t_eval=t, rtol=1e-9, atol=1e-12).y[0]).max() < 1e-6
 
 
-def test_wrong_input_is_refused():
+def test_invalid_input_is_refused():
     start, commands = some(3, 5)
     with pytest.raises(DataError, match="must be \\(cars, 6\\)"):
         rollout(SimulatorConfig(), start[:, :5], commands)
@@ -331,7 +335,7 @@ def test_wrong_input_is_refused():
         rollout(SimulatorConfig(), start, commands, values={"timing.control_period": 0.1})
 
 
-def test_no_commands_and_commands_of_another_type():
+def test_empty_commands_and_commands_of_another_dtype_are_accepted():
     start, commands = some(3, 5)
     empty = rollout(SimulatorConfig(), start, commands[:, :0], measured=True)
     assert torch.equal(empty.states[:, 0], start)
@@ -343,8 +347,8 @@ def test_no_commands_and_commands_of_another_type():
 def test_measuring_does_not_change_the_trajectory():
     start, commands = some(3, 10)
     config = SimulatorConfig(effects=all_effects())
-    seen = rollout(config, start, commands, measured=True).states
-    assert torch.equal(seen, rollout(config, start, commands).states)
+    states = rollout(config, start, commands, measured=True).states
+    assert torch.equal(states, rollout(config, start, commands).states)
 
 
 @pytest.mark.gpu

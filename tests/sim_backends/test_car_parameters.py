@@ -1,4 +1,4 @@
-"""Car files: valid and invalid tables, and that reading and writing are inverse."""
+"""Test car files: valid and invalid tables, and round trips."""
 
 import re
 import tomllib
@@ -68,9 +68,9 @@ def test_toml_round_trip_keeps_effects_and_priors():
     config = SimulatorConfig.from_tables(tables)
     assert config.effects["marker_offset"] == {"ahead": 0.0, "left": 0.01}
     assert config.priors == {"motor.drive_gain": (6.0, 10.0), "effects.marker_offset.left": (-0.1, 0.1)}
-    again = SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(config.to_tables())))
-    assert again == config
-    assert again.values()["motor.drive_gain"] == 8.0
+    reread = SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(config.to_tables())))
+    assert reread == config
+    assert reread.values()["motor.drive_gain"] == 8.0
 
 
 @pytest.mark.parametrize(
@@ -156,8 +156,8 @@ def test_number_may_have_a_standard_deviation_with_or_without_a_range():
         SimulatorConfig.from_tables({"motor": {"drive_gain": {"value": 8.2, "high": 9.0, "std": 0.1}}})
 
 
-def test_a_latency_that_the_car_file_does_not_state_is_unknown_until_it_is_set() -> None:
-    """The simulator uses the default; written files do not state the latency either."""
+def test_latency_missing_in_the_car_file_is_unknown_until_set() -> None:
+    """The simulator uses the default latency; written files omit it."""
     silent = SimulatorConfig.from_tables({"mocap": {"rate": 100.0}})
     assert silent.unknown == {"mocap.latency"}
     assert silent.mocap.latency_s == SimulatorConfig().mocap.latency_s

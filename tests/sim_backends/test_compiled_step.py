@@ -1,4 +1,4 @@
-"""The traced and compiled step against the operators that it was traced from, value and derivative."""
+"""Test the compiled step against the torch operators it is traced from (values and derivatives)."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled.tracing import Tracer, gradients
 from sim_backends.effects import EFFECTS
 
-EVERYTHING = {  # all but the one that turns a kinematic or linear-tyre car into a dynamic one
+ALL_EFFECTS = {  # except tyre saturation, which makes a kinematic or linear-tyre car dynamic
     name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items() if name != "tyre_saturation"
 }
 
@@ -22,7 +22,7 @@ def some(cars, ticks):
 
 
 @pytest.mark.parametrize("kind", ["dynamic", "linear_tyre", "kinematic", "blend"])
-@pytest.mark.parametrize("effects", [{}, EVERYTHING])
+@pytest.mark.parametrize("effects", [{}, ALL_EFFECTS])
 @pytest.mark.parametrize("per_car_delay", [False, True])
 def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_car_delay):
     config = SimulatorConfig(kind=kind, effects=effects)
@@ -37,8 +37,8 @@ def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_
         (out.states.square().sum() + out.measured[:, 3:].sum()).backward()
         grads = [start.grad, commands.grad, *([mu.grad] if mu.grad is not None else [])]
         results.append([out.states.detach(), out.measured.detach(), *grads, *([delay.grad] if per_car_delay else [])])
-    for ours, theirs in zip(*results, strict=True):
-        assert torch.allclose(ours, theirs, rtol=1e-9, atol=1e-10)
+    for compiled, reference in zip(*results, strict=True):
+        assert torch.allclose(compiled, reference, rtol=1e-9, atol=1e-10)
 
 
 def test_gradient_of_more_cars_than_one_chunk(monkeypatch):

@@ -1,4 +1,4 @@
-"""Effect ids occur as strings in the effect classes only."""
+"""Test that effect ids occur as strings in the effect classes only."""
 
 import ast
 import re
@@ -9,15 +9,15 @@ from sim_backends.effects import EFFECTS
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("carlab", "drivers", "learning", "mocap", "sim_backends")
 OWN_GENERATOR = ROOT / "carlab" / "benchmark"
-"""The proof's world is independent of the simulator and has its own catalogue."""
+"""The simulator of the proof is independent and has its own catalogue."""
 EFFECT_CLASSES = ROOT / "sim_backends" / "effects"
 DOTTED = re.compile(rf"\beffects\.({'|'.join(EFFECTS)})\b")
 
 
 def ids_in(source: str) -> list[tuple[int, str]]:
-    """Lines and texts of string constants that are an effect's id, or a dotted name with an id."""
+    """Return lines and texts of string constants that are an effect id or a dotted name with one."""
     tree = ast.parse(source)
-    # The audit of recordings has ids of findings; one of them is the word of an effect.
+    # One id of the recording audit equals an effect id.
     findings = {
         id(node.args[0])
         for node in ast.walk(tree)

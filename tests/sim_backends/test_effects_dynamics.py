@@ -1,4 +1,4 @@
-"""Dynamics effects against an independent implementation of their equations, integrated by scipy."""
+"""Test dynamics effects against independent equations integrated by scipy."""
 
 import math
 
@@ -112,16 +112,18 @@ def reference_rates(t, s, d, u, p, e):
     front_each = -mu_front * math.sin(p.front_c * math.atan(p.front_b * slip_front))
     rear_each = -mu_rear * math.sin(p.rear_c * math.atan(p.rear_b * slip_rear))
     height = e["load_transfer"]["height"] if has("load_transfer") else 0.0
-    moved, force = 0.0, demand
-    for _ in range(60):  # the loop of load transfer and traction limit, by brute force
+    transferred_load, force = 0.0, demand
+    for _ in range(60):  # fixed-point iteration of load transfer and traction limit
         force = demand
         if has("traction_limit"):
             q = e["traction_limit"]
-            grip = mu_rear * (z_rear + moved) + (mu_front * (z_front - moved) if q.get("axle") == "all" else 0.0)
+            grip = mu_rear * (z_rear + transferred_load) + (
+                mu_front * (z_front - transferred_load) if q.get("axle") == "all" else 0.0
+            )
             force = min(max(demand, -q["share"] * grip), q["share"] * grip)
-        m_ax = force + body_x - front_each * (z_front - moved) * math.sin(d)
-        moved = m_ax * height / (a + b)
-    z_front, z_rear = z_front - moved, z_rear + moved
+        m_ax = force + body_x - front_each * (z_front - transferred_load) * math.sin(d)
+        transferred_load = m_ax * height / (a + b)
+    z_front, z_rear = z_front - transferred_load, z_rear + transferred_load
     f_front, f_rear = front_each * z_front, rear_each * z_rear
     rim_rate = 0.0
     if has("longitudinal_slip"):
@@ -165,7 +167,7 @@ def reference_rates(t, s, d, u, p, e):
 def by_scipy(p, effects, start=START, drive=DRIVE):
     hidden = [0.0, 0.0, start[3], 0.0, 0.0]
 
-    # Hidden states start steady at neutral: integrate the lagging ones alone with a fixed body state.
+    # Hidden states start in steady state: integrate them with a fixed body state.
     def held(t, s):
         return [0.0] * 6 + reference_rates(0.0, [*start, *s[6:]], 0.0, 0.0, p, effects)[6:]
 
@@ -173,7 +175,7 @@ def by_scipy(p, effects, start=START, drive=DRIVE):
     if set(effects) & {"tyre_relaxation", "roll_dynamics"}:
         state[6:] = solve_ivp(held, (0, 30), state, rtol=1e-9, atol=1e-11, method="LSODA").y[6:, -1]
         state[8] = start[3]
-    if "longitudinal_slip" in effects:  # where wheels and car speed up alike
+    if "longitudinal_slip" in effects:  # wheels and car accelerate equally
         q, demand = effects["longitudinal_slip"], -p.damping_nspm * start[3]
         limit = p.rear_mu * p.mass_kg * G * p.front_axle_m / (p.front_axle_m + p.rear_axle_m)
         share = demand / (1 + q["inertia"] / RADIUS**2 / p.mass_kg) / limit
@@ -201,8 +203,8 @@ def by_plant(config, start=START, drive=DRIVE):
     return plant.state.to_array()
 
 
-def difference(ours, reference):
-    error = ours - reference[:6]
+def difference(simulated, reference):
+    error = simulated - reference[:6]
     error[2] = math.remainder(error[2], 2 * math.pi)
     return np.abs(error).max()
 
@@ -212,7 +214,7 @@ def test_agrees_with_scipy(case, monkeypatch):
     config = SimulatorConfig(command_delay_s=0.0, effects=CASES[case])
     reference = by_scipy(config.parameters, CASES[case])
     if case != "tyre_saturation":
-        assert difference(by_scipy(config.parameters, {})[:6], reference) > 3e-3  # the drive shows the effect
+        assert difference(by_scipy(config.parameters, {})[:6], reference) > 3e-3  # the drive excites the effect
     coarse = difference(by_plant(config), reference)
     monkeypatch.setattr("sim_backends.plant.MAX_STEP_S", 0.001)
     fine = difference(by_plant(config), reference)

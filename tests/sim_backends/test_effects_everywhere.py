@@ -1,4 +1,4 @@
-"""Properties of every effect: identity, engines, gradients, files, symmetries, hidden states."""
+"""Test properties of each effect: identity, engines, gradients, files, symmetries, hidden states."""
 
 import math
 import tomllib
@@ -60,7 +60,7 @@ IDS = [
 def typical(name):
     numbers = {p.name: p.typical for p in EFFECTS[name].parameters}
     stronger = {"battery_sag": {"rate": 0.2}, "friction_drift": {"rate": -0.2}}
-    # Delays that do not end where the number of steps of a piece changes.
+    # These delays do not coincide with changes of the number of steps.
     stronger |= {"steering_delay": {"delay": 0.0273}, "throttle_delay": {"delay": 0.0214}}
     return {**numbers, **stronger.get(name, {})}
 
@@ -75,7 +75,7 @@ def past(cars=4, ticks=5):
     return torch.tensor(np.random.default_rng(5).uniform(-1, 1, (cars, ticks, 2)))
 
 
-def test_the_catalogue_is_complete():
+def test_catalogue_is_complete():
     assert list(CATALOGUE) == IDS
     assert all(effect.catalogued == (name in IDS) for name, effect in EFFECTS.items())
     assert all(bool(effect.class_statement) != effect.catalogued for effect in EFFECTS.values())
@@ -94,7 +94,7 @@ def test_effect_at_its_identity_changes_neither_states_nor_gradients(name, engin
         numbers = {k: v for k, v in numbers.items() if not k.startswith("mocap.")}
         values = {k: torch.full((4,), v, dtype=torch.float64, requires_grad=True) for k, v in numbers.items()}
         (start, commands), history = some(), past()
-        commands[:, 2] = 0.0  # where a dead band and a power have kinks
+        commands[:, 2] = 0.0  # the kink of a dead band and a power
         leaves = [t.requires_grad_() for t in (start, commands, history)]
         out = rollout(config, start, commands, history=history, values=values, measured=True, t0_s=2.0, engine=engine)
         (out.states.square().sum() + out.measured.square().sum()).backward()
@@ -106,8 +106,8 @@ def test_effect_at_its_identity_changes_neither_states_nor_gradients(name, engin
         assert value.grad is None or torch.isfinite(value.grad).all(), key
         if key in plain_values and not (key.startswith("tyre.") and name == "tyre_saturation"):
             assert torch.allclose(value.grad, plain_values[key].grad, rtol=1e-9, atol=1e-9), key
-    for ours, theirs in zip(leaves, plain_leaves, strict=True):
-        assert torch.allclose(ours.grad, theirs.grad, rtol=1e-9, atol=1e-9)
+    for with_effect, without in zip(leaves, plain_leaves, strict=True):
+        assert torch.allclose(with_effect.grad, without.grad, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -134,7 +134,7 @@ def test_plant_arrays_operators_and_compiled_gradients_agree(name, kind, monkeyp
     operators = rollout(config, start, commands, engine="operators").states
     leaf = commands.clone().requires_grad_()
     compiled = rollout(config, start, leaf).states
-    with monkeypatch.context() as patch:  # the code for many cars, which writes over what is not needed any more
+    with monkeypatch.context() as patch:  # the in-place code for many cars
         patch.setattr("sim_backends.compiled.step.FEW_CARS", 2)
         many = rollout(config, start, commands).states
     for other in (operators, compiled.detach(), many):
@@ -175,7 +175,7 @@ def test_gradients_by_the_effects_numbers_equal_finite_differences(name):
     (start, commands), history = some(cars=1), past(cars=1)
     keys = [f"effects.{name}.{p.name}" for p in EFFECTS[name].parameters if not p.choices]
     numbers = {f"effects.{name}.{k}": v for k, v in typical(name).items()}
-    if name == "low_friction_patch":  # on its rim, where the place counts
+    if name == "low_friction_patch":  # on its rim, where the position matters
         x, y = float(start[0, 0]), float(start[0, 1])
         numbers |= {f"effects.{name}.x": x - 0.5, f"effects.{name}.y": y - 0.4, f"effects.{name}.radius": 0.65}
     if name == "coast_brake":
@@ -193,9 +193,9 @@ def test_gradients_by_the_effects_numbers_equal_finite_differences(name):
     losses(leaves).sum().backward()
     step = 1e-6
     for key in keys:
-        moved = {k: torch.full((2,), v, dtype=torch.float64) for k, v in numbers.items()}
-        moved[key] += torch.tensor([step, -step], dtype=torch.float64)
-        up, down = losses(moved).tolist()
+        perturbed = {k: torch.full((2,), v, dtype=torch.float64) for k, v in numbers.items()}
+        perturbed[key] += torch.tensor([step, -step], dtype=torch.float64)
+        up, down = losses(perturbed).tolist()
         assert float(leaves[key].grad) == pytest.approx((up - down) / (2 * step), rel=5e-4, abs=1e-6), key
         assert abs(up - down) > 1e-12, key
 
@@ -204,9 +204,9 @@ def test_gradients_by_the_effects_numbers_equal_finite_differences(name):
 def test_toml_round_trip(name):
     for given in ({}, typical(name)):
         config = SimulatorConfig(effects={name: given})
-        again = SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(config.to_tables())))
-        assert again == config
-        assert set(again.effects[name]) == {p.name for p in EFFECTS[name].parameters}
+        reread = SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(config.to_tables())))
+        assert reread == config
+        assert set(reread.effects[name]) == {p.name for p in EFFECTS[name].parameters}
 
 
 def test_choice_is_a_word_in_car_files_and_a_position_elsewhere():
@@ -223,7 +223,7 @@ def test_choice_is_a_word_in_car_files_and_a_position_elsewhere():
         SimulatorConfig(effects={"steering_lag": {"time_constant": "rear"}})
 
 
-# Numbers that change sign where left and right are exchanged; a heading is mirrored by its sign.
+# Parameters that change sign under the mirror symmetry.
 MIRRORED = {
     "steering_offset": ("angle",),
     "steering_asymmetry": ("gain",),
@@ -244,76 +244,76 @@ FLIP = torch.tensor([1, -1, -1, 1, -1, -1], dtype=torch.float64)
 @pytest.mark.parametrize("name", NAMES)
 def test_mirror_symmetry(name):
     start, commands = some()
-    ours = rollout(SimulatorConfig(effects={name: typical(name)}), start, commands, history=past(), measured=True)
+    original = rollout(SimulatorConfig(effects={name: typical(name)}), start, commands, history=past(), measured=True)
     other = {k: -v if k in MIRRORED.get(name, ()) else v for k, v in typical(name).items()}
-    turned = torch.tensor([-1.0, 1.0], dtype=torch.float64)
-    theirs = rollout(
+    mirror = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+    image = rollout(
         SimulatorConfig(effects={name: other}),
         start * FLIP,
-        commands * turned,
-        history=past() * turned,
+        commands * mirror,
+        history=past() * mirror,
         measured=True,
     )
-    assert torch.allclose(ours.states, theirs.states * FLIP, rtol=0, atol=1e-11)
-    assert torch.allclose(ours.measured, theirs.measured * FLIP, rtol=0, atol=1e-11)
+    assert torch.allclose(original.states, image.states * FLIP, rtol=0, atol=1e-11)
+    assert torch.allclose(original.measured, image.measured * FLIP, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_rigid_motion_of_the_world_with_its_fixed_objects(name):
     start, commands = some()
-    # A scale of motion capture leaves its own origin where it is.
+    # The position scale of motion capture has a fixed origin.
     turn, east, north = 1.1, *((0.0, 0.0) if name == "position_scale" else (4.0, -7.0))
     c, s = math.cos(turn), math.sin(turn)
 
-    def moved(states):
+    def transformed(states):
         x, y, yaw, *rest = states.unbind(-1)
         return torch.stack([east + c * x - s * y, north + s * x + c * y, yaw + turn, *rest], dim=-1)
 
     numbers = typical(name)
-    there = dict(numbers)
+    moved_parameters = dict(numbers)
     if name == "low_friction_patch":
-        there["x"], there["y"] = (
+        moved_parameters["x"], moved_parameters["y"] = (
             east + c * numbers["x"] - s * numbers["y"],
             north + s * numbers["x"] + c * numbers["y"],
         )
     if name in ("road_slope", "wind"):
-        there["direction"] += turn
-    ours = rollout(SimulatorConfig(effects={name: numbers}), start, commands, measured=True)
-    theirs = rollout(SimulatorConfig(effects={name: there}), moved(start), commands, measured=True)
-    assert torch.allclose(moved(ours.states), theirs.states, rtol=0, atol=1e-10)
-    assert torch.allclose(moved(ours.measured), theirs.measured, rtol=0, atol=1e-10)
+        moved_parameters["direction"] += turn
+    original = rollout(SimulatorConfig(effects={name: numbers}), start, commands, measured=True)
+    image = rollout(SimulatorConfig(effects={name: moved_parameters}), transformed(start), commands, measured=True)
+    assert torch.allclose(transformed(original.states), image.states, rtol=0, atol=1e-10)
+    assert torch.allclose(transformed(original.measured), image.measured, rtol=0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_rollout_with_history_continues_a_longer_rollout(name):
-    """The history sets the hidden states, t0_s the time."""
+    """The history determines the hidden states, ``t0_s`` the time."""
     config = SimulatorConfig(effects={name: typical(name)})
     generator = np.random.default_rng(8)
     start = torch.tensor([[0, 0, 0, 2.0, 0, 0], [1, 0, 1, 1.5, 0, 0]], dtype=torch.float64)
     commands = torch.tensor(generator.uniform([-0.6, 0.1], [0.6, 0.6], (2, 45, 2)))
-    whole = rollout(config, start, commands).states
+    full = rollout(config, start, commands).states
     half = rollout(
         config,
-        whole[:, 30],
+        full[:, 30],
         commands[:, 30:],
         history=commands[:, :30],
-        history_states=whole[:, :30],
+        history_states=full[:, :30],
         t0_s=30 * config.control_period_s,
     ).states
-    assert torch.allclose(half, whole[:, 30:], rtol=0, atol=2e-3)
+    assert torch.allclose(half, full[:, 30:], rtol=0, atol=2e-3)
     if not {"states", "has_state"} & {k for k in dir(EFFECTS[name]) if getattr(EFFECTS[name], k)}:
-        assert torch.allclose(half, whole[:, 30:], rtol=0, atol=1e-9)
+        assert torch.allclose(half, full[:, 30:], rtol=0, atol=1e-9)
 
 
 def test_hidden_states_without_history_are_steady_for_the_initial_velocities():
-    """On a steady circle the steady hidden states are exact: a restarted rollout does not change."""
+    """On a steady circle the steady-state hidden states are exact, so a restarted rollout is unchanged."""
     effects = {n: typical(n) for n in ("tyre_relaxation", "roll_dynamics", "longitudinal_slip", "steering_lag")}
     config = SimulatorConfig(effects=effects)
     start = torch.tensor([[0, 0, 0, 1.2, 0, 0]], dtype=torch.float64)
     commands = torch.tensor([0.25, 0.3], dtype=torch.float64).expand(1, 400, 2)
-    whole = rollout(config, start, commands).states
-    again = rollout(config, whole[:, 360], commands[:, 360:], history=commands[:, :20]).states
-    assert torch.allclose(again, whole[:, 360:], rtol=0, atol=1e-4)
+    full = rollout(config, start, commands).states
+    restarted = rollout(config, full[:, 360], commands[:, 360:], history=commands[:, :20]).states
+    assert torch.allclose(restarted, full[:, 360:], rtol=0, atol=1e-4)
 
 
 def test_time_dependent_effects_use_the_time_since_the_first_row():
@@ -338,7 +338,7 @@ def test_time_dependent_effects_use_the_time_since_the_first_row():
 
 
 def test_result_does_not_depend_on_the_listed_order_of_effects():
-    """Also, all effects at once stay finite, from rest and in reverse."""
+    """All effects together give finite states from standstill and in reverse."""
     everything = {n: typical(n) for n in NAMES}
     backwards = dict(reversed(everything.items()))
     start, commands = some()
@@ -356,16 +356,16 @@ def test_yaw_misalignment_changes_only_measured_states():
         effects={"mocap_latency": {"latency": 0.0}, "mocap_yaw_misalignment": {"angle": angle}, "marker_offset": {}}
     )
     out = rollout(config, start, commands, measured=True)
-    true, seen = out.states, out.measured
-    assert torch.allclose(seen[..., 2], true[..., 2] + angle)
-    assert torch.allclose(seen[..., :2], true[..., :2])
-    # The velocity in the world is the same one.
-    for states in (true, seen):
+    true, measured = out.states, out.measured
+    assert torch.allclose(measured[..., 2], true[..., 2] + angle)
+    assert torch.allclose(measured[..., :2], true[..., :2])
+    # The velocity in the world frame is unchanged.
+    for states in (true, measured):
         states_vx = states[..., 3] * torch.cos(states[..., 2]) - states[..., 4] * torch.sin(states[..., 2])
         assert torch.allclose(
             states_vx, true[..., 3] * torch.cos(true[..., 2]) - true[..., 4] * torch.sin(true[..., 2])
         )
     small = torch.stack([true[..., 3] + angle * true[..., 4], true[..., 4] - angle * true[..., 3]], dim=-1)
-    assert (seen[..., 3:5] - small).abs().max() < angle**2 * 3
+    assert (measured[..., 3:5] - small).abs().max() < angle**2 * 3
     plant = Plant(SimulatorConfig(effects={"mocap_yaw_misalignment": {"angle": angle}}))
     assert plant.measured_pose(0.0).yaw_rad == pytest.approx(angle)

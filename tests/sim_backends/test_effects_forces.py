@@ -1,4 +1,4 @@
-"""Single dynamics effects: closed forms, balances and conserved quantities."""
+"""Test single dynamics effects by closed forms, balances and conserved quantities."""
 
 import math
 
@@ -31,7 +31,7 @@ def drive(cfg, start, action=(0.0, 0.0), duration_s=1.0):
 
 
 def forces_at(effects, state, steering=0.0, throttle=0.0, t_s=0.0):
-    """All forces of a model at a state whose hidden states have settled."""
+    """Return all forces of a model in steady state of its hidden states."""
     cfg = config(effects)
     model = SingleTrack(FLOATS, "dynamic", cfg.values(), cfg.effects)
     actuation = model.actuation(P.max_angle_rad * steering, throttle)
@@ -93,7 +93,7 @@ def test_slope_conserves_energy_without_drive_and_resistance():
     assert abs(after - before) > 0.1
 
 
-def test_a_car_facing_up_the_slope_rolls_back():
+def test_car_facing_up_the_slope_rolls_back():
     state = drive(config({"road_slope": {"angle": 0.1, "direction": 0.7}}), (0, 0, 0.7, 0, 0, 0)).state
     assert state.vx_mps < -0.3
     assert abs(state.vy_mps) < 1e-9
@@ -106,8 +106,8 @@ def test_crossing_a_patch_loses_grip_between_its_rims_only():
         _, plain = forces_at({"rolling_resistance": {}}, (x, 0.0, 0.0, 2.0, 0.5, 0.0))
         assert forces.side_rear / plain.side_rear == pytest.approx(factor, abs=1e-12)
         assert forces.grip_front == pytest.approx(P.front_mu * factor)
-    past, beside = (drive(config({"low_friction_patch": disc}), (1.2, y, 0, 2.0, 0.3, 0)).state for y in (0.0, 5.0))
-    assert abs(past.yaw_rad - beside.yaw_rad) > 5e-3
+    inside, outside = (drive(config({"low_friction_patch": disc}), (1.2, y, 0, 2.0, 0.3, 0)).state for y in (0.0, 5.0))
+    assert abs(inside.yaw_rad - outside.yaw_rad) > 5e-3
 
 
 def test_friction_drift_scales_the_largest_side_force_with_time():
@@ -124,10 +124,10 @@ def test_load_transfer_balances_the_moments_about_the_axles():
     for throttle, steering in ((1.0, 0.0), (-1.0, 0.0), (0.7, 0.8), (0.0, -0.9)):
         rates, forces = forces_at({"load_transfer": {"height": height}}, state, steering, throttle)
         ax = rates[3] - state[4] * state[5]
-        moved = P.mass_kg * ax * height / P.wheelbase_m
-        assert forces.load_rear == pytest.approx(P.mass_kg * G * 0.13 / 0.3 + moved, rel=1e-12)
-        assert forces.load_front == pytest.approx(P.mass_kg * G * 0.17 / 0.3 - moved, rel=1e-12)
-        assert (moved > 0) == (ax > 0)
+        transferred_load = P.mass_kg * ax * height / P.wheelbase_m
+        assert forces.load_rear == pytest.approx(P.mass_kg * G * 0.13 / 0.3 + transferred_load, rel=1e-12)
+        assert forces.load_front == pytest.approx(P.mass_kg * G * 0.17 / 0.3 - transferred_load, rel=1e-12)
+        assert (transferred_load > 0) == (ax > 0)
 
 
 def test_downforce_adds_grip_with_the_square_of_speed():
@@ -136,7 +136,7 @@ def test_downforce_adds_grip_with_the_square_of_speed():
     assert forces.load_front / forces.load_rear == pytest.approx(0.17 / 0.13)
 
 
-def test_relaxation_is_first_order_in_distance_at_every_speed():
+def test_relaxation_is_first_order_in_distance_at_each_speed():
     """A held slip angle: the force has built up to 1 - 1/e after one relaxation length, whatever the speed."""
     length = 0.3
     cfg = config({"tyre_relaxation": {"length": length}}, **STRAIGHT_ON)
@@ -189,15 +189,15 @@ def test_roll_settles_where_loss_and_side_force_agree(sensitivity):
 
 
 def test_wheel_slip_balances_the_drive_at_steady_slip():
-    """At constant speed the tyres pass on what the motor asks for, at the slip where the tanh has that value."""
+    """At constant speed the tyre force equals the drive force, which determines the slip of the tanh curve."""
     stiffness, speed = 30.0, 2.0
     throttle = 0.5
     cfg = config({"longitudinal_slip": {"inertia": 3e-4, "stiffness": stiffness}})
     plant = drive(cfg, (0,) * 6, (0.0, throttle), 8.0)
     state = plant.state
-    top = P.drive_gain_n * throttle / P.damping_nspm  # no slip needed where no force is left
+    top = P.drive_gain_n * throttle / P.damping_nspm  # without net force there is no slip
     assert state.vx_mps == pytest.approx(top, rel=2e-3)
-    # Held back by a constant drag there is a force, and so slip.
+    # A constant drag requires a force, and so slip.
     held = config(
         {
             "longitudinal_slip": {"inertia": 3e-4, "stiffness": stiffness},

@@ -1,4 +1,4 @@
-"""Input effects of the actuator chain: closed forms, explicit trajectories and scipy."""
+"""Test input effects of the actuator chain by closed forms, explicit trajectories and scipy."""
 
 import itertools
 import math
@@ -24,7 +24,7 @@ def chain(effects):
 
 
 def angles(effects, commands, step_s=0.01, start=0.0):
-    """Wheel angle after each step of ``step_s`` in which the given steering is held."""
+    """Return the wheel angle after each step of ``step_s`` with held steering."""
     one = chain(effects)
     memory, found = one.settled((start, 0.0)), []
     for command in commands:
@@ -50,7 +50,7 @@ def test_rate_limit_takes_the_time_of_its_ramp():
 
 @pytest.mark.parametrize("name", ["steering_lag", "steering_rate_limit"])
 @pytest.mark.parametrize("strength", [0.1, 0.5, 1.0, 3.0, 20.0, 1000.0])
-def test_mean_over_a_step_is_accurate_for_every_servo_speed(name, strength):
+def test_mean_over_a_step_is_accurate_for_each_servo_speed(name, strength):
     """Simpson's rule over start, middle and end, as in Runge-Kutta; ``strength`` is the rate per step."""
     step_s, jump = 0.01, 0.6
     effects = {
@@ -68,14 +68,14 @@ def test_mean_over_a_step_is_accurate_for_every_servo_speed(name, strength):
 def test_backlash_is_the_play_operator_written_out():
     play = 0.2
     commanded = [0.05, 0.3, 0.25, 0.15, 0.05, 0.0, 0.1, 0.2, 0.3, -0.4, -0.2, -0.2]
-    # Starts settled at 0 and moves only when the command has gone 0.1 beyond it.
+    # The wheel starts at 0 and moves when the command exceeds the play of 0.1.
     expected = [0.0, 0.2, 0.2, 0.2, 0.15, 0.1, 0.1, 0.1, 0.2, -0.3, -0.3, -0.3]
     found = angles({"steering_backlash": {"play": play}}, [c / MAX_ANGLE for c in commanded])
     assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_backlash_is_rate_independent():
-    """Rate independence: a slow sweep and a jump to the same turning points end alike."""
+    """Backlash is rate independent: a slow sweep and jumps to the same turning points end equally."""
     effects = {"steering_backlash": {"play": 0.15}}
     turning = [0.0, 0.9, -0.3, 0.5, 0.45]
     slow = [v for a, b in itertools.pairwise(turning) for v in np.linspace(a, b, 40)[1:]]
@@ -132,7 +132,7 @@ def test_effects_act_in_the_documented_order():
 
 
 def test_throttle_delay_moves_the_drive_alone():
-    """A step of both commands: the car turns in at the same time and speeds up later by the delay."""
+    """After a step of both commands the car steers at the same time and accelerates later by the delay."""
     period_s = 0.01
     start = torch.tensor([[0, 0, 0, 1.0, 0, 0]], dtype=torch.float64)
     commands = torch.zeros(1, 30, 2, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The measurement model on floats, arrays and tensors: inverse, filter, window, latency and delays."""
+"""Test the measurement model on floats, arrays and tensors: inverse, filter, window, latency, delays."""
 
 import math
 
@@ -29,7 +29,7 @@ def model_of(config, ops=FLOATS, convert=float):
 
 
 @pytest.mark.parametrize("name", OBSERVATIONS)
-def test_inverse_of_every_observation_effect_recovers_the_state(name):
+def test_inverse_of_each_observation_effect_recovers_the_state(name):
     for size in (-3.0, 0.0, 1.0, 10.0):
         low, high = EFFECTS[name].parameters[0].low, EFFECTS[name].parameters[0].high
         values = {p.name: min(max(size * p.typical, low), high) for p in EFFECTS[name].parameters}
@@ -45,10 +45,10 @@ def test_newtons_inverse_equals_the_closed_form(name):
 
 
 def test_newtons_inverse_of_a_rotation_by_90_degrees():
-    """There the first pivot is zero."""
+    """The first pivot of the Jacobian is zero."""
     effect = EFFECTS["mocap_yaw_misalignment"]
-    seen = effect.observe(FLOATS, STATE, {"angle": math.pi / 2})
-    assert ObservationEffect.invert(effect, FLOATS, seen, {"angle": math.pi / 2}) == pytest.approx(STATE, rel=1e-11)
+    measured = effect.observe(FLOATS, STATE, {"angle": math.pi / 2})
+    assert ObservationEffect.invert(effect, FLOATS, measured, {"angle": math.pi / 2}) == pytest.approx(STATE, rel=1e-11)
 
 
 def test_floats_arrays_and_tensors_give_equal_measurements():
@@ -69,14 +69,14 @@ def test_floats_arrays_and_tensors_give_equal_measurements():
         before = batch(settings["velocities_before"], of)
         found = model.measure(batch(trajectory, of), 0.03, window_s2=3e-4, velocities_before=before)
         inverted = model.invert(found[0])
-        for wanted, state in zip(expected, found, strict=True):
-            for value, row in zip(wanted, state, strict=True):
+        for expected_state, state in zip(expected, found, strict=True):
+            for value, row in zip(expected_state, state, strict=True):
                 assert np.allclose(np.asarray(row), value, rtol=1e-13)
         assert np.allclose(np.asarray(inverted[0]), model_of(config).invert(expected[0])[0], rtol=1e-12)
 
 
-def test_the_filter_solves_its_differential_equation():
-    """Response to a ramp of slope 1: ``t - T (1 - exp(-t / T))``; a time constant of 0 passes it on."""
+def test_filter_solves_its_differential_equation():
+    """The ramp response is ``t - T (1 - exp(-t / T))``; a time constant of 0 changes nothing."""
     period, lag = 0.02, 0.07
     inputs = [(k * period,) * 3 for k in range(20)]
     for k, output in enumerate(filter_velocities(FLOATS, inputs, period, lag)):
@@ -85,8 +85,8 @@ def test_the_filter_solves_its_differential_equation():
     assert filter_velocities(FLOATS, inputs[:1], period, lag, (5.0,) * 3) == [(5.0,) * 3]
 
 
-def test_the_window_is_the_mean_of_world_velocities_over_a_box():
-    """Velocities of poses by a central difference over two ticks; their variance in time is that of the box."""
+def test_window_is_the_mean_of_world_velocities_over_a_box():
+    """The reference is the central difference of poses over two ticks, a box window."""
     period = 0.01
     half = period
     t = period * np.arange(-4, 5)
@@ -105,9 +105,9 @@ def test_the_window_is_the_mean_of_world_velocities_over_a_box():
     mean = (pose(t + half) - pose(t - half)) / (2.0 * half)
     states = [tuple(row) for row in np.column_stack([*pose(t), *body(world(t), yaw)])]
     found = windowed(FLOATS, states, period, (2.0 * half) ** 2 / 12.0)
-    wanted = np.column_stack(body(mean, yaw))
-    assert np.allclose([s[3:] for s in found[1:-1]], wanted[1:-1], atol=2e-8)
-    assert np.abs(wanted - [s[3:] for s in states]).max() > 5e-5
+    expected = np.column_stack(body(mean, yaw))
+    assert np.allclose([s[3:] for s in found[1:-1]], expected[1:-1], atol=2e-8)
+    assert np.abs(expected - [s[3:] for s in states]).max() > 5e-5
     assert found[0] == states[0]
     assert found[-1] == states[-1]
 

@@ -1,4 +1,4 @@
-"""The single-car plant in continuous time."""
+"""Test the single-car plant in continuous time."""
 
 import subprocess
 import sys
@@ -53,8 +53,8 @@ def test_result_does_not_depend_on_the_number_of_calls():
 def test_time_never_goes_back():
     plant = Plant(SimulatorConfig())
     plant.command(0.0, Action(0.0, 0.5))
-    there = plant.advance(0.5)
-    assert plant.advance(0.2) == there
+    latest = plant.advance(0.5)
+    assert plant.advance(0.2) == latest
     assert plant.t_s == 0.5
 
 
@@ -89,7 +89,7 @@ def test_reset_discards_pending_commands():
     assert plant.advance(1.0) == CarState()
 
 
-def test_the_single_car_needs_no_torch():
+def test_single_car_needs_no_torch():
     code = (
         "import sys; from sim_backends import SimulatedCar, Plant, MocapSensor, SimulatorConfig; "
         "car = SimulatedCar(); car.open(); car.observe(); car.close(); print('torch' in sys.modules)"

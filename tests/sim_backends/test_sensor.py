@@ -1,4 +1,4 @@
-"""Simulated motion capture: schedule, noise, losses, latency."""
+"""Test simulated motion capture: schedule, noise, losses, latency."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from sim_backends.sensor import MocapSensor
 
 
 class Moving:
-    """A point at x = t, turning through the wrap."""
+    """A point at x = t whose yaw crosses pi."""
 
     def measured_pose(self, t_s):
         return Pose(t_s, 0.0, -3.0)
@@ -67,7 +67,7 @@ def test_latency_is_replaced_by_the_effect_and_wire_latency_is_added():
     assert MocapSensor(slow, extra_latency_s=0.004).latency_s == pytest.approx(0.034)
 
 
-def test_a_single_exposure_can_be_made_at_any_time():
+def test_single_exposure_can_be_made_at_any_time():
     sensor = MocapSensor(config(position_std_m=0.0, yaw_std_rad=0.0))
     plant = Plant(SimulatorConfig())
     sample = sensor.expose(0.123, plant)

@@ -1,4 +1,4 @@
-"""The speed measurements are consistent (the benchmark checks the limits)."""
+"""Test that the speed measurements are consistent; the benchmark checks the limits."""
 
 import numpy as np
 import pytest
@@ -13,13 +13,13 @@ def test_simulation_speed_is_consistent_and_far_above_the_loop():
     assert torch.get_num_threads() == threads
     fast, plain = found["batched_2048_cars_car_steps_per_s"], found["plain_numpy_loop_car_steps_per_s"]
     assert found["ratio_to_plain_numpy_loop"] == pytest.approx(fast / plain)
-    # A shared machine: only the order of magnitude is asserted here.
+    # Only the order of magnitude is asserted, because the machine is shared.
     assert found["ratio_to_plain_numpy_loop"] > 50
     assert found["needed_share_of_copy_bandwidth"] < 1
     assert all(np.isfinite(v) and v > 0 for v in found.values())
 
 
-def test_gradient_speed_counts_every_number():
+def test_gradient_speed_counts_each_number():
     found = gradient_speed(cars=1024, repeats=1, batch=2048)
     assert found["numbers"] == 6 + 60 + 13
     assert found["ratio"] > 2

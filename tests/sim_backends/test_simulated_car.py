@@ -1,4 +1,4 @@
-"""The simulated car implements the interface of every car."""
+"""Test that the simulated car implements the car interface."""
 
 import math
 
@@ -132,7 +132,7 @@ def test_stop_is_neutral_from_then_on(planned):
         car.stop(planned=planned)
         car.clock.sleep_until(t0 + 0.08)
         at_stop = car.true_state.vx_mps
-        assert at_stop > before  # commands on their way still act
+        assert at_stop > before  # delayed commands still act
         car.clock.sleep_until(t0 + 0.58)
         assert car.true_state.vx_mps == pytest.approx(at_stop * math.exp(-0.5 * p.damping_nspm / p.mass_kg), rel=1e-6)
 
@@ -198,7 +198,7 @@ def test_velocity_filter_lag_slows_the_velocity_columns_only():
             car.arm()
             seen.append(drive(car, [Action(0.0, 0.5)] * 15)[-1].state)
     assert seen[0].x_m == seen[1].x_m
-    # After a while a lag trails a ramp by its time constant times the slope; the speed here is nearly a ramp.
+    # In steady state a lag trails a ramp by time constant times slope; the speed is nearly a ramp.
     p = SimulatorConfig().parameters
     slope = (0.5 * p.drive_gain_n - p.damping_nspm * seen[0].vx_mps) / p.mass_kg
     assert 0.1 * slope < seen[0].vx_mps - seen[1].vx_mps < 0.3 * slope

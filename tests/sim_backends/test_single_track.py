@@ -1,4 +1,4 @@
-"""The base model against scipy, closed forms, symmetries and signs."""
+"""Test the base model against scipy, closed forms, symmetries and signs."""
 
 import math
 
@@ -33,7 +33,7 @@ def drive(cfg, start, actions, hold_s=0.2):
 
 
 def reference_derivative(cfg, state, steering, throttle):
-    """Independent implementation of the equations of the four kinds from the literature."""
+    """Evaluate an independent implementation of the four model kinds from the literature."""
     p = cfg.parameters
     vx, vy, r = state[3:]
     d = p.max_angle_rad * steering
@@ -80,7 +80,7 @@ def test_agrees_with_scipy(kind, start):
             max_step=0.01,
         ).y[:, -1]
     ours = drive(cfg, start, MODERATE)
-    # Steps of 10 ms against eigenvalues of up to 76 1/s: the error of RK4 itself, and kinks of the blend.
+    # The error is that of RK4 with 10 ms for eigenvalues up to 76 1/s, and of the kinks of the blend.
     tolerance = 2e-3 if kind in ("blend", "linear_tyre") else 5e-4
     error = np.abs(ours - state)
     error[2] = abs(math.remainder(error[2], 2 * math.pi))
@@ -226,7 +226,7 @@ def test_aerodynamic_drag_has_its_closed_form():
         assert state[3] == pytest.approx(speed / (1 + coefficient / mass * 3.0 * 1.0), rel=1e-8)
 
 
-def test_every_effect_declares_what_the_catalogue_needs():
+def test_each_effect_declares_what_the_catalogue_needs():
     for effect_id, effect in EFFECTS.items():
         assert effect.id == effect_id
         assert effect.kind in ("input", "dynamics", "observation")

@@ -1,4 +1,4 @@
-"""Speed comparison of four implementations of a Runge-Kutta step of N cars (decision 0001).
+"""Compare the speed of four implementations of a Runge-Kutta step of N cars (decision 0001).
 
 Run it on an idle machine: ``pytest -m slow -s tests/sim_backends/test_step_comparison.py``.
 """
@@ -28,7 +28,7 @@ Step = Callable[[Rows], tuple[torch.Tensor, ...]]
 
 
 class CasadiOps:
-    """The elementary functions on CasADi's symbols."""
+    """Elementary functions on CasADi symbols."""
 
     def __init__(self, casadi: Any) -> None:
         for name in ("sin", "cos", "atan", "atan2", "tanh", "exp", "sqrt", "hypot", "fabs", "sign"):
@@ -46,7 +46,7 @@ class CasadiOps:
 
 
 def rows_of(cars: int, dtype: torch.dtype) -> Rows:
-    """State (6 rows) and wheel angle, its sine and cosine, and throttle of ``cars`` cars."""
+    """Return states (6 rows), wheel angle with sine and cosine, and throttle of ``cars`` cars."""
     rng = np.random.default_rng(0)
     state = rng.normal(0.0, 1.0, (6, cars)) * 0.3 + np.array([0, 0, 0, 2.0, 0, 0])[:, None]
     angle = rng.uniform(-0.4, 0.4, cars)
@@ -101,12 +101,12 @@ def casadi_seconds(casadi: Any, rows: Rows, *, gradient: bool) -> float:
 
 
 def fastest(run: Callable[[], object], rounds: int = 60) -> float:
-    """Shortest time of a call [s], after it was warmed up."""
+    """Return the shortest time of a call [s] after a warm-up."""
     return min(seconds(run) for _ in range(rounds))
 
 
 def seconds(run: Callable[[], object]) -> float:
-    """Time of one call [s]."""
+    """Return the time of one call [s]."""
     start_s = time.perf_counter()
     run()
     return time.perf_counter() - start_s
@@ -125,11 +125,11 @@ def test_all_engines_give_the_same_step_and_gradient() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")  # of torch itself, where it compiles
+@pytest.mark.filterwarnings("ignore")  # warnings of torch's compiler
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 @pytest.mark.parametrize("gradient", [False, True], ids=["step", "gradient"])
-def test_the_compiled_step_is_the_fastest(gradient: bool, dtype: torch.dtype) -> None:
+def test_compiled_step_is_the_fastest(gradient: bool, dtype: torch.dtype) -> None:
     casadi = pytest.importorskip("casadi", reason="the comparison needs: pip install casadi")
     import torch._inductor.config as inductor
 
