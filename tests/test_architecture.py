@@ -148,7 +148,7 @@ def test_files_have_at_most_400_lines() -> None:
 
 
 def test_functions_have_at_most_60_lines() -> None:
-    """``reference_rates`` is excepted: it is one table of equations. ruff limits branches."""
+    """``reference_rates`` is excepted, because it is one table of equations."""
     sources = [*SOURCES, *(p for folder in ("tests", "docs", "examples") for p in (ROOT / folder).rglob("*.py"))]
     long = {
         f"{path.relative_to(ROOT)}: {node.name}"

@@ -137,29 +137,32 @@ def parameters_only() -> Diagnosis:
     return replace(mismatch(), verdict="parameters", effects=(), held_out=held, data_faults=())
 
 
-def nothing() -> Diagnosis:
+def no_mismatch() -> Diagnosis:
     held = {"nominal": replace(WITH, score=1.03), "refit": replace(WITH, score=1.02), "noise_floor": FLOOR}
     return replace(parameters_only(), verdict="none", held_out=held)
 
 
-def bad_data() -> Diagnosis:
+def faulty_data() -> Diagnosis:
     fault = DataFault("stale_samples", "yaw_rate", 1834, "unusable: the column repeats itself for 61 s")
-    return replace(nothing(), verdict="data", held_out={}, parameters={}, data_faults=(fault,))
+    return replace(no_mismatch(), verdict="data", held_out={}, parameters={}, data_faults=(fault,))
 
 
-def nameless() -> Diagnosis:
-    rest = Unexplained(
+def unexplained_physics() -> Diagnosis:
+    unexplained = Unexplained(
         0.83, ("vx", "x"), "speed > 1.8 m/s", "even in steering, grows with speed; acts on vx", "a_x = -0.31 |d| v"
     )
-    return replace(nothing(), verdict="unexplained", held_out=mismatch().held_out, unexplained=rest)
+    return replace(no_mismatch(), verdict="unexplained", held_out=mismatch().held_out, unexplained=unexplained)
 
 
-def no_verdict() -> Diagnosis:
-    why = "The car hardly moves in the recordings to fit; record a drive (carlab drive --policy figure_eight)."
-    return Diagnosis("inconclusive", why, (), {}, 1.0, {}, None, (), USES[:1], 0, 0.0, why)
+def inconclusive() -> Diagnosis:
+    reason = "The car hardly moves in the recordings to fit; record a drive (carlab drive --policy figure_eight)."
+    return Diagnosis("inconclusive", reason, (), {}, 1.0, {}, None, (), USES[:1], 0, 0.0, reason)
 
 
-CASES = {d.verdict: d for d in (mismatch(), parameters_only(), nothing(), bad_data(), nameless(), no_verdict())}
+CASES = {
+    d.verdict: d
+    for d in (mismatch(), parameters_only(), no_mismatch(), faulty_data(), unexplained_physics(), inconclusive())
+}
 
 
 def model() -> SimulatorConfig:

@@ -34,7 +34,7 @@ class Car:
     motor_lag_s: float = 0.0
     velocity_lag_s: float = 0.0
     drag: float = 1.2
-    turn: float = 0.0
+    mean_steering: float = 0.0
 
     def drive(self) -> EpisodeData:
         rng = np.random.default_rng(self.seed)
@@ -43,31 +43,31 @@ class Car:
         steps_per_row = round(1.0 / self.rate_hz / step)
         count = len(fine)
 
-        def wander(period_s: float) -> np.ndarray:
+        def random_signal(period_s: float) -> np.ndarray:
             knots = np.arange(0.0, self.seconds + 5.0, period_s)
             return np.interp(fine, knots, rng.uniform(-1, 1, len(knots)))
 
         ticks = np.arange(count) // steps_per_row * steps_per_row
-        steering = (self.turn + 0.5 * wander(0.7) + 0.3 * wander(2.5))[ticks]
-        throttle = np.clip(0.35 + 0.35 * wander(0.9) + 0.15 * wander(3.0), -1, 1)[ticks]
+        steering = (self.mean_steering + 0.5 * random_signal(0.7) + 0.3 * random_signal(2.5))[ticks]
+        throttle = np.clip(0.35 + 0.35 * random_signal(0.9) + 0.15 * random_signal(3.0), -1, 1)[ticks]
 
         def delayed(u: np.ndarray, delay_s: float) -> np.ndarray:
             shift = round(delay_s / step)
             return np.concatenate([np.full(shift, u[0]), u[: count - shift]]) if shift else u
 
-        push = delayed(throttle, self.throttle_delay_s)
+        drive = delayed(throttle, self.throttle_delay_s)
         if self.motor_lag_s:
-            push = lfilter([step / self.motor_lag_s], [1, step / self.motor_lag_s - 1], push)
-        speed = lfilter([step], [1.0, self.drag * step - 1.0], 5.0 * push)
+            drive = lfilter([step / self.motor_lag_s], [1, step / self.motor_lag_s - 1], drive)
+        speed = lfilter([step], [1.0, self.drag * step - 1.0], 5.0 * drive)
         target_rate = speed * np.tan(0.4 * delayed(steering, self.steering_delay_s)) / 0.3
         rate = lfilter([step / 0.06], [1.0, step / 0.06 - 1.0], target_rate)
         yaw = np.cumsum(rate) * step
-        side = 0.02 * rate
-        x = np.cumsum(speed * np.cos(yaw) - side * np.sin(yaw)) * step
-        y = np.cumsum(speed * np.sin(yaw) + side * np.cos(yaw)) * step
+        lateral_speed = 0.02 * rate
+        x = np.cumsum(speed * np.cos(yaw) - lateral_speed * np.sin(yaw)) * step
+        y = np.cumsum(speed * np.sin(yaw) + lateral_speed * np.cos(yaw)) * step
         poses = np.column_stack([x, y, yaw])[::steps_per_row]
         poses = poses + rng.normal(size=poses.shape) * [5e-4, 5e-4, 2e-3]
-        measured = np.column_stack([speed, side, rate])
+        measured = np.column_stack([speed, lateral_speed, rate])
         if self.velocity_lag_s:
             share = step / self.velocity_lag_s
             measured = lfilter([share], [1, share - 1], measured, axis=0)
@@ -96,7 +96,7 @@ def held() -> EpisodeData:
 
 @pytest.fixture(scope="module")
 def circling() -> EpisodeData:
-    return Car(seed=2, turn=0.4).drive()
+    return Car(seed=2, mean_steering=0.4).drive()
 
 
 def with_states(episode: EpisodeData, change) -> EpisodeData:

@@ -99,7 +99,7 @@ def test_replay_scores_the_held_out_share_of_a_diagnosis(
 def test_replay_of_a_real_recording_prints_the_error_of_the_report(
     shared: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The ETH car, whose recordings have all kinds of faults; the car file as given needs no fit."""
+    """The recordings of the ETH car have many kinds of faults; the given car file needs no fit."""
     recording = shared / "data" / "eth_rc_car" / "train_2.csv.gz"
     report = carlab.diagnose(recording, "eth_rc_car", stop=lambda: True)
     rows = replayed(recording, "eth_rc_car", "last 30 %", capfd)
@@ -137,7 +137,7 @@ def test_short_recording_is_inconclusive(
 def test_recording_with_frequently_lost_tracking_is_faulty(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Motion capture takes another body for the car for a third of a second in each second."""
+    """In a third of the rows motion capture confuses another body with the car."""
     rows = [r.split(",") for r in (concealed[0] / "fit.csv").read_text().splitlines()]
     column = rows[0].index("x")
     for k, row in enumerate(rows[1:]):
@@ -175,7 +175,7 @@ def test_fitted_recording_cannot_be_held_out(concealed: tuple[Path, float], tmp_
 def test_held_out_share_is_not_fitted(
     concealed: tuple[Path, float], tmp_path: Path, capfd: pytest.CaptureFixture[str], share: float
 ) -> None:
-    """The gap of 1.5 s before it, the history of held-out windows, is not fitted either."""
+    """The 1.5 s before it, the history of held-out windows, are not fitted either."""
     rows = [
         r for r in (concealed[0] / "fit.csv").read_text().splitlines() if r[0] == "t" or float(r.split(",")[0]) < 12
     ]

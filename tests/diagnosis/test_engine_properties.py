@@ -119,12 +119,12 @@ def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "among", [pytest.param(NEAREST, id="nearest"), pytest.param(None, id="catalogue", marks=pytest.mark.slow)]
+    "candidates", [pytest.param(NEAREST, id="nearest"), pytest.param(None, id="catalogue", marks=pytest.mark.slow)]
 )
-def test_uncatalogued_physics_is_described_without_a_name(tmp_path: Path, among: tuple[str, ...] | None) -> None:
+def test_uncatalogued_physics_is_described_without_a_name(tmp_path: Path, candidates: tuple[str, ...] | None) -> None:
     """A cable that pulls the rear of the car towards a point resembles no effect of the catalogue."""
     case = make_case("outside", 41, effects=("cable_pull",), excess=4.0, fit_s=60, hold_s=30)
-    found = outcome(write(tmp_path, case), effects=among).diagnosis
+    found = outcome(write(tmp_path, case), effects=candidates).diagnosis
     assert found.verdict == "unexplained"
     assert found.effects == ()
     assert found.unexplained is not None
@@ -165,10 +165,10 @@ def test_effect_without_gain_on_unseen_blocks_is_eliminated(
     scale = Scale.of(prediction_errors(simulate_windows(windows, car), windows)[0], floor, 0.2)
     named = ("aerodynamic_drag", "steering_asymmetry", "torque_steer")
     base = refit(problem, (), Fit(car, (), np.zeros(0), 0.0, np.zeros(0)), scale)
-    kept = eliminate(problem, refit(problem, named, base.fit, scale), RunControl())
-    assert kept.model.effects == ("aerodynamic_drag",)
-    assert set(kept.model.fit.config.effects) == {"aerodynamic_drag"}
-    assert kept.deletions["aerodynamic_drag"].standard_errors > 2.0
+    remaining = eliminate(problem, refit(problem, named, base.fit, scale), RunControl())
+    assert remaining.model.effects == ("aerodynamic_drag",)
+    assert set(remaining.model.fit.config.effects) == {"aerodynamic_drag"}
+    assert remaining.deletions["aerodynamic_drag"].standard_errors > 2.0
 
 
 def test_impulse_responses_sum_to_the_simulated_change(drag: tuple[Path, float], windows: PredictionWindows) -> None:

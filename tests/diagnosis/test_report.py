@@ -186,7 +186,7 @@ def test_page_contains_effect_interval_set_and_next_drive(written: Path) -> None
 
 
 def test_report_without_a_verdict_states_why_and_what_to_record(tmp_path: Path) -> None:
-    write_report(material.no_verdict(), Exhibits(), tmp_path, material.model())
+    write_report(material.inconclusive(), Exhibits(), tmp_path, material.model())
     words = " ".join(read_page(tmp_path)[1].words)
     assert "No verdict. The car hardly moves in the recordings to fit" in words
     assert "carlab drive --policy figure_eight" in words
@@ -258,7 +258,7 @@ def test_recordings_of_equal_names_have_different_entities(tmp_path: Path) -> No
 
 def test_report_replaces_an_older_one_without_leftover_files(tmp_path: Path) -> None:
     write_report(material.mismatch(), material.exhibits(), tmp_path, material.model())
-    write_report(material.nothing(), Exhibits(), tmp_path, material.model())
+    write_report(material.no_mismatch(), Exhibits(), tmp_path, material.model())
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["verdict"] == "none"
     assert {p.name for p in tmp_path.iterdir()} == {"report.json", "report.html", "report.rrd", "model.toml"}
 
@@ -266,7 +266,7 @@ def test_report_replaces_an_older_one_without_leftover_files(tmp_path: Path) -> 
 def test_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine", encoding="utf-8")
     with pytest.raises(DataError, match="a file has the path of its folder; choose another folder"):
-        write_report(material.nothing(), Exhibits(), tmp_path / "taken", material.model())
+        write_report(material.no_mismatch(), Exhibits(), tmp_path / "taken", material.model())
     assert (tmp_path / "taken").read_text(encoding="utf-8") == "mine"
 
 
@@ -274,14 +274,14 @@ def test_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None:
 def test_file_that_cannot_be_written_leaves_no_report_json(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     with pytest.raises(DataError, match=re.escape(name)):
-        write_report(material.nothing(), Exhibits(), tmp_path, material.model())
+        write_report(material.no_mismatch(), Exhibits(), tmp_path, material.model())
     assert not (tmp_path / "report.json").exists()
     assert [p for p in tmp_path.iterdir() if "partial" in p.name] == []
 
 
 def test_restarts_are_the_first_rows_of_predictions() -> None:
-    made = material.trace()
-    assert restarts(made.recorded, made.predicted["refit"]) == list(range(30, len(made.times_s) - 60, 30))
+    trace = material.trace()
+    assert restarts(trace.recorded, trace.predicted["refit"]) == list(range(30, len(trace.times_s) - 60, 30))
 
 
 @pytest.mark.parametrize(

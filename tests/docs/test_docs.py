@@ -1,4 +1,4 @@
-"""Documentation: commands parse or run, car files load, programs run, links and references resolve."""
+"""Test the documentation: commands parse or run, car files load, programs run, links and references resolve."""
 
 import os
 import re

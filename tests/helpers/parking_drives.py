@@ -97,7 +97,7 @@ def drive_like_learning(
 
 
 def concealed_drives(effect: str | None, size: float, seed: int, episodes: int = 5, share: float = 0.0) -> Concealed:
-    """Episodes of a car of the independent generator with one concealed effect, and the simulator without it.
+    """Generate episodes of an independent car with one concealed effect, and the simulator without it.
 
     Args:
         effect: effect id, or None.
@@ -138,7 +138,7 @@ def concealed_drives(effect: str | None, size: float, seed: int, episodes: int =
 
 
 def _scores(recordings: Sequence[Recording], nominal: BaseCar, true: BaseCar) -> dict[str, float]:
-    """Scores of the nominal car by channel, by the generator's windows, simulator and floor."""
+    """Return scores of the nominal car by channel, with the generator's windows, simulator and floor."""
     squared = [
         (channel_scores(cut_windows(r, true, horizon_s=0.8, every_s=0.2), nominal.free()) ** 2) for r in recordings
     ]

@@ -56,9 +56,9 @@ def test_rows_are_in_the_world_frame() -> None:
         tick = row + HISTORY
         t = episode.times_s[tick]
         velocity = cmath.exp(1.5j * t)
-        wanted = [velocity.imag / 1.5, -velocity.real / 1.5, np.sin(1.5 * t + 0.2), np.cos(1.5 * t + 0.2)]
-        wanted += [velocity.real, velocity.imag, 1.5, *episode.sent[tick - HISTORY : tick + 1].ravel()]
-        assert np.allclose(inputs[row], wanted, atol=1e-5)
+        expected = [velocity.imag / 1.5, -velocity.real / 1.5, np.sin(1.5 * t + 0.2), np.cos(1.5 * t + 0.2)]
+        expected += [velocity.real, velocity.imag, 1.5, *episode.sent[tick - HISTORY : tick + 1].ravel()]
+        assert np.allclose(inputs[row], expected, atol=1e-5)
         later = cmath.exp(1.5j * episode.times_s[tick + 1])
         assert np.allclose(changes[row, 4:6], [later.real - velocity.real, later.imag - velocity.imag], atol=1e-5)
 

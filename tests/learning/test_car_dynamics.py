@@ -36,7 +36,7 @@ INPUTS = 3 + 2 * (HISTORY + 1)
 
 
 class CirclingPolicy:
-    """Random commands that turn the car through more than a full circle."""
+    """A policy of random left turns, for more than a full circle."""
 
     name = "circling"
 
@@ -282,27 +282,27 @@ def test_car_loaded_from_a_file_predicts_the_same(tmp_path: Path, dof: float | N
 
 def write_damaged_file(path: Path, kind: str) -> None:
     save_car(random_car(), path)
-    whole = path.read_bytes()
+    file_bytes = path.read_bytes()
     content: dict[str, Any] = torch.load(path, weights_only=True)
-    if kind == "of another version":
+    if kind == "another version":
         torch.save(content | {"version": 99}, path)
-    elif kind == "a particle short of a number":
+    elif kind == "a particle without one parameter":
         torch.save(content | {"parameters": content["parameters"][:, :-1]}, path)
-    elif kind == "one particle alone":
+    elif kind == "one particle":
         torch.save(content | {"parameters": content["parameters"][0]}, path)
-    elif kind == "of another network":
+    elif kind == "another network":
         torch.save(content | {"network": [INPUTS + 2, 6, 8, 4]}, path)
-    elif kind == "of an unknown activation":
+    elif kind == "unknown activation":
         torch.save(content | {"activation": "tanh"}, path)
-    elif kind == "without a part":
+    elif kind == "missing key":
         del content["units"]
         torch.save(content, path)
     elif kind == "a list":
         torch.save([1, 2], path)
-    elif kind == "not there":
+    elif kind == "missing":
         path.unlink()
     else:
-        path.write_bytes({"cut short": whole[: len(whole) // 2], "empty": b"", "text": b"rubbish\n"}[kind])
+        path.write_bytes({"cut short": file_bytes[: len(file_bytes) // 2], "empty": b"", "text": b"rubbish\n"}[kind])
 
 
 def test_file_of_an_earlier_version_is_reported_with_its_version(tmp_path: Path) -> None:
@@ -319,9 +319,9 @@ def test_file_of_an_earlier_version_is_reported_with_its_version(tmp_path: Path)
 
 
 KINDS = (
-    *("of another version", "a particle short of a number", "of another network", "without a part", "a list"),
-    "of an unknown activation",
-    *("not there", "cut short", "empty", "one particle alone", "text"),
+    *("another version", "a particle without one parameter", "another network", "missing key", "a list"),
+    "unknown activation",
+    *("missing", "cut short", "empty", "one particle", "text"),
 )
 
 

@@ -128,12 +128,12 @@ class TestWithSimulator:
             for s in range(3)
         ]
         scaled = np.concatenate([shape[k] / NOISE.double().numpy()[k] for k in range(2)])
-        wanted = np.concatenate([y[:, k] / NOISE.double().numpy()[k] for k in range(2)])
+        scaled_outputs = np.concatenate([y[:, k] / NOISE.double().numpy()[k] for k in range(2)])
         covariance = np.linalg.inv(np.eye(3) + scaled.T @ scaled)
         draws = torch.cat(parameters).double().numpy()
         std = np.sqrt(np.diag(covariance))
         assert np.allclose(draws.std(axis=0), std, rtol=0.2)
-        assert np.allclose((draws.mean(axis=0) - covariance @ scaled.T @ wanted) / std, 0.0, atol=0.3)
+        assert np.allclose((draws.mean(axis=0) - covariance @ scaled.T @ scaled_outputs) / std, 0.0, atol=0.3)
 
     def test_discrepancy_is_smaller_for_a_correct_simulator(self):
         """One data set comes from the simulator, the other from a function that it cannot represent."""

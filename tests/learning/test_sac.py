@@ -85,11 +85,11 @@ def _quiet() -> object:
 def test_training_steps_equal_stable_baselines(steps: int, n_step_returns: bool) -> None:
     stock, fast = (trained(kind, batches(steps, n_step_returns=n_step_returns)) for kind in (SAC, FastSac))
     fresh = agent(SAC).policy.state_dict()
-    for name, wanted in stock.policy.state_dict().items():
+    for name, expected in stock.policy.state_dict().items():
         found = fast.policy.state_dict()[name]
-        torch.testing.assert_close(found, wanted, rtol=2e-3, atol=2e-5 * steps, msg=lambda m, n=name: f"{n}: {m}")
+        torch.testing.assert_close(found, expected, rtol=2e-3, atol=2e-5 * steps, msg=lambda m, n=name: f"{n}: {m}")
         if "log_std.bias" not in name:
-            assert not torch.equal(wanted, fresh[name]), name
+            assert not torch.equal(expected, fresh[name]), name
     assert float(fast.log_ent_coef.detach()) == pytest.approx(float(stock.log_ent_coef.detach()), abs=1e-5)
     for name in ("train/ent_coef", "train/actor_loss", "train/critic_loss") if steps == 1 else ():
         assert fast.logger.name_to_value[name] == pytest.approx(stock.logger.name_to_value[name], rel=1e-3), name

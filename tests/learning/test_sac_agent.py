@@ -218,13 +218,13 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("kind", ["not there", "empty", "cut short", "text", "a folder"])
+@pytest.mark.parametrize("kind", ["missing", "empty", "cut short", "text", "a folder"])
 def test_invalid_agent_file_is_refused_with_the_remedy(saved: Path, tmp_path: Path, kind: str) -> None:
-    whole, path = (saved / AGENT_FILE).read_bytes(), tmp_path / AGENT_FILE
+    file_bytes, path = (saved / AGENT_FILE).read_bytes(), tmp_path / AGENT_FILE
     if kind == "a folder":
         path.mkdir()
-    elif kind != "not there":
-        path.write_bytes({"empty": b"", "cut short": whole[: len(whole) // 2], "text": b"rubbish\n"}[kind])
+    elif kind != "missing":
+        path.write_bytes({"empty": b"", "cut short": file_bytes[: len(file_bytes) // 2], "text": b"rubbish\n"}[kind])
     with pytest.raises(DataError, match=r"remove the folder to train again\.$") as error:
         SacAgent.load(tmp_path, SMALL, 0)
     assert "\n" not in str(error.value)

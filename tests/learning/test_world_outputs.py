@@ -63,7 +63,7 @@ def test_measured_outputs_equal_differences_of_world_states():
     assert np.allclose(found, expected, atol=1e-12)
 
 
-def test_density_factorises_for_a_known_yaw_change_of_zero():
+def test_density_factorises_for_a_known_yaw_of_zero():
     """For a car facing x, sine and cosine of yaw are independent of the other five outputs."""
     means, stds = MEANS[:1].clone(), STDS[:1].clone()
     means[..., 2], stds[..., 2] = 0.0, 1e-4

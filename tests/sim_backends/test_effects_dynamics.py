@@ -225,10 +225,10 @@ def test_agrees_with_scipy(case, monkeypatch):
 @pytest.mark.parametrize("kind", ["kinematic", "linear_tyre"])
 def test_tyre_saturation_is_the_pacejka_car(kind):
     numbers = {"mu_front": 0.5, "B_front": 3.0, "C_front": 1.3, "mu_rear": 0.45, "B_rear": 4.0, "C_rear": 1.4}
-    ours = by_plant(SimulatorConfig(kind=kind, command_delay_s=0.0, effects={"tyre_saturation": numbers}))
+    simulated = by_plant(SimulatorConfig(kind=kind, command_delay_s=0.0, effects={"tyre_saturation": numbers}))
     names = {f"tyre.{k.split('_')[1]}.{k.split('_')[0]}": v for k, v in numbers.items()}
     same = SimulatorConfig(command_delay_s=0.0).with_values(names)
-    assert difference(ours, by_scipy(same.parameters, {})) < 5e-4
+    assert difference(simulated, by_scipy(same.parameters, {})) < 5e-4
     own = SimulatorConfig(kind=kind, effects={"tyre_saturation": {}}).with_values({"tyre.front.mu": 0.3})
     assert own.effects["tyre_saturation"]["mu_front"] == 0.43
     assert (

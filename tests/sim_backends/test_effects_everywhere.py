@@ -262,12 +262,12 @@ def test_mirror_symmetry(name):
 def test_rigid_motion_of_the_world_with_its_fixed_objects(name):
     start, commands = some()
     # The position scale of motion capture has a fixed origin.
-    turn, east, north = 1.1, *((0.0, 0.0) if name == "position_scale" else (4.0, -7.0))
-    c, s = math.cos(turn), math.sin(turn)
+    angle, east, north = 1.1, *((0.0, 0.0) if name == "position_scale" else (4.0, -7.0))
+    c, s = math.cos(angle), math.sin(angle)
 
     def transformed(states):
         x, y, yaw, *rest = states.unbind(-1)
-        return torch.stack([east + c * x - s * y, north + s * x + c * y, yaw + turn, *rest], dim=-1)
+        return torch.stack([east + c * x - s * y, north + s * x + c * y, yaw + angle, *rest], dim=-1)
 
     numbers = typical(name)
     moved_parameters = dict(numbers)
@@ -277,7 +277,7 @@ def test_rigid_motion_of_the_world_with_its_fixed_objects(name):
             north + s * numbers["x"] + c * numbers["y"],
         )
     if name in ("road_slope", "wind"):
-        moved_parameters["direction"] += turn
+        moved_parameters["direction"] += angle
     original = rollout(SimulatorConfig(effects={name: numbers}), start, commands, measured=True)
     image = rollout(SimulatorConfig(effects={name: moved_parameters}), transformed(start), commands, measured=True)
     assert torch.allclose(transformed(original.states), image.states, rtol=0, atol=1e-10)
@@ -339,11 +339,11 @@ def test_time_dependent_effects_use_the_time_since_the_first_row():
 
 def test_result_does_not_depend_on_the_listed_order_of_effects():
     """All effects together give finite states from standstill and in reverse."""
-    everything = {n: typical(n) for n in NAMES}
-    backwards = dict(reversed(everything.items()))
+    all_effects = {n: typical(n) for n in NAMES}
+    backwards = dict(reversed(all_effects.items()))
     start, commands = some()
     start[0], start[1, 3] = 0.0, -1.5
-    one, other = (rollout(SimulatorConfig(effects=e), start, commands, measured=True) for e in (everything, backwards))
+    one, other = (rollout(SimulatorConfig(effects=e), start, commands, measured=True) for e in (all_effects, backwards))
     assert torch.allclose(one.states, other.states, rtol=0, atol=1e-9)
     assert torch.allclose(one.measured, other.measured, rtol=0, atol=1e-9)
     assert torch.isfinite(one.measured).all()

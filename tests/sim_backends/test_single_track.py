@@ -79,10 +79,10 @@ def test_agrees_with_scipy(kind, start):
             method="DOP853",
             max_step=0.01,
         ).y[:, -1]
-    ours = drive(cfg, start, MODERATE)
+    simulated = drive(cfg, start, MODERATE)
     # The error is that of RK4 with 10 ms for eigenvalues up to 76 1/s, and of the kinks of the blend.
     tolerance = 2e-3 if kind in ("blend", "linear_tyre") else 5e-4
-    error = np.abs(ours - state)
+    error = np.abs(simulated - state)
     error[2] = abs(math.remainder(error[2], 2 * math.pi))
     assert error.max() < tolerance
 

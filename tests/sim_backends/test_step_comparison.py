@@ -120,8 +120,8 @@ def test_all_engines_give_the_same_step_and_gradient() -> None:
         assert other.detach().numpy() == pytest.approx(one.detach().numpy(), abs=1e-12)
     for one, other in zip(*gradients, strict=True):
         zero = torch.zeros(64, dtype=torch.float64)
-        wanted, got = (zero if g is None else g for g in (one, other))
-        assert got.numpy() == pytest.approx(wanted.numpy(), abs=1e-11)
+        expected, found = (zero if g is None else g for g in (one, other))
+        assert found.numpy() == pytest.approx(expected.numpy(), abs=1e-11)
 
 
 @pytest.mark.slow
