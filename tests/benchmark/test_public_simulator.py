@@ -109,30 +109,32 @@ def test_locked_wheel_rolls_again(model: Model) -> None:
 
 def test_noise_rates_and_bounds_of_a_recording() -> None:
     car = PublicCar("drift")
-    made = drive_public(car, 3, 0, 5.0)
-    rows = len(made.recording.t_s)
+    public_drive = drive_public(car, 3, 0, 5.0)
+    rows = len(public_drive.recording.t_s)
     assert rows == 151
-    assert np.diff(made.recording.t_s) == pytest.approx(1.0 / 30.0)
-    std = made.recording.error[:, :3].std(axis=0)
+    assert np.diff(public_drive.recording.t_s) == pytest.approx(1.0 / 30.0)
+    std = public_drive.recording.error[:, :3].std(axis=0)
     assert std == pytest.approx([0.0006, 0.0006, 0.002], rel=4.0 / math.sqrt(2 * rows))
-    assert made.recording.clean[:, :3] == pytest.approx(made.drive.rows[:, :3], abs=1e-9)
-    max_steering_rate = np.abs(np.gradient(made.states[:, 2], made.drive.capture_s)).max()
+    assert public_drive.recording.clean[:, :3] == pytest.approx(public_drive.drive.rows[:, :3], abs=1e-9)
+    max_steering_rate = np.abs(np.gradient(public_drive.states[:, 2], public_drive.drive.capture_s)).max()
     assert max_steering_rate <= 0.4 / math.sqrt(SCALE) * (1.0 + 1e-6)
     # Distance travelled is the integral of the package's speed.
-    step = np.hypot(*np.diff(made.drive.captures[:, :2], axis=0).T).sum()
-    speed = np.hypot(made.drive.captures[:, 3], made.drive.captures[:, 4])
-    assert step == pytest.approx(np.trapezoid(speed, made.drive.capture_s), rel=2e-3)
+    step = np.hypot(*np.diff(public_drive.drive.captures[:, :2], axis=0).T).sum()
+    speed = np.hypot(public_drive.drive.captures[:, 3], public_drive.drive.captures[:, 4])
+    assert step == pytest.approx(np.trapezoid(speed, public_drive.drive.capture_s), rel=2e-3)
     repeated = drive_public(PublicCar("drift"), 3, 0, 5.0)
-    assert np.array_equal(repeated.recording.measured, made.recording.measured)
+    assert np.array_equal(repeated.recording.measured, public_drive.recording.measured)
 
 
 def test_commands_reach_the_wheels_after_the_delay() -> None:
     car = PublicCar("drift")
-    made = drive_public(car, 3, 0, 5.0)
-    issued_s, acting_s = made.drive.row_s, made.drive.switch_s[1:]
+    public_drive = drive_public(car, 3, 0, 5.0)
+    issued_s, acting_s = public_drive.drive.row_s, public_drive.drive.switch_s[1:]
     assert acting_s == pytest.approx(issued_s[: len(acting_s)] + 0.05, abs=1e-9)
-    assert made.drive.switch_values[1:, 0] == pytest.approx(0.5 * made.recording.commands[: len(acting_s), 0])
-    seconds, angle = made.drive.capture_s, made.states[:, 2]
+    assert public_drive.drive.switch_values[1:, 0] == pytest.approx(
+        0.5 * public_drive.recording.commands[: len(acting_s), 0]
+    )
+    seconds, angle = public_drive.drive.capture_s, public_drive.states[:, 2]
     assert np.abs(angle[seconds < acting_s[0] - 1e-6]).max() < 1e-12
     assert np.abs(angle[(seconds > acting_s[0] + 0.01) & (seconds < acting_s[1])]).min() > 1e-6
 

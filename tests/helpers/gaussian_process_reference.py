@@ -36,13 +36,13 @@ def kernel(discrepancy, first, second, parameters=None):
     return np.stack(found)
 
 
-def discrepancy_alone(x, y, at, discrepancy, noise):
+def discrepancy_alone(x, y, query, discrepancy, noise):
     """Return mean (M, 2), std (M, 2) and covariances (2, M, M) of the discrepancy without a simulator."""
     means, covariances = [], []
     train_query, train_train, query_query = (
-        kernel(discrepancy, x, at),
+        kernel(discrepancy, x, query),
         kernel(discrepancy, x, x),
-        kernel(discrepancy, at, at),
+        kernel(discrepancy, query, query),
     )
     for k, (output_mean, unit) in enumerate(
         zip(UNITS.output_mean.numpy(), UNITS.output_std.double().numpy(), strict=True)
@@ -59,12 +59,12 @@ def raw_noise(posterior):
     return (posterior.noise_std * UNITS.output_std).double().numpy()
 
 
-def simulator_and_discrepancy(x, y, at, discrepancy, noise, parameters=None):
+def simulator_and_discrepancy(x, y, query, discrepancy, noise, parameters=None):
     """Return mean (M, 2), std (M, 2) and covariances (2, M, M) of simulator plus discrepancy.
 
     The outputs share the simulator's parameters, so all outputs are conditioned jointly.
     """
-    n, m, units = len(x), len(at), UNITS.output_std.double().numpy()
+    n, m, units = len(x), len(query), UNITS.output_std.double().numpy()
 
     def joint(first, second):
         """Return the joint covariance (2 N, 2 M) of both outputs."""
@@ -76,8 +76,8 @@ def simulator_and_discrepancy(x, y, at, discrepancy, noise, parameters=None):
         return a @ b.T + of_discrepancy
 
     train_covariance = joint(x, x) + np.diag(np.repeat(noise**2 + CHOLESKY_JITTER * units**2, n))
-    gain = np.linalg.solve(train_covariance, joint(x, at)).T
+    gain = np.linalg.solve(train_covariance, joint(x, query)).T
     mean = (gain @ np.asarray(y, dtype=float).T.ravel()).reshape(2, m)
-    covariance = joint(at, at) - gain @ joint(x, at)
+    covariance = joint(query, query) - gain @ joint(x, query)
     blocks = np.stack([covariance[k * m : (k + 1) * m, k * m : (k + 1) * m] for k in range(2)])
     return mean.T, np.sqrt(blocks.diagonal(axis1=1, axis2=2).T + noise**2), blocks

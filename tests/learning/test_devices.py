@@ -307,7 +307,9 @@ def test_model_env_is_equal_on_the_device(device: str, task: ParkingTask | PathT
         ended += int(found[2].sum())
     assert ended > 10
     assert_close(on_device.features, on_cpu.features)
-    for a, b in zip(*(env.roll_out(lambda seen: -0.5 * seen[:, :2]) for env in (on_device, on_cpu)), strict=True):
+    for a, b in zip(
+        *(env.roll_out(lambda observations: -0.5 * observations[:, :2]) for env in (on_device, on_cpu)), strict=True
+    ):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
 
 
@@ -322,17 +324,17 @@ def test_agent_is_equal_on_the_device_and_can_be_saved_and_retrained(device: str
             ModelEnv(random_car(at), TASKS[0], SMALL.cars, device=at), 24, evaluate=lambda agent: 1.0, n_evaluations=2
         )
         agents.append(agent)
-    seen = np.random.default_rng(2).normal(size=(50, feature_size(HISTORY))).astype(np.float32)
-    on_device, on_cpu = (agent.act(seen) for agent in agents)
+    observations = np.random.default_rng(2).normal(size=(50, feature_size(HISTORY))).astype(np.float32)
+    on_device, on_cpu = (agent.act(observations) for agent in agents)
     if not torch.cuda.is_available():  # Real CUDA draws exploration noise from its own generator.
         np.testing.assert_allclose(on_device, on_cpu, atol=1e-3)
     agents[0].save(tmp_path)
     loaded = SacAgent.load(tmp_path, SMALL, 0, device)
     assert loaded.policy().sac.device.type == "cpu", "a policy drives the car on the CPU"
-    np.testing.assert_allclose(loaded.act(seen), on_device, atol=1e-6)
+    np.testing.assert_allclose(loaded.act(observations), on_device, atol=1e-6)
     loaded.train(ModelEnv(random_car(device), TASKS[0], SMALL.cars, device=device), 8)
     assert next(loaded.policy().sac.policy.parameters()).device.type == "cuda"
-    assert not np.allclose(loaded.act(seen), on_device, atol=1e-6)
+    assert not np.allclose(loaded.act(observations), on_device, atol=1e-6)
 
 
 def test_sac_gradient_steps_are_equal_on_the_device(device: str) -> None:

@@ -261,9 +261,9 @@ def test_parameter_uncertainty_is_not_attributed_to_the_discrepancy():
     settings = (torch.tensor([0.05]), torch.tensor([0.1]), torch.ones(40))
     exact, _ = fit_discrepancy(x, y, None, *settings)
     uncertain, noise = fit_discrepancy(x, y, 4.0 * (x @ x.T)[None], *settings)
-    at = torch.tensor([[2.0]], dtype=torch.float64)
-    assert float(exact(at)) > 1.0
-    assert float(uncertain(at)) < 0.1
+    query = torch.tensor([[2.0]], dtype=torch.float64)
+    assert float(exact(query)) > 1.0
+    assert float(uncertain(query)) < 0.1
     assert float(noise) == pytest.approx(0.05, rel=0.3)
 
 

@@ -137,18 +137,18 @@ class TestTrend:
         units = Normaliser(torch.tensor([0.5, 7.0]), torch.tensor([1.5, 1.0]), UNITS.output_mean, UNITS.output_std)
         x, points = (torch.cat([v, torch.full_like(v, 7.5)], dim=1) for v in (X, torch.linspace(-3, 4, 64)[:, None]))
         target = infer(None, x, Y, units, NOISE)
-        found = distil(target, points, self.settings, start=torch.zeros(3, Network(2, 1, (4,)).parameters))
+        distilled = distil(target, points, self.settings, start=torch.zeros(3, Network(2, 1, (4,)).parameters))
         mean, std = (v.double().numpy()[:, 0] for v in target.predict(points))
         slope, offset = np.polyfit(points[:, 0].double().numpy(), mean, 1, w=1.0 / std)
-        at = torch.tensor([[-3.0, 7.5], [0.0, 7.5], [4.0, 7.5]])
-        assert np.allclose(found.predict(at).mean[:, 0], slope * at[:, 0].numpy() + offset, atol=2e-3)
+        query = torch.tensor([[-3.0, 7.5], [0.0, 7.5], [4.0, 7.5]])
+        assert np.allclose(distilled.predict(query).mean[:, 0], slope * query[:, 0].numpy() + offset, atol=2e-3)
         assert abs(slope) > 0.3
 
     def test_trend_alone_reproduces_a_linear_target(self):
         target = infer(FixedLine(), EMPTY, EMPTY, UNITS, NOISE, with_discrepancy=False)
         points = torch.linspace(-3, 4, 16)[:, None]
-        found = distil(target, points, self.settings, start=constant((0.0,), (0.0,)))
-        assert np.allclose(found.predict(points).mean, 0.7 * points - 1.2, atol=1e-3)
+        distilled = distil(target, points, self.settings, start=constant((0.0,), (0.0,)))
+        assert np.allclose(distilled.predict(points).mean, 0.7 * points - 1.2, atol=1e-3)
 
 
 @pytest.fixture
@@ -164,9 +164,9 @@ def test_inputs_are_clipped_at_the_edge_of_the_training_inputs():
     x = torch.from_numpy(rng.uniform(-9.0, 9.0, (60, 1))).float()
     units = Normaliser(torch.zeros(1), torch.ones(1), torch.zeros(1), torch.ones(1))
     target = infer(None, x, 0.5 * x + 0.05 * torch.from_numpy(rng.normal(size=(60, 1))).float(), units, torch.ones(1))
-    found = distil(target, torch.linspace(-9.0, 9.0, 400)[:, None], DistillationSettings(steps=200, hidden=(16,)))
-    at = torch.tensor([[-8.5], [8.5], [9.0], [30.0]])
-    predicted = found.predict(at).mean[:, 0]
+    distilled = distil(target, torch.linspace(-9.0, 9.0, 400)[:, None], DistillationSettings(steps=200, hidden=(16,)))
+    query = torch.tensor([[-8.5], [8.5], [9.0], [30.0]])
+    predicted = distilled.predict(query).mean[:, 0]
     assert predicted[:2].tolist() == pytest.approx([-4.25, 4.25], abs=0.2)
     assert predicted[3] == pytest.approx(float(predicted[2]), abs=0.05)
 
@@ -185,7 +185,7 @@ class TestNoise:
     @pytest.mark.parametrize("heights", [[(0.2, 0.0)] * 2, [(-0.3, 0.1)] * 3, [(0.05, 0.2), (-0.05, -0.2)]])
     def test_noise_is_the_predictive_variance_not_covered_by_the_particles(self, heights):
         """Per point it sums measurement noise, squared error of the mean and target variance beyond the particles'."""
-        found = distil(self.target, self.points, self.settings, start=constant(*heights))
+        distilled = distil(self.target, self.points, self.settings, start=constant(*heights))
         x = (self.points[:, 0].double().numpy() - 0.5) / 1.5
         for k, (noise, discrepancy) in enumerate(((0.1, 0.15), (0.4, 0.2))):
             # Smooth part, offset and slope of the discrepancy have the prior size.
@@ -194,7 +194,7 @@ class TestNoise:
             values = np.array(heights)[:, k]
             uncovered = values.mean() ** 2 + discrepancy_variance - values.var()
             missed = (weight * uncovered).sum() / weight.sum()
-            assert float(found.noise_std[k]) == pytest.approx(np.sqrt(noise**2 + missed), rel=1e-4)
+            assert float(distilled.noise_std[k]) == pytest.approx(np.sqrt(noise**2 + missed), rel=1e-4)
 
     @pytest.mark.parametrize(("rows", "at_data"), [(39, False), (40, True)])
     def test_noise_is_fitted_at_the_data_from_40_rows_on(self, rows, at_data):
@@ -204,15 +204,15 @@ class TestNoise:
         y = torch.tensor([[1.0 + 2.0 * 0.3, -3.0 + 0.5 * 0.3]]).expand(rows, 2)
         y = y + torch.tensor([[0.2, 0.2]]) * torch.randn((rows, 2), generator=generator(4))
         target = infer(None, x, y, self.units, torch.tensor([0.2, 0.2]), discrepancy_std=torch.tensor([0.6, 0.6]))
-        found = distil(target, self.points, self.settings, start=constant(*heights))
+        distilled = distil(target, self.points, self.settings, start=constant(*heights))
         mean, std = target.predict(x if at_data else self.points)
         missed = ((mean - self.units.raw_outputs(torch.tensor([0.3, 0.3]))) / self.units.output_std) ** 2
         noise = target.noise_std**2
         function_variance = (std / self.units.output_std) ** 2 - noise - torch.tensor(heights).var(dim=0, correction=0)
         weight = torch.ones_like(function_variance) if at_data else (std / self.units.output_std) ** -2
         expected = (noise + (weight * (missed + function_variance)).sum(dim=0) / weight.sum(dim=0)).sqrt()
-        assert np.allclose(found.noise_std, expected, rtol=2e-3)
-        assert (bool((found.noise_std < 1.5 * target.noise_std).all())) is at_data
+        assert np.allclose(distilled.noise_std, expected, rtol=2e-3)
+        assert (bool((distilled.noise_std < 1.5 * target.noise_std).all())) is at_data
 
     @pytest.mark.parametrize("outlier_error", [5.0, 50.0])
     def test_one_row_with_a_large_error_hardly_changes_the_noise(self, outlier_error):
@@ -222,23 +222,23 @@ class TestNoise:
         y = y + torch.tensor([[0.2, 0.2]]) * torch.randn((61, 2), generator=generator(4))
         y[-1] += outlier_error
         target = infer(None, x, y, self.units, torch.tensor([0.2, 0.2]), discrepancy_std=torch.tensor([0.6, 0.6]))
-        found = distil(target, self.points, self.settings, start=constant(*[(0.3, 0.3)] * 2))
+        distilled = distil(target, self.points, self.settings, start=constant(*[(0.3, 0.3)] * 2))
         missed = (target.predict(x[-1:])[0] - self.units.raw_outputs(torch.tensor([0.3, 0.3]))) / self.units.output_std
         assert (missed[0] > 4.0 * target.noise_std).any()
-        assert torch.allclose(found.noise_std, target.noise_std, rtol=0.25)
+        assert torch.allclose(distilled.noise_std, target.noise_std, rtol=0.25)
 
     def test_noise_variance_is_at_least_half_of_the_measurement_variance(self):
-        found = distil(self.target, self.points, self.settings, start=constant((2.0, 2.0), (-2.0, -2.0)))
-        assert np.allclose(found.noise_std, [0.1 * np.sqrt(0.5), 0.4 * np.sqrt(0.5)], rtol=1e-5)
+        distilled = distil(self.target, self.points, self.settings, start=constant((2.0, 2.0), (-2.0, -2.0)))
+        assert np.allclose(distilled.noise_std, [0.1 * np.sqrt(0.5), 0.4 * np.sqrt(0.5)], rtol=1e-5)
 
     def test_prediction_has_the_degrees_of_freedom_of_the_target(self):
         """Three equal particles predict a Student-t distribution with the scale of their noise."""
         target = infer(None, EMPTY, EMPTY, UNITS, NOISE)
-        found = distil(replace(target, dof=4.0), self.points, self.settings, start=constant(*[(0.0,)] * 3))
-        at = np.array([-3.0, 0.0, 0.9, 1.0, 1.3, 4.0])
-        prediction = found.predict(torch.zeros(len(at), 1))
-        expected = student(4.0, loc=1.0, scale=2.0 * float(found.noise_std)).logpdf(at)
-        density = prediction.log_density(torch.tensor(at, dtype=torch.float32)[:, None])
+        distilled = distil(replace(target, dof=4.0), self.points, self.settings, start=constant(*[(0.0,)] * 3))
+        query = np.array([-3.0, 0.0, 0.9, 1.0, 1.3, 4.0])
+        prediction = distilled.predict(torch.zeros(len(query), 1))
+        expected = student(4.0, loc=1.0, scale=2.0 * float(distilled.noise_std)).logpdf(query)
+        density = prediction.log_density(torch.tensor(query, dtype=torch.float32)[:, None])
         assert np.allclose(density, expected, atol=1e-4)
 
 
@@ -269,19 +269,19 @@ def particles(target, points, steps_done):
 
 
 class TestFit:
-    at = torch.linspace(-2.9, 3.9, 60)[:, None]
+    query = torch.linspace(-2.9, 3.9, 60)[:, None]
 
     def test_particles_have_the_mean_and_standard_deviation_of_the_target(self, target, particles):
-        mean, std = target.predict(self.at)
+        mean, std = target.predict(self.query)
         function_std = (std**2 - (target.noise_std * UNITS.output_std) ** 2).sqrt()
-        prediction = particles.predict(self.at)
+        prediction = particles.predict(self.query)
         assert float(function_std.max()) > 4.0 * float(function_std.min())
         assert ((prediction.mean - mean).abs() < 0.25 * std).all()
         assert torch.allclose(prediction.epistemic_std, function_std, rtol=0.2, atol=0.02)
         assert torch.allclose(prediction.std, std, rtol=0.2)
 
     def test_particles_have_the_correlation_of_the_target_between_inputs(self, target, particles):
-        pairs = torch.stack([self.at[:-9], self.at[9:]], dim=1)
+        pairs = torch.stack([self.query[:-9], self.query[9:]], dim=1)
         _, covariance = target.marginals(pairs)
         exact = covariance[:, 0, 0, 1] / (covariance[:, 0, 0, 0] * covariance[:, 0, 1, 1]).sqrt()
         values = particles.predict(pairs.flatten(0, 1)).means[:, :, 0].view(-1, len(pairs), 2)
@@ -302,20 +302,20 @@ class TestFit:
         noise = torch.randn(8, 2, generator=generator(4)) * torch.tensor([0.05, 5.0])
         y = torch.cat([torch.sin(X), 20.0 - 3.0 * X], dim=1) + noise
         target = infer(None, X, y, units, torch.tensor([0.05, 5.0]))
-        points = self.at.repeat(10, 1)
-        found = distil(target, points, replace(SETTINGS, steps=800))
-        mean, std = target.predict(self.at)
-        prediction = found.predict(self.at)
+        points = self.query.repeat(10, 1)
+        distilled = distil(target, points, replace(SETTINGS, steps=800))
+        mean, std = target.predict(self.query)
+        prediction = distilled.predict(self.query)
         assert ((prediction.mean - mean).abs() < 0.3 * std).all()
         assert torch.allclose(prediction.std, std, rtol=0.25)
-        assert torch.allclose(found.noise_std, target.noise_std, rtol=0.4)
+        assert torch.allclose(distilled.noise_std, target.noise_std, rtol=0.4)
 
     def test_warm_start_from_fitted_particles_converges_within_20_steps(self, target, points, particles):
         warm = distil(target, points, replace(SETTINGS, steps=20, learning_rate=1e-4), start=particles.parameters)
         fresh = distil(target, points, replace(SETTINGS, steps=20, learning_rate=1e-4))
-        mean, std = target.predict(self.at)
-        assert ((warm.predict(self.at).mean - mean).abs() < 0.25 * std).all()
-        assert ((fresh.predict(self.at).mean - mean).abs() > 0.25 * std).any()
+        mean, std = target.predict(self.query)
+        assert ((warm.predict(self.query).mean - mean).abs() < 0.25 * std).all()
+        assert ((fresh.predict(self.query).mean - mean).abs() > 0.25 * std).any()
 
     def test_start_parameters_are_not_modified(self, target, points, particles):
         start = particles.parameters.clone()
@@ -343,35 +343,35 @@ class TestMeasurementPoints:
     rows = 100.0 + normal(30, 1).float()
 
     def test_half_of_the_points_are_near_the_data_and_half_in_the_domain(self):
-        found = measurement_points(RandomLine(), self.rows, UNITS, generator(), count=1001)
-        near = found[:, 0] > 50.0
-        assert found.shape == (1001, 1)
+        sampled_points = measurement_points(RandomLine(), self.rows, UNITS, generator(), count=1001)
+        near = sampled_points[:, 0] > 50.0
+        assert sampled_points.shape == (1001, 1)
         assert int(near.sum()) == 500
-        distance = (found[near] - self.rows.T).abs().min(dim=1).values
+        distance = (sampled_points[near] - self.rows.T).abs().min(dim=1).values
         assert 0.0 < float(distance.max()) < 5.0 * MAX_NEIGHBOUR_DISTANCE * 1.5
-        assert found[~near].min() >= -3.0
-        assert found[~near].max() <= 4.0
-        assert float(found[~near].std()) == pytest.approx(7.0 / np.sqrt(12.0), rel=0.1)
+        assert sampled_points[~near].min() >= -3.0
+        assert sampled_points[~near].max() <= 4.0
+        assert float(sampled_points[~near].std()) == pytest.approx(7.0 / np.sqrt(12.0), rel=0.1)
 
     def test_points_near_data_have_offsets_in_normalised_units(self):
         """Offsets are normal with a uniform scale up to 0.5: their standard deviation is 0.5 / sqrt(3)."""
         units = Normaliser(torch.zeros(2), torch.tensor([1.0, 100.0]), torch.zeros(1), torch.ones(1))
         row = torch.tensor([[3.0, -70.0]])
-        found = measurement_points(None, row.repeat(25, 1), units, generator(), count=8000, domain=row)
-        offsets = ((found - row) / units.input_std)[:4000]
+        sampled_points = measurement_points(None, row.repeat(25, 1), units, generator(), count=8000, domain=row)
+        offsets = ((sampled_points - row) / units.input_std)[:4000]
         assert torch.allclose(offsets.mean(dim=0), torch.zeros(2), atol=0.02)
         assert torch.allclose(offsets.std(dim=0), torch.full((2,), MAX_NEIGHBOUR_DISTANCE / 3.0**0.5), rtol=0.05)
 
     @pytest.mark.parametrize("count", [0, 19])
     def test_all_points_are_in_the_domain_with_fewer_than_20_rows(self, count):
-        found = measurement_points(RandomLine(), self.rows[:count], UNITS, generator(), count=64)
-        assert found.shape == (64, 1)
-        assert found.max() <= 4.0
+        sampled_points = measurement_points(RandomLine(), self.rows[:count], UNITS, generator(), count=64)
+        assert sampled_points.shape == (64, 1)
+        assert sampled_points.max() <= 4.0
 
     @pytest.mark.parametrize(("count", "near"), [(0, 0), (30, 32)])
     def test_domain_points_are_the_given_ones_without_a_simulator(self, count, near):
         others = torch.tensor([[-1.0], [0.5], [2.0]])
-        found = measurement_points(None, self.rows[:count], UNITS, generator(), count=64, domain=others)
-        assert found.shape == (64, 1)
-        assert int((found > 50.0).sum()) == near
-        assert set(found[near:, 0].tolist()) == {-1.0, 0.5, 2.0}
+        sampled_points = measurement_points(None, self.rows[:count], UNITS, generator(), count=64, domain=others)
+        assert sampled_points.shape == (64, 1)
+        assert int((sampled_points > 50.0).sum()) == near
+        assert set(sampled_points[near:, 0].tolist()) == {-1.0, 0.5, 2.0}

@@ -115,12 +115,12 @@ def test_std_of_student_noise_exceeds_its_scale(dof, factor):
 
 def test_gaussians_approximate_a_student_mixture():
     mixture = Mixture(torch.tensor([[[-1.0]], [[2.0]]]).double().expand(2, 9, 1), torch.tensor([[[0.5]], [[1.5]]]), 4.0)
-    at = torch.linspace(-6.0, 8.0, 9).double()[:, None]
-    exact = [student(4.0, m, s).pdf(at[:, 0].numpy()) for m, s in ((-1.0, 0.5), (2.0, 1.5))]
+    query = torch.linspace(-6.0, 8.0, 9).double()[:, None]
+    exact = [student(4.0, m, s).pdf(query[:, 0].numpy()) for m, s in ((-1.0, 0.5), (2.0, 1.5))]
     found = mixture.gaussians(200)
     assert found.means.shape == (400, 9, 1)
     assert math.isinf(found.dof)
-    assert np.allclose(found.log_density(at), np.log(np.mean(exact, axis=0)), atol=0.05)
+    assert np.allclose(found.log_density(query), np.log(np.mean(exact, axis=0)), atol=0.05)
     sharp = Mixture(random(4, 5, 3), random(4, 1, 3, seed=1).exp())
     assert sharp.gaussians() is sharp
 
@@ -151,10 +151,10 @@ def test_smoothed_student_mixture_is_one_student_distribution():
     """Noise scale 0.3 and means with standard deviation 0.4 combine to scale 0.5."""
     means = torch.randn(400, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     means = 1.0 + 0.4 * (means - means.mean()) / means.std(correction=0)
-    at = np.linspace(-4.0, 6.0, 21)
+    query = np.linspace(-4.0, 6.0, 21)
     found = Mixture(means[:, None, None].expand(-1, 21, 1), torch.tensor([[[0.3]]]).double(), 4.0).smoothed(1.0)
-    expected = student(4.0, loc=1.0, scale=0.5).logpdf(at)
-    assert np.allclose(found.log_density(torch.from_numpy(at)[:, None]), expected, atol=1e-6)
+    expected = student(4.0, loc=1.0, scale=0.5).logpdf(query)
+    assert np.allclose(found.log_density(torch.from_numpy(query)[:, None]), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("dof", [2.5, 20.0])

@@ -26,11 +26,11 @@ from learning.world.car_fit import load_car, save_car
 class Payload:
     """An object that creates a folder when it is unpickled."""
 
-    def __init__(self, made: Path) -> None:
-        self._made = made
+    def __init__(self, created_folder: Path) -> None:
+        self._created_folder = created_folder
 
     def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
-        return os.mkdir, (str(self._made),)
+        return os.mkdir, (str(self._created_folder),)
 
 
 def write_stable_baselines(path: Path, payload: Payload) -> None:
@@ -64,13 +64,13 @@ WRITERS = [write_stable_baselines, write_pickle, write_torch, write_object_array
 def test_payload_in_a_model_file_does_not_run(
     tmp_path: Path, name: str, write: Callable[[Path, Payload], None]
 ) -> None:
-    made = tmp_path / "made"
+    created_folder = tmp_path / "made"
     folder = tmp_path / "models" / "0001"
     folder.mkdir(parents=True)
-    write(folder / name, Payload(made))
+    write(folder / name, Payload(created_folder))
     with pytest.raises(DataError, match=r"; remove .* to train again\.$") as error:
         load_car(folder / name) if name == "dynamics.pt" else SacAgent.load(folder, SacSettings(), 0)
-    assert not made.exists()
+    assert not created_folder.exists()
     assert "\n" not in str(error.value)
     assert "weights_only" not in str(error.value)
     assert str(folder) in str(error.value)
@@ -87,14 +87,14 @@ def test_payload_runs_with_unsafe_readers(tmp_path: Path) -> None:
         write_object_array: lambda path: np.load(path, allow_pickle=True)["version"],
     }
     for write in WRITERS:
-        made = tmp_path / write.__name__
+        created_folder = tmp_path / write.__name__
         path = tmp_path / f"{write.__name__}.zip"
-        write(path, Payload(made))
+        write(path, Payload(created_folder))
         try:
             readers[write](path)
         except Exception:  # The file holds nothing but the payload.
-            assert made.is_dir(), write.__name__
-        assert made.is_dir(), write.__name__
+            assert created_folder.is_dir(), write.__name__
+        assert created_folder.is_dir(), write.__name__
 
 
 WIDTH = 3 + 2 * 2

@@ -30,38 +30,38 @@ class TestWithoutSimulator:
     x, y = rows(30)
 
     def test_predictions_equal_the_gaussian_process(self, posterior):
-        at, _ = rows(1500, seed=1)
-        mean, std = posterior.predict(at)
-        exact_mean, exact, _ = discrepancy_alone(self.x, self.y, at, posterior.discrepancy, raw_noise(posterior))
+        query, _ = rows(1500, seed=1)
+        mean, std = posterior.predict(query)
+        exact_mean, exact, _ = discrepancy_alone(self.x, self.y, query, posterior.discrepancy, raw_noise(posterior))
         assert np.allclose(mean, exact_mean, atol=2e-5)
         assert np.allclose(std, exact, rtol=1e-5)
 
     def test_marginals_equal_the_gaussian_process(self, posterior):
-        at, _ = rows(35, seed=2)
-        means, covariances = posterior.marginals(at.view(7, 5, 2))
+        query, _ = rows(35, seed=2)
+        means, covariances = posterior.marginals(query.view(7, 5, 2))
         units = UNITS.output_std.numpy()
         for k in range(7):
             mean, _, exact = discrepancy_alone(
-                self.x, self.y, at[5 * k : 5 * k + 5], posterior.discrepancy, raw_noise(posterior)
+                self.x, self.y, query[5 * k : 5 * k + 5], posterior.discrepancy, raw_noise(posterior)
             )
             assert np.allclose(means[k].numpy().T * units + UNITS.output_mean.numpy(), mean, atol=2e-5)
             assert np.allclose(covariances[k], exact / units[:, None, None] ** 2, atol=2e-5)
 
     def test_prediction_is_close_to_the_true_function_near_the_data(self, posterior):
         """The outputs have amplitudes of 2 and 0.6 and noise of 0.2 and 0.1."""
-        at, _ = rows(200, seed=3)
-        error = posterior.predict(at)[0].numpy() - truth(at)
+        query, _ = rows(200, seed=3)
+        error = posterior.predict(query)[0].numpy() - truth(query)
         assert (np.sqrt((error**2).mean(axis=0)) < [0.4, 0.15]).all()
 
 
-def errors_over_seeds(x, y, at, count, **settings):
+def errors_over_seeds(x, y, query, count, **settings):
     """Return errors of the mean (count, M, 2) in exact standard deviations, and variance ratios."""
     mean_errors, ratios = [], []
     for seed in range(count):
         posterior = infer(Linear(), x, y, UNITS, NOISE, seed=seed, **settings)
-        mean, std = posterior.predict(at)
+        mean, std = posterior.predict(query)
         exact_mean, exact, _ = simulator_and_discrepancy(
-            x, y, at, posterior.discrepancy, raw_noise(posterior), posterior.parameters
+            x, y, query, posterior.discrepancy, raw_noise(posterior), posterior.parameters
         )
         variance, exact_variance = (v**2 - raw_noise(posterior) ** 2 for v in (std.double().numpy(), exact))
         mean_errors.append((mean.numpy() - exact_mean) / np.sqrt(exact_variance))
@@ -70,7 +70,7 @@ def errors_over_seeds(x, y, at, count, **settings):
 
 
 class TestWithSimulator:
-    at, _ = rows(40, seed=1)
+    query, _ = rows(40, seed=1)
 
     @pytest.mark.parametrize(
         "settings",
@@ -78,7 +78,7 @@ class TestWithSimulator:
     )
     def test_posterior_equals_the_gaussian_process_of_simulator_and_discrepancy(self, settings):
         """Differences stay within the Monte Carlo error of 128 draws; the average of six seeds is closer."""
-        mean_errors, ratios = errors_over_seeds(*rows(12), self.at, 6, **settings)
+        mean_errors, ratios = errors_over_seeds(*rows(12), self.query, 6, **settings)
         assert np.abs(mean_errors).max() < 4.0 / math.sqrt(PARAMETER_DRAWS)
         assert np.abs(ratios - 1.0).max() < 4.5 * math.sqrt(2.0 / PARAMETER_DRAWS)
         assert np.abs(mean_errors.mean(axis=0)).max() < 2.0 / math.sqrt(PARAMETER_DRAWS)
@@ -87,11 +87,11 @@ class TestWithSimulator:
     def test_marginals_equal_the_gaussian_process_of_simulator_and_discrepancy(self):
         x, y = rows(12)
         posterior = infer(Linear(), x, y, UNITS, NOISE)
-        means, covariances = posterior.marginals(self.at[:20].view(4, 5, 2))
+        means, covariances = posterior.marginals(self.query[:20].view(4, 5, 2))
         units = UNITS.output_std.numpy()
         for k in range(4):
             mean, _, exact = simulator_and_discrepancy(
-                x, y, self.at[5 * k : 5 * k + 5], posterior.discrepancy, raw_noise(posterior), posterior.parameters
+                x, y, self.query[5 * k : 5 * k + 5], posterior.discrepancy, raw_noise(posterior), posterior.parameters
             )
             exact = exact / units[:, None, None] ** 2
             std = np.sqrt(exact.diagonal(axis1=1, axis2=2))
@@ -146,17 +146,17 @@ class TestWithSimulator:
 
 
 class TestWithoutRows:
-    at, _ = rows(10, seed=1)
+    query, _ = rows(10, seed=1)
 
     @pytest.mark.parametrize("expected", [None, torch.tensor([0.3, 0.7])])
     def test_prior_has_the_moments_of_simulator_draws_and_prior_discrepancy(self, expected):
         posterior = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, discrepancy_std=expected)
-        means, covariances = posterior.marginals(self.at.view(2, 5, 2))
+        means, covariances = posterior.marginals(self.query.view(2, 5, 2))
         assert posterior.parameters.shape == (PARAMETER_DRAWS, 3)
-        drawn = np.einsum("onk,pk->pon", features(self.at), posterior.parameters.double().numpy())
+        drawn = np.einsum("onk,pk->pon", features(self.query), posterior.parameters.double().numpy())
         drawn = (drawn - UNITS.output_mean.numpy()[:, None]) / UNITS.output_std.numpy()[:, None]
         size = [PRIOR_DISCREPANCY_STD] * 2 if expected is None else (expected / UNITS.output_std).tolist()
-        x = (self.at.double().numpy() - UNITS.input_mean.numpy()) / UNITS.input_std.numpy()
+        x = (self.query.double().numpy() - UNITS.input_mean.numpy()) / UNITS.input_std.numpy()
         distance = ((x[:, None] - x[None]) ** 2).sum(axis=2)
         for k in range(2):
             kernel, mean = np.exp(-0.5 * distance / PRIOR_LENGTHSCALE**2), drawn[:, k].mean(axis=0)
@@ -168,8 +168,8 @@ class TestWithoutRows:
                 assert np.allclose(covariances[b, k], exact[block, block], atol=1e-4)
 
     def test_parameter_draws_have_the_prior_distribution(self):
-        mean, std = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, with_discrepancy=False).predict(self.at)
-        exact = np.sqrt((features(self.at) ** 2).sum(axis=2).T + NOISE.numpy() ** 2)
+        mean, std = infer(Linear(), EMPTY, EMPTY, UNITS, NOISE, with_discrepancy=False).predict(self.query)
+        exact = np.sqrt((features(self.query) ** 2).sum(axis=2).T + NOISE.numpy() ** 2)
         assert np.abs(mean.numpy() / exact).max() < 4.0 / math.sqrt(PARAMETER_DRAWS)
         assert np.allclose(std, exact, rtol=4.0 / math.sqrt(2.0 * PARAMETER_DRAWS))
 
@@ -179,14 +179,14 @@ class TestOutliers:
 
     noise = torch.tensor([0.1, 0.05])
     x, y = rows(100, noise=noise)
-    at, _ = rows(200, seed=5)
+    query, _ = rows(200, seed=5)
 
     def with_outliers(self, size):
         errors = torch.tensor([[1.0, 0.3], [-1.0, 0.25], [1.2, -0.25], [0.9, -0.3]])
         return self.y.index_add(0, torch.tensor([3, 30, 60, 90]), size * errors)
 
     def error(self, mean):
-        return np.sqrt(((np.asarray(mean) - truth(self.at)) ** 2).mean(axis=0))
+        return np.sqrt(((np.asarray(mean) - truth(self.query)) ** 2).mean(axis=0))
 
     @pytest.mark.parametrize("model", [None, Linear()])
     @pytest.mark.parametrize("size", [3.0, 30.0])
@@ -194,12 +194,12 @@ class TestOutliers:
         """A Gaussian process with the same covariance and Gaussian noise follows the outliers."""
         y = self.with_outliers(size)
         posterior, clean = (infer(model, self.x, v, UNITS, self.noise) for v in (y, self.y))
-        robust_error = self.error(posterior.predict(self.at)[0])
-        assert (robust_error < self.error(clean.predict(self.at)[0]) + 0.2 * self.noise.numpy()).all()
+        robust_error = self.error(posterior.predict(self.query)[0])
+        assert (robust_error < self.error(clean.predict(self.query)[0]) + 0.2 * self.noise.numpy()).all()
         assert posterior.dof < 10.0
         assert np.allclose(raw_noise(posterior), self.noise, rtol=0.5)
         gaussian_process = simulator_and_discrepancy if model else discrepancy_alone
-        gaussian_mean = gaussian_process(self.x, y, self.at, posterior.discrepancy, raw_noise(posterior))[0]
+        gaussian_mean = gaussian_process(self.x, y, self.query, posterior.discrepancy, raw_noise(posterior))[0]
         assert (self.error(gaussian_mean) > 3.0 * robust_error).all()
 
     def test_weights_stay_gaussian_with_fewer_than_40_rows(self):
@@ -225,11 +225,11 @@ class TestCorrelatedErrors:
         posterior = infer(model, x, y, UNITS, 2.0 * NOISE)
         monkeypatch.setattr(inference, "output_correlation", lambda w: (torch.eye(2).double(), torch.ones(2)))
         independent_model = infer(model, x, y, UNITS, 2.0 * NOISE)
-        at, outputs = self.correlated_rows(500, 1, correlation)
+        query, outputs = self.correlated_rows(500, 1, correlation)
         joint, independent = (
-            float(f.prediction(at).log_density(outputs).mean()) for f in (posterior, independent_model)
+            float(f.prediction(query).log_density(outputs).mean()) for f in (posterior, independent_model)
         )
-        return joint - independent, posterior.prediction(at)
+        return joint - independent, posterior.prediction(query)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("count", [300, 600])
@@ -263,7 +263,7 @@ class TestRestarts:
         """The average gain over three data sets is clear and no data set loses."""
         gains = []
         for seed in range(3):
-            at, y = rows(300, 100 + seed)
+            query, y = rows(300, 100 + seed)
             single, restarted = (
                 infer(
                     model,
@@ -276,7 +276,9 @@ class TestRestarts:
                 )
                 for restart_scales in ({"restart_scales": (1.0,)}, {})
             )
-            before, after = (negative_log_likelihood(posterior.prediction(at), y) for posterior in (single, restarted))
+            before, after = (
+                negative_log_likelihood(posterior.prediction(query), y) for posterior in (single, restarted)
+            )
             gains.append(before - after)
         assert min(gains) > -0.02
         assert np.mean(gains) > 0.3
@@ -297,8 +299,10 @@ class TestRestarts:
 
     def test_restart_without_a_computable_covariance_is_skipped(self):
         x, y = rows(50)
-        at, _ = rows(5, seed=1)
-        first, both = (infer(None, x, y, UNITS, NOISE, restart_scales=s).predict(at) for s in ((1.0,), (1.0, math.nan)))
+        query, _ = rows(5, seed=1)
+        first, both = (
+            infer(None, x, y, UNITS, NOISE, restart_scales=s).predict(query) for s in ((1.0,), (1.0, math.nan))
+        )
         assert torch.equal(first[0], both[0])
         assert torch.equal(first[1], both[1])
 
@@ -326,8 +330,8 @@ class TestFewRows:
 
 
 def test_equal_seeds_give_equal_predictions():
-    at, _ = rows(5, seed=1)
-    first, second, other = (infer(Linear(), *rows(8), UNITS, NOISE, seed=s).predict(at) for s in (2, 2, 3))
+    query, _ = rows(5, seed=1)
+    first, second, other = (infer(Linear(), *rows(8), UNITS, NOISE, seed=s).predict(query) for s in (2, 2, 3))
     assert torch.equal(first[0], second[0])
     assert torch.equal(first[1], second[1])
     assert not torch.equal(first[0], other[0])
@@ -340,6 +344,6 @@ def test_rows_beyond_the_maximum_are_subsampled(monkeypatch):
     all_inputs = UNITS.inputs(x).double()
     subset = [int((all_inputs == row).all(dim=1).nonzero().item()) for row in posterior.inputs]
     assert len(set(subset)) == 25
-    at, _ = rows(10, seed=1)
-    exact_mean, _, _ = discrepancy_alone(x[subset], y[subset], at, posterior.discrepancy, raw_noise(posterior))
-    assert np.allclose(posterior.predict(at)[0], exact_mean, atol=2e-5)
+    query, _ = rows(10, seed=1)
+    exact_mean, _, _ = discrepancy_alone(x[subset], y[subset], query, posterior.discrepancy, raw_noise(posterior))
+    assert np.allclose(posterior.predict(query)[0], exact_mean, atol=2e-5)

@@ -28,11 +28,11 @@ class FailingSimulator(Linear):
 @pytest.mark.parametrize("count", [0, 12, 60])
 def test_parameter_draws_with_nan_outputs_are_excluded(count):
     x, y = (v[:count] for v in rows(60))
-    at, _ = rows(5, seed=1)
-    found = infer(FailingSimulator(), x, y, UNITS, NOISE)
-    assert found.parameters[:, 0].min() >= -2.0
-    mean, std = found.predict(at)
-    expected_mean, expected_std = infer(Linear(), x, y, UNITS, NOISE).predict(at)
+    query, _ = rows(5, seed=1)
+    posterior = infer(FailingSimulator(), x, y, UNITS, NOISE)
+    assert posterior.parameters[:, 0].min() >= -2.0
+    mean, std = posterior.predict(query)
+    expected_mean, expected_std = infer(Linear(), x, y, UNITS, NOISE).predict(query)
     assert np.allclose(mean, expected_mean, atol=0.4 * float(expected_std.max()))
     assert np.allclose(std, expected_std, rtol=0.35)
     with pytest.raises(DataError, match="narrow the ranges"):
@@ -48,16 +48,16 @@ def test_simulator_without_parameters_is_accepted():
             return super().__call__(inputs, torch.tensor([[0.8, -1.1, 0.4]]).expand(len(parameters), 3).to(inputs))
 
     x, y = rows(30)
-    found = infer(Fixed(), x, y, UNITS, NOISE)
-    at, expected = rows(50, seed=1, noise=torch.zeros(2))
-    assert float(((found.predict(at)[0] - expected) / UNITS.output_std).abs().max()) < 0.5
+    posterior = infer(Fixed(), x, y, UNITS, NOISE)
+    query, expected = rows(50, seed=1, noise=torch.zeros(2))
+    assert float(((posterior.predict(query)[0] - expected) / UNITS.output_std).abs().max()) < 0.5
 
 
 def test_constant_output_keeps_one_percent_of_the_expected_noise():
     x, y = rows(60)
     y[:, 1] = UNITS.output_mean[1]
-    found = infer(None, x, y, UNITS, NOISE)
-    noise = found.noise_std * UNITS.output_std / NOISE
+    posterior = infer(None, x, y, UNITS, NOISE)
+    noise = posterior.noise_std * UNITS.output_std / NOISE
     assert float(noise[1]) >= 0.01
     assert 0.5 < float(noise[0]) < 2.0
 
@@ -78,6 +78,6 @@ def test_invalid_input_is_refused(changed, message):
 
 
 def test_prediction_is_empty_at_zero_inputs():
-    found = infer(None, *rows(12), UNITS, NOISE)
-    mean, std = found.predict(EMPTY)
+    posterior = infer(None, *rows(12), UNITS, NOISE)
+    mean, std = posterior.predict(EMPTY)
     assert mean.shape == std.shape == (0, 2)

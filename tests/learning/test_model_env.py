@@ -84,13 +84,13 @@ def test_steps_and_rewards_are_those_reference_step() -> None:
     past = before[:, 7:].reshape(6, HISTORY, 2)
     for _ in range(4):
         commands = rng.uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
-        seen, rewards, done, _ = env.step(commands)
+        observations, rewards, done, _ = env.step(commands)
         assert not done.any()
         states = [reference_step(s, p[-1]) for s, p in zip(states, past, strict=True)]
         past = np.concatenate([past[:, 1:], commands[:, None]], axis=1)
         expected = rows_of(np.array(states), past.reshape(6, -1))
         np.testing.assert_allclose(env.features.numpy(), expected, atol=1e-5)
-        np.testing.assert_allclose(seen, expected / [2, 2, 1, 1, 2, 1, 4, 1, 1, 1, 1], atol=1e-5)
+        np.testing.assert_allclose(observations, expected / [2, 2, 1, 1, 2, 1, 4, 1, 1, 1, 1], atol=1e-5)
         by_formula = [parking_reward(s, a) for s, a in zip(states, commands, strict=True)]
         np.testing.assert_allclose(rewards, REWARD_SCALE * np.array(by_formula), atol=1e-4)
 
@@ -107,7 +107,7 @@ def test_bonus_is_in_training_rewards_and_not_in_rollout_returns() -> None:
     commands = np.random.default_rng(0).uniform(-0.4, 0.4, (6, 2)).astype(np.float32)
     (_, plain_rewards, _, _), (_, rewards, _, _) = plain.step(commands), with_bonus.step(commands)
     np.testing.assert_allclose(rewards - plain_rewards, REWARD_SCALE * with_bonus.features[:, 0].numpy(), atol=1e-4)
-    totals = [env.roll_out(lambda seen: np.zeros((6, 2), np.float32))[0] for env in (plain, with_bonus)]
+    totals = [env.roll_out(lambda observations: np.zeros((6, 2), np.float32))[0] for env in (plain, with_bonus)]
     assert torch.equal(*totals)
 
 
@@ -171,7 +171,7 @@ def test_episode_is_truncated_after_the_ticks_of_the_task() -> None:
     for tick in range(14):
         driven = [reference_step(state_of(f), f[9:11]) for f in env.features.numpy().astype(np.float64)]
         past = np.hstack([env.features.numpy()[:, 9:11], commands])
-        seen, _, done, infos = env.step(commands)
+        observations, _, done, infos = env.step(commands)
         ended += done
         if tick == 0:
             assert 10 < done.sum() < 60, "initial episodes end at different ticks"
@@ -181,8 +181,8 @@ def test_episode_is_truncated_after_the_ticks_of_the_task() -> None:
         for k in np.flatnonzero(done):
             assert infos[k]["TimeLimit.truncated"] is True
             np.testing.assert_allclose(infos[k]["terminal_observation"], final[k], atol=1e-5)
-            assert np.all(seen[k][7:] == 0.0), "a new start has zero past commands"
-            assert abs(seen[k][0] * 2 - 1.42) < 0.1 + 1e-6
+            assert np.all(observations[k][7:] == 0.0), "a new start has zero past commands"
+            assert abs(observations[k][0] * 2 - 1.42) < 0.1 + 1e-6
     assert (ended == 2).all()
 
 
@@ -245,8 +245,8 @@ def test_rollout_sums_rewards_of_each_car_until_its_episode_ends() -> None:
     commands = np.stack([np.full(12, 0.3), throttle], axis=1).astype(np.float32)
     views: list[np.ndarray] = []
 
-    def act(seen: np.ndarray) -> np.ndarray:
-        views.append(seen.copy())
+    def act(observations: np.ndarray) -> np.ndarray:
+        views.append(observations.copy())
         return commands
 
     total, last = env.roll_out(act)
@@ -274,7 +274,7 @@ def test_rollout_ends_for_a_parked_car() -> None:
         TASK, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9,
         stop_when_parked=True,
     )  # fmt: skip
-    total, _ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda seen: np.zeros((3, 2), np.float32))
+    total, _ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
     assert total.tolist() == pytest.approx([1.0] * 3), "one rewarded tick"
     total, _ = ModelEnv(StationaryCar(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
     assert total.tolist() == pytest.approx([9.0] * 3)
@@ -312,9 +312,9 @@ def test_sac_trains_in_the_environment_with_correct_terminal_observations() -> N
 def test_policy_inputs_are_scaled_and_clipped() -> None:
     features = np.array([[1.0, -3.0, 0.6, -0.8, 2.0, 0.5, 8.0, 0.1, -1.0], [500.0, -500.0, 0, 1, 100.0, 0, 0, 0, 0]])
     before = features.copy()
-    seen = policy_inputs(features)
-    assert seen.dtype == np.float32
-    assert seen[0].tolist() == pytest.approx([0.5, -1.5, 0.6, -0.8, 1.0, 0.5, 2.0, 0.1, -1.0])
-    assert seen[1].tolist() == [10.0, -10.0, 0.0, 1.0, 10.0, 0.0, 0.0, 0.0, 0.0]
+    observations = policy_inputs(features)
+    assert observations.dtype == np.float32
+    assert observations[0].tolist() == pytest.approx([0.5, -1.5, 0.6, -0.8, 1.0, 0.5, 2.0, 0.1, -1.0])
+    assert observations[1].tolist() == [10.0, -10.0, 0.0, 1.0, 10.0, 0.0, 0.0, 0.0, 0.0]
     assert np.array_equal(features, before), "policy_inputs must not modify its argument"
-    assert np.array_equal(policy_inputs(features[0]), seen[0])
+    assert np.array_equal(policy_inputs(features[0]), observations[0])

@@ -130,11 +130,11 @@ def draws_of_one_parameter(shape, observed, noise, count=2000):
 
 def posterior_by_quadrature(log_likelihood):
     """Return grid points and weights of the posterior with a standard normal prior."""
-    at = np.linspace(-6.0, 6.0, 24_001)
+    grid = np.linspace(-6.0, 6.0, 24_001)
     with np.errstate(invalid="ignore"):
-        logs = np.nan_to_num(log_likelihood(at), nan=-np.inf) - 0.5 * at**2
+        logs = np.nan_to_num(log_likelihood(grid), nan=-np.inf) - 0.5 * grid**2
     weight = np.exp(logs - logs.max())
-    return at, weight / weight.sum()
+    return grid, weight / weight.sum()
 
 
 def test_both_modes_of_a_bimodal_posterior_are_sampled():
@@ -145,15 +145,15 @@ def test_both_modes_of_a_bimodal_posterior_are_sampled():
 
     observed = [1.4, 1.45, 1.45, 1.5]
     draws = draws_of_one_parameter(shape, observed, 0.15)
-    at, weight = posterior_by_quadrature(
+    grid, weight = posterior_by_quadrature(
         lambda t: -0.5 * sum((s - shape(torch.tensor(t)).numpy()) ** 2 for s in observed) / 0.15**2
     )
-    below = at < 0.3
+    below = grid < 0.3
     assert 0.3 < weight[below].sum() < 0.7
     assert (draws < 0.3).mean() == pytest.approx(weight[below].sum(), abs=0.06)
     for side, part in ((below, draws[draws < 0.3]), (~below, draws[draws >= 0.3])):
-        mean = (weight * at)[side].sum() / weight[side].sum()
-        std = np.sqrt((weight * (at - mean) ** 2)[side].sum() / weight[side].sum())
+        mean = (weight * grid)[side].sum() / weight[side].sum()
+        std = np.sqrt((weight * (grid - mean) ** 2)[side].sum() / weight[side].sum())
         assert part.mean() == pytest.approx(mean, abs=0.2 * std)
         assert part.std() == pytest.approx(std, rel=0.15)
 
@@ -166,9 +166,9 @@ def test_draws_avoid_parameters_with_invalid_outputs(broken):
         return torch.where(t > 0.7, t, torch.full_like(t, broken))
 
     draws = draws_of_one_parameter(shape, [0.5], 0.5)
-    at, weight = posterior_by_quadrature(lambda t: np.where(t > 0.7, -0.5 * ((0.5 - t) / 0.5) ** 2, np.nan))
-    mean = (weight * at).sum()
-    std = np.sqrt((weight * (at - mean) ** 2).sum())
+    grid, weight = posterior_by_quadrature(lambda t: np.where(t > 0.7, -0.5 * ((0.5 - t) / 0.5) ** 2, np.nan))
+    mean = (weight * grid).sum()
+    std = np.sqrt((weight * (grid - mean) ** 2).sum())
     assert draws.min() > 0.7
     assert draws.mean() == pytest.approx(mean, abs=0.15 * std)
     assert draws.std() == pytest.approx(std, rel=0.1)

@@ -35,12 +35,12 @@ def batches(count: int, *, n_step_returns: bool = False) -> list[ReplayBufferSam
     generator = torch.Generator().manual_seed(3)
     found = []
     for _ in range(count):
-        seen, after = (torch.randn((BATCH, WIDTH), generator=generator) for _ in range(2))
+        observations, next_observations = (torch.randn((BATCH, WIDTH), generator=generator) for _ in range(2))
         action = torch.rand((BATCH, 2), generator=generator) * 2.0 - 1.0
         done = (torch.rand((BATCH, 1), generator=generator) < 0.2).float()
         reward = torch.randn((BATCH, 1), generator=generator)
         discounts = 0.9 ** torch.randint(1, 6, (BATCH, 1), generator=generator) if n_step_returns else None
-        found.append(ReplayBufferSamples(seen, action, after, done, reward, discounts))
+        found.append(ReplayBufferSamples(observations, action, next_observations, done, reward, discounts))
     return found
 
 
@@ -100,15 +100,15 @@ def test_agent_with_a_loaded_state_acts_and_trains_identically() -> None:
     first = trained(FastSac, material)
     restored = agent(FastSac)
     restored.load_learned_state(first.learned_state())
-    seen = np.random.default_rng(0).normal(size=(7, WIDTH)).astype(np.float32)
-    original_result, restored_result = (a.predict(seen, deterministic=True)[0] for a in (first, restored))
+    observations = np.random.default_rng(0).normal(size=(7, WIDTH)).astype(np.float32)
+    original_result, restored_result = (a.predict(observations, deterministic=True)[0] for a in (first, restored))
     np.testing.assert_array_equal(original_result, restored_result)
     for a in (first, restored):
         replace_replay(a, batches(5))
         a.set_logger(_quiet())
         torch.manual_seed(1)
         a.train(5, BATCH)
-    original_result, restored_result = (a.predict(seen, deterministic=True)[0] for a in (first, restored))
+    original_result, restored_result = (a.predict(observations, deterministic=True)[0] for a in (first, restored))
     np.testing.assert_array_equal(original_result, restored_result)
     original_result, restored_result = (a.learned_state() for a in (first, restored))
     assert all(
@@ -119,9 +119,9 @@ def test_agent_with_a_loaded_state_acts_and_trains_identically() -> None:
 
 def test_learn_maximises_the_reward() -> None:
     """The reward is the first action, so the trained policy chooses it near one."""
-    made = agent(FastSac, learning_starts=50, batch_size=BATCH)
-    made.learn(600)
-    assert made.predict(np.zeros(WIDTH, np.float32), deterministic=True)[0][0] > 0.8
+    learner = agent(FastSac, learning_starts=50, batch_size=BATCH)
+    learner.learn(600)
+    assert learner.predict(np.zeros(WIDTH, np.float32), deterministic=True)[0][0] > 0.8
 
 
 def test_unsupported_network_is_refused() -> None:

@@ -68,8 +68,8 @@ def test_density_factorises_for_a_known_yaw_of_zero():
     means, stds = MEANS[:1].clone(), STDS[:1].clone()
     means[..., 2], stds[..., 2] = 0.0, 1e-4
     found = seven_outputs(Mixture(means, stds), VELOCITY, torch.zeros(1))
-    at = means[0] + 0.7 * stds[0] * torch.tensor([1.0, -1.0, 0.0, 1.0, 1.0, -1.0])
-    truth = measured_seven_outputs(at, VELOCITY, torch.zeros(1))
+    changes = means[0] + 0.7 * stds[0] * torch.tensor([1.0, -1.0, 0.0, 1.0, 1.0, -1.0])
+    truth = measured_seven_outputs(changes, VELOCITY, torch.zeros(1))
     five = norm.logpdf(0.7, 0.0, 1.0) * 5 - np.log(stds[0, 0, [0, 1, 3, 4, 5]].numpy()).sum()
     angle = norm(found.means[0, 0, 2:4], found.stds[0, 0, 2:4]).logpdf(truth[0, 2:4]).sum()
     assert np.isclose(float(found.log_density(truth)[0]), five + angle, atol=1e-3)
