@@ -293,7 +293,7 @@ class TestFit:
         assert (particles.noise_std**2 >= 0.4999 * target.noise_std**2).all()
 
     @pytest.mark.usefixtures("particles")
-    def test_progress_is_called_each_two_hundred_steps(self, steps_done):
+    def test_progress_is_called_every_200_steps(self, steps_done):
         assert steps_done == [200, 400, 600, 800, 1000, 1200, 1400]
 
     def test_outputs_have_separate_means_standard_deviations_and_noise(self):
