@@ -169,7 +169,7 @@ def test_baseline_predictors_have_closed_form_errors():
     np.testing.assert_allclose(no_change[:, 2], -0.5, atol=1e-9)
 
 
-def test_predictions_at_stamps_restart_each_horizon(even):
+def test_predictions_at_stamps_restart_every_horizon(even):
     windows = recorded_windows(even, 1.0, 1.0)
     wrong = replace(CONFIG, parameters=replace(PARAMETERS, drive_gain_n=9.5))
     overlay = predicted_at(even.times_s, windows, SimulatorModel(wrong).predict(windows))
