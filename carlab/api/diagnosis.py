@@ -320,15 +320,15 @@ def _read_csv(path: Path, mapping: Any, material: Material) -> None:
     """Add a CSV's episodes and its repaired data faults; the diagnosis detects faults without repair itself."""
     from carlab.diagnosis.findings import DataFault
     from carlab.recording.audit.report import Severity
-    from carlab.recording.csv.repairing_import import import_mended
+    from carlab.recording.csv.repairing_import import import_repaired
 
-    read = import_mended(path, mapping=mapping)
+    read = import_repaired(path, mapping=mapping)
     material.episodes += list(read.imported.episodes)
     material.notes.append(read.imported.announcement)
     repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
     rows = read.imported.episodes[-1].ticks + 1
     material.faults += [
         DataFault(f.id, f.channel, f.count or rows, f"repaired: {f.sentence}")
-        for f in (*read.mended, *repaired)
+        for f in (*read.repaired, *repaired)
         if f.id in REPORTED_FAULTS
     ]

@@ -295,7 +295,7 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
     campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
     available(campaign.plan.device)
     _check_as_before(request, campaign.plan, choice)
-    campaign.set_aside_stopped_episode()
+    campaign.move_stopped_episode()
     restore_missing_rows(run, campaign.plan.task)
     return campaign
 

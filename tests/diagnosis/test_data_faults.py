@@ -13,7 +13,7 @@ from carlab.diagnosis.recording_faults.integration_step import check_integration
 from carlab.recording.audit.report import RefusedError
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
-from carlab.recording.csv.repairing_import import import_mended
+from carlab.recording.csv.repairing_import import import_repaired
 from carlab.recording.faults.robust import first_order_lag, held_means
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -376,8 +376,8 @@ def test_held_values_are_averaged_and_a_lag_has_its_own_delay_only():
     np.testing.assert_allclose((grid - followed)[200:], 0.2, atol=1e-6)
 
 
-class TestMendedImport:
-    def test_degrees_and_a_gap_are_mended(self, clean, tmp_path):
+class TestRepairedImport:
+    def test_import_repairs_degrees_and_a_gap(self, clean, tmp_path):
         keep = np.ones(len(clean.states), dtype=bool)
         keep[500:520] = False
         states = clean.states[keep].copy()
@@ -385,8 +385,8 @@ class TestMendedImport:
         write_csv(without_rows(clean, ~keep, states), tmp_path / "drive.csv")
         with pytest.raises(RefusedError):
             import_csv(tmp_path / "drive.csv")
-        read = import_mended(tmp_path / "drive.csv")
-        assert {f.id for f in read.mended} == {"wrong_unit", "dropouts"}
+        read = import_repaired(tmp_path / "drive.csv")
+        assert {f.id for f in read.repaired} == {"wrong_unit", "dropouts"}
         episode = read.imported.episode
         np.testing.assert_allclose(np.cos(episode.states[:, YAW]), np.cos(clean.states[keep, YAW]), atol=1e-6)
         assert np.ptp(episode.extra["segment"]) == 1
@@ -394,4 +394,4 @@ class TestMendedImport:
     def test_what_has_no_safe_remedy_is_refused_as_before(self, clean, tmp_path):
         write_csv(with_sent(clean, lambda sent: np.multiply(sent, 30.0, out=sent)), tmp_path / "drive.csv")
         with pytest.raises(DataError, match="say what full command is"):
-            import_mended(tmp_path / "drive.csv")
+            import_repaired(tmp_path / "drive.csv")

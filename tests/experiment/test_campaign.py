@@ -299,11 +299,11 @@ def test_an_episode_is_repeated_after_a_second_signal(interrupted: InterruptedRu
             recorder.emit(replace(document, reason=EndReason.LOOP_HUNG) if ended else document)
     campaign = Campaign(choose_car("sim"), interrupted.plan, 3, run)
     shutil.copytree(interrupted.run.models / "0002", run.models / "0004")
-    campaign.set_aside_stopped_episode()
+    campaign.move_stopped_episode()
     assert len(run.recordings()) == 3, "something was learned from it"
     shutil.rmtree(run.models / "0004")
-    campaign.set_aside_stopped_episode()
-    campaign.set_aside_stopped_episode()
+    campaign.move_stopped_episode()
+    campaign.move_stopped_episode()
     assert [p.name for p in run.recordings()] == ["0001.mcap", "0002.mcap"]
     assert (run.stopped / "0003.mcap").is_file()
     assert run.next_episode() == 4

@@ -155,7 +155,7 @@ class Campaign:
         Raises:
             DataError: training failed, or a recording could not be written.
         """
-        self.set_aside_stopped_episode()
+        self.move_stopped_episode()
         self._check()
         while (done := len(self.run.recordings())) < self.episodes:
             folder = model_folder(self.run.models, done + 1)
@@ -175,7 +175,7 @@ class Campaign:
                 return
             result = self._drive(done + 1)
             if result is None or result.reason in STOPPED:
-                self.set_aside_stopped_episode()
+                self.move_stopped_episode()
                 return
             if result.reason is EndReason.RECORDER_ERROR:
                 raise DataError(result.data.metadata["end_detail"])
@@ -188,7 +188,7 @@ class Campaign:
             if not continues:
                 return
 
-    def set_aside_stopped_episode(self) -> None:
+    def move_stopped_episode(self) -> None:
         """Move the last recording to ``stopped`` if a person ended it or the loop hung; the episode is repeated."""
         recordings = self.run.recordings()
         if not recordings or model_folder(self.run.models, len(recordings) + 1).is_dir():

@@ -19,14 +19,14 @@ _MAX_ITERATIONS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class MendedImport:
+class RepairedImport:
     """The imported recording, and the repaired findings that would have prevented the import."""
 
     imported: ImportedRecording
-    mended: tuple[Finding, ...]
+    repaired: tuple[Finding, ...]
 
 
-def import_mended(path: Path | str, *, mapping: ColumnMapping | None = None) -> MendedImport:
+def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -> RepairedImport:
     """Import a CSV; errors for which the audit proposes an option are repaired.
 
     Repairs: units of pose and velocities are declared, rows with a missing value or a stamp that does not increase are
@@ -35,10 +35,10 @@ def import_mended(path: Path | str, *, mapping: ColumnMapping | None = None) -> 
     Raises:
         DataError: the file cannot be read, or has an error without such a repair.
     """
-    mended: list[Finding] = []
+    repaired: list[Finding] = []
     for _ in range(_MAX_ITERATIONS):
         try:
-            return MendedImport(import_csv(path, mapping=mapping), tuple(mended))
+            return RepairedImport(import_csv(path, mapping=mapping), tuple(repaired))
         except RefusedError as refused:
             if mapping is None:
                 mapping = recognise_layout(read_csv(path).header, Path(path).name)
@@ -47,7 +47,7 @@ def import_mended(path: Path | str, *, mapping: ColumnMapping | None = None) -> 
                 if changed is None or changed == mapping:
                     raise
                 mapping = changed
-                mended.append(finding)
+                repaired.append(finding)
     raise DataError(f"{path} has too many faults for the automatic repair; import it with carlab import.")
 
 
