@@ -1,4 +1,4 @@
-"""A program that drives the emulated car and misbehaves as configured; the tests run it as a process and break things.
+"""Drive the emulated car with one configured misbehaviour; the tests run this program as a process.
 
 python driving_program.py RUNS_FOLDER MISBEHAVIOUR
 Prints one JSON line with its process ids and run folder, then ``tick N`` per tick.
@@ -28,61 +28,61 @@ FOREVER_TICKS = 3000
 
 
 class MisbehavingPolicy:
-    """Drives a circle; at one tick it misbehaves as configured."""
+    """Drives a circle and misbehaves at tick ``MISBEHAVE_AT_TICK``."""
 
     name = "misbehaving"
 
-    def __init__(self, how: str) -> None:
-        self.how = how
+    def __init__(self, misbehaviour: str) -> None:
+        self.misbehaviour = misbehaviour
 
     def reset(self) -> None: ...
 
     def act(self, view: PolicyInput) -> Action | None:
         if view.step == MISBEHAVE_AT_TICK:
-            if self.how == "policy_error":
+            if self.misbehaviour == "policy_error":
                 raise RuntimeError("the policy has a bug")
-            if self.how == "nan":
+            if self.misbehaviour == "nan":
                 return Action(float("nan"), 0.3)
-            if self.how == "hang_sleep":
+            if self.misbehaviour == "hang_sleep":
                 time.sleep(3600)
-            if self.how == "hang_busy":
+            if self.misbehaviour == "hang_busy":
                 while True:
                     pass
-            if self.how == "exit":
+            if self.misbehaviour == "exit":
                 os._exit(7)
         return Action(1.0, 0.3)
 
 
-def main(folder: str, how: str) -> int:
-    run = RunDirectory.create(folder, how)
+def main(folder: str, misbehaviour: str) -> int:
+    run = RunDirectory.create(folder, misbehaviour)
     car = EmulatedCar(default_car())
     car.log_to(run.path)
-    if how == "recorder_error":
-        written = RerunSink._write
-        count = [0]
+    if misbehaviour == "recorder_error":
+        original_write = RerunSink._write
+        n_writes = [0]
 
-        def broken(self: RerunSink, item: object) -> None:
-            count[0] += 1
-            if count[0] > 3 * MISBEHAVE_AT_TICK:
+        def failing_write(self: RerunSink, item: object) -> None:
+            n_writes[0] += 1
+            if n_writes[0] > 3 * MISBEHAVE_AT_TICK:
                 raise OSError(28, "No space left on device")
-            written(self, item)  # type: ignore[arg-type]
+            original_write(self, item)  # type: ignore[arg-type]
 
-        RerunSink._write = broken  # type: ignore[method-assign,assignment]
+        RerunSink._write = failing_write  # type: ignore[method-assign,assignment]
 
     def on_tick(tick: Tick) -> None:
         print(f"tick {tick.step}", flush=True)
         if tick.step == MISBEHAVE_AT_TICK:
-            if how == "unplug":
+            if misbehaviour == "unplug":
                 car.world.request(do="unplug")
-            if how == "mocap_silent":
+            if misbehaviour == "mocap_silent":
                 car.world.request(do="mocap", faults={"no_frames": True})
-            if how == "mocap_hidden":
+            if misbehaviour == "mocap_hidden":
                 car.world.request(do="mocap", faults={"occlusion": 1.0})
-            if how == "mocap_jump":
+            if misbehaviour == "mocap_jump":
                 car.world.request(do="place", state=[1.5, 0.0, 0.0, 0.0, 0.0, 0.0])
-            if how == "world_dies":
+            if misbehaviour == "world_dies":
                 os.kill(car.world.addresses["pid"], signal.SIGKILL)
-            if how == "mocap_error":
+            if misbehaviour == "mocap_error":
                 car.hardware.pose_source.since = None  # type: ignore[assignment,method-assign]
 
     def on_abandon(reason: EndReason, detail: str) -> None:
@@ -94,7 +94,7 @@ def main(folder: str, how: str) -> int:
         print(json.dumps({"run": str(run.path), "main": os.getpid(), "sender": sender.pid}), flush=True)  # type: ignore[union-attr]
         session = Session(
             car,
-            MisbehavingPolicy(how),
+            MisbehavingPolicy(misbehaviour),
             RecordedTask(CarState(), max_ticks=FOREVER_TICKS),
             replace(_envelope()),
             run,

@@ -1,4 +1,4 @@
-"""A run alternates training and driving, resumes after interruptions, and trains on the commands that were sent."""
+"""A learning run alternates training and driving, resumes after interruptions, and trains on the sent commands."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ from learning.world.car_fit import load_car
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> InterruptedRun:
     choice = choose_car("sim", seed=0)
     run = RunDirectory.create(tmp_path_factory.mktemp("runs"), "learn")
-    found = InterruptedRun(run, tiny_plan(choice), log_sent_actions(choice))
+    record = InterruptedRun(run, tiny_plan(choice), log_sent_actions(choice))
 
     def run_episodes(hooks: CampaignHooks) -> None:
-        hooks.on_figures = found.figures.append
-        campaign = Campaign(choice, found.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
+        hooks.on_figures = record.figures.append
+        campaign = Campaign(choice, record.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
         campaign.write_plan()
         for result in campaign.run_episodes():
-            found.results.append(result)
-            write_report(run, found.plan, found.figures[-1])
+            record.results.append(result)
+            write_report(run, record.plan, record.figures[-1])
 
-    def kill(what: str, done: int, total: int) -> None:
-        if found.results and what == "learning to drive":
+    def kill(stage: str, done: int, total: int) -> None:
+        if record.results and stage == "learning to drive":
             (child,) = multiprocessing.active_children()
             (run.models / "0002.partial").mkdir(exist_ok=True)
             (run.models / "0002.partial" / "dynamics.pt").write_bytes(b"rubbish")
@@ -68,19 +68,19 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> InterruptedRun:
 
     with choice.car:
         run_episodes(CampaignHooks(stop=(run.models / "0001").is_dir))
-        found.files_after_stop = names(run)
-        found.first_model = (run.models / "0001" / "policy.npz").read_bytes()
+        record.files_after_stop = names(run)
+        record.first_model = (run.models / "0001" / "policy.npz").read_bytes()
         with pytest.raises(DataError) as error:
             run_episodes(CampaignHooks(on_training=kill))
-        found.error_text = str(error.value)
-        found.files_after_kill = names(run)
-        (run.models / "0002.partial").mkdir()  # as where the whole program was killed with it
+        record.error_text = str(error.value)
+        record.files_after_kill = names(run)
+        (run.models / "0002.partial").mkdir()  # as after a kill of the whole program
         (run.models / "0002.partial" / "policy.npz").write_bytes(b"rubbish")
         run_episodes(CampaignHooks())
-    return found
+    return record
 
 
-def test_an_interrupted_run_resumes_at_the_next_episode(interrupted: InterruptedRun) -> None:
+def test_interrupted_run_resumes_at_the_next_episode(interrupted: InterruptedRun) -> None:
     assert interrupted.files_after_stop == ["models/0001"]
     assert interrupted.files_after_kill == ["episodes/0001.mcap", "models/0001"]
     assert "exit code -9" in interrupted.error_text
@@ -92,23 +92,25 @@ def test_an_interrupted_run_resumes_at_the_next_episode(interrupted: Interrupted
         "diagnosis.json", "dynamics.pt", "policy.npz", "training.json",
     ]  # fmt: skip
     assert (interrupted.run.models / "0001" / "policy.npz").read_bytes() == interrupted.first_model, (
-        "it was not learned again"
+        "the first model is not trained again"
     )
 
 
-def test_a_complete_run_does_nothing(interrupted: InterruptedRun) -> None:
+def test_complete_run_trains_and_drives_nothing(interrupted: InterruptedRun) -> None:
     before = names(interrupted.run)
     choice = choose_car("sim")
-    assert list(Campaign(choice, interrupted.plan, 2, interrupted.run).run_episodes()) == [], "the car is not even open"
+    assert list(Campaign(choice, interrupted.plan, 2, interrupted.run).run_episodes()) == [], (
+        "no episode is driven: the car is not open"
+    )
     assert names(interrupted.run) == before
 
 
-def test_the_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, tmp_path: Path) -> None:
-    found = resumed_campaign(interrupted.run, choose_car("sim"), CampaignHooks())
-    assert (found.plan, found.episodes, found.max_ticks) == (interrupted.plan, 2, TICKS)
-    assert (found.place, found.record_rerun) == (True, False)
-    other = RunDirectory.create(tmp_path, "other")
-    whole = json.loads((interrupted.run.path / "campaign.json").read_text())
+def test_training_plan_is_read_from_the_run_folder(interrupted: InterruptedRun, tmp_path: Path) -> None:
+    resumed = resumed_campaign(interrupted.run, choose_car("sim"), CampaignHooks())
+    assert (resumed.plan, resumed.episodes, resumed.max_ticks) == (interrupted.plan, 2, TICKS)
+    assert (resumed.place, resumed.record_rerun) == (True, False)
+    invalid_run = RunDirectory.create(tmp_path, "other")
+    complete = json.loads((interrupted.run.path / "campaign.json").read_text())
     changes: list[dict[str, object]] = [
         {"threads": "x"},
         {"method": "other"},
@@ -116,32 +118,32 @@ def test_the_training_plan_is_read_from_the_run_folder(interrupted: InterruptedR
         {"ticks": 0},
         {"seed": 1.5},
     ]
-    wrong_plans = [json.dumps({**whole, "plan": {**whole["plan"], **change}}) for change in changes]
-    for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}', *wrong_plans):
+    invalid_plans = [json.dumps({**complete, "plan": {**complete["plan"], **change}}) for change in changes]
+    for content in (None, "{", "{}", '{"episodes": 3, "plan": {"prior_toml": "no toml"}}', *invalid_plans):
         if content is not None:
-            (other.path / "campaign.json").write_text(content)
+            (invalid_run.path / "campaign.json").write_text(content)
         with pytest.raises(DataError, match="cannot be resumed"):
-            resumed_campaign(other, choose_car("sim"), CampaignHooks())
+            resumed_campaign(invalid_run, choose_car("sim"), CampaignHooks())
 
 
-def test_the_curve_has_the_figures_of_the_recordings(interrupted: InterruptedRun) -> None:
+def test_learning_curve_has_the_figures_of_the_recordings(interrupted: InterruptedRun) -> None:
     rows = json.loads((interrupted.run.path / "learn.json").read_text())["episodes"]
     assert [r["episode"] for r in rows] == [1, 2]
     for row in rows:
-        driven = read_episode(interrupted.run.episode_path(row["episode"]))
-        trained = json.loads((interrupted.run.models / f"{row['episode']:04d}" / "training.json").read_text())
-        assert driven.ticks == TICKS
-        assert driven.metadata["model"] == str(row["episode"])
-        assert row["total_reward"] == pytest.approx(driven.rewards.sum())
-        x, y, yaw, vx, vy, _ = driven.states[-1]
+        episode = read_episode(interrupted.run.episode_path(row["episode"]))
+        training_figures = json.loads((interrupted.run.models / f"{row['episode']:04d}" / "training.json").read_text())
+        assert episode.ticks == TICKS
+        assert episode.metadata["model"] == str(row["episode"])
+        assert row["total_reward"] == pytest.approx(episode.rewards.sum())
+        x, y, yaw, vx, vy, _ = episode.states[-1]
         assert row["distance_m"] == pytest.approx(np.hypot(x, y))
         assert row["yaw_error_rad"] == pytest.approx(abs(np.angle(np.exp(1j * yaw))))
         assert row["speed_mps"] == pytest.approx(np.hypot(vx, vy))
         assert row["parked"] is False
-        assert row["end"] == driven.metadata["end_reason"] == "COMPLETED"
-        assert row["predicted_return"] == trained["return_in_model"]
+        assert row["end"] == episode.metadata["end_reason"] == "COMPLETED"
+        assert row["predicted_return"] == training_figures["return_in_model"]
     assert [r["rows"] for r in rows] == [0, TICKS - HISTORY]
-    assert rows[0]["updates"] > rows[1]["updates"] == 32, "before the first there is most to learn"
+    assert rows[0]["updates"] > rows[1]["updates"] == 32, "the first training makes more updates"
     assert [str(r) for r in learning_curve(interrupted.run)] == [str(f) for f in interrupted.figures]
     assert (interrupted.run.path / "learn.png").read_bytes().startswith(b"\x89PNG")
     assert (interrupted.run.path / "learn.rrd").stat().st_size > 1000
@@ -156,44 +158,44 @@ def test_likelihood_uses_the_model_trained_before_the_episode(interrupted: Inter
         )
         for n in ("0001", "0002")
     ]
-    assert nll[0] > nll[1] + 0.1, "the second has learned from it"
+    assert nll[0] > nll[1] + 0.1, "the second model was trained on this episode"
     assert interrupted.figures[1].last_episode_nll == pytest.approx(nll[0], abs=1e-3)
     assert np.isnan(interrupted.figures[0].last_episode_nll)
 
 
-def test_a_recorded_row_ends_in_the_command_of_its_tick(interrupted: InterruptedRun) -> None:
+def test_transition_input_ends_with_the_command_sent_at_its_tick(interrupted: InterruptedRun) -> None:
     episodes = [read_episode(path) for path in interrupted.run.recordings()]
-    heard = np.array([a.to_array() for a in interrupted.sent_actions])
-    np.testing.assert_array_equal(np.concatenate([e.sent for e in episodes]), heard)
-    assert len(np.unique(heard, axis=0)) > TICKS
+    sent_commands = np.array([a.to_array() for a in interrupted.sent_actions])
+    np.testing.assert_array_equal(np.concatenate([e.sent for e in episodes]), sent_commands)
+    assert len(np.unique(sent_commands, axis=0)) > TICKS
     rows = transitions_of(episodes, HISTORY)
     assert len(rows) == 2 * (TICKS - HISTORY)
     for row, number, tick in zip(rows.inputs, rows.episode, rows.tick, strict=True):
-        np.testing.assert_array_equal(row[-2:], heard[number * TICKS + tick])
+        np.testing.assert_array_equal(row[-2:], sent_commands[number * TICKS + tick])
 
 
-def test_policy_and_start_states_use_the_past_commands(
+def test_policy_and_training_features_contain_the_past_commands(
     interrupted: InterruptedRun,
 ) -> None:
     path = interrupted.run.episode_path(2)
     ticks = [d for d in read_documents(path) if isinstance(d, Tick)]
     assert len(ticks) == TICKS
     assert ticks[0].features[-2 * HISTORY :].tolist() == [0.0] * 2 * HISTORY
-    for before, now in pairwise(ticks):
-        np.testing.assert_array_equal(now.features[-2:], before.sent.to_array())
-        np.testing.assert_array_equal(now.features[-4:-2], before.features[-2:])
-    driven = read_episode(path)
-    wanted = np.array([t.features for t in ticks[HISTORY:]])
-    np.testing.assert_allclose(recorded_features([driven], HISTORY), wanted, atol=1e-12)
-    states = driven.states.copy()
+    for previous, current in pairwise(ticks):
+        np.testing.assert_array_equal(current.features[-2:], previous.sent.to_array())
+        np.testing.assert_array_equal(current.features[-4:-2], previous.features[-2:])
+    episode = read_episode(path)
+    expected = np.array([t.features for t in ticks[HISTORY:]])
+    np.testing.assert_allclose(recorded_features([episode], HISTORY), expected, atol=1e-12)
+    states = episode.states.copy()
     states[5, 4] = np.nan
-    left = recorded_features([driven, replace(driven, states=states)], HISTORY)
-    assert len(left) == 2 * len(wanted) - 1
-    np.testing.assert_allclose(recorded_features([driven], 0), encode(driven.states[:-1], np.zeros((TICKS, 0, 2))))
+    with_nan_state = recorded_features([episode, replace(episode, states=states)], HISTORY)
+    assert len(with_nan_state) == 2 * len(expected) - 1
+    np.testing.assert_allclose(recorded_features([episode], 0), encode(episode.states[:-1], np.zeros((TICKS, 0, 2))))
 
 
 @pytest.mark.realtime
-def test_the_recorded_command_is_the_command_of_the_firmware(
+def test_recorded_command_equals_the_command_received_by_the_firmware(
     interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def act(self: SacPolicy, view: PolicyInput) -> Action:
@@ -205,70 +207,70 @@ def test_the_recorded_command_is_the_command_of_the_firmware(
     shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
     choice = choose_car("emulated", seed=0)
     choice.log_to(run.path)
-    heard = log_sent_actions(choice)
+    sent_actions = log_sent_actions(choice)
     with choice.car:
         (result,) = Campaign(choice, interrupted.plan, 1, run, max_ticks=TICKS, record_rerun=False).run_episodes()
-    driven = read_episode(result.path)
-    rows = transitions_of([driven], HISTORY)
+    episode = read_episode(result.path)
+    rows = transitions_of([episode], HISTORY)
     assert len(rows) > TICKS // 2
-    wanted = np.array([a.to_array() for a in heard])
-    np.testing.assert_array_equal(rows.inputs[:, -2:], wanted[rows.tick])
+    sent_commands = np.array([a.to_array() for a in sent_actions])
+    np.testing.assert_array_equal(rows.inputs[:, -2:], sent_commands[rows.tick])
     currents = [e for e in read_log(run.path / "firmware.jsonl") if e.name == "current"]
     times_s, values = np.array([e.t_s for e in currents]), np.array([e.value for e in currents])
-    # The last thing that the firmware heard before the next tick; a busy machine may be late for some.
-    last = values[np.searchsorted(times_s, driven.times_s[rows.tick + 1]) - 1]
-    per_throttle = last / rows.inputs[:, -1]
-    assert np.mean(np.abs(per_throttle / np.median(per_throttle) - 1.0) < 0.01) > 0.7
+    # The last current received before the next tick; on a busy machine some commands arrive later.
+    last_currents = values[np.searchsorted(times_s, episode.times_s[rows.tick + 1]) - 1]
+    current_per_throttle = last_currents / rows.inputs[:, -1]
+    assert np.mean(np.abs(current_per_throttle / np.median(current_per_throttle) - 1.0) < 0.01) > 0.7
 
 
 @pytest.mark.realtime
 def test_training_and_driving_do_not_overlap(interrupted: InterruptedRun, tmp_path: Path) -> None:
-    """On the wire: no process but the one that drives is alive at any tick; the firmware hears neutral in between."""
+    """No training process is alive at any tick; between the episodes the firmware receives neutral commands."""
     run = RunDirectory.create(tmp_path, "late")
     choice = choose_car("emulated", seed=0)
     choice.log_to(run.path)
     clock = MonotonicClock()
-    alive: list[str] = []
-    learning_s: list[float] = []
+    child_names: list[str] = []
+    progress_s: list[float] = []
     ticks_s: list[float] = []
 
     def on_tick(tick: Tick) -> None:
-        alive.extend(child.name for child in multiprocessing.active_children())
+        child_names.extend(child.name for child in multiprocessing.active_children())
         ticks_s.append(tick.t_s)
 
     hooks = CampaignHooks(
-        SessionHooks(on_tick=on_tick), on_training=lambda what, done, total: learning_s.append(clock.now_s())
+        SessionHooks(on_tick=on_tick), on_training=lambda stage, done, total: progress_s.append(clock.now_s())
     )
     with choice.car:
         campaign = Campaign(choice, interrupted.plan, 2, run, hooks, max_ticks=TICKS, record_rerun=False)
         assert len(list(campaign.run_episodes())) == 2
     assert len(ticks_s) > TICKS
-    assert not {"training", "quick check"} & set(alive)
-    learning = np.array(learning_s)
-    second = learning[learning > ticks_s[0]]
-    assert len(second) > 3, "it learned a second time, after the first episode"
+    assert not {"training", "quick check"} & set(child_names)
+    training_s = np.array(progress_s)
+    second_training_s = training_s[training_s > ticks_s[0]]
+    assert len(second_training_s) > 3, "a second training runs after the first episode"
     entries = [e for e in read_log(run.path / "firmware.jsonl") if ticks_s[0] < e.t_s < ticks_s[-1]]
     currents = [e for e in entries if e.name == "current"]
-    heard = [e for e in currents if second.min() < e.t_s < second.max()]
-    assert len(heard) > 3
-    assert all(e.value == 0.0 for e in heard), "neutral, again and again"
-    assert not [e for e in entries if e.name == "motor_timeout"], "the firmware missed no command in all that time"
-    meanwhile = np.diff([e.t_s for e in heard])
-    driving = np.diff([e.t_s for e in currents if e.t_s < ticks_s[0] + 0.5 * TICKS * choice.control_period_s])
-    assert np.median(meanwhile) == pytest.approx(np.median(driving), rel=0.5)
+    commands_during_training = [e for e in currents if second_training_s.min() < e.t_s < second_training_s.max()]
+    assert len(commands_during_training) > 3
+    assert all(e.value == 0.0 for e in commands_during_training), "the car is in neutral during training"
+    assert not [e for e in entries if e.name == "motor_timeout"], "no gap in the commands lets the firmware time out"
+    training_periods_s = np.diff([e.t_s for e in commands_during_training])
+    driving_periods_s = np.diff([e.t_s for e in currents if e.t_s < ticks_s[0] + 0.5 * TICKS * choice.control_period_s])
+    assert np.median(training_periods_s) == pytest.approx(np.median(driving_periods_s), rel=0.5)
     late_s = np.concatenate([read_episode(path).extra["late_s"][:-1] for path in run.recordings()])
     assert np.median(late_s) < 0.005
 
 
-def test_an_interrupted_episode_is_repeated(interrupted: InterruptedRun, tmp_path: Path) -> None:
-    """What was recorded is kept, and the run comes to as many whole episodes as were wanted."""
+def test_interrupted_episode_is_kept_and_repeated(interrupted: InterruptedRun, tmp_path: Path) -> None:
+    """The recording is moved to ``stopped``, and the run reaches the requested number of complete episodes."""
     run = RunDirectory.create(tmp_path, "stopped")
     shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
-    heard: list[int] = []
+    steps: list[int] = []
 
     def on_tick(tick: Tick) -> None:
-        heard.append(tick.step)
-        if len(heard) == 5:
+        steps.append(tick.step)
+        if len(steps) == 5:
             signal.raise_signal(signal.SIGINT)
 
     choice = choose_car("sim", seed=0)
@@ -278,29 +280,31 @@ def test_an_interrupted_episode_is_repeated(interrupted: InterruptedRun, tmp_pat
     with choice.car:
         assert list(campaign.run_episodes()) == []
         assert (run.recordings(), figures) == ([], [])
-        cut = read_episode(run.stopped / "0001.mcap")
-        assert (cut.ticks, cut.metadata["end_reason"]) == (5, "STOP_REQUESTED")
+        stopped_episode = read_episode(run.stopped / "0001.mcap")
+        assert (stopped_episode.ticks, stopped_episode.metadata["end_reason"]) == (5, "STOP_REQUESTED")
         (result,) = campaign.run_episodes()
-    assert [p.name for p in run.recordings()] == ["0002.mcap"], "its number is not given twice"
+    assert [p.name for p in run.recordings()] == ["0002.mcap"], "the number of a stopped episode is not reused"
     assert (result.data.ticks, result.reason, figures[0].episode) == (TICKS, EndReason.COMPLETED, 1)
 
 
-def test_an_episode_is_repeated_after_a_second_signal(interrupted: InterruptedRun, tmp_path: Path) -> None:
+def test_hung_episode_is_moved_to_stopped_if_no_model_was_trained_on_it(
+    interrupted: InterruptedRun, tmp_path: Path
+) -> None:
     run = RunDirectory.create(tmp_path, "killed")
     for model in ("0001", "0002"):
         shutil.copytree(interrupted.run.models / model, run.models / model)
     for recording in interrupted.run.recordings():
         shutil.copy(recording, run.episodes)
-    hung = run.recordings()[-1]
-    documents = read_documents(hung)
+    last_recording = run.recordings()[-1]
+    documents = read_documents(last_recording)
     with Recorder([McapSink(run.episode_path(3))]) as recorder:
         for document in documents:
-            ended = isinstance(document, EpisodeEnded)
-            recorder.emit(replace(document, reason=EndReason.LOOP_HUNG) if ended else document)
+            is_end = isinstance(document, EpisodeEnded)
+            recorder.emit(replace(document, reason=EndReason.LOOP_HUNG) if is_end else document)
     campaign = Campaign(choose_car("sim"), interrupted.plan, 3, run)
     shutil.copytree(interrupted.run.models / "0002", run.models / "0004")
     campaign.move_stopped_episode()
-    assert len(run.recordings()) == 3, "something was learned from it"
+    assert len(run.recordings()) == 3, "a model was trained on the episode"
     shutil.rmtree(run.models / "0004")
     campaign.move_stopped_episode()
     campaign.move_stopped_episode()
@@ -309,59 +313,63 @@ def test_an_episode_is_repeated_after_a_second_signal(interrupted: InterruptedRu
     assert run.next_episode() == 4
 
 
-def test_a_missing_row_is_restored_from_the_recording(interrupted: InterruptedRun, tmp_path: Path) -> None:
+def test_missing_row_of_the_learning_curve_is_restored_from_the_recording(
+    interrupted: InterruptedRun, tmp_path: Path
+) -> None:
     run = RunDirectory.create(tmp_path, "rows")
     for recording in interrupted.run.recordings():
         shutil.copy(recording, run.episodes)
     for model in interrupted.run.models.iterdir():
         shutil.copytree(model, run.models / model.name)
-    whole = json.loads((interrupted.run.path / "learn.json").read_text())
-    (run.path / "learn.json").write_text(json.dumps({**whole, "episodes": whole["episodes"][:1]}))
+    complete = json.loads((interrupted.run.path / "learn.json").read_text())
+    (run.path / "learn.json").write_text(json.dumps({**complete, "episodes": complete["episodes"][:1]}))
     restore_missing_rows(run, interrupted.plan.task)
-    wanted = [replace(f, verdict="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in interrupted.figures]
-    assert str(learning_curve(run)[1]) == str(wanted[1])
+    expected = [replace(f, verdict="", excess=np.nan, excess_std=np.nan, diagnosis="") for f in interrupted.figures]
+    assert str(learning_curve(run)[1]) == str(expected[1])
     before = (run.path / "learn.json").read_bytes()
     restore_missing_rows(run, interrupted.plan.task)
     assert (run.path / "learn.json").read_bytes() == before
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_is_named(interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    learned, agent = load_car(interrupted.run.models / "0002" / "dynamics.pt"), interrupted.run.models / "0002"
-    taught = SacAgent.load(agent, SacSettings(), 0)
+def test_full_disk_is_reported_for_each_file_of_a_run(
+    interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    car_model, model_dir = load_car(interrupted.run.models / "0002" / "dynamics.pt"), interrupted.run.models / "0002"
+    agent = SacAgent.load(model_dir, SacSettings(), 0)
     for name, write in (
-        ("dynamics.pt", lambda folder: car_fit.save_car(learned, folder / "dynamics.pt")),
-        ("policy.npz", taught.save),
+        ("dynamics.pt", lambda folder: car_fit.save_car(car_model, folder / "dynamics.pt")),
+        ("policy.npz", agent.save),
     ):
 
-        def full(folder: Path, name: str = name, write: Any = write) -> None:
+        def write_to_full_disk(folder: Path, name: str = name, write: Any = write) -> None:
             (folder / name).symlink_to("/dev/full")
             write(folder)
 
         with pytest.raises(DataError, match="the disk is full; free some space") as error:
-            training._publish(tmp_path / "0001", {}, full)
+            training._publish(tmp_path / "0001", {}, write_to_full_disk)
         assert "\n" not in str(error.value)
         assert not (tmp_path / "0001").exists()
 
-    def opened(self: PipeFile) -> None:
+    def open_full_disk(self: PipeFile) -> None:
         self._file = Path("/dev/full").open("wb", buffering=0)  # noqa: SIM115
 
     curve = tmp_path / "learn.rrd"
-    curve.write_bytes(b"what was there")
-    monkeypatch.setattr(PipeFile, "open", opened)
+    curve.write_bytes(b"previous content")
+    monkeypatch.setattr(PipeFile, "open", open_full_disk)
     with pytest.raises(DataError, match="the disk is full; free some space"):
         write_learning_curve(
             curve, [{"episode": 1.0}], [np.zeros((3, 6))], [(np.zeros((0, 2)), *[np.zeros((0, 2, 6))] * 2)]
         )
-    assert curve.read_bytes() == b"what was there"
+    assert curve.read_bytes() == b"previous content"
     (interrupted.run.path / "learn.json.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match="the disk is full; free some space"):
         save_row(interrupted.run, interrupted.figures[0])
 
 
-@pytest.mark.parametrize(("reality", "driven"), [(Reality.SIMULATED, 2), (Reality.REAL, 1)])
-def test_a_real_car_stays_stopped_after_a_safety_stop(
-    interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reality: Reality, driven: int
+@pytest.mark.parametrize(("reality", "n_episodes"), [(Reality.SIMULATED, 2), (Reality.REAL, 1)])
+def test_real_car_drives_no_further_episode_after_a_safety_stop(
+    interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reality: Reality, n_episodes: int
 ) -> None:
     choice = choose_car("sim", seed=0)
     monkeypatch.setattr(choice.car, "reality", reality)
@@ -371,10 +379,10 @@ def test_a_real_car_stays_stopped_after_a_safety_stop(
     with choice.car as car:
         car.place(CarState(5.0, 5.0))
         results = list(Campaign(choice, interrupted.plan, 2, run, place=False, record_rerun=False).run_episodes())
-    assert [r.reason.name for r in results] == ["GEOFENCE"] * driven
+    assert [r.reason.name for r in results] == ["GEOFENCE"] * n_episodes
 
 
-def test_the_report_is_written_beside_an_episode_without_a_tick(interrupted: InterruptedRun, tmp_path: Path) -> None:
+def test_report_is_written_for_an_episode_without_a_tick(interrupted: InterruptedRun, tmp_path: Path) -> None:
     run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
     shutil.copytree(interrupted.run.models / "0001", run.models / "0001")
     row = replace(interrupted.figures[0], end="GEOFENCE", total_reward=0.0)

@@ -29,26 +29,26 @@ FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 needs_dev_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 
 
-def fill_disk(monkeypatch: pytest.MonkeyPatch, when: type[Tick] | type[EpisodeEnded]) -> None:
-    """From a document of this type on, nothing is written to the MCAP file any more."""
+def fill_disk(monkeypatch: pytest.MonkeyPatch, failing: type[Tick] | type[EpisodeEnded]) -> None:
+    """Let the MCAP sink fail with ENOSPC when it writes a document of type ``failing``."""
     write = McapSink._write
 
-    def fails(self: McapSink, item: Any) -> None:
-        if isinstance(item, when):
+    def failing_write(self: McapSink, item: Any) -> None:
+        if isinstance(item, failing):
             raise FULL
         write(self, item)
 
-    monkeypatch.setattr(McapSink, "_write", fails)
+    monkeypatch.setattr(McapSink, "_write", failing_write)
 
 
-@pytest.mark.parametrize("when", [Tick, EpisodeEnded])
-def test_a_recording_that_cannot_be_finished_ends_the_run(
+@pytest.mark.parametrize("failing", [Tick, EpisodeEnded])
+def test_recording_that_cannot_be_finished_ends_the_run(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
-    when: type[Tick] | type[EpisodeEnded],
+    failing: type[Tick] | type[EpisodeEnded],
 ) -> None:
-    fill_disk(monkeypatch, when)
+    fill_disk(monkeypatch, failing)
     run = RunDirectory.create(tmp_path, "full")
     with SimulatedCar() as car:
         session = Session(
@@ -66,7 +66,7 @@ def test_a_recording_that_cannot_be_finished_ends_the_run(
     assert not (run.episodes / "0001.mcap").exists()
 
 
-def test_learning_ends_with_the_sentence_and_drives_no_further_episode(
+def test_learning_run_ends_with_one_sentence_when_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fill_disk(monkeypatch, EpisodeEnded)
@@ -85,7 +85,7 @@ def test_learning_ends_with_the_sentence_and_drives_no_further_episode(
 
 
 @needs_dev_full
-def test_the_log_of_a_run_loses_lines_in_silence(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_run_log_prints_no_traceback_when_the_disk_is_full(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     run = RunDirectory.create(tmp_path, "full")
     (run.path / "log.jsonl").symlink_to("/dev/full")
     handler, logger = run.log_handler(), logging.getLogger("carlab.test_disk_full")
@@ -99,7 +99,7 @@ def test_the_log_of_a_run_loses_lines_in_silence(tmp_path: Path, capfd: pytest.C
 
 
 @needs_dev_full
-def test_the_firmware_emulator_goes_on_without_its_log_file(tmp_path: Path) -> None:
+def test_command_log_keeps_its_entries_when_the_disk_is_full(tmp_path: Path) -> None:
     path = tmp_path / "firmware.jsonl"
     path.symlink_to("/dev/full")
     log = CommandLog(path)
@@ -110,16 +110,16 @@ def test_the_firmware_emulator_goes_on_without_its_log_file(tmp_path: Path) -> N
     assert len(log.entries("current")) == 20_000
 
 
-def test_an_error_of_the_disk_names_the_disk_and_no_cable(
+def test_full_disk_error_of_a_command_names_the_disk_and_no_cable(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     from carlab.cli import run
     from carlab.cli.check import Check
 
-    def fails(self: Check) -> int:
+    def run_with_full_disk(self: Check) -> int:
         raise FULL
 
-    monkeypatch.setattr(Check, "run", fails)
+    monkeypatch.setattr(Check, "run", run_with_full_disk)
     assert run(["check"]) == 1
     text = capfd.readouterr().err
     assert "the disk is full; free some space on the disk of" in text

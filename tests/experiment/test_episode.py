@@ -1,4 +1,4 @@
-"""The loop: documents in order, rows aligned with commands, every end with its reason and the car in neutral."""
+"""The control loop of one episode: order of documents, alignment of rows and commands, end reasons, stopped car."""
 
 import math
 from collections.abc import Callable
@@ -28,7 +28,7 @@ PERIOD_S = 1.0 / 30.0
 
 
 class FunctionPolicy:
-    """A policy made of a function of the tick."""
+    """A policy that is a function of the tick."""
 
     name = "function"
 
@@ -42,7 +42,7 @@ class FunctionPolicy:
 
 
 class StopCountingCar(SimulatedCar):
-    """Remembers how it was stopped."""
+    """Records for each stop whether it was planned."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -53,16 +53,16 @@ class StopCountingCar(SimulatedCar):
         super().stop(planned=planned)
 
 
-def wave(step: int) -> Action:
+def sine_steering(step: int) -> Action:
     return Action(round(0.5 * math.sin(step / 5), 6), 0.3)
 
 
-def test_documents_come_in_order_and_agree_with_the_arrays() -> None:
+def test_documents_are_in_order_and_agree_with_the_arrays() -> None:
     documents: list[Document] = []
     with SimulatedCar() as car:
         data = run_episode(
             car,
-            FunctionPolicy(wave),
+            FunctionPolicy(sine_steering),
             ParkingTask(),
             SafetyEnvelope(),
             period_s=PERIOD_S,
@@ -84,7 +84,7 @@ def test_documents_come_in_order_and_agree_with_the_arrays() -> None:
     assert not transitions[-1].terminated
 
 
-def test_the_row_learned_from_holds_the_action_sent_at_its_tick() -> None:
+def test_transition_holds_the_action_sent_at_its_tick() -> None:
     documents: list[Document] = []
     with SimulatedCar() as car:
         run_episode(
@@ -107,7 +107,7 @@ def test_the_row_learned_from_holds_the_action_sent_at_its_tick() -> None:
 @pytest.mark.parametrize(
     ("act", "envelope", "reason", "planned"),
     [
-        (wave, SafetyEnvelope(), EndReason.COMPLETED, True),
+        (sine_steering, SafetyEnvelope(), EndReason.COMPLETED, True),
         (lambda k: None if k == 5 else NEUTRAL, SafetyEnvelope(), EndReason.POLICY_FINISHED, True),
         (lambda k: Action(math.nan, 0.0), SafetyEnvelope(), EndReason.BAD_COMMAND, False),
         (lambda k: 1 / 0, SafetyEnvelope(), EndReason.POLICY_ERROR, False),  # type: ignore[return-value]
@@ -120,7 +120,7 @@ def test_the_row_learned_from_holds_the_action_sent_at_its_tick() -> None:
         ),
     ],
 )
-def test_every_end_has_its_reason_and_leaves_the_car_stopped(
+def test_episode_ends_with_its_reason_and_a_stopped_car(
     act: Callable[[int], Action | None], envelope: SafetyEnvelope, reason: EndReason, planned: bool
 ) -> None:
     documents: list[Document] = []
@@ -146,21 +146,23 @@ def test_every_end_has_its_reason_and_leaves_the_car_stopped(
         assert abs(data.states[:, :2]).max() < 1.5
 
 
-def test_a_request_to_stop_ends_after_the_tick() -> None:
-    asked: list[int] = []
+def test_stop_request_ends_the_episode_after_the_tick() -> None:
+    requests: list[int] = []
 
     def stop() -> EndReason | None:
-        asked.append(1)
-        return EndReason.STOP_REQUESTED if len(asked) > 10 else None
+        requests.append(1)
+        return EndReason.STOP_REQUESTED if len(requests) > 10 else None
 
     with SimulatedCar() as car:
         hooks = EpisodeHooks(stop_requested=stop)
-        data = run_episode(car, FunctionPolicy(wave), ParkingTask(), SafetyEnvelope(), period_s=PERIOD_S, hooks=hooks)
+        data = run_episode(
+            car, FunctionPolicy(sine_steering), ParkingTask(), SafetyEnvelope(), period_s=PERIOD_S, hooks=hooks
+        )
     assert data.ticks == 10
     assert data.metadata["end_reason"] == "STOP_REQUESTED"
 
 
-def test_an_error_of_the_recorder_stops_the_car_first() -> None:
+def test_recorder_error_is_raised_after_the_car_is_stopped() -> None:
     def emit(document: Document) -> None:
         if isinstance(document, Tick) and document.step == 3:
             raise OSError(28, "No space left on device")
@@ -169,7 +171,7 @@ def test_an_error_of_the_recorder_stops_the_car_first() -> None:
         with pytest.raises(OSError, match="No space"):
             run_episode(
                 car,
-                FunctionPolicy(wave),
+                FunctionPolicy(sine_steering),
                 ParkingTask(),
                 SafetyEnvelope(),
                 period_s=PERIOD_S,
@@ -178,7 +180,7 @@ def test_an_error_of_the_recorder_stops_the_car_first() -> None:
         assert car.stops == [False]
 
 
-def test_a_goal_reached_ends_where_the_task_says_so() -> None:
+def test_reached_goal_ends_the_episode_if_the_task_stops_when_parked() -> None:
     task = ParkingTask(stop_when_parked=True)
     with SimulatedCar() as car:
         car.place(CarState(0.05, 0.0, 0.1))
@@ -187,22 +189,22 @@ def test_a_goal_reached_ends_where_the_task_says_so() -> None:
     assert data.metadata["end_reason"] == "GOAL_REACHED"
 
 
-def test_replaying_an_episode_repeats_it() -> None:
+def test_replayed_commands_reproduce_the_episode() -> None:
     with SimulatedCar(seed=1) as car:
         car.place(CarState())
         first = run_episode(
-            car, FunctionPolicy(wave), RecordedTask(CarState(), 60), SafetyEnvelope(), period_s=PERIOD_S
+            car, FunctionPolicy(sine_steering), RecordedTask(CarState(), 60), SafetyEnvelope(), period_s=PERIOD_S
         )
     with SimulatedCar(seed=1) as car:
         car.place(CarState())
         policy = ReplayPolicy(first.times_s[:-1], first.sent)
-        again = run_episode(car, policy, RecordedTask(CarState(), 100), SafetyEnvelope(), period_s=PERIOD_S)
-    assert again.metadata["end_reason"] == "POLICY_FINISHED"
-    np.testing.assert_array_equal(again.sent, first.sent)
-    np.testing.assert_allclose(again.states, first.states, atol=1e-9)
+        replayed = run_episode(car, policy, RecordedTask(CarState(), 100), SafetyEnvelope(), period_s=PERIOD_S)
+    assert replayed.metadata["end_reason"] == "POLICY_FINISHED"
+    np.testing.assert_array_equal(replayed.sent, first.sent)
+    np.testing.assert_allclose(replayed.states, first.states, atol=1e-9)
 
 
-def test_the_parking_policy_parks() -> None:
+def test_parking_policy_parks_from_ten_starts() -> None:
     task = ParkingTask()
     simulator = SimulatorConfig()
     for seed in range(200, 210):
@@ -234,18 +236,18 @@ def test_manoeuvres_stay_in_range_and_end(name: str) -> None:
     assert data.ticks == pytest.approx(manoeuvre.duration_s / PERIOD_S, abs=1)
 
 
-def test_the_chirp_sweeps_the_frequencies_it_says() -> None:
+def test_chirp_sweeps_the_requested_frequencies() -> None:
     chirp = steering_chirp(low_hz=0.5, high_hz=3.0, duration_s=12.0, amplitude=0.4)
     t = np.arange(0.0, 12.0, 0.001)
     values = np.array([chirp.at(float(s)).steering for s in t])
     crossings = t[1:][np.diff(np.sign(values)) != 0]
-    # Phase pi (f0 + (f1 - f0) t / 2T) t 2 gives 2 * mean frequency * duration crossings in all.
+    # The phase 2 pi (f0 + (f1 - f0) t / 2T) t gives 2 * mean frequency * duration zero crossings.
     assert len(crossings) == pytest.approx(2 * 1.75 * 12.0, abs=1)
     assert 1 / (2 * np.diff(crossings)[0]) == pytest.approx(0.7, abs=0.15)
     assert 1 / (2 * np.diff(crossings)[-1]) == pytest.approx(3.0, abs=0.15)
 
 
-def test_scripts_are_what_their_names_say() -> None:
+def test_steering_steps_and_coast_down_have_the_requested_levels() -> None:
     steps = steering_steps(small=0.3, large=0.8)
     levels = {steps.at(t).steering for t in np.arange(0, steps.duration_s, 0.05)}
     assert levels == {0.0, 0.3, -0.3, 0.8, -0.8}

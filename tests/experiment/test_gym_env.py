@@ -1,4 +1,4 @@
-"""The Gymnasium environments: both checkers, the action history, and what an independent loop over the car sees."""
+"""The Gymnasium environments: environment checkers, action history, seeds and end reasons."""
 
 import warnings
 from collections.abc import Iterator
@@ -20,14 +20,14 @@ def env(request: pytest.FixtureRequest) -> Iterator[gym.Env]:
     made.close()
 
 
-def test_both_checkers_pass_without_a_warning(env: gym.Env) -> None:
+def test_environment_checkers_pass_without_a_warning(env: gym.Env) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         gymnasium_check(env.unwrapped, skip_render_check=True)
         sb3_check(env.unwrapped, warn=True)
 
 
-def test_the_row_after_a_tick_ends_in_the_action_sent_at_it(env: gym.Env) -> None:
+def test_observation_ends_with_the_last_sent_actions(env: gym.Env) -> None:
     env.reset(seed=1)
     sent = [np.zeros(2, dtype=np.float32)] * 3
     rng = np.random.default_rng(0)
@@ -35,23 +35,23 @@ def test_the_row_after_a_tick_ends_in_the_action_sent_at_it(env: gym.Env) -> Non
         action = rng.uniform(-0.6, 0.6, 2).astype(np.float32)
         observation, *_ = env.step(action)
         sent = [*sent[1:], action]
-        # Oldest first, newest last, whatever the car's state.
+        # Oldest action first.
         np.testing.assert_allclose(observation[7:], np.concatenate(sent), atol=1e-6)
 
 
-def test_seeded_episodes_are_identical_and_others_differ() -> None:
-    def roll(seed: int) -> np.ndarray:
+def test_episodes_are_identical_for_one_seed_and_differ_between_seeds() -> None:
+    def rollout(seed: int) -> np.ndarray:
         env = gym.make("carlab/Parking-v0")
         rows = [env.reset(seed=seed)[0]]
         rows += [env.step(np.array([0.3, -0.4], dtype=np.float32))[0] for _ in range(30)]
         env.close()
         return np.stack(rows)
 
-    assert roll(5).tobytes() == roll(5).tobytes()
-    assert not np.array_equal(roll(5), roll(6))
+    assert rollout(5).tobytes() == rollout(5).tobytes()
+    assert not np.array_equal(rollout(5), rollout(6))
 
 
-def test_parking_lasts_as_long_as_the_paper_s_and_says_how_it_ended() -> None:
+def test_parking_episode_has_100_steps_and_reports_its_end() -> None:
     env = gym.make("carlab/Parking-v0")
     env.reset(seed=0)
     for step in range(100):
@@ -63,7 +63,7 @@ def test_parking_lasts_as_long_as_the_paper_s_and_says_how_it_ended() -> None:
     env.close()
 
 
-def test_leaving_the_arena_truncates_with_the_reason() -> None:
+def test_leaving_the_arena_truncates_with_reason_geofence() -> None:
     env = gym.make("carlab/Parking-v0")
     env.reset(seed=0)
     info: dict[str, object] = {}
@@ -78,7 +78,7 @@ def test_leaving_the_arena_truncates_with_the_reason() -> None:
     env.close()
 
 
-def test_stepping_before_reset_is_refused() -> None:
+def test_step_before_reset_is_refused() -> None:
     env = gym.make("carlab/Parking-v0").unwrapped
     assert isinstance(env, CarEnv)
     with pytest.raises(gym.error.ResetNeeded):

@@ -1,4 +1,4 @@
-"""Signals, and a watch that acts whatever the loop hangs in."""
+"""Signal handling of a drive, and the watch that stops a hung control loop."""
 
 import logging
 import signal
@@ -12,11 +12,11 @@ import pytest
 from carlab.core.outcome import EndReason
 from carlab.experiment.episodes.interrupts import SIGNALS, Flag, Interrupts, LoopWatch
 
-PATIENT_S = 20.0
+TIMEOUT_S = 20.0
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_asks_and_a_second_one_urges(number: signal.Signals) -> None:
+def test_first_signal_requests_a_stop_and_second_one_is_urgent(number: signal.Signals) -> None:
     before = signal.getsignal(number)
     with Interrupts() as interrupts:
         assert interrupts.reason() is None
@@ -28,30 +28,30 @@ def test_a_signal_asks_and_a_second_one_urges(number: signal.Signals) -> None:
     assert signal.getsignal(number) is before
 
 
-def test_who_is_interrupted_while_driving_is_interrupted_after_it() -> None:
-    with Interrupts() as whole:
+def test_signal_in_an_inner_context_is_passed_to_the_outer_one() -> None:
+    with Interrupts() as outer:
         with Interrupts():
             pass
-        assert whole.reason() is None
+        assert outer.reason() is None
         with Interrupts():
             signal.raise_signal(signal.SIGINT)
-        assert whole.reason() is EndReason.STOP_REQUESTED
-        assert not whole.urgent.is_set()
+        assert outer.reason() is EndReason.STOP_REQUESTED
+        assert not outer.urgent.is_set()
 
 
-def test_a_storm_of_signals_does_not_stop_the_program_in_its_handler() -> None:
-    """One signal's handler interrupts another's at any instruction: with a lock in them they would wait for ever."""
-    stormy = threading.Event()
+def test_many_signals_do_not_deadlock_their_handlers() -> None:
+    """A signal interrupts the handler of another one at any instruction; a lock in the handlers would deadlock."""
+    finished = threading.Event()
     main = threading.main_thread().ident
     assert main is not None
 
-    def storm() -> None:
-        while not stormy.is_set():
+    def send_signals() -> None:
+        while not finished.is_set():
             signal.pthread_kill(main, signal.SIGINT)
             signal.pthread_kill(main, signal.SIGTERM)
 
     with Interrupts() as interrupts:
-        thread = threading.Thread(target=storm)
+        thread = threading.Thread(target=send_signals)
         thread.start()
         try:
             end_s = time.monotonic() + 1.0
@@ -59,40 +59,40 @@ def test_a_storm_of_signals_does_not_stop_the_program_in_its_handler() -> None:
                 interrupts.requested = Flag()
                 interrupts.requested.wait(0.001)
         finally:
-            stormy.set()
+            finished.set()
             thread.join()
         assert interrupts.requested.is_set()
 
 
-def test_a_flag_waits_as_long_as_it_is_told_and_no_longer_than_it_must() -> None:
+def test_flag_wait_ends_at_the_timeout_or_when_the_flag_is_set() -> None:
     flag = Flag()
     begin_s = time.monotonic()
     assert not flag.wait(0.05)
     assert time.monotonic() - begin_s >= 0.05
     timer = threading.Timer(0.05, flag.set)
     timer.start()
-    assert flag.wait(PATIENT_S)
-    assert time.monotonic() - begin_s < PATIENT_S / 2
+    assert flag.wait(TIMEOUT_S)
+    assert time.monotonic() - begin_s < TIMEOUT_S / 2
     timer.join()
 
 
-def test_a_signal_leaves_a_question_at_once_and_nothing_else() -> None:
+def test_signal_cancels_the_current_and_all_later_prompts() -> None:
     answers: list[str] = []
     with Interrupts() as interrupts:
 
-        def question() -> None:
+        def prompt() -> None:
             signal.raise_signal(signal.SIGTERM)
-            answers.append("it went on waiting")
+            answers.append("the prompt continued after the signal")
 
-        interrupts.prompt(question)
+        interrupts.prompt(prompt)
         assert interrupts.reason() is EndReason.STOP_REQUESTED
-        interrupts.prompt(lambda: answers.append("asked although it is over"))
+        interrupts.prompt(lambda: answers.append("prompted after the stop request"))
         signal.raise_signal(signal.SIGINT)
         assert interrupts.urgent.is_set()
     assert answers == []
 
 
-def test_a_question_without_a_signal_is_asked_and_its_errors_pass() -> None:
+def test_prompt_without_a_signal_runs_and_raises_its_errors() -> None:
     answers: list[str] = []
 
     def fail() -> None:
@@ -102,36 +102,36 @@ def test_a_question_without_a_signal_is_asked_and_its_errors_pass() -> None:
         interrupts.prompt(lambda: answers.append("asked"))
         with pytest.raises(EOFError):
             interrupts.prompt(fail)
-        signal.raise_signal(signal.SIGINT)  # Raises nothing here.
+        signal.raise_signal(signal.SIGINT)  # Outside a prompt a signal raises nothing.
     assert answers == ["asked"]
 
 
 @contextmanager
 def blocked_log() -> Iterator[threading.Event]:
-    """A log whose terminal takes nothing (Ctrl-S) until the event is set."""
-    flows = threading.Event()
+    """A log handler that blocks until the event is set, like a terminal after Ctrl-S."""
+    unblocked = threading.Event()
 
     class Blocked(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            assert flows.wait(PATIENT_S), "it waited for the log"
+            assert unblocked.wait(TIMEOUT_S), "the log handler was not unblocked"
 
     handler = Blocked()
     logging.getLogger().addHandler(handler)
     try:
-        yield flows
+        yield unblocked
     finally:
-        flows.set()
+        unblocked.set()
         logging.getLogger().removeHandler(handler)
 
 
-def test_a_loop_that_hangs_in_the_log_is_stopped() -> None:
+def test_loop_that_hangs_in_the_log_is_stopped() -> None:
     stopped: list[str] = []
-    with blocked_log() as flows:
+    with blocked_log() as unblocked:
 
         def on_hang(where: str, stack: str) -> None:
             stopped.append(where)
-            assert "test_a_loop_that_hangs_in_the_log" in stack
-            flows.set()
+            assert "test_loop_that_hangs_in_the_log" in stack
+            unblocked.set()
 
         with LoopWatch(on_hang, timeout_s=0.2) as watch:
             watch.beat("logging")
@@ -139,10 +139,10 @@ def test_a_loop_that_hangs_in_the_log_is_stopped() -> None:
     assert stopped == ["logging"]
 
 
-def test_a_beating_or_resting_loop_is_left_alone() -> None:
+def test_loop_watch_does_not_stop_a_beating_or_paused_loop() -> None:
     stopped: list[str] = []
     with LoopWatch(lambda where, stack: stopped.append(where), timeout_s=0.5) as watch:
-        time.sleep(0.7)  # Before the first beat nothing is driven.
+        time.sleep(0.7)  # The watch starts at the first beat.
         for _ in range(10):
             watch.beat("driving")
             time.sleep(0.07)
@@ -151,10 +151,10 @@ def test_a_beating_or_resting_loop_is_left_alone() -> None:
     assert stopped == []
 
 
-def test_urgency_does_not_wait_for_the_time_out() -> None:
+def test_urgent_flag_stops_the_loop_before_the_timeout() -> None:
     urgent, hung = Flag(), threading.Event()
     with LoopWatch(lambda where, stack: hung.set(), timeout_s=1e6, urgent=urgent, grace_s=0.1) as watch:
         watch.beat("driving")
         assert not hung.wait(0.3)
         urgent.set()
-        assert hung.wait(PATIENT_S)
+        assert hung.wait(TIMEOUT_S)

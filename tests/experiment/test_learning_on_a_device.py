@@ -1,4 +1,4 @@
-"""A run that learns on another device: it learns what it would have learned here, and drives from the CPU."""
+"""A run that trains on another device: the model equals that of the CPU, and the policy drives on the CPU."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ SMALL = {"history": 1, "model_steps": 20, "updates": 32, "ticks": 12, "threads":
 
 
 @pytest.fixture(autouse=True)
-def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two episodes in this process, for the stand-in is in this process, too; nothing is to be learned well."""
-    monkeypatch.setattr(
-        campaign, "train_in_subprocess",
-        lambda plan, models, recordings, envelope, tell, stop: training.train(plan, models, recordings, envelope, tell),
-    )  # fmt: skip
+def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few draws and steps; training in this process, where the stand-in of the device is installed."""
+
+    def train_here(plan: Any, models: Any, recordings: Any, envelope: Any, on_progress: Any, stop: Any) -> Any:
+        return training.train(plan, models, recordings, envelope, on_progress)
+
+    monkeypatch.setattr(campaign, "train_in_subprocess", train_here)
     monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 10)
     monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
     monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)
@@ -39,52 +40,58 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("learning.posterior.parameter_posterior.RANDOM_WALK_STEPS", 1)
 
 
-def learned(folder: Path, device: str, episodes: int) -> RunDirectory:
+def learn(folder: Path, device: str, episodes: int) -> RunDirectory:
     choice = choose_car("sim", seed=0)
     run = RunDirectory.create(folder, device)
     prior = tomli_w.dumps(prior_simulator(choice.simulator, "kinematic").to_tables())
     plan = replace(TrainingPlan(prior, **SMALL), device=device)
     with choice.car:
-        going = Campaign(choice, plan, episodes, run, max_ticks=SMALL["ticks"], record_rerun=False)
-        going.write_plan()
-        assert len(list(going.run_episodes())) == episodes
+        learning_run = Campaign(choice, plan, episodes, run, max_ticks=SMALL["ticks"], record_rerun=False)
+        learning_run.write_plan()
+        assert len(list(learning_run.run_episodes())) == episodes
     return run
 
 
 def device_of(agent: SacAgent | SacPolicy) -> torch.device:
-    """Of the numbers that act."""
+    """Device of the policy's parameters."""
     sac = agent.policy().sac if isinstance(agent, SacAgent) else agent.sac
     return next(sac.policy.parameters()).device
 
 
-def test_a_run_learns_there_and_drives_here(device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    where: list[tuple[str, str]] = []
+def test_run_trains_on_the_device_and_drives_on_the_cpu(
+    device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    devices: list[tuple[str, str]] = []
 
-    def noting(what: str, device_of: Callable[..., torch.device], own: Callable[..., Any]) -> Callable[..., Any]:
-        def noted(*given: Any, **others: Any) -> Any:
-            where.append((what, device_of(*given).type))
-            return own(*given, **others)
+    def log_device(
+        step: str, device_of: Callable[..., torch.device], function: Callable[..., Any]
+    ) -> Callable[..., Any]:
+        def logged(*arguments: Any, **others: Any) -> Any:
+            devices.append((step, device_of(*arguments).type))
+            return function(*arguments, **others)
 
-        return noted
+        return logged
 
-    car = noting("car", lambda dynamics, path: dynamics.posterior.parameters.device, save_car)
+    car = log_device("car", lambda dynamics, path: dynamics.posterior.parameters.device, save_car)
     monkeypatch.setattr("learning.world.car_fit.save_car", car)
-    policy = noting("policy", lambda agent, folder: device_of(agent), SacAgent.save)
+    policy = log_device("policy", lambda agent, folder: device_of(agent), SacAgent.save)
     monkeypatch.setattr(SacAgent, "save", policy)
-    monkeypatch.setattr(campaign, "Session", noting("driving", lambda car, policy, *_: device_of(policy), Session))
-    there = learned(tmp_path, device, 2)
-    assert where == [("car", "cuda"), ("policy", "cuda"), ("driving", "cpu")] * 2
-    here = learned(tmp_path, "cpu", 1)
-    assert {device for _, device in where[6:]} == {"cpu"}
-    first, wanted = (load_car(run.models / "0001" / training.DYNAMICS_FILE).posterior for run in (there, here))
-    torch.testing.assert_close(first.parameters, wanted.parameters, rtol=1e-3, atol=1e-3)
-    figures = json.loads((there.models / "0002" / training.FIGURES_FILE).read_text())
+    monkeypatch.setattr(campaign, "Session", log_device("driving", lambda car, policy, *_: device_of(policy), Session))
+    device_run = learn(tmp_path, device, 2)
+    assert devices == [("car", "cuda"), ("policy", "cuda"), ("driving", "cpu")] * 2
+    cpu_run = learn(tmp_path, "cpu", 1)
+    assert {device for _, device in devices[6:]} == {"cpu"}
+    device_posterior, cpu_posterior = (
+        load_car(run.models / "0001" / training.DYNAMICS_FILE).posterior for run in (device_run, cpu_run)
+    )
+    torch.testing.assert_close(device_posterior.parameters, cpu_posterior.parameters, rtol=1e-3, atol=1e-3)
+    figures = json.loads((device_run.models / "0002" / training.FIGURES_FILE).read_text())
     assert figures["rows"] == SMALL["ticks"] - SMALL["history"]
     assert np.isfinite(figures["last_episode_nll"])
     choice = choose_car("sim", seed=0)
-    assert resumed_campaign(there, choice, CampaignHooks()).plan.device == "cuda"
-    assert resumed_campaign(there, choice, CampaignHooks(), "cpu").plan.device == "cpu"
-    old = json.loads((there.path / campaign.CAMPAIGN_FILE).read_text())
-    del old["plan"]["device"]
-    (there.path / campaign.CAMPAIGN_FILE).write_text(json.dumps(old))
-    assert resumed_campaign(there, choice, CampaignHooks()).plan.device == "cpu"
+    assert resumed_campaign(device_run, choice, CampaignHooks()).plan.device == "cuda"
+    assert resumed_campaign(device_run, choice, CampaignHooks(), "cpu").plan.device == "cpu"
+    without_device = json.loads((device_run.path / campaign.CAMPAIGN_FILE).read_text())
+    del without_device["plan"]["device"]
+    (device_run.path / campaign.CAMPAIGN_FILE).write_text(json.dumps(without_device))
+    assert resumed_campaign(device_run, choice, CampaignHooks()).plan.device == "cpu"

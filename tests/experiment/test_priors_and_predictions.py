@@ -1,4 +1,4 @@
-"""Priors of a run of learning from a car file, and predictions of a model that is known."""
+"""Prior simulators of a learning run, and predicted windows of a model with known dynamics."""
 
 from __future__ import annotations
 
@@ -22,63 +22,63 @@ from sim_backends.car_parameters import SimulatorConfig, preset_names
 
 
 @pytest.mark.parametrize("name", preset_names())
-def test_a_prior_has_ranges_about_the_numbers_of_the_car(name: str) -> None:
+def test_prior_ranges_contain_the_parameters_of_the_car(name: str) -> None:
     car = choose_car(name).simulator
     for kind in ("kinematic", "nominal"):
-        found = prior_simulator(car, kind)
-        assert found.kind == ("kinematic" if kind == "kinematic" else car.kind)
-        assert found.parameters == car.parameters
-        assert found.priors
-        for key, (low, high) in found.priors.items():
+        prior = prior_simulator(car, kind)
+        assert prior.kind == ("kinematic" if kind == "kinematic" else car.kind)
+        assert prior.parameters == car.parameters
+        assert prior.priors
+        for key, (low, high) in prior.priors.items():
             value = car.values()[key]
             assert low < value < high
             if key in car.priors:
-                assert (low, high) == car.priors[key], "ranges of the file hold for wheels that do not slip, too"
+                assert (low, high) == car.priors[key], "the kinematic prior keeps the ranges of the car file, too"
             else:
                 assert sorted([low / value, high / value]) == pytest.approx([0.7, 1.3])
-        assert SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(found.to_tables()))) == found
+        assert SimulatorConfig.from_tables(tomllib.loads(tomli_w.dumps(prior.to_tables()))) == prior
 
 
-def test_a_prior_whose_wheels_do_not_slip_has_neither_effects_nor_ranges_of_tyres() -> None:
+def test_kinematic_prior_has_no_effects_and_no_tyre_ranges() -> None:
     ranges = {"tyre.front.mu": (0.2, 1.1), "motor.drive_gain": (1.0, 50.0)}
     car = replace(SimulatorConfig(), effects={"steering_lag": {}}, priors=ranges)
-    assert prior_simulator(car, "nominal") == car, "ranges of the file are those to be had"
-    found = prior_simulator(car, "kinematic")
-    assert found.effects == {}
-    assert not [name for name in found.priors if name.startswith("tyre")]
-    assert found.priors["motor.drive_gain"] == (1.0, 50.0)
-    assert found.priors["motor.damping"][1] == pytest.approx(1.3 * car.values()["motor.damping"])
+    assert prior_simulator(car, "nominal") == car, "the nominal prior is the car file"
+    prior = prior_simulator(car, "kinematic")
+    assert prior.effects == {}
+    assert not [name for name in prior.priors if name.startswith("tyre")]
+    assert prior.priors["motor.drive_gain"] == (1.0, 50.0)
+    assert prior.priors["motor.damping"][1] == pytest.approx(1.3 * car.values()["motor.damping"])
 
 
 def recording_of(ticks: int) -> EpisodeData:
-    """A recording at 30 Hz whose states and commands have nothing to do with each other."""
+    """A recording at 30 Hz with independent random states and commands."""
     rng = np.random.default_rng(0)
     sent = rng.uniform(-1.0, 1.0, (ticks, 2))
     return EpisodeData(np.arange(ticks + 1) / 30.0, rng.normal(size=(ticks + 1, 6)), sent, sent, sent[:, 0])
 
 
 @pytest.mark.parametrize("history", [0, 1, 3])
-def test_predictions_follow_the_model_and_the_recorded_commands(history: int) -> None:
-    """It goes ahead by the oldest throttle that it sees and turns by 0.05 rad, from each stretch's recorded start."""
+def test_predicted_windows_follow_the_model_and_the_recorded_commands(history: int) -> None:
+    """The model moves ahead by the oldest throttle of its input and turns by 0.05 rad a tick, from a recorded state."""
     width = 3 + 2 * (history + 1)
     network = Network(width, 6, (1,), slope=1.0)
     parameters = torch.zeros(4, network.parameters)
     (first, _), (last, bias) = network.split(parameters)
     first[:, 4, 0] = last[:, 0, 0] = 1.0
     bias[:, 0, 2] = 0.05
-    units = Normaliser(*(f(n) for n in (width, 6) for f in (torch.zeros, torch.ones)))
-    car = CarDynamics(ParticlePosterior(network, parameters, torch.full((6,), 1e-7), units), history)
-    driven = recording_of(100)
-    found = predict_windows(car, driven)
-    assert found.ticks[:, 0].tolist() == [history, history + 30, history + 60]
-    assert found.mean.shape == found.std.shape == (3, 31, 6)
-    for (start, *_), path in zip(found.ticks, found.mean, strict=True):
-        x, y, yaw = driven.states[start, :3]
+    normaliser = Normaliser(*(f(n) for n in (width, 6) for f in (torch.zeros, torch.ones)))
+    car = CarDynamics(ParticlePosterior(network, parameters, torch.full((6,), 1e-7), normaliser), history)
+    episode = recording_of(100)
+    predicted = predict_windows(car, episode)
+    assert predicted.ticks[:, 0].tolist() == [history, history + 30, history + 60]
+    assert predicted.mean.shape == predicted.std.shape == (3, 31, 6)
+    for (start, *_), mean in zip(predicted.ticks, predicted.mean, strict=True):
+        x, y, yaw = episode.states[start, :3]
         headings = yaw + 0.05 * np.arange(31)
-        ahead = driven.sent[start - history : start - history + 30, 1]
-        np.testing.assert_allclose(path[1:, 0], x + np.cumsum(ahead * np.cos(headings[:-1])), atol=1e-4)
-        np.testing.assert_allclose(path[1:, 1], y + np.cumsum(ahead * np.sin(headings[:-1])), atol=1e-4)
-        np.testing.assert_allclose(np.exp(1j * path[:, 2]), np.exp(1j * headings), atol=1e-4)
-        np.testing.assert_allclose(path[:, 3:], np.tile(driven.states[start, 3:], (31, 1)), atol=1e-4)
-    assert found.std.max() < 1e-4
+        ahead = episode.sent[start - history : start - history + 30, 1]
+        np.testing.assert_allclose(mean[1:, 0], x + np.cumsum(ahead * np.cos(headings[:-1])), atol=1e-4)
+        np.testing.assert_allclose(mean[1:, 1], y + np.cumsum(ahead * np.sin(headings[:-1])), atol=1e-4)
+        np.testing.assert_allclose(np.exp(1j * mean[:, 2]), np.exp(1j * headings), atol=1e-4)
+        np.testing.assert_allclose(mean[:, 3:], np.tile(episode.states[start, 3:], (31, 1)), atol=1e-4)
+    assert predicted.std.max() < 1e-4
     assert predict_windows(car, recording_of(20)).mean.shape == (0, 31, 6)

@@ -1,4 +1,4 @@
-"""After an episode: whether reality has left the simulator; nothing that goes wrong with it ends a run."""
+"""The quick check after an episode: whether the simulator explains the recording; a failed check ends no run."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ LAGGING = replace(SIMULATOR, effects={"motor_lag": {"time_constant": 0.08}})
 ROW = EpisodeFigures(1, 20.0, 30.0, False, 0.5, 0.1, 0.0, 97, 1.0, 0.1, 3.0, 60.0, 100, "COMPLETED")
 
 
-def a_run(folder: Path, true: SimulatorConfig, episodes: int) -> RunDirectory:
+def make_run(folder: Path, true: SimulatorConfig, episodes: int) -> RunDirectory:
     run: RunDirectory = drives.drive_like_learning(true, folder, episodes, seed=21)
     for number in range(1, episodes + 1):
         (run.models / f"{number:04d}").mkdir()
     return run
 
 
-def test_the_check_is_kept_beside_the_model_and_names_the_next_step(tmp_path: Path) -> None:
-    run = a_run(tmp_path, LAGGING, 4)
+def test_check_is_saved_in_the_model_folder_and_names_the_next_step(tmp_path: Path) -> None:
+    run = make_run(tmp_path, LAGGING, 4)
     check_result = run_check_subprocess(run, SIMULATOR)
     assert check_result is not None
     assert (check_result.episode, check_result.verdict) == (4, "left")
     assert check_result.excess > 1.0
     assert "motor_lag" in check_result.sentences[1]
-    kept = json.loads(check_path(run, 4).read_text())
-    assert kept["sentences"] == list(check_result.sentences)
-    assert kept["causes"][0]["id"] == "motor_lag"
-    assert kept["next"] == f"carlab diagnose {run.path} --car {run.path}/simulator.toml --out {run.path}/diagnosis"
-    assert kept["next"] in check_result.sentences[1]
+    saved = json.loads(check_path(run, 4).read_text())
+    assert saved["sentences"] == list(check_result.sentences)
+    assert saved["causes"][0]["id"] == "motor_lag"
+    assert saved["next"] == f"carlab diagnose {run.path} --car {run.path}/simulator.toml --out {run.path}/diagnosis"
+    assert saved["next"] in check_result.sentences[1]
     assert not check_path(run, 3).exists()
 
 
-def test_what_goes_wrong_is_told_in_one_sentence(tmp_path: Path) -> None:
-    run = a_run(tmp_path, SIMULATOR, 1)
+def test_failed_check_is_reported_in_one_sentence_and_not_repeated(tmp_path: Path) -> None:
+    run = make_run(tmp_path, SIMULATOR, 1)
     run.recordings()[0].write_bytes(b"rubbish")
     check_result = run_check_subprocess(run, SIMULATOR)
     assert check_result is not None
@@ -56,35 +56,35 @@ def test_what_goes_wrong_is_told_in_one_sentence(tmp_path: Path) -> None:
     assert "learning continues" in sentence
     assert "MCAP" in sentence
     assert "\n" not in sentence
-    assert json.loads(check_path(run, 1).read_text())["verdict"] == "failed", "it is not tried again"
+    assert json.loads(check_path(run, 1).read_text())["verdict"] == "failed", "a failed check is not repeated"
     with pytest.raises(DataError):
         check(run.path, run.recordings(), SIMULATOR)
 
 
-def test_a_check_that_is_stopped_leaves_nothing_and_is_made_up_for(tmp_path: Path) -> None:
-    run = a_run(tmp_path, SIMULATOR, 1)
+def test_stopped_check_writes_nothing_and_is_repeated(tmp_path: Path) -> None:
+    run = make_run(tmp_path, SIMULATOR, 1)
     assert run_check_subprocess(run, SIMULATOR, stop=lambda: True) is None
     assert not check_path(run, 1).exists()
     save_row(run, ROW)
-    heard: list[QuickCheck] = []
+    checks: list[QuickCheck] = []
 
     def on_check(check_result: QuickCheck) -> None:
-        heard.append(check_result)
+        checks.append(check_result)
         save_check(run, check_result)
 
     campaign = Campaign(choose_car("sim"), TrainingPlan(""), 1, run, CampaignHooks(on_check=on_check))
     assert list(campaign.run_episodes()) == []
-    assert [t.verdict for t in heard] == ["explains"]
+    assert [t.verdict for t in checks] == ["explains"]
     (row,) = learning_curve(run)
-    assert (row.verdict, row.excess) == ("explains", heard[0].excess)
-    assert row.diagnosis == heard[0].sentences[0]
+    assert (row.verdict, row.excess) == ("explains", checks[0].excess)
+    assert row.diagnosis == checks[0].sentences[0]
     assert row.total_reward == ROW.total_reward
     assert list(campaign.run_episodes()) == []
-    assert len(heard) == 1, "once an episode"
+    assert len(checks) == 1, "one check per episode"
 
 
-def test_rows_of_a_learning_curve_come_back_with_a_check_without_and_from_older_runs(tmp_path: Path) -> None:
-    run = a_run(tmp_path, SIMULATOR, 0)
+def test_learning_curve_rows_are_read_with_and_without_a_check(tmp_path: Path) -> None:
+    run = make_run(tmp_path, SIMULATOR, 0)
     check_result = QuickCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
     save_row(run, replace(ROW, episode=2))
     save_check(run, check_result)
@@ -99,8 +99,8 @@ def test_rows_of_a_learning_curve_come_back_with_a_check_without_and_from_older_
     assert content["episodes"][1]["excess_std"] is None
 
 
-def test_rows_of_the_first_version_are_read_under_their_new_names(tmp_path: Path) -> None:
-    run = a_run(tmp_path, SIMULATOR, 0)
+def test_rows_of_schema_version_1_are_read_under_their_new_names(tmp_path: Path) -> None:
+    run = make_run(tmp_path, SIMULATOR, 0)
     row = replace(ROW, predicted_return=31.5, verdict="left").to_dict()
     assert row["distance_m"] == ROW.distance_m
     row["foretold"], row["reality"] = row.pop("predicted_return"), row.pop("verdict")
@@ -114,15 +114,15 @@ def test_rows_of_the_first_version_are_read_under_their_new_names(tmp_path: Path
 
 
 @pytest.mark.parametrize("changed", [{"distance_m": "far"}, {"episode": [1]}, {"unknown": 1.0}])
-def test_a_row_that_is_none_is_refused_in_a_sentence(tmp_path: Path, changed: dict[str, object]) -> None:
-    run = a_run(tmp_path, SIMULATOR, 0)
+def test_malformed_row_is_refused_in_one_sentence(tmp_path: Path, changed: dict[str, object]) -> None:
+    run = make_run(tmp_path, SIMULATOR, 0)
     (run.path / "learn.json").write_text(json.dumps({"episodes": [{**ROW.to_dict(), **changed}]}))
     with pytest.raises(DataError, match=r"cannot be read .*remove it, and the next run restores it\.$"):
         learning_curve(run)
 
 
 @pytest.mark.parametrize(
-    ("distance_m", "yaw_rad", "strictly"), [(0.049, 0.19, True), (0.051, 0.0, False), (0.0, 0.21, False)]
+    ("distance_m", "yaw_rad", "is_strict"), [(0.049, 0.19, True), (0.051, 0.0, False), (0.0, 0.21, False)]
 )
-def test_the_strict_criterion_is_that_of_the_authors(distance_m: float, yaw_rad: float, strictly: bool) -> None:
-    assert replace(ROW, distance_m=distance_m, yaw_error_rad=yaw_rad).is_strictly_parked is strictly
+def test_strict_parking_criterion_is_that_of_the_authors(distance_m: float, yaw_rad: float, is_strict: bool) -> None:
+    assert replace(ROW, distance_m=distance_m, yaw_error_rad=yaw_rad).is_strictly_parked is is_strict

@@ -1,4 +1,4 @@
-"""Driving by hand: a dead-man that means it, through SDL's own event queue."""
+"""Driving by hand: dead-man switch, latching stops, gamepad axes, and keyboard input through SDL's event queue."""
 
 import pygame
 import pytest
@@ -17,13 +17,13 @@ from carlab.experiment.episodes.teleop_policy import (
 )
 
 VIEW = PolicyInput(features=None, observation=Observation(CarState(), 0.0, 0.0, 0), step=0, elapsed_s=0.0)  # type: ignore[arg-type]
-REST = [0.0, 0.0, -1.0, 0.0, 0.0, -1.0]
+AXES_AT_REST = [0.0, 0.0, -1.0, 0.0, 0.0, -1.0]
 
 
-class Hands:
-    """A device that says what the test sets."""
+class FakeDevice:
+    """An input device that returns the input ``now``."""
 
-    name = "hands"
+    name = "fake device"
 
     def __init__(self) -> None:
         self.now = TeleopInput()
@@ -39,21 +39,21 @@ class Hands:
         self.opened -= 1
 
 
-def test_release_is_neutral_within_one_tick_and_holding_again_drives_on() -> None:
-    hands = Hands()
-    with TeleopPolicy(hands, max_throttle=0.5) as policy:
-        assert hands.opened == 1
+def test_released_dead_man_switch_gives_neutral_until_it_is_held_again() -> None:
+    device = FakeDevice()
+    with TeleopPolicy(device, max_throttle=0.5) as policy:
+        assert device.opened == 1
         policy.reset()
-        hands.now = TeleopInput(steering=0.4, throttle=1.0, deadman=True)
+        device.now = TeleopInput(steering=0.4, throttle=1.0, deadman=True)
         action = policy.act(VIEW)
         assert action is not None
         assert (action.steering, action.throttle) == (0.4, 0.5)
-        hands.now = TeleopInput(steering=0.4, throttle=1.0, deadman=False)
+        device.now = TeleopInput(steering=0.4, throttle=1.0, deadman=False)
         assert policy.act(VIEW).is_neutral  # type: ignore[union-attr]
         assert policy.stop_reason() is None
-        hands.now = TeleopInput(throttle=1.0, deadman=True)
+        device.now = TeleopInput(throttle=1.0, deadman=True)
         assert not policy.act(VIEW).is_neutral  # type: ignore[union-attr]
-    assert hands.opened == 0
+    assert device.opened == 0
 
 
 @pytest.mark.parametrize(
@@ -63,49 +63,49 @@ def test_release_is_neutral_within_one_tick_and_holding_again_drives_on() -> Non
         (TeleopInput(deadman=True, throttle=1.0, present=False), EndReason.DEADMAN_RELEASED),
     ],
 )
-def test_an_emergency_stop_and_an_unplugged_device_latch(event: TeleopInput, reason: EndReason) -> None:
-    hands = Hands()
-    policy = TeleopPolicy(hands)
+def test_emergency_stop_and_unplugged_device_latch(event: TeleopInput, reason: EndReason) -> None:
+    device = FakeDevice()
+    policy = TeleopPolicy(device)
     policy.reset()
-    hands.now = event
+    device.now = event
     assert policy.act(VIEW).is_neutral  # type: ignore[union-attr]
     assert policy.stop_reason() is reason
-    hands.now = TeleopInput(deadman=True, throttle=1.0)
+    device.now = TeleopInput(deadman=True, throttle=1.0)
     assert policy.act(VIEW).is_neutral  # type: ignore[union-attr]
     assert policy.stop_reason() is reason
 
 
-def test_finishing_ends_the_script() -> None:
-    hands = Hands()
-    policy = TeleopPolicy(hands)
-    hands.now = TeleopInput(deadman=True, finish=True)
+def test_finish_input_ends_the_policy() -> None:
+    device = FakeDevice()
+    policy = TeleopPolicy(device)
+    device.now = TeleopInput(deadman=True, finish=True)
     assert policy.act(VIEW) is None
 
 
-def test_gamepad_axes_follow_the_conventions() -> None:
+def test_gamepad_axes_follow_the_sign_conventions() -> None:
     mapping = GamepadMapping()
     buttons = [False] * 12
-    assert gamepad_input(REST, buttons, mapping) == TeleopInput()
-    left = gamepad_input([-1.0, *REST[1:]], buttons, mapping)
+    assert gamepad_input(AXES_AT_REST, buttons, mapping) == TeleopInput()
+    left = gamepad_input([-1.0, *AXES_AT_REST[1:]], buttons, mapping)
     assert left.steering == pytest.approx(1.0)  # Stick to the left steers left, which is positive.
-    forward = gamepad_input([*REST[:5], 1.0], buttons, mapping)
+    forward = gamepad_input([*AXES_AT_REST[:5], 1.0], buttons, mapping)
     assert forward.throttle == pytest.approx(1.0)
     both = gamepad_input([0.0, 0.0, 1.0, 0.0, 0.0, 1.0], buttons, mapping)
     assert both.throttle == 0.0
-    drift = gamepad_input([0.07, *REST[1:]], buttons, mapping)
+    drift = gamepad_input([0.07, *AXES_AT_REST[1:]], buttons, mapping)
     assert drift.steering == 0.0
-    held = gamepad_input(REST, [*[False] * 4, True], mapping)
+    held = gamepad_input(AXES_AT_REST, [*[False] * 4, True], mapping)
     assert held.deadman
     assert gamepad_input([], [], mapping) == TeleopInput()
 
 
-def test_no_gamepad_is_a_sentence() -> None:
+def test_missing_gamepad_is_reported() -> None:
     with pytest.raises(NotReadyError, match="plug it in"):
         GamepadSource(index=31).open()
     assert not GamepadSource().poll().present
 
 
-def test_keyboard_through_sdl_events() -> None:
+def test_keyboard_input_follows_sdl_events() -> None:
     source = KeyboardSource(throttle=0.4)
     source.open()
     try:

@@ -1,4 +1,4 @@
-"""What is trained between episodes: what the model gets of the recordings, and what happens where a fit fails."""
+"""Training between episodes: velocity delay, history length, failed fits and recordings without usable rows."""
 
 from __future__ import annotations
 
@@ -30,74 +30,74 @@ from learning.world import car_fit, model_env
 from learning.world.history import HistoryChoice
 
 
-def test_the_model_is_told_by_how_much_recorded_velocities_are_late(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A line through the poses of 50 ms, 100 of them a second, has its slope 25 ms ago."""
+def test_model_uses_the_velocity_delay_of_the_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line fitted to the poses of the last 50 ms at 100 Hz gives the velocity of 25 ms before."""
     plan, run = tiny_plan(choose_car("sim")), drive(tmp_path, TICKS)
-    told: list[float] = []
+    delays_s: list[float] = []
 
-    def fitted(plan: TrainingPlan, model: CarModel, *rest: Any) -> None:
-        told.append(model.velocity_delay_s)
-        raise DataError("seen enough")
+    def stop_fit(plan: TrainingPlan, model: CarModel, *rest: Any) -> None:
+        delays_s.append(model.velocity_delay_s)
+        raise DataError("fit is not needed")
 
-    monkeypatch.setattr(training, "_fitted", fitted)
-    with pytest.raises(DataError, match="seen enough"):
+    monkeypatch.setattr(training, "_fitted", stop_fit)
+    with pytest.raises(DataError, match="fit is not needed"):
         train(plan, tmp_path / "none", [], ENVELOPE, lambda *what: None)
-    with pytest.raises(DataError, match="seen enough"):
+    with pytest.raises(DataError, match="fit is not needed"):
         train(plan, tmp_path / "some", run.recordings(), ENVELOPE, lambda *what: None)
-    assert told == pytest.approx([0.025, 0.025], abs=1e-3)
-    late = replace(read_episode(run.episode_path(1)), extra={"velocity_delay_s": np.array([0.01, 0.02, np.nan, 0.04])})
-    assert training.velocity_delay_s([late]) == 0.02
-    assert training.velocity_delay_s([replace(late, extra={})]) == 0.025, "of recordings that do not say"
+    assert delays_s == pytest.approx([0.025, 0.025], abs=1e-3)
+    with_delays = replace(
+        read_episode(run.episode_path(1)), extra={"velocity_delay_s": np.array([0.01, 0.02, np.nan, 0.04])}
+    )
+    assert training.velocity_delay_s([with_delays]) == 0.02
+    assert training.velocity_delay_s([replace(with_delays, extra={})]) == 0.025, (
+        "the default for recordings without the column"
+    )
 
 
-def test_after_three_episodes_it_is_found_how_many_commands_count(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[int] = []
+def test_history_length_is_selected_after_three_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    episode_counts: list[int] = []
 
     def find(episodes: list[EpisodeData]) -> HistoryChoice:
-        asked.append(len(episodes))
+        episode_counts.append(len(episodes))
         return HistoryChoice(6, {3: -1.0, 6: -2.0})
 
     monkeypatch.setattr(training, "find_history", find)
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     recordings = drive(tmp_path, TICKS, episodes=3).recordings()
-    found = [train(plan, tmp_path / str(n), recordings[:n], ENVELOPE, lambda *what: None) for n in (2, 3)]
-    assert asked == [3]
-    assert [f.get("history_asked") for f in found] == [None, 6]
-    assert "supports 6 past commands" in found[1]["history_words"]
+    figures = [train(plan, tmp_path / str(n), recordings[:n], ENVELOPE, lambda *what: None) for n in (2, 3)]
+    assert episode_counts == [3]
+    assert [f.get("history_asked") for f in figures] == [None, 6]
+    assert "supports 6 past commands" in figures[1]["history_words"]
 
 
-def test_what_diverged_is_learned_again_with_smaller_steps(
+def test_diverged_training_is_repeated_with_a_smaller_learning_rate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rates: dict[str, list[float]] = {"model": [], "policy": []}
-    fit, teach = car_fit.fit_car, SacAgent.train
-    broken = {"model", "policy"}
+    original_fit, original_train = car_fit.fit_car, SacAgent.train
+    diverging = {"model", "policy"}
 
     def fit_car(rows: Any, model: Any, settings: Any, **others: Any) -> Any:
         rates["model"].append(settings.learning_rate)
         if len(rates["model"]) == 1:
             raise DivergedError("The fit diverged.")
-        return fit(rows, model, settings, **others)
+        return original_fit(rows, model, settings, **others)
 
-    def taught(self: SacAgent, *arguments: Any) -> dict[str, float]:
+    def train_policy(self: SacAgent, *arguments: Any) -> dict[str, float]:
         rates["policy"].append(self._settings.learning_rate)
-        if len(rates["policy"]) == 1 or "always" in broken:
+        if len(rates["policy"]) == 1 or "always" in diverging:
             raise DivergedError("The policy diverged.")
-        return teach(self, *arguments)
+        return original_train(self, *arguments)
 
     monkeypatch.setattr(car_fit, "fit_car", fit_car)
-    monkeypatch.setattr(SacAgent, "train", taught)
+    monkeypatch.setattr(SacAgent, "train", train_policy)
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     (tmp_path / "models").mkdir()
     train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
     assert all(second == 0.25 * first for first, second in rates.values())
     assert "The model diverged" in caplog.text
     assert "The policy diverged" in caplog.text
-    broken.add("always")
+    diverging.add("always")
     (tmp_path / "other").mkdir()
     with pytest.raises(DivergedError, match="with a smaller learning rate") as error:
         train(plan, tmp_path / "other", [], ENVELOPE, lambda *what: None)
@@ -105,49 +105,49 @@ def test_what_diverged_is_learned_again_with_smaller_steps(
     assert list((tmp_path / "other").iterdir()) == []
 
 
-def test_from_an_episode_that_is_too_short_nothing_is_learned_but_the_prior(tmp_path: Path) -> None:
+def test_too_short_episode_gives_no_training_rows(tmp_path: Path) -> None:
     run = drive(tmp_path, HISTORY)
-    told: list[str] = []
+    stages: list[str] = []
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
-    figures = train(plan, run.models, run.recordings(), ENVELOPE, lambda what, done, total: told.append(what))
+    figures = train(plan, run.models, run.recordings(), ENVELOPE, lambda stage, done, total: stages.append(stage))
     assert figures["rows"] == 0
     assert "last_episode_nll" not in figures
     assert json.loads((run.models / "0002" / "training.json").read_text()) == figures
-    assert list(dict.fromkeys(told)) == ["reading the recordings", "learning the car", "learning to drive"]
+    assert list(dict.fromkeys(stages)) == ["reading the recordings", "learning the car", "learning to drive"]
 
 
-def test_the_learned_car_keeps_more_room_and_is_paid_for_standing_in_its_spot(
+def test_model_env_has_a_larger_stopping_margin_and_a_parking_bonus(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At 2 m/s the gate asks for 0.97 m; a policy that lives on just that is stopped as soon as the car slides more."""
-    made: list[model_env.ModelEnv] = []
+    """At 2 m/s the geofence needs 0.97 m; with this margin alone a policy is stopped as soon as the car slides more."""
+    envs: list[model_env.ModelEnv] = []
 
-    class Kept(model_env.ModelEnv):
+    class CountedEnv(model_env.ModelEnv):
         def __init__(self, *arguments: Any, **options: Any) -> None:
             super().__init__(*arguments, **options)
-            made.append(self)
+            envs.append(self)
 
-    monkeypatch.setattr(model_env, "ModelEnv", Kept)
+    monkeypatch.setattr(model_env, "ModelEnv", CountedEnv)
     (tmp_path / "models").mkdir()
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
     train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
     edge_m = max(x for x, _ in ENVELOPE.arena_m)
     history = np.zeros((HISTORY, 2))
-    for world in made:
-        for left_m, stopped in ((1.1, True), (1.4, False)):
-            rushing = CarState(edge_m - left_m, 0.0, 0.0, 2.0, 0.0, 0.0)
-            assert can_stop_inside(ENVELOPE.arena_m, rushing, ENVELOPE.reaction_s, ENVELOPE.deceleration_mps2)
-            row = torch.from_numpy(encode(rushing.to_array()[None], history[None])).float()
-            assert world._stopped(row).tolist() == [stopped]
-    trained, judged = made
-    there = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
-    assert trained._bonus is not None
-    assert trained._bonus(there).tolist() == pytest.approx([PARKED_BONUS, 0.0])
-    assert judged._bonus is None, "the predicted return is the task's reward alone"
+    for env in envs:
+        for margin_m, stopped in ((1.1, True), (1.4, False)):
+            state = CarState(edge_m - margin_m, 0.0, 0.0, 2.0, 0.0, 0.0)
+            assert can_stop_inside(ENVELOPE.arena_m, state, ENVELOPE.reaction_s, ENVELOPE.deceleration_mps2)
+            row = torch.from_numpy(encode(state.to_array()[None], history[None])).float()
+            assert env._stopped(row).tolist() == [stopped]
+    training_env, evaluation_env = envs
+    features = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
+    assert training_env._bonus is not None
+    assert training_env._bonus(features).tolist() == pytest.approx([PARKED_BONUS, 0.0])
+    assert evaluation_env._bonus is None, "the predicted return is the task's reward alone"
 
 
-def test_an_episode_that_ended_before_its_first_tick_is_no_obstacle(tmp_path: Path) -> None:
-    """Somebody put the car down outside the arena: the gate ends the episode at once, and the next may follow."""
+def test_training_accepts_an_episode_without_a_tick(tmp_path: Path) -> None:
+    """The car stands outside the arena: the geofence ends the episode at once."""
     run = drive(tmp_path, TICKS, CarState(5.0, 5.0))
     assert len(run.recordings()) == 1
     plan = tiny_plan(choose_car("sim"), model_steps=20, updates=8)
@@ -155,17 +155,17 @@ def test_an_episode_that_ended_before_its_first_tick_is_no_obstacle(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("recording", "changes", "said"),
+    ("recording", "changes", "message"),
     [(b"rubbish", {}, "not an MCAP file"), (None, {"threads": 0}, "Training failed: RuntimeError")],
 )
-def test_what_goes_wrong_in_the_other_process_is_said_in_a_sentence(
-    tmp_path: Path, recording: bytes | None, changes: dict[str, Any], said: str
+def test_error_in_the_training_process_is_reported_in_one_sentence(
+    tmp_path: Path, recording: bytes | None, changes: dict[str, Any], message: str
 ) -> None:
     run = RunDirectory.create(tmp_path, "wrong")
     if recording is not None:
         run.episode_path(1).write_bytes(recording)
     plan = tiny_plan(choose_car("sim"), model_steps=1, **changes)
-    with pytest.raises(DataError, match=said) as error:
+    with pytest.raises(DataError, match=message) as error:
         train_in_subprocess(plan, run.models, run.recordings(), ENVELOPE, lambda *what: None)
     assert "\n" not in str(error.value)
     assert names(run) == ([] if recording is None else ["episodes/0001.mcap"])

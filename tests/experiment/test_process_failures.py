@@ -1,6 +1,7 @@
-"""Whatever dies, the motor stops: asserted on the bytes that the fake firmware decoded, and on the recording.
+"""The motor stops after the failure of any process or connection.
 
-Each case runs a program that drives the emulated car over the whole hardware path, and breaks something.
+Each case runs a program that drives the emulated car over the whole hardware path and injects one failure. The tests
+check the command log of the emulated firmware and the recording.
 """
 
 import json
@@ -28,7 +29,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.timeout(120)]
 
 @dataclass
 class Driving:
-    """The program while it drives."""
+    """A running driving program."""
 
     process: subprocess.Popen[str]
     run: Path
@@ -37,7 +38,7 @@ class Driving:
     last_line: str = ""
 
     def until(self, start: str) -> str:
-        """Read its output up to a line that begins so; fails at its end."""
+        """Read the output up to a line that begins with ``start``; fails at the end of the output."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
             self.last_line = line.strip()
@@ -46,14 +47,14 @@ class Driving:
         raise AssertionError(f"the program ended before '{start}'; its last line was '{self.last_line}'")
 
     def end(self) -> int:
-        """Wait for its end and return its exit code."""
+        """Wait for the end of the program and return its exit code."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
             self.last_line = line.strip()
         return self.process.wait()
 
     def firmware_log(self, settled_s: float = 2.5) -> list[LogEntry]:
-        """What the firmware heard and did; waits until the sender's neutral or the motor's time-out is in it."""
+        """Entries of the firmware, once they end with the sender's neutral commands or with the motor time-out."""
         deadline_s = time.monotonic() + settled_s + 5.0
         while time.monotonic() < deadline_s:
             log = read_log(self.run / "firmware.jsonl")
@@ -72,9 +73,9 @@ class Driving:
 
 
 @contextmanager
-def driving(folder: Path, how: str) -> Iterator[Driving]:
+def driving(folder: Path, misbehaviour: str) -> Iterator[Driving]:
     process = subprocess.Popen(
-        [sys.executable, str(PROGRAM), str(folder), how],
+        [sys.executable, str(PROGRAM), str(folder), misbehaviour],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -94,23 +95,23 @@ def driving(folder: Path, how: str) -> Iterator[Driving]:
                 stream.close()
 
 
-def assert_neutral_at_the_end(log: list[LogEntry], at_least: int = 3, over_s: float = 0.055) -> None:
-    """The last motor commands are zero current, several of them over a while, and the servo is centred."""
+def assert_neutral_at_the_end(log: list[LogEntry], min_commands: int = 3, min_duration_s: float = 0.055) -> None:
+    """The last ``min_commands`` motor commands over ``min_duration_s`` are zero current; the servo is centred."""
     motor = [e for e in log if e.name in ("current", "brake", "duty")]
-    assert any(e.value > 0.5 for e in motor), "it never drove"
-    tail: list[LogEntry] = []
+    assert any(e.value > 0.5 for e in motor), "the car never drove"
+    neutral: list[LogEntry] = []
     for entry in reversed(motor):
         if entry.value != 0.0:
             break
-        tail.append(entry)
-    assert len(tail) >= at_least, f"only {len(tail)} neutral commands at the end"
-    assert tail[0].t_s - tail[-1].t_s >= over_s
+        neutral.append(entry)
+    assert len(neutral) >= min_commands, f"only {len(neutral)} neutral commands at the end"
+    assert neutral[0].t_s - neutral[-1].t_s >= min_duration_s
     servo = [e for e in log if e.name == "servo"]
     assert servo[-1].value == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_the_episode_in_order(tmp_path: Path, number: signal.Signals) -> None:
+def test_signal_ends_the_episode_with_stop_requested(tmp_path: Path, number: signal.Signals) -> None:
     with driving(tmp_path, "well_behaved") as program:
         program.until(f"tick {BREAK_AT_TICK}")
         os.kill(program.main, number)
@@ -123,7 +124,7 @@ def test_a_signal_ends_the_episode_in_order(tmp_path: Path, number: signal.Signa
 
 
 @pytest.mark.parametrize(
-    ("how", "reason"),
+    ("misbehaviour", "reason"),
     [
         ("policy_error", "POLICY_ERROR"),
         ("nan", "BAD_COMMAND"),
@@ -133,15 +134,15 @@ def test_a_signal_ends_the_episode_in_order(tmp_path: Path, number: signal.Signa
         ("mocap_jump", "POSE_JUMP"),
     ],
 )
-def test_an_error_ends_the_episode_in_neutral_with_its_reason(tmp_path: Path, how: str, reason: str) -> None:
-    with driving(tmp_path, how) as program:
+def test_error_ends_the_episode_in_neutral_with_its_reason(tmp_path: Path, misbehaviour: str, reason: str) -> None:
+    with driving(tmp_path, misbehaviour) as program:
         assert program.end() == 4
         assert program.last_line == f"ended {reason}"
         assert_neutral_at_the_end(program.firmware_log())
         assert program.recording.metadata["end_reason"] == reason
 
 
-def test_an_unexpected_exception_stops_the_car_and_is_not_swallowed(tmp_path: Path) -> None:
+def test_unexpected_exception_stops_the_car_and_is_raised(tmp_path: Path) -> None:
     with driving(tmp_path, "mocap_error") as program:
         assert program.end() == 1
         assert program.process.stderr is not None
@@ -152,9 +153,9 @@ def test_an_unexpected_exception_stops_the_car_and_is_not_swallowed(tmp_path: Pa
         assert "TypeError" in recording.metadata["end_detail"]
 
 
-@pytest.mark.parametrize("how", ["hang_sleep", "hang_busy"])
-def test_a_hung_loop_is_stopped_from_outside(tmp_path: Path, how: str) -> None:
-    with driving(tmp_path, how) as program:
+@pytest.mark.parametrize("misbehaviour", ["hang_sleep", "hang_busy"])
+def test_hung_loop_is_stopped_by_the_loop_watch(tmp_path: Path, misbehaviour: str) -> None:
+    with driving(tmp_path, misbehaviour) as program:
         assert program.end() == 4
         assert program.last_line == "abandoned LOOP_HUNG"
         log = program.firmware_log()
@@ -166,7 +167,7 @@ def test_a_hung_loop_is_stopped_from_outside(tmp_path: Path, how: str) -> None:
         assert moving[-1].t_s - recording.times_s[-1] < 0.4
 
 
-def test_two_interrupts_do_not_wait_for_a_hung_loop(tmp_path: Path) -> None:
+def test_second_interrupt_stops_a_hung_loop_at_once(tmp_path: Path) -> None:
     with driving(tmp_path, "hang_sleep") as program:
         program.until("tick 19")
         time.sleep(0.2)
@@ -179,20 +180,20 @@ def test_two_interrupts_do_not_wait_for_a_hung_loop(tmp_path: Path) -> None:
         assert program.recording.metadata["end_reason"] == "STOP_REQUESTED"
 
 
-def test_unplugging_latches_and_the_firmware_times_out(tmp_path: Path) -> None:
+def test_unplugged_port_latches_a_fault_and_the_firmware_times_out(tmp_path: Path) -> None:
     with driving(tmp_path, "unplug") as program:
         assert program.end() == 4
         assert program.last_line == "ended ACTUATOR_FAULT"
         log = read_log(program.run / "firmware.jsonl")
-        pulled_s = next(e.t_s for e in log if e.name == "unplug")
-        # Nothing was sent to the port afterwards, by nobody: no re-arming.
-        assert not [e for e in log if e.t_s > pulled_s + 0.05 and e.name in ("current", "servo")]
+        unplugged_s = next(e.t_s for e in log if e.name == "unplug")
+        # No process sends to the port afterwards: nothing re-arms.
+        assert not [e for e in log if e.t_s > unplugged_s + 0.05 and e.name in ("current", "servo")]
         timeout = next(e for e in log if e.name == "motor_timeout")
-        assert pulled_s + 0.9 < timeout.t_s < pulled_s + 1.5
+        assert unplugged_s + 0.9 < timeout.t_s < unplugged_s + 1.5
         assert program.recording.metadata["end_reason"] == "ACTUATOR_FAULT"
 
 
-def test_killing_the_program_leaves_neutral_and_a_recoverable_recording(tmp_path: Path) -> None:
+def test_killed_program_ends_in_neutral_with_a_recoverable_recording(tmp_path: Path) -> None:
     with driving(tmp_path, "well_behaved") as program:
         program.until(f"tick {BREAK_AT_TICK}")
         os.kill(program.main, signal.SIGKILL)
@@ -206,13 +207,13 @@ def test_killing_the_program_leaves_neutral_and_a_recoverable_recording(tmp_path
         assert recovered.metadata["end_reason"] == "CRASHED"
 
 
-def test_leaving_without_a_word_leaves_neutral(tmp_path: Path) -> None:
+def test_exit_without_cleanup_ends_in_neutral(tmp_path: Path) -> None:
     with driving(tmp_path, "exit") as program:
         assert program.end() == 7
         assert_neutral_at_the_end(program.firmware_log())
 
 
-def test_killing_the_sender_brings_the_firmware_s_time_out(tmp_path: Path) -> None:
+def test_killed_sender_ends_in_the_time_out_of_the_firmware(tmp_path: Path) -> None:
     with driving(tmp_path, "well_behaved") as program:
         program.until(f"tick {BREAK_AT_TICK}")
         killed_s = time.monotonic()
@@ -221,36 +222,36 @@ def test_killing_the_sender_brings_the_firmware_s_time_out(tmp_path: Path) -> No
         assert program.last_line == "ended ACTUATOR_FAULT"
         log = program.firmware_log()
         timeouts = [e for e in log if e.name == "motor_timeout"]
-        assert timeouts, "the firmware never noticed"
+        assert timeouts, "the firmware did not time out"
         assert timeouts[0].t_s - killed_s < 2.0
         assert not [e for e in log if e.name == "current" and e.t_s > killed_s + 0.1]
         assert program.recording.metadata["end_reason"] == "ACTUATOR_FAULT"
 
 
-def test_a_sender_that_hangs_is_a_fault_and_not_a_hung_loop(tmp_path: Path) -> None:
+def test_hung_sender_ends_with_actuator_fault_and_not_with_loop_hung(tmp_path: Path) -> None:
     with driving(tmp_path, "well_behaved") as program:
         program.until(f"tick {BREAK_AT_TICK}")
         os.kill(program.sender, signal.SIGSTOP)
-        stopped_s = time.monotonic()
+        suspended_s = time.monotonic()
         assert program.end() == 4
         assert program.last_line == "ended ACTUATOR_FAULT"
         assert "sender process hangs" in program.recording.metadata["end_detail"]
         log = program.firmware_log()
         assert any(e.name == "motor_timeout" for e in log)
-        assert not [e for e in log if e.name == "current" and e.value != 0.0 and e.t_s > stopped_s + 0.1]
-    assert not is_there(program.sender)
+        assert not [e for e in log if e.name == "current" and e.value != 0.0 and e.t_s > suspended_s + 0.1]
+    assert not process_exists(program.sender)
 
 
-def test_a_world_that_dies_ends_the_episode_and_leaves_no_process(tmp_path: Path) -> None:
+def test_killed_emulator_ends_the_episode_and_leaves_no_process(tmp_path: Path) -> None:
     with driving(tmp_path, "world_dies") as program:
         assert program.end() == 4
         assert program.last_line in ("ended ACTUATOR_FAULT", "ended POSE_STALE")
         assert program.recording.ticks >= 15
-    assert not is_there(program.sender)
+    assert not process_exists(program.sender)
 
 
-def is_there(pid: int) -> bool:
-    """Whether a process is there, zombies included."""
+def process_exists(pid: int) -> bool:
+    """Whether a process exists, zombies included."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -258,18 +259,18 @@ def is_there(pid: int) -> bool:
     return True
 
 
-def test_a_stopped_program_is_braked_by_its_sender(tmp_path: Path) -> None:
+def test_suspended_program_is_stopped_by_its_sender(tmp_path: Path) -> None:
     with driving(tmp_path, "well_behaved") as program:
         program.until(f"tick {BREAK_AT_TICK}")
         os.kill(program.main, signal.SIGSTOP)
-        stopped_s = time.monotonic()
+        suspended_s = time.monotonic()
         time.sleep(1.0)
         log = read_log(program.run / "firmware.jsonl")
         os.kill(program.main, signal.SIGCONT)
         moving = [e for e in log if e.name == "current" and e.value != 0.0]
-        assert moving[-1].t_s < stopped_s + 0.4
-        # What was latched while it stood still stays latched when it goes on.
+        assert moving[-1].t_s < suspended_s + 0.4
+        # A fault that was latched during the suspension stays latched afterwards.
         assert program.end() == 4
-        later = [e for e in program.firmware_log() if e.name == "current" and e.value != 0.0]
-        assert later[-1].t_s < stopped_s + 0.4
+        moving_afterwards = [e for e in program.firmware_log() if e.name == "current" and e.value != 0.0]
+        assert moving_afterwards[-1].t_s < suspended_s + 0.4
         assert program.recording.metadata["end_reason"] in ("ACTUATOR_FAULT", "POSE_STALE", "LOOP_HUNG")
