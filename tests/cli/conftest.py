@@ -1,4 +1,4 @@
-"""Runs a command line in this process."""
+"""Fixture that runs a command line in this process."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from carlab.cli import run
 
 @pytest.fixture
 def carlab(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
-    """A call of ``carlab``: its exit code and what it printed, on one line."""
+    """Call ``carlab``; returns its exit code and its output on one line."""
 
     def call(*argv: object) -> tuple[int, str]:
         try:

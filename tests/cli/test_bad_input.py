@@ -1,4 +1,4 @@
-"""Bad input gets one clear sentence with the next step and a non-zero exit; never a traceback."""
+"""Invalid input is refused with one sentence, the next step and a non-zero exit code; never with a traceback."""
 
 import math
 import socket
@@ -46,7 +46,7 @@ def car_file(folder: Path, port: str = "/dev/carlab-nowhere", command_port: int 
 
 
 def canonical_csv(folder: Path, rows: int = 300) -> tuple[Path, np.ndarray]:
-    """A circle driven at 1 m/s, exactly."""
+    """Path of a CSV and an exact circle at 1 m/s, shape (rows, 9)."""
     t = np.arange(rows) / 30.0
     yaw = 0.8 * t
     columns = [t, np.sin(yaw) / 0.8, (1 - np.cos(yaw)) / 0.8, (yaw + math.pi) % (2 * math.pi) - math.pi]
@@ -60,10 +60,10 @@ def write(path: Path, data: np.ndarray, header: str = "t,x,y,yaw,vx,vy,yaw_rate,
     return path
 
 
-def test_a_wrong_port_and_a_silent_camera_system_are_told_together(carlab: Carlab, tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as nobody:
-        nobody.bind(("127.0.0.1", 0))
-        path = car_file(tmp_path, command_port=nobody.getsockname()[1])
+def test_wrong_port_and_silent_mocap_server_are_reported_together(carlab: Carlab, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent_server:
+        silent_server.bind(("127.0.0.1", 0))
+        path = car_file(tmp_path, command_port=silent_server.getsockname()[1])
         code, text = carlab("check", "--car", path)
     assert code == 3
     assert "/dev/carlab-nowhere" in text
@@ -72,35 +72,35 @@ def test_a_wrong_port_and_a_silent_camera_system_are_told_together(carlab: Carla
     assert "Motive" in text
 
 
-def test_an_unknown_body_is_answered_with_those_there_are(carlab: Carlab, tmp_path: Path, world: World) -> None:
+def test_unknown_rigid_body_is_refused_with_the_available_ones(carlab: Carlab, tmp_path: Path, world: World) -> None:
     with world:
-        there = world.addresses
-        path = car_file(tmp_path, there["port"], there["command_port"], 'body = "truck"')
+        addresses = world.addresses
+        path = car_file(tmp_path, addresses["port"], addresses["command_port"], 'body = "truck"')
         code, text = carlab("check", "--car", path)
         assert code == 3
         assert "truck" in text
         assert "car" in text.split("truck")[1]
-        path = car_file(tmp_path, there["port"], there["command_port"], "body_id = 77")
+        path = car_file(tmp_path, addresses["port"], addresses["command_port"], "body_id = 77")
         code, text = carlab("listen", "--car", path, "--seconds", "0.2")
         assert code == 3
         assert "77" in text
 
 
-def test_frames_of_another_version_are_named(carlab: Carlab, tmp_path: Path, world: World) -> None:
+def test_frames_of_another_natnet_version_are_refused(carlab: Carlab, tmp_path: Path, world: World) -> None:
     world.server.faults = ServerFaults(frame_version=BitstreamVersion(3, 0))
     with world:
-        there = world.addresses
-        path = car_file(tmp_path, there["port"], there["command_port"])
+        addresses = world.addresses
+        path = car_file(tmp_path, addresses["port"], addresses["command_port"])
         code, text = carlab("listen", "--car", path, "--seconds", "0.3")
     assert code == 3
     assert "4.1" in text
 
 
-def test_garbage_and_half_frames_between_good_ones_only_count(carlab: Carlab, tmp_path: Path, world: World) -> None:
+def test_malformed_frames_are_counted_and_ignored(carlab: Carlab, tmp_path: Path, world: World) -> None:
     world.server.faults = ServerFaults(garbage=0.3, truncation=0.3)
     with world:
-        there = world.addresses
-        path = car_file(tmp_path, there["port"], there["command_port"])
+        addresses = world.addresses
+        path = car_file(tmp_path, addresses["port"], addresses["command_port"])
         code, text = carlab("listen", "--car", path, "--seconds", "0.8")
     assert code == 0
     assert "malformed" in text
@@ -117,7 +117,9 @@ def test_garbage_and_half_frames_between_good_ones_only_count(carlab: Carlab, tm
         ("this is no toml\n", ["TOML"]),
     ],
 )
-def test_a_wrong_car_file_names_the_key(carlab: Carlab, tmp_path: Path, table: str, words: list[str]) -> None:
+def test_invalid_car_file_is_refused_with_the_name_of_the_key(
+    carlab: Carlab, tmp_path: Path, table: str, words: list[str]
+) -> None:
     path = tmp_path / "wrong.toml"
     path.write_text(table, encoding="utf-8")
     code, text = carlab("drive", "--car", path, "--out", tmp_path / "runs")
@@ -127,7 +129,7 @@ def test_a_wrong_car_file_names_the_key(carlab: Carlab, tmp_path: Path, table: s
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_car_that_does_not_exist(carlab: Carlab, tmp_path: Path) -> None:
+def test_unknown_car_is_refused(carlab: Carlab, tmp_path: Path) -> None:
     code, text = carlab("drive", "--car", "emulatd", "--out", tmp_path)
     assert code == 2
     assert "emulated" in text
@@ -152,7 +154,7 @@ def damaged(kind: str, data: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "words", "remedy"),
+    ("kind", "words", "option"),
     [
         ("gap", ["gap"], ["--gaps", "split"]),
         ("nan", ["51"], ["--missing", "drop"]),
@@ -161,8 +163,8 @@ def damaged(kind: str, data: np.ndarray) -> tuple[np.ndarray, str]:
         ("column", ["yaw"], None),
     ],
 )
-def test_a_damaged_csv_is_refused_in_a_sentence_whose_remedy_works(
-    carlab: Carlab, tmp_path: Path, kind: str, words: list[str], remedy: list[str] | None
+def test_damaged_csv_is_refused_with_an_option_that_repairs_it(
+    carlab: Carlab, tmp_path: Path, kind: str, words: list[str], option: list[str] | None
 ) -> None:
     path, data = canonical_csv(tmp_path)
     write(path, *damaged(kind, data))
@@ -172,34 +174,34 @@ def test_a_damaged_csv_is_refused_in_a_sentence_whose_remedy_works(
     for word in words:
         assert word in text
     assert not list(tmp_path.glob("*.mcap*"))
-    if remedy is not None:
-        assert " ".join(remedy) in text
-        code, text = carlab("import", path, "--out", out, *remedy)
+    if option is not None:
+        assert " ".join(option) in text
+        code, text = carlab("import", path, "--out", out, *option)
         assert code == 0, text
         assert list(tmp_path.glob("*.mcap"))
 
 
-def test_an_mcap_cut_short_is_recovered_and_one_of_nothing_refused(carlab: Carlab, tmp_path: Path) -> None:
+def test_truncated_mcap_is_recovered_and_mcap_without_ticks_is_refused(carlab: Carlab, tmp_path: Path) -> None:
     path, data = canonical_csv(tmp_path)
-    whole = tmp_path / "drive.mcap"
-    assert carlab("import", write(path, data), "--out", whole)[0] == 0
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    code, text = carlab("export", cut, "--out", tmp_path / "cut.csv")
+    complete = tmp_path / "drive.mcap"
+    assert carlab("import", write(path, data), "--out", complete)[0] == 0
+    truncated = tmp_path / "truncated.mcap"
+    truncated.write_bytes(complete.read_bytes()[: complete.stat().st_size // 2])
+    code, text = carlab("export", truncated, "--out", tmp_path / "cut.csv")
     assert code == 0
     assert "recovered" in text
     rows = np.genfromtxt(tmp_path / "cut.csv", delimiter=",", names=True)
     assert 20 < len(rows) < len(data)
     np.testing.assert_allclose(rows["x"], data[: len(rows), 1], atol=1e-12)
-    for content in (b"", b"\x89MCAP0\r\n", b"t,x,y\n1,2,3\n", whole.read_bytes()[:300]):
-        cut.write_bytes(content)
-        code, text = carlab("view", cut, "--save", tmp_path / "cut.rrd")
+    for content in (b"", b"\x89MCAP0\r\n", b"t,x,y\n1,2,3\n", complete.read_bytes()[:300]):
+        truncated.write_bytes(content)
+        code, text = carlab("view", truncated, "--save", tmp_path / "cut.rrd")
         assert code == 1
-        assert "cut.mcap" in text
+        assert "truncated.mcap" in text
         assert not (tmp_path / "cut.rrd").exists()
 
 
-def test_nothing_is_overwritten(carlab: Carlab, tmp_path: Path) -> None:
+def test_import_does_not_overwrite_a_recording(carlab: Carlab, tmp_path: Path) -> None:
     path, data = canonical_csv(tmp_path)
     out = tmp_path / "drive.mcap"
     assert carlab("import", write(path, data), "--out", out)[0] == 0
@@ -210,7 +212,7 @@ def test_nothing_is_overwritten(carlab: Carlab, tmp_path: Path) -> None:
     assert out.read_bytes() == before
 
 
-def test_usage_errors_suggest(carlab: Carlab) -> None:
+def test_misspelt_option_is_refused_with_a_suggestion(carlab: Carlab) -> None:
     code, text = carlab("drive", "--epsodes", "3")
     assert code == 2
     assert "--episodes" in text
@@ -236,7 +238,7 @@ def test_usage_errors_suggest(carlab: Carlab) -> None:
         ("replay drive.csv --save drive.png", [".rrd"]),
     ],
 )
-def test_an_impossible_option_is_refused_before_anything_happens(
+def test_invalid_option_is_refused_before_a_file_is_written(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, words: list[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -248,7 +250,7 @@ def test_an_impossible_option_is_refused_before_anything_happens(
     assert [entry.name for entry in tmp_path.iterdir()] == ["drive.csv"]
 
 
-def test_a_second_emulator_leaves_the_port_of_the_first_alone(carlab: Carlab, tmp_path: Path) -> None:
+def test_second_emulator_does_not_take_the_port_of_the_first(carlab: Carlab, tmp_path: Path) -> None:
     link = tmp_path / "carlab-vesc"
     config = WorldConfig(simulator=SimulatorConfig().to_tables(), serial_link=str(link))
     with World(config):
@@ -260,7 +262,7 @@ def test_a_second_emulator_leaves_the_port_of_the_first_alone(carlab: Carlab, tm
         assert terminal.exists()
 
 
-def test_driving_without_a_folder_to_write_to(carlab: Carlab, tmp_path: Path) -> None:
+def test_drive_is_refused_if_its_folder_cannot_be_created(carlab: Carlab, tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     start_s = MonotonicClock().now_s()

@@ -1,4 +1,4 @@
-"""Options of ``carlab bench`` that would not be heard are refused; those that count are not."""
+"""Options of ``carlab bench`` without effect in a study are refused; the others are accepted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GIVEN = {
     "data": Path("folder"), "car": Path("mine.toml"), "history": 0, "diagnosed": Path("model.toml"), "pair": 2,
     "recorded_s": (40.0, 20.0), "runs": Path("others"), "episodes": 3, "updates": 50, "steps": 70,
 }  # fmt: skip
-HEARD = {
+ACCEPTED = {
     ("speed", ()): {"seconds"},
     ("regression", ()): {"case", "rows", "seeds", "methods", "way", "data", "steps"},
     ("regression", (("case", "realcar"),)): {
@@ -33,25 +33,27 @@ HEARD = {
 }  # fmt: skip
 
 
-def test_every_option_has_its_place() -> None:
+def test_every_option_is_assigned_to_studies() -> None:
     names = {option.name for option in fields(Bench)}
     assert names == EVERYWHERE | set(PLACES)
     assert not EVERYWHERE & set(PLACES)
-    usual = Bench()
+    defaults = Bench()
     for name, value in GIVEN.items():
-        assert value != getattr(usual, name), name
+        assert value != getattr(defaults, name), name
 
 
-@pytest.mark.parametrize(("what", "others"), HEARD)
+@pytest.mark.parametrize(("study", "other_options"), ACCEPTED)
 @pytest.mark.parametrize("name", GIVEN)
-def test_an_option_is_heard_or_refused(what: str, others: tuple[tuple[str, object], ...], name: str) -> None:
-    given = Bench(what, **({name: GIVEN[name]} | dict(others)))  # type: ignore[arg-type]
-    if name in HEARD[what, others]:
-        check_options(given)
+def test_option_is_accepted_or_refused_as_listed(
+    study: str, other_options: tuple[tuple[str, object], ...], name: str
+) -> None:
+    command = Bench(study, **({name: GIVEN[name]} | dict(other_options)))  # type: ignore[arg-type]
+    if name in ACCEPTED[study, other_options]:
+        check_options(command)
     else:
-        option = f"--{name.replace('_', '-')} has no effect in 'bench {what}"
+        option = f"--{name.replace('_', '-')} has no effect in 'bench {study}"
         with pytest.raises(ConfigError, match=rf"^{option}.*'; use it with 'bench .*'.*\.$"):
-            check_options(given)
+            check_options(command)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +74,7 @@ def test_an_option_is_heard_or_refused(what: str, others: tuple[tuple[str, objec
         ("parking --way authors", "--way has no effect in 'bench parking'; use it with 'bench regression'."),
     ],
 )
-def test_it_is_told_where_the_option_counts(
+def test_refusal_names_the_studies_in_which_the_option_has_an_effect(
     options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -85,7 +87,7 @@ def test_it_is_told_where_the_option_counts(
     "command",
     [found[0] or found[1] for found in re.findall(r"^\$ (carlab bench .*)$|`(carlab bench [^`]*)`", README, re.M)],
 )
-def test_what_the_readme_types_is_heard(command: str) -> None:
-    made = tyro.extras.subcommand_cli_from_dict(_verbs(), args=shlex.split(command)[1:], prog="carlab")
-    assert isinstance(made, Bench)
-    check_options(made)
+def test_commands_of_the_readme_are_accepted(command: str) -> None:
+    parsed = tyro.extras.subcommand_cli_from_dict(_verbs(), args=shlex.split(command)[1:], prog="carlab")
+    assert isinstance(parsed, Bench)
+    check_options(parsed)

@@ -1,4 +1,4 @@
-"""What ``carlab bench`` keeps of a study: every figure as soon as it is measured, whatever fails later."""
+"""Files of ``carlab bench``: each score is saved as soon as it is measured, whatever fails later."""
 
 from __future__ import annotations
 
@@ -24,158 +24,161 @@ from carlab.studies.regression.study import run_study
 from learning.evaluation import Mixture
 
 Carlab = Callable[..., tuple[int, str]]
-FEW = ("bench", "regression", "--case", "pendulum", "--rows", 5, "--methods", "ridge", "SysID")
+SMALL = ("bench", "regression", "--case", "pendulum", "--rows", 5, "--methods", "ridge", "SysID")
 RIDGE = METHODS["ridge"]
 
 
-def strict(path: Path) -> dict[str, Any]:
-    """The content of a file, which is JSON for every reader: NaN is none of it."""
+def read_strict_json(path: Path) -> dict[str, Any]:
+    """Content of a JSON file; fails on NaN, which the JSON standard does not have."""
 
-    def refused(word: str) -> None:
-        pytest.fail(f"{word} is no JSON")
+    def fail(constant: str) -> None:
+        pytest.fail(f"{constant} is not JSON")
 
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"), parse_constant=refused)
-    return found
-
-
-def stand_in(monkeypatch: pytest.MonkeyPatch, instead: Callable[[Any], Any]) -> None:
-    monkeypatch.setitem(METHODS, "SysID", instead)
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"), parse_constant=fail)
+    return content
 
 
-def test_a_failed_fit_is_reported_and_the_study_goes_on(
+def replace_sysid(monkeypatch: pytest.MonkeyPatch, method: Callable[[Any], Any]) -> None:
+    monkeypatch.setitem(METHODS, "SysID", method)
+
+
+def test_failed_fit_is_reported_and_the_study_continues(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def sometimes(task: Any) -> Any:
+    def fails_for_seed_1(task: Any) -> Any:
         if task.seed == 1:
             raise DataError("The simulator gives no finite outputs for this data; check the car file and the rows.")
         return RIDGE(task)
 
-    stand_in(monkeypatch, sometimes)
+    replace_sysid(monkeypatch, fails_for_seed_1)
     out = tmp_path / "study.json"
-    code, text = carlab(*FEW, "--seeds", 3, "--out", out)
+    code, text = carlab(*SMALL, "--seeds", 3, "--out", out)
     assert code == 1
     assert "SysID, 5 rows, seed 1 failed: The simulator gives no finite outputs for this data" in text
     assert "SysID, 1 of 3 failed" in text
-    figures = strict(out)
+    figures = read_strict_json(out)
     assert [(s["method"], s["seed"], s["failed"] is None) for s in figures["scores"]] == [
         ("ridge", 0, True), ("SysID", 0, True), ("ridge", 1, True), ("SysID", 1, False), ("ridge", 2, True),
         ("SysID", 2, True),
     ]  # fmt: skip
     assert figures["scores"][3]["nll"] is None
-    ridge, identified = figures["rows"]
-    assert (ridge["seeds"], ridge["failed"], identified["seeds"], identified["failed"]) == (3, 0, 2, 1)
-    own = [figures["scores"][k]["nll"] for k in (1, 5)]
-    assert identified["nll"] == pytest.approx(np.mean(own))
-    assert identified["nll_standard_error"] == pytest.approx(np.std(own, ddof=1) / math.sqrt(2.0))
+    ridge, sysid = figures["rows"]
+    assert (ridge["seeds"], ridge["failed"], sysid["seeds"], sysid["failed"]) == (3, 0, 2, 1)
+    sysid_nlls = [figures["scores"][k]["nll"] for k in (1, 5)]
+    assert sysid["nll"] == pytest.approx(np.mean(sysid_nlls))
+    assert sysid["nll_standard_error"] == pytest.approx(np.std(sysid_nlls, ddof=1) / math.sqrt(2.0))
     assert out.with_suffix(".png").stat().st_size > 10_000
 
 
-def test_where_every_fit_fails_the_row_says_so(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def never(task: Any) -> Any:
-        raise DataError("There is nothing to be identified.")
+def test_row_reports_that_every_fit_failed(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def always_fails(task: Any) -> Any:
+        raise DataError("The parameters cannot be identified.")
 
-    stand_in(monkeypatch, never)
+    replace_sysid(monkeypatch, always_fails)
     out = tmp_path / "study.json"
-    code, text = carlab(*FEW[:-2], "SysID", "--seeds", 2, "--out", out)
+    code, text = carlab(*SMALL[:-2], "SysID", "--seeds", 2, "--out", out)
     assert code == 1
     assert "SysID, 2 of 2 failed" in text
-    (row,) = strict(out)["rows"]
+    (row,) = read_strict_json(out)["rows"]
     assert (row["seeds"], row["failed"], row["nll"], row["seconds_standard_error"]) == (0, 2, None, None)
     assert not out.with_suffix(".png").exists()
 
 
-def cholesky(task: Any) -> Any:
+def failing_cholesky(task: Any) -> Any:
     return torch.linalg.cholesky(-torch.eye(3))
 
 
-def numpys(task: Any) -> Any:
+def singular_inverse(task: Any) -> Any:
     return np.linalg.inv(np.zeros((2, 2)))
 
 
-def on_a_device(task: Any) -> Any:
+def failing_cusolver(task: Any) -> Any:
     raise RuntimeError("cusolver error: CUSOLVER_STATUS_EXECUTION_FAILED, when calling `cusolverDnSpotrf`\nmore of it")
 
 
-def blind(task: Any) -> Any:
-    class Nothing:
+def predicts_nan(task: Any) -> Any:
+    class NanModel:
         def predict(self, inputs: torch.Tensor) -> Mixture:
-            nowhere = torch.full((1, len(inputs), 3), math.nan)
-            return Mixture(nowhere, torch.ones(1, 1, 3))
+            nan_mean = torch.full((1, len(inputs), 3), math.nan)
+            return Mixture(nan_mean, torch.ones(1, 1, 3))
 
-    return Nothing()
+    return NanModel()
 
 
 @pytest.mark.parametrize(
-    ("instead", "words"),
-    [(cholesky, "linalg.cholesky"), (numpys, "Singular matrix"), (on_a_device, "cusolver error"), (blind, "finite")],
+    ("method", "words"),
+    [
+        (failing_cholesky, "linalg.cholesky"),
+        (singular_inverse, "Singular matrix"),
+        (failing_cusolver, "cusolver error"),
+        (predicts_nan, "finite"),
+    ],
 )
-def test_matrices_that_cannot_be_factored_fail_one_fit(
-    monkeypatch: pytest.MonkeyPatch, instead: Callable[[Any], Any], words: str
+def test_numerical_error_fails_only_its_own_fit(
+    monkeypatch: pytest.MonkeyPatch, method: Callable[[Any], Any], words: str
 ) -> None:
-    stand_in(monkeypatch, instead)
-    broken, whole = run_study("pendulum", rows=(5,), seeds=1, methods=("SysID", "ridge"))
-    assert words in str(broken.failed)
-    assert "\n" not in str(broken.failed)
-    assert math.isnan(broken.nll)
-    assert whole.failed is None
-    assert math.isfinite(whole.nll)
+    replace_sysid(monkeypatch, method)
+    sysid, ridge = run_study("pendulum", rows=(5,), seeds=1, methods=("SysID", "ridge"))
+    assert words in str(sysid.failed)
+    assert "\n" not in str(sysid.failed)
+    assert math.isnan(sysid.nll)
+    assert ridge.failed is None
+    assert math.isfinite(ridge.nll)
 
 
-def test_an_error_of_the_program_ends_the_study_and_keeps_what_was_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def wrong(task: Any) -> Any:
+def test_programming_error_ends_the_study_and_keeps_the_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def shape_error(task: Any) -> Any:
         return torch.ones(2) @ torch.ones(3)
 
-    stand_in(monkeypatch, wrong)
+    replace_sysid(monkeypatch, shape_error)
     out = tmp_path / "study.json"
     with pytest.raises(RuntimeError, match="size"):
-        run([str(word) for word in (*FEW, "--seeds", 1, "--out", out)])
-    assert [s["method"] for s in strict(out)["scores"]] == ["ridge"]
+        run([str(word) for word in (*SMALL, "--seeds", 1, "--out", out)])
+    assert [s["method"] for s in read_strict_json(out)["scores"]] == ["ridge"]
 
 
-def test_the_file_holds_all_scores_so_far_while_the_next_one_is_fitted(
+def test_file_holds_all_earlier_scores_during_a_fit(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, seen = tmp_path / "study.json", []
+    out, saved_scores = tmp_path / "study.json", []
 
-    def watched(task: Any) -> Any:
-        seen.append([(s["method"], s["seed"]) for s in strict(out)["scores"]])
+    def read_file_and_fit(task: Any) -> Any:
+        saved_scores.append([(s["method"], s["seed"]) for s in read_strict_json(out)["scores"]])
         if task.seed == 1:
             signal.raise_signal(signal.SIGINT)
         return RIDGE(task)
 
-    stand_in(monkeypatch, watched)
-    code, text = carlab(*FEW, "--seeds", 5, "--out", out)
+    replace_sysid(monkeypatch, read_file_and_fit)
+    code, text = carlab(*SMALL, "--seeds", 5, "--out", out)
     assert code == 130
     assert "interrupted" in text
-    assert seen == [[("ridge", 0)], [("ridge", 0), ("SysID", 0), ("ridge", 1)]]
-    assert len(strict(out)["scores"]) == 4
+    assert saved_scores == [[("ridge", 0)], [("ridge", 0), ("SysID", 0), ("ridge", 1)]]
+    assert len(read_strict_json(out)["scores"]) == 4
     assert out.with_suffix(".png").is_file()
 
 
-def test_a_file_is_written_whole_or_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_is_unchanged_if_it_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "study.json"
     write_figures(out, {"scores": [1]})
-    assert strict(out) == {"scores": [1]}
+    assert read_strict_json(out) == {"scores": [1]}
 
-    def full(number: int) -> None:
+    def fail_with_full_disk(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("os.fsync", full)
+    monkeypatch.setattr("os.fsync", fail_with_full_disk)
     with pytest.raises(DataError, match=r"study\.json could not be written because the disk is full"):
         write_figures(out, {"scores": [1, 2]})
-    assert strict(out) == {"scores": [1]}
+    assert read_strict_json(out) == {"scores": [1]}
     assert [path.name for path in tmp_path.iterdir()] == ["study.json"]
 
 
-def test_standard_errors_are_of_every_figure() -> None:
+def test_every_figure_has_its_standard_error() -> None:
     values = np.array([[1.0, 0.5, 0.02, 3.0], [4.0, 0.7, 0.05, 9.0], [5.0, 0.1, 0.01, 1.0]])
     scores = [Score("1d", "ridge", 5, k, *map(float, values[k])) for k in range(3)]
     (row,) = summarised(scores)
     for k, name in enumerate(FIGURES):
         assert getattr(row, name) == pytest.approx(values[:, k].mean())
-        spread = values[:, k].std(ddof=1) / math.sqrt(3.0)
-        assert getattr(row, f"{name}_standard_error") == pytest.approx(spread)
+        expected = values[:, k].std(ddof=1) / math.sqrt(3.0)
+        assert getattr(row, f"{name}_standard_error") == pytest.approx(expected)
     figures: Any = as_json(scores[:1], "carlab bench regression")
     assert figures["rows"][0]["rmse_standard_error"] is None, "a single fit has no standard error"

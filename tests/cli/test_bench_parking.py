@@ -1,4 +1,4 @@
-"""``carlab bench parking`` from the command line: what it drives, takes up, writes and refuses."""
+"""``carlab bench parking`` from the command line: driving, resuming, output and refusals."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def test_two_methods_are_driven_resumed_and_compared(tmp_path: Path, capsys: pyt
     out, runs = tmp_path / "parking.json", tmp_path / "runs"
     arguments = ["bench", "parking", *SMALL, "--runs", str(runs), "--out", str(out)]
     assert run([*arguments, "--episodes", "1"]) == 0
-    first = {p.name: (p / "models" / "0001" / "dynamics.pt").stat().st_mtime_ns for p in runs.iterdir()}
-    assert len(first) == 2
+    first_mtimes = {p.name: (p / "models" / "0001" / "dynamics.pt").stat().st_mtime_ns for p in runs.iterdir()}
+    assert len(first_mtimes) == 2
     study = json.loads(out.read_text())
     assert [(r["method"], r["seeds"], r["episodes"]) for r in study["methods"]] == [
         ("sim-fsvgd", 1, 1),
@@ -26,20 +26,20 @@ def test_two_methods_are_driven_resumed_and_compared(tmp_path: Path, capsys: pyt
     assert study["command"].startswith("carlab")
     assert out.with_suffix(".png").stat().st_size > 10_000
     capsys.readouterr()
-    assert run([*arguments, "--episodes", "1"]) == 0, "nothing is left to do"
-    again = {p.name: (p / "models" / "0001" / "dynamics.pt").stat().st_mtime_ns for p in runs.iterdir()}
-    assert again == first
-    assert "never" in capsys.readouterr().out, "forty gradient steps park nothing"
+    assert run([*arguments, "--episodes", "1"]) == 0, "the study is complete"
+    second_mtimes = {p.name: (p / "models" / "0001" / "dynamics.pt").stat().st_mtime_ns for p in runs.iterdir()}
+    assert second_mtimes == first_mtimes
+    assert "never" in capsys.readouterr().out, "40 updates do not suffice to park"
     before = out.read_bytes()
-    others = ["bench", "parking", *SMALL[:3], "--seeds", "1", "--runs", str(runs), "--out", str(out)]
-    assert run([*others, "--updates", "40", "--steps", "60"]) == 2
+    changed = ["bench", "parking", *SMALL[:3], "--seeds", "1", "--runs", str(runs), "--out", str(out)]
+    assert run([*changed, "--updates", "40", "--steps", "60"]) == 2
     assert "was started with --steps 50" in " ".join(capsys.readouterr().err.split())
-    assert run([*others, "--steps", "50"]) == 2
+    assert run([*changed, "--steps", "50"]) == 2
     assert "was started with --updates 40" in " ".join(capsys.readouterr().err.split())
     assert out.read_bytes() == before
 
 
-def test_an_unknown_method_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_method_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["bench", "parking", "--methods", "ridge", "--runs", str(tmp_path / "runs")]) == 2
     assert "There is no method 'ridge'" in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()

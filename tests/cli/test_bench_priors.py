@@ -1,4 +1,4 @@
-"""``carlab bench priors`` as it is called."""
+"""``carlab bench priors`` from the command line."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAR = SimulatorConfig.from_preset()
 
 
 def record(path: Path, seed: int, ticks: int = 180) -> None:
-    """A drive of the plain simulator as CSV."""
+    """Record a drive of the simulated car without extra effects as CSV."""
     rng = np.random.default_rng(seed)
     plant, period, rows = Plant(CAR), CAR.control_period_s, []
     plant.reset(CarState(0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 0.0)
@@ -56,7 +56,7 @@ def model(tmp_path: Path) -> Path:
     return path
 
 
-def test_recordings_are_learned_under_four_priors(carlab: Carlab, folder: Path, model: Path, tmp_path: Path) -> None:
+def test_recordings_are_learned_with_four_priors(carlab: Carlab, folder: Path, model: Path, tmp_path: Path) -> None:
     out = tmp_path / "study.json"
     arguments = ("--rows", 20, "--seeds", 1, "--history", 3, "--steps", 30, "--out", out)
     code, text = carlab("bench", "priors", "--data", folder, "--car", "rc_car", "--diagnosed", model, *arguments)
@@ -72,7 +72,7 @@ def test_recordings_are_learned_under_four_priors(carlab: Carlab, folder: Path, 
 
 
 @pytest.mark.slow
-def test_two_effects_are_concealed_diagnosed_and_learned_with(carlab: Carlab, tmp_path: Path) -> None:
+def test_two_concealed_effects_are_diagnosed_and_used_as_a_prior(carlab: Carlab, tmp_path: Path) -> None:
     out = tmp_path / "study.json"
     arguments = ("--recorded-s", 40, 20, "--rows", 20, "--seeds", 1, "--history", 4, "--steps", 30, "--out", out)
     code, text = carlab("bench", "priors", *arguments)
@@ -86,29 +86,29 @@ def test_two_effects_are_concealed_diagnosed_and_learned_with(carlab: Carlab, tm
     assert len(json.loads(out.read_text())["scores"]) == 4
 
 
-def test_what_cannot_be_studied_is_said(carlab: Carlab, folder: Path, model: Path, tmp_path: Path) -> None:
-    def said(*arguments: object) -> str:
+def test_invalid_studies_are_reported(carlab: Carlab, folder: Path, model: Path, tmp_path: Path) -> None:
+    def error_of(*arguments: object) -> str:
         code, text = carlab("bench", "priors", *arguments)
         assert code == 2
         return text
 
-    assert "is not a folder" in said("--data", tmp_path / "none")
-    assert "no pair 7; choose 1 to 3" in said("--pair", 7)
-    assert "--rows 0: give a number above zero" in said("--rows", 0)
-    given = ("--data", folder, "--car", "rc_car", "--diagnosed")
-    assert "none.toml" in said(*given, tmp_path / "none.toml")
-    used = [
+    assert "is not a folder" in error_of("--data", tmp_path / "none")
+    assert "no pair 7; choose 1 to 3" in error_of("--pair", 7)
+    assert "--rows 0: give a number above zero" in error_of("--rows", 0)
+    options = ("--data", folder, "--car", "rc_car", "--diagnosed")
+    assert "none.toml" in error_of(*options, tmp_path / "none.toml")
+    recordings = [
         {"path": "2.csv", "sha256": hashlib.sha256((folder / "2.csv").read_bytes()).hexdigest(), "role": "held out"}
     ]
-    (model.parent / "report.json").write_text(json.dumps({"recordings": used}))
-    assert "was diagnosed with 2.csv, which is held out here" in said(*given, model)
+    (model.parent / "report.json").write_text(json.dumps({"recordings": recordings}))
+    assert "was diagnosed with 2.csv, which is held out here" in error_of(*options, model)
     (model.parent / "report.json").write_text(json.dumps({"recordings": []}))
     slow = tmp_path / "slow.toml"
     slow.write_text(tomli_w.dumps(replace(CAR, control_period_s=0.05).to_tables()))
-    assert "control_period of the prior is 0.05 s, that of a recording is 0.033" in said(
+    assert "control_period of the prior is 0.05 s, that of a recording is 0.033" in error_of(
         "--data", folder, "--car", slow, "--diagnosed", model
     )
-    assert "prior is 0.05 s, that of the car's file is 0.033" in said(*given, slow, "--history", 3)
+    assert "prior is 0.05 s, that of the car's file is 0.033" in error_of(*options, slow, "--history", 3)
     (folder / "2.csv").unlink()
     code, text = carlab("bench", "priors", "--data", folder)
     assert code == 1

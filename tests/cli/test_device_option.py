@@ -1,4 +1,4 @@
-"""``--device``: refused in a sentence where there is no such device, and kept beside the figures."""
+"""``--device``: refused in one sentence if the device does not exist, and written to the figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Carlab = Callable[..., tuple[int, str]]
 
 
 @pytest.mark.parametrize("verb", [("learn",), ("bench", "speed"), ("bench", "regression")])
-def test_cuda_that_is_not_there_is_refused(
+def test_missing_cuda_device_is_refused(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: tuple[str, ...]
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
@@ -29,23 +29,23 @@ def test_cuda_that_is_not_there_is_refused(
     assert "invalid choice 'abacus'" in text
 
 
-@pytest.mark.parametrize(("options", "told"), [((), "cpu"), (("--device", "cuda"), "cuda: Imaginary 9000")])
-def test_figures_tell_their_device(
-    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], told: str
+@pytest.mark.parametrize(("options", "device_text"), [((), "cpu"), (("--device", "cuda"), "cuda: Imaginary 9000")])
+def test_figures_name_their_device(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], device_text: str
 ) -> None:
-    asked: list[str] = []
-    study = run_study
+    requested: list[str] = []
+    run_on_cpu = run_study
 
-    def here(case: str, *, device: str, **others: object) -> object:
-        asked.append(device)
-        return study(case, **others)
+    def log_device_and_run(case: str, *, device: str, **others: object) -> object:
+        requested.append(device)
+        return run_on_cpu(case, **others)
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Imaginary 9000")
-    monkeypatch.setattr("carlab.studies.regression.study.run_study", here)
+    monkeypatch.setattr("carlab.studies.regression.study.run_study", log_device_and_run)
     out = tmp_path / "study.json"
-    few = ("--case", "pendulum", "--rows", 5, "--seeds", 1, "--methods", "ridge")
-    code, _ = carlab("bench", "regression", *few, "--out", out, *options)
+    small = ("--case", "pendulum", "--rows", 5, "--seeds", 1, "--methods", "ridge")
+    code, _ = carlab("bench", "regression", *small, "--out", out, *options)
     assert code == 0
-    assert json.loads(out.read_text())["device"] == told
-    assert asked == [told.split(":")[0]]
+    assert json.loads(out.read_text())["device"] == device_text
+    assert requested == [device_text.split(":")[0]]

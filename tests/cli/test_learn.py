@@ -1,4 +1,4 @@
-"""``carlab learn`` as it is called: what it refuses, what it prints, and resuming a run."""
+"""``carlab learn`` from the command line: refusals, output and resuming a run."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ TICKS = 20
 TINY = ("--ticks", TICKS, "--model-steps", 40, "--updates", 32, "--history", 1, "--no-rerun")
 
 
-def said_by(*argv: object) -> tuple[int, str]:
-    """Exit code of a command line that is right, and what it printed, on one line."""
+def run_command(*argv: object) -> tuple[int, str]:
+    """Exit code of a valid command line, and its output on one line."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         code = run([str(a) for a in argv])
@@ -40,7 +40,7 @@ def said_by(*argv: object) -> tuple[int, str]:
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread() -> Any:
-    """A second thread of torch costs more than it gives where others compute as well."""
+    """Train with one thread of torch: more threads are slower if other processes compute."""
     plan = learning._plan
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learning, "_plan", lambda request, choice: replace(plan(request, choice), threads=1))
@@ -49,21 +49,21 @@ def one_thread() -> Any:
 
 @pytest.fixture(scope="module")
 def learned(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Path]:
-    """A whole run of two episodes: exit code, what it printed, its folder."""
+    """A complete run of two episodes: exit code, output and folder."""
     out = tmp_path_factory.mktemp("runs")
-    code, text = said_by("learn", "--car", "sim", "--episodes", 2, "--out", out, *TINY)
+    code, text = run_command("learn", "--car", "sim", "--episodes", 2, "--out", out, *TINY)
     (folder,) = out.iterdir()
     return code, text, folder
 
 
 @pytest.fixture(scope="module")
-def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Path]:
-    """The same run with three episodes wanted: resumed."""
+def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Path]:
+    """The same run, resumed with three episodes."""
     folder = tmp_path_factory.mktemp("longer") / learned[2].name
     shutil.copytree(learned[2], folder)
-    found = *said_by("learn", "--resume", folder, "--episodes", 3), folder
+    result = *run_command("learn", "--resume", folder, "--episodes", 3), folder
     assert json.loads((folder / "campaign.json").read_text())["episodes"] == 3
-    return found
+    return result
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def longer(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFact
         ("--method guessing", "'sim-fsvgd', 'fsvgd'"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_in_a_sentence_and_leaves_nothing(
+def test_invalid_options_are_refused_and_write_nothing(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str, words: str
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
@@ -94,7 +94,7 @@ def test_what_cannot_be_meant_is_refused_in_a_sentence_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_goes_on_with_its_own_car_alone(carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path) -> None:
+def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(learned[2], folder)
     files = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != "log.jsonl"}
@@ -123,7 +123,7 @@ def test_a_run_goes_on_with_its_own_car_alone(carlab: Carlab, learned: tuple[int
         ("--prior nominal", "--prior: this run was started with another prior; remove the option, or start a new"),
     ],
 )
-def test_a_run_goes_on_as_it_was_started(
+def test_resume_refuses_changed_options(
     carlab: Carlab, learned: tuple[int, str, Path], options: str, words: str
 ) -> None:
     code, text = carlab("learn", "--resume", learned[2], *options.split())
@@ -131,7 +131,7 @@ def test_a_run_goes_on_as_it_was_started(
     assert words in text
 
 
-def test_a_learned_car_of_another_version_is_learned_anew_once_its_folder_is_removed(
+def test_model_of_another_version_is_trained_again_after_its_folder_is_removed(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
 ) -> None:
     folder = tmp_path / "run"
@@ -149,7 +149,7 @@ def test_a_learned_car_of_another_version_is_learned_anew_once_its_folder_is_rem
     assert len(json.loads((folder / "learn.json").read_text())["episodes"]) == len(done) + 1
 
 
-def test_the_same_numbers_in_other_words_are_the_same_car(
+def test_resume_accepts_a_car_file_with_equal_parameters(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
 ) -> None:
     folder, same = tmp_path / "run", tmp_path / "same.toml"
@@ -160,7 +160,7 @@ def test_the_same_numbers_in_other_words_are_the_same_car(
     assert "is complete" in text
 
 
-def test_only_a_run_of_learning_is_resumed_again(carlab: Carlab, tmp_path: Path) -> None:
+def test_resume_refuses_folders_that_are_no_learning_run(carlab: Carlab, tmp_path: Path) -> None:
     (tmp_path / "some").mkdir()
     code, text = carlab("learn", "--resume", tmp_path / "some")
     assert code == 1
@@ -172,7 +172,7 @@ def test_only_a_run_of_learning_is_resumed_again(carlab: Carlab, tmp_path: Path)
     assert "cannot be resumed" in text
 
 
-def test_an_impossible_prior_file_is_named(carlab: Carlab, tmp_path: Path) -> None:
+def test_invalid_prior_file_is_refused_with_the_name_of_the_key(carlab: Carlab, tmp_path: Path) -> None:
     path = tmp_path / "model.toml"
     path.write_text("[vehicle]\nmas = 1.6\n", encoding="utf-8")
     code, text = carlab("learn", "--prior", path, "--out", tmp_path / "runs")
@@ -181,18 +181,18 @@ def test_an_impossible_prior_file_is_named(carlab: Carlab, tmp_path: Path) -> No
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_run_learns_drives_and_prints_how_it_went(learned: tuple[int, str, Path]) -> None:
+def test_run_trains_drives_and_prints_its_results(learned: tuple[int, str, Path]) -> None:
     code, text, folder = learned
     assert code == 0
     assert "SIMULATED" in text
     rows = text.split("───")[-1]
     curve = json.loads((folder / "learn.json").read_text())["episodes"]
     for row in curve:
-        driven = read_episode(folder / "episodes" / f"{row['episode']:04d}.mcap")
-        assert driven.ticks == TICKS
-        line = f"{row['episode']} {driven.rewards.sum():.1f} {row['predicted_return']:.1f} {row['distance_m']:.2f}"
+        episode = read_episode(folder / "episodes" / f"{row['episode']:04d}.mcap")
+        assert episode.ticks == TICKS
+        line = f"{row['episode']} {episode.rewards.sum():.1f} {row['predicted_return']:.1f} {row['distance_m']:.2f}"
         assert line in rows
-        assert f"episode {row['episode']}: return {driven.rewards.sum():.1f}" in text
+        assert f"episode {row['episode']}: return {episode.rewards.sum():.1f}" in text
     assert f"learned from {TICKS - 1} rows" in text
     assert f"Learned and recorded in {folder} (learn.png, learn.rrd)." in text
     assert [e["ticks"] for e in json.loads((folder / "result.json").read_text())["episodes"]] == [TICKS, TICKS]
@@ -200,7 +200,7 @@ def test_a_run_learns_drives_and_prints_how_it_went(learned: tuple[int, str, Pat
     assert sorted(p.name for p in folder.glob("models/*")) == ["0001", "0002"]
 
 
-def test_a_run_that_is_done_stays_as_it_is(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
+def test_resuming_a_complete_run_changes_no_file(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
     folder = learned[2]
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "log.jsonl"}
     code, _ = carlab("learn", "--resume", folder)
@@ -208,63 +208,63 @@ def test_a_run_that_is_done_stays_as_it_is(carlab: Carlab, learned: tuple[int, s
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != "log.jsonl"} == before
 
 
-def test_a_run_that_is_done_says_so(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
+def test_resuming_a_complete_run_prints_a_message(carlab: Carlab, learned: tuple[int, str, Path]) -> None:
     _, text = carlab("learn", "--resume", learned[2])
     assert text.rpartition("╯")[2].strip()
 
 
-def test_a_run_that_wants_more_is_resumed(longer: tuple[int, str, Path]) -> None:
-    code, text, folder = longer
+def test_complete_run_is_resumed_with_more_episodes(extended: tuple[int, str, Path]) -> None:
+    code, text, folder = extended
     assert code == 0
     assert "episode 3: return" in text
     assert [r["episode"] for r in json.loads((folder / "learn.json").read_text())["episodes"]] == [1, 2, 3]
     assert sorted(p.name for p in folder.glob("episodes/*.mcap")) == ["0001.mcap", "0002.mcap", "0003.mcap"]
 
 
-def test_options_of_the_run_hold_when_it_is_resumed(longer: tuple[int, str, Path]) -> None:
-    folder = longer[2]
+def test_resumed_run_keeps_its_options(extended: tuple[int, str, Path]) -> None:
+    folder = extended[2]
     assert read_episode(folder / "episodes" / "0003.mcap").ticks == TICKS
     assert not list(folder.glob("episodes/*.rrd"))
 
 
-def test_a_run_that_is_resumed_has_the_noise_of_its_own_seed_and_all_its_results(
-    carlab: Carlab, longer: tuple[int, str, Path], monkeypatch: pytest.MonkeyPatch
+def test_resumed_run_keeps_its_seed_and_all_results(
+    carlab: Carlab, extended: tuple[int, str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = longer[2]
+    folder = extended[2]
     assert [e["episode"] for e in json.loads((folder / "result.json").read_text())["episodes"]] == [1, 2, 3]
     seeds: list[int] = []
-    choose = carlab_cars.choose_car
+    original_choose_car = carlab_cars.choose_car
 
-    def chosen(car: str, **others: Any) -> Any:
+    def log_seed(car: str, **others: Any) -> Any:
         seeds.append(others["seed"])
-        return choose(car, **others)
+        return original_choose_car(car, **others)
 
-    monkeypatch.setattr(carlab_cars, "choose_car", chosen)
-    wanted = json.loads((folder / "campaign.json").read_text())
-    other = {**wanted, "plan": {**wanted["plan"], "seed": 7}}
-    (folder / "campaign.json").write_text(json.dumps(other))
+    monkeypatch.setattr(carlab_cars, "choose_car", log_seed)
+    original = json.loads((folder / "campaign.json").read_text())
+    with_seed_7 = {**original, "plan": {**original["plan"], "seed": 7}}
+    (folder / "campaign.json").write_text(json.dumps(with_seed_7))
     try:
         assert carlab("learn", "--resume", folder)[0] == 0
     finally:
-        (folder / "campaign.json").write_text(json.dumps(wanted))
+        (folder / "campaign.json").write_text(json.dumps(original))
     assert seeds == [7]
 
 
 def interrupted(plan: Any, models: Path, recordings: list[Path], *others: Any) -> dict[str, Any] | None:
-    """A training during which somebody presses ^C."""
+    """A training during which the user presses ^C."""
     signal.raise_signal(signal.SIGINT)
-    assert others[-1](), "it is asked to stop"
+    assert others[-1](), "the training sees the stop request"
     return None
 
 
-def test_an_interrupted_run_tells_how_it_goes_on(
+def test_interrupted_run_prints_the_command_that_resumes_it(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("carlab.experiment.campaign.campaign.train_in_subprocess", interrupted)
     folder = tmp_path / "run"
     shutil.copytree(learned[2], folder)
-    wanted = json.loads((folder / "campaign.json").read_text())
-    (folder / "campaign.json").write_text(json.dumps(wanted | {"episodes": 5}))
+    campaign = json.loads((folder / "campaign.json").read_text())
+    (folder / "campaign.json").write_text(json.dumps(campaign | {"episodes": 5}))
     code, text = carlab("learn", "--resume", folder)
     assert code == 130
     assert f"2 of 5 episodes; resume with: carlab learn --resume {folder}" in text
@@ -279,36 +279,35 @@ def test_an_interrupted_run_tells_how_it_goes_on(
         CarOptions("sim", Path("a b.toml")),
     ],
 )
-def test_the_car_that_a_command_names_is_the_one_that_it_was(options: CarOptions) -> None:
-    """The printed command means the same options when it is parsed."""
+def test_printed_car_options_parse_to_the_same_options(options: CarOptions) -> None:
     assert tyro.cli(CarOptions, args=shlex.split(options.to_text())) == options
 
 
-def test_a_run_that_learned_nothing_is_not_to_be_resumed(
+def test_resume_command_is_printed_only_if_the_run_folder_exists(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Interrupted before anything was there, its folder goes; a command that names it would lead nowhere."""
+    """A run that is interrupted before its first model may have no folder to resume."""
     monkeypatch.setattr("carlab.experiment.campaign.campaign.train_in_subprocess", interrupted)
     code, text = carlab("learn", "--out", tmp_path / "runs", *TINY)
     assert code == 130
-    left = list((tmp_path / "runs").iterdir())
-    assert [f"--resume {folder}" in text for folder in left] == [True] * len(left)
-    assert ("--resume" in text) == bool(left)
+    folders = list((tmp_path / "runs").iterdir())
+    assert [f"--resume {folder}" in text for folder in folders] == [True] * len(folders)
+    assert ("--resume" in text) == bool(folders)
 
 
 @pytest.mark.parametrize("name", ["agent.zip", "policy.npz", "dynamics.pt"])
-def test_a_run_folder_of_a_stranger_runs_no_code(
+def test_resume_executes_no_pickled_code_of_the_run_folder(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, name: str
 ) -> None:
-    """The model that the run goes on from holds a pickle that would make a folder."""
-    folder, made = tmp_path / "run", tmp_path / "made"
+    """The last model of the run contains a pickle that would create a folder."""
+    folder, created_by_pickle = tmp_path / "run", tmp_path / "made"
     shutil.copytree(learned[2], folder)
     model = folder / "models" / "0002"
     for file in ("policy.npz",) if name == "agent.zip" else (name,):
         (model / file).unlink()
-    (model / name).write_bytes(b"cposix\nmkdir\n(V" + str(made).encode() + b"\ntR.")
+    (model / name).write_bytes(b"cposix\nmkdir\n(V" + str(created_by_pickle).encode() + b"\ntR.")
     code, text = carlab("learn", "--resume", folder, "--episodes", 3)
-    assert not made.exists()
+    assert not created_by_pickle.exists()
     assert code == 1
     assert "Traceback" not in text
     assert "to train again." in text

@@ -1,4 +1,4 @@
-"""The picture of a regression study: who is in it, what can be read off, and that the file is what the screen shows."""
+"""The picture of a regression study: lines, colours, axes, error bands and the saved file."""
 
 import math
 from dataclasses import replace
@@ -37,19 +37,19 @@ def panels():
     pyplot.close(figure)
 
 
-def test_each_method_has_a_line_and_the_one_without_gap_is_told_from_the_one_with(panels):
+def test_each_method_has_a_line_and_its_variant_another_line_style(panels):
     lines = {line.get_label(): line for line in panels.axes[0].get_lines()}
     assert list(lines) == ["Sim-FSVGD", "Sim-FSVGD without gap", "SysID", "ridge"]
     assert [text.get_text() for text in panels.legends[0].get_texts()] == list(lines)
     for name, line in lines.items():
         assert list(line.get_ydata()) == [r.nll for r in ROWS if r.method == name]
-    whole, part = lines["Sim-FSVGD"], lines["Sim-FSVGD without gap"]
-    assert whole.get_color() == part.get_color()
-    assert whole.get_linestyle() != part.get_linestyle()
+    full, without_gap = lines["Sim-FSVGD"], lines["Sim-FSVGD without gap"]
+    assert full.get_color() == without_gap.get_color()
+    assert full.get_linestyle() != without_gap.get_linestyle()
 
 
 @pytest.mark.parametrize("known", [(), ("Sim-FSVGD", "SysID")])
-def test_lines_of_another_study_are_told_from_each_other(known):
+def test_methods_of_another_study_have_different_colours(known):
     priors = ("none (FSVGD)", "kinematic", "nominal", "diagnosed")
     figure = picture([row(name, n, -6.0 - k) for k, name in enumerate(known + priors) for n in (20, 50)])
     try:
@@ -61,7 +61,7 @@ def test_lines_of_another_study_are_told_from_each_other(known):
         pyplot.close(figure)
 
 
-def test_a_value_far_off_is_a_number_at_the_edge_and_squeezes_no_other(panels):
+def test_outlier_is_printed_at_the_edge_and_does_not_stretch_the_axis(panels):
     for axis, text, name in ((panels.axes[0], "↑ 315", "nll"), (panels.axes[2], "↑ 0.49", "calibration")):
         assert [t.get_text() for t in axis.texts] == [text]
         low, high = axis.get_ylim()
@@ -71,7 +71,7 @@ def test_a_value_far_off_is_a_number_at_the_edge_and_squeezes_no_other(panels):
     assert panels.axes[0].get_ylim()[1] < -6.4 + 1.2 * MAX_SHOWN_NAT
 
 
-def test_where_most_are_far_off_none_is_cut():
+def test_axis_covers_all_values_if_most_of_them_are_outliers():
     figure = picture([row("Sim-FSVGD", 2, -0.2), row("FSVGD", 2, 168.0), row("GreyBox", 2, 36.0)])
     try:
         assert figure.axes[0].get_ylim()[1] > 168.0
@@ -80,7 +80,7 @@ def test_where_most_are_far_off_none_is_cut():
         pyplot.close(figure)
 
 
-def test_likelihoods_that_lie_far_apart_can_be_read_off():
+def test_axis_of_distant_likelihoods_has_at_least_three_ticks():
     values = {"Sim-FSVGD": (-23.5, -25.3), "ridge": (-12.6, -15.8)}
     figure = picture([row(m, n, nll) for m, both in values.items() for n, nll in zip((50, 800), both, strict=True)])
     axis = figure.axes[0]
@@ -89,7 +89,7 @@ def test_likelihoods_that_lie_far_apart_can_be_read_off():
     pyplot.close(figure)
 
 
-def test_a_method_is_the_same_colour_in_every_picture_and_no_two_share_one():
+def test_colour_of_a_method_is_unique_and_the_same_in_every_picture():
     colours = {}
     for names in (list(METHODS), list(METHODS)[::-2]):
         figure = picture([row(name, 5, -1.0) for name in names])
@@ -99,14 +99,14 @@ def test_a_method_is_the_same_colour_in_every_picture_and_no_two_share_one():
     assert len(set(colours.values())) == len(METHODS) - 1
 
 
-def test_the_file_is_a_picture(tmp_path):
+def test_saved_file_is_an_image_of_the_expected_size(tmp_path):
     draw(ROWS, tmp_path / "study.png")
     pixels = imread(tmp_path / "study.png")
     assert pixels.shape[:2] == (round(130 * SIZE_INCHES[1]), round(130 * SIZE_INCHES[0]))
     assert pixels[..., :3].std() > 0.05
 
 
-def test_every_figure_has_a_panel_with_bands_of_its_standard_error(panels):
+def test_every_figure_has_a_panel_with_standard_error_bands(panels):
     assert len(panels.axes) == len(FIGURES) == 4
     for axis, name in zip(panels.axes, FIGURES, strict=True):
         lines = {line.get_label(): line for line in axis.get_lines()}
@@ -121,10 +121,12 @@ def test_every_figure_has_a_panel_with_bands_of_its_standard_error(panels):
     assert panels.axes[3].get_ylabel() == "seconds a fit"
 
 
-def test_a_single_seed_has_no_band_and_a_fit_that_failed_no_point():
-    none = {f"{name}_standard_error": math.nan for name in FIGURES}
-    nothing = Row("SysID", 50, 0, *(math.nan,) * 5, math.nan, failed=3)
-    figure = picture([*(replace(r, seeds=1, **none) for r in ROWS if (r.method, r.rows) != ("SysID", 50)), nothing])
+def test_single_seed_has_no_band_and_failed_fit_no_point():
+    no_errors = {f"{name}_standard_error": math.nan for name in FIGURES}
+    failed_row = Row("SysID", 50, 0, *(math.nan,) * 5, math.nan, failed=3)
+    figure = picture(
+        [*(replace(r, seeds=1, **no_errors) for r in ROWS if (r.method, r.rows) != ("SysID", 50)), failed_row]
+    )
     try:
         for axis in figure.axes:
             assert not axis.collections
@@ -133,8 +135,8 @@ def test_a_single_seed_has_no_band_and_a_fit_that_failed_no_point():
         pyplot.close(figure)
 
 
-def test_seconds_far_apart_are_all_told(tmp_path):
-    """Ridge is done in milliseconds; a band wider than its mean reaches below zero, which a logarithm has not."""
+def test_durations_far_apart_are_all_visible(tmp_path):
+    """Ridge takes milliseconds; its band reaches below zero, which a logarithmic axis cannot show."""
     fast = {"seconds": 0.002, "seconds_standard_error": 0.003}
     slow = {"seconds": 900.0, "seconds_standard_error": 20.0}
     rows = [replace(r, **(fast if r.method == "ridge" else slow)) for r in ROWS]

@@ -1,4 +1,4 @@
-"""``carlab replay`` on a simulated car: errors by part and channel, the overlay in rerun, and what it refuses."""
+"""``carlab replay`` on a simulated car: errors by part and channel, the overlay in rerun, and refusals."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ HEADER = "t,x,y,yaw,vx,vy,yaw_rate,steering,throttle"
 
 
 def circle(path: Path, seconds: float, offset_s: float = 0.0) -> Path:
-    """A circle driven at 1 m/s, exactly."""
+    """Write an exact circle at 1 m/s as CSV."""
     t = offset_s + np.arange(round(30 * seconds)) / 30.0
     yaw = 0.8 * t
     columns = [t, np.sin(yaw) / 0.8, (1 - np.cos(yaw)) / 0.8, (yaw + math.pi) % (2 * math.pi) - math.pi]
@@ -21,8 +21,8 @@ def circle(path: Path, seconds: float, offset_s: float = 0.0) -> Path:
     return path
 
 
-def test_both_parts_and_all_channels_are_printed_beside_constant_velocity(carlab: Carlab, tmp_path: Path) -> None:
-    """Constant velocity is right on a circle; the default car takes another one."""
+def test_both_parts_and_all_channels_are_compared_with_constant_velocity(carlab: Carlab, tmp_path: Path) -> None:
+    """The constant-velocity prediction is exact on a circle; the default car drives another circle."""
     code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), "--save", tmp_path / "drive.rrd")
     assert code == 0
     assert "whole recording (107 windows from 0.6 to 29.9 s)" in text
@@ -33,14 +33,14 @@ def test_both_parts_and_all_channels_are_printed_beside_constant_velocity(carlab
     assert (tmp_path / "drive.rrd").stat().st_size > 0
 
 
-def test_a_short_recording_is_scored_whole(carlab: Carlab, tmp_path: Path) -> None:
+def test_short_recording_is_scored_as_a_whole(carlab: Carlab, tmp_path: Path) -> None:
     code, text = carlab("replay", circle(tmp_path / "drive.csv", 5.0))
     assert code == 0
     assert "whole recording (" in text
     assert "The last part is too short to be scored by itself." in text
 
 
-def test_another_share_and_horizon_are_scored(carlab: Carlab, tmp_path: Path) -> None:
+def test_given_holdout_share_and_horizon_are_used(carlab: Carlab, tmp_path: Path) -> None:
     path = circle(tmp_path / "drive.csv", 30.0)
     code, text = carlab("replay", path, "--holdout-share", "0.5", "--horizon", "0.5", "--stride", "0.5")
     assert code == 0
@@ -56,7 +56,7 @@ def test_another_share_and_horizon_are_scored(carlab: Carlab, tmp_path: Path) ->
         (("--stride", "-1"), "--stride -1: give a number above zero"),
     ],
 )
-def test_what_cannot_be_scored_is_said_in_a_sentence(
+def test_invalid_options_are_refused_in_one_sentence(
     carlab: Carlab, tmp_path: Path, options: tuple[str, ...], words: str
 ) -> None:
     code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), *options)

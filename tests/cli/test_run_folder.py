@@ -1,4 +1,4 @@
-"""What a run leaves behind: everything when it drove, nothing when it did not; and what an interruption is worth."""
+"""The run folder: complete after a drive, absent if the car did not open, consistent after an interruption."""
 
 import json
 import logging
@@ -22,7 +22,7 @@ from carlab.recording.mcap.source import read_episode
 Carlab = Callable[..., tuple[int, str]]
 
 
-def test_a_run_keeps_its_results_and_its_log(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_folder_contains_results_and_log(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def act(self: object, view: PolicyInput) -> Action:
         logging.getLogger("test").warning("tick %d", view.step)
         return NEUTRAL
@@ -46,7 +46,7 @@ def test_a_run_keeps_its_results_and_its_log(carlab: Carlab, tmp_path: Path, mon
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(5, "no such thing")])
-def test_a_car_that_does_not_open_leaves_no_folder(
+def test_no_folder_remains_if_the_car_does_not_open(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     def refuse(self: object) -> None:
@@ -58,7 +58,9 @@ def test_a_car_that_does_not_open_leaves_no_folder(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_interrupted_replay_says_so(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupted_replay_ends_with_stop_requested(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     code, _ = carlab("drive", "--ticks", "20", "--out", tmp_path, "--name", "first", "--no-rerun", "--no-picture")
     assert code == 0
     (recording,) = tmp_path.glob("*first/episodes/*.mcap")
@@ -76,7 +78,7 @@ def test_an_interrupted_replay_says_so(carlab: Carlab, tmp_path: Path, monkeypat
     assert json.loads(result.read_text())["end_reason"] == "STOP_REQUESTED"
 
 
-def test_an_interrupted_import_leaves_no_half_file(
+def test_interrupted_import_leaves_no_partial_file(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = "".join(f"{n / 30},{n / 30},0,0,1,0,0,0,0.2\n" for n in range(100))
@@ -90,23 +92,23 @@ def test_an_interrupted_import_leaves_no_half_file(
     assert [entry.name for entry in tmp_path.iterdir()] == ["drive.csv"]
 
 
-def test_interrupting_the_question_ends_the_run_like_interrupting_the_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_during_the_placing_prompt_requests_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     from rich.progress import Progress
 
-    def at_the_keyboard(*args: object, **kwargs: object) -> str:
+    def interrupted_input(*args: object, **kwargs: object) -> str:
         os.kill(os.getpid(), signal.SIGINT)
         signal.sigtimedwait([], 5.0)
-        pytest.fail("the question was not interrupted")
+        pytest.fail("the prompt was not interrupted")
 
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr("carlab.cli.runs.console.input", at_the_keyboard)
+    monkeypatch.setattr("carlab.cli.runs.console.input", interrupted_input)
     with Interrupts() as interrupts:
         ask_to_place(Progress(disable=True), "")(CarState())
         assert interrupts.count == 1
         assert interrupts.requested.is_set()
 
 
-def test_a_simulated_car_driven_by_hand_runs_in_real_time(
+def test_simulated_car_driven_by_hand_runs_in_real_time(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":carlab")
@@ -120,7 +122,7 @@ def test_a_simulated_car_driven_by_hand_runs_in_real_time(
 
 
 @pytest.mark.parametrize(("option", "throttle"), [((), 0.4), (("--max-throttle", "0.1"), 0.1)])
-def test_a_key_gives_the_throttle_that_was_allowed(
+def test_key_gives_the_maximum_throttle(
     carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: tuple[str, ...], throttle: float
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":carlab")
