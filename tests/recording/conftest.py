@@ -1,4 +1,4 @@
-"""Documents of an episode as a control loop would emit them, with awkward numbers in every place."""
+"""Documents of an episode as a control loop emits them, with values that are hard to store exactly."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A drive in closed form, for files whose every number is known: no code of the package is used to make it."""
+"""A drive in closed form, computed without code of the package: the true value of every number in a file is known."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def acceleration(t):
 
 
 def drive(t: np.ndarray) -> dict[str, np.ndarray]:
-    """Channels at stamps ``t``, without slip; the motion follows the commands DELAY_S late.
+    """Channels of a drive without slip at stamps ``t``; the motion follows the commands with a delay of DELAY_S.
 
     Curvature = 8 * steering (clipped) and acceleration = 5 * throttle - speed.
     """
@@ -38,9 +38,9 @@ def drive(t: np.ndarray) -> dict[str, np.ndarray]:
         for a, b in pairwise(t.tolist())
     ]
     x, y = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]).T
-    later = t + DELAY_S
-    v = speed(later)
-    safe = np.where(np.abs(v) < 0.25, np.copysign(0.25, v), v)
+    t_of_command = t + DELAY_S
+    v = speed(t_of_command)
+    bounded_speed = np.where(np.abs(v) < 0.25, np.copysign(0.25, v), v)
     return {
         "t": t,
         "x": x,
@@ -49,8 +49,8 @@ def drive(t: np.ndarray) -> dict[str, np.ndarray]:
         "vx": speed(t),
         "vy": np.zeros_like(t),
         "yaw_rate": yaw_rate(t),
-        "steering": np.clip(yaw_rate(later) / safe / 8.0, -1, 1),
-        "throttle": (acceleration(later) + v) / 5.0,
+        "steering": np.clip(yaw_rate(t_of_command) / bounded_speed / 8.0, -1, 1),
+        "throttle": (acceleration(t_of_command) + v) / 5.0,
     }
 
 

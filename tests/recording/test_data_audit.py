@@ -1,4 +1,4 @@
-"""Faults put into a clean drive are found, named and undone by the option advised; real recordings say what is so."""
+"""The audit finds injected faults and proposes the option that repairs them; real recordings have the known faults."""
 
 import importlib.util
 import json
@@ -23,7 +23,7 @@ UNEVEN = np.arange(1200) / 40.0 + RNG.uniform(-0.002, 0.002, 1200)
 
 @pytest.fixture(scope="module")
 def clean():
-    """A drive with the noise of motion capture on pose and velocities."""
+    """A drive with measurement noise on pose and velocities."""
     columns = foreign.drive(UNEVEN)
     rng = np.random.default_rng(6)
     noise = {"x": 3e-4, "y": 3e-4, "yaw": 2e-3, "vx": 0.01, "vy": 0.01, "yaw_rate": 0.03}
@@ -32,17 +32,17 @@ def clean():
     }
 
 
-def grave(report):
+def warnings_of(report):
     return {(f.id, f.channel): f for f in report.findings if f.severity >= Severity.WARNING}
 
 
-def run(tmp_path, drive, **options):
+def import_drive(tmp_path, drive, **options):
     return import_csv(foreign.write(tmp_path / "run.csv", drive), mapping=CANONICAL.with_options(**options))
 
 
-def test_a_clean_recording_raises_no_alarm(clean, tmp_path):
-    report = run(tmp_path, clean).report
-    assert grave(report) == {}
+def test_clean_recording_has_no_warning(clean, tmp_path):
+    report = import_drive(tmp_path, clean).report
+    assert warnings_of(report) == {}
     (steering,) = report.of("command_delay", "steering")
     assert steering.evidence["delay_s"] == pytest.approx(foreign.DELAY_S, abs=0.03)
     (throttle,) = report.of("command_delay", "throttle")
@@ -52,7 +52,7 @@ def test_a_clean_recording_raises_no_alarm(clean, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("fault", "found", "remedy"),
+    ("fault", "finding", "options"),
     [
         (lambda c: {"steering": -c["steering"]}, ("wrong_sign", "steering"), {"columns": {"steering": {"sign": -1}}}),
         (lambda c: {"throttle": -c["throttle"]}, ("wrong_sign", "throttle"), {"columns": {"throttle": {"sign": -1}}}),
@@ -83,86 +83,86 @@ def test_a_clean_recording_raises_no_alarm(clean, tmp_path):
         (lambda c: {"yaw": c["yaw"] - 0.8}, ("wrong_frame", "yaw"), {"yaw_offset_rad": 0.8}),
     ],
     ids=[
-        "steering",
-        "throttle",
-        "yaw_rate",
-        "vx",
+        "steering sign",
+        "throttle sign",
+        "yaw rate sign",
+        "vx sign",
         "gyro scale",
         "speed scale",
         "world frame",
-        "clockwise",
-        "axes",
-        "no speed",
+        "clockwise yaw",
+        "swapped axes",
+        "zero speed",
         "yaw offset",
     ],
 )
-def test_fault_is_found_and_its_remedy_helps(clean, fault, found, remedy, tmp_path):
+def test_fault_is_found_and_repaired_by_its_option(clean, fault, finding, options, tmp_path):
     columns = {**clean, **fault(clean)}
-    report = run(tmp_path, columns).report
-    assert found in grave(report)
-    assert grave(report)[found].option.startswith("--")
-    repaired = run(tmp_path, columns, **remedy)
-    assert grave(repaired.report) == {}
+    report = import_drive(tmp_path, columns).report
+    assert finding in warnings_of(report)
+    assert warnings_of(report)[finding].option.startswith("--")
+    repaired = import_drive(tmp_path, columns, **options)
+    assert warnings_of(repaired.report) == {}
     truth = foreign.drive(UNEVEN)
     np.testing.assert_allclose(repaired.episode.states[:, 3], truth["vx"], atol=0.1)
     np.testing.assert_allclose(repaired.episode.states[:, 5], truth["yaw_rate"], atol=0.2)
 
 
-def test_nothing_is_converted_on_suspicion(clean, tmp_path):
+def test_suspected_fault_is_reported_but_not_repaired(clean, tmp_path):
     columns = {**clean, "steering": -clean["steering"]}
-    np.testing.assert_array_equal(run(tmp_path, columns).episode.sent[:, 0], -clean["steering"][:-1])
+    np.testing.assert_array_equal(import_drive(tmp_path, columns).episode.sent[:, 0], -clean["steering"][:-1])
 
 
 @pytest.mark.parametrize("cut", [0.0, np.pi])
-def test_spikes_of_a_wrapped_difference(clean, cut, tmp_path):
-    """What a logger makes that differentiates an angle with a branch cut at ``cut``: off by 2 pi / period there."""
+def test_spikes_of_a_differentiated_wrapped_angle_are_found_and_repaired(clean, cut, tmp_path):
+    """A logger differentiates an angle with a branch cut at ``cut``: the rate there is off by 2 pi / period."""
     angle = (foreign.yaw(UNEVEN) - cut) % (2 * np.pi)
-    made = np.diff(angle, prepend=angle[0]) / np.diff(UNEVEN, prepend=UNEVEN[0] - 0.025)
+    logged_rate = np.diff(angle, prepend=angle[0]) / np.diff(UNEVEN, prepend=UNEVEN[0] - 0.025)
     truth = foreign.yaw_rate(UNEVEN)
-    at = np.flatnonzero(np.abs(made - truth) > 50)
-    assert len(at) >= 3
-    columns = {**clean, "yaw_rate": made}
-    imported = run(tmp_path, columns)
+    spike_rows = np.flatnonzero(np.abs(logged_rate - truth) > 50)
+    assert len(spike_rows) >= 3
+    columns = {**clean, "yaw_rate": logged_rate}
+    imported = import_drive(tmp_path, columns)
     (finding,) = imported.report.of("yaw_wrap_spikes", "yaw_rate")
-    assert finding.rows == tuple(at + 1)
+    assert finding.rows == tuple(spike_rows + 1)
     assert finding.severity is Severity.FAULT
-    np.testing.assert_array_equal(imported.episode.states[:, 5], made)
-    repaired = run(tmp_path, columns, repair_yaw_rate=True)
+    np.testing.assert_array_equal(imported.episode.states[:, 5], logged_rate)
+    repaired = import_drive(tmp_path, columns, repair_yaw_rate=True)
     assert repaired.report.of("yaw_wrap_spikes")[0].severity is Severity.REPAIRED
-    np.testing.assert_allclose(repaired.episode.states[at, 5], truth[at], atol=0.15)
-    untouched = np.setdiff1d(np.arange(len(UNEVEN)), at)
-    np.testing.assert_array_equal(repaired.episode.states[untouched, 5], made[untouched])
+    np.testing.assert_allclose(repaired.episode.states[spike_rows, 5], truth[spike_rows], atol=0.15)
+    other_rows = np.setdiff1d(np.arange(len(UNEVEN)), spike_rows)
+    np.testing.assert_array_equal(repaired.episode.states[other_rows, 5], logged_rate[other_rows])
 
 
-def test_lag_of_filtered_velocities(clean, tmp_path):
-    late = UNEVEN - 0.06
-    columns = {**clean, "vx": foreign.speed(late), "yaw_rate": foreign.yaw_rate(late)}
-    report = run(tmp_path, columns).report
+def test_lag_of_filtered_velocities_is_estimated(clean, tmp_path):
+    delayed_t = UNEVEN - 0.06
+    columns = {**clean, "vx": foreign.speed(delayed_t), "yaw_rate": foreign.yaw_rate(delayed_t)}
+    report = import_drive(tmp_path, columns).report
     for channel in ("vx, vy", "yaw_rate"):
         (finding,) = report.of("column_shift", channel)
         assert finding.evidence["lag_s"] == pytest.approx(0.06, abs=0.01)
-    from_pose = run(tmp_path, columns, velocities="pose").episode
+    from_pose = import_drive(tmp_path, columns, velocities="pose").episode
     assert from_pose.metadata["velocity_delay_s"] == "0"
     np.testing.assert_array_equal(from_pose.extra["vx"], columns["vx"])
 
 
-def test_pose_of_another_body(clean, tmp_path):
+def test_poses_of_another_body_are_found_and_split_off(clean, tmp_path):
     x, y = clean["x"].copy(), clean["y"].copy()
     x[500:560], y[500:560] = -4.0, 1.0
-    imported = run(tmp_path, {**clean, "x": x, "y": y})
+    imported = import_drive(tmp_path, {**clean, "x": x, "y": y})
     (finding,) = imported.report.of("outliers", "x, y, yaw")
     assert finding.rows == (501, 561)
     assert finding.option == "--gaps split"
-    # Velocities are right up to the rows beside the break.
-    pose_only = run(tmp_path, {**clean, "x": x, "y": y}, velocities="pose").episode
+    # The velocities are correct up to the rows next to the jump.
+    pose_only = import_drive(tmp_path, {**clean, "x": x, "y": y}, velocities="pose").episode
     rows = np.r_[490:500, 560:570]
     np.testing.assert_allclose(pose_only.states[rows, 3], foreign.speed(UNEVEN)[rows], atol=0.1)
-    parts = run(tmp_path, {**clean, "x": x, "y": y}, gaps="split").episodes
+    parts = import_drive(tmp_path, {**clean, "x": x, "y": y}, gaps="split").episodes
     assert [part.ticks + 1 for part in parts] == [500, 60, 640]
 
 
-def test_hard_driving_is_no_jump():
-    """20 m/s^2 and 100 rad/s^2, far beyond tyres, at 30 and at 100 Hz."""
+def test_hard_driving_is_not_a_pose_jump():
+    """Accelerations of 20 m/s^2 and 100 rad/s^2, far above those of a tyre, at 30 and at 100 Hz."""
     for rate in (30.0, 100.0):
         t = np.arange(0, 4, 1 / rate)
         x = 5 * np.sin(2 * t)
@@ -170,23 +170,23 @@ def test_hard_driving_is_no_jump():
         assert len(pose_jumps(t, x, np.zeros_like(t), yaw)) == 0
 
 
-def test_slow_columns_in_fast_rows(tmp_path):
+def test_columns_with_held_samples_are_found_with_their_rate(tmp_path):
     t = np.arange(3000) / 100.0
     columns = foreign.drive(t)
     held = (np.arange(3000) // 10) * 10
     columns["throttle"] = columns["throttle"][held]
     columns["encoder"] = columns["vx"][held]
-    (finding,) = run(tmp_path, columns).report.of("held_samples")
+    (finding,) = import_drive(tmp_path, columns).report.of("held_samples")
     assert finding.channel == "throttle, encoder"
     assert finding.evidence["rows"] == 10
     assert finding.evidence["rate_hz"] == pytest.approx(10.0, rel=1e-3)
 
 
-def test_nominal_clock_over_uneven_rows_is_seen_and_rebuilt(tmp_path):
+def test_nominal_clock_over_uneven_rows_is_found_and_rebuilt(tmp_path):
     rng = np.random.default_rng(8)
     step = rng.choice([4, 5], p=[0.9, 0.1], size=1199) / 120.0
-    true = np.concatenate([[0.0], np.cumsum(step)])
-    columns = foreign.drive(true)
+    true_t = np.concatenate([[0.0], np.cumsum(step)])
+    columns = foreign.drive(true_t)
     for name, axis in (("vx_world", columns["x"]), ("vy_world", columns["y"])):
         columns[name] = np.concatenate([[0.0], np.diff(axis) / step])
     columns["t"] = np.arange(1200) / 30.0
@@ -196,45 +196,45 @@ def test_nominal_clock_over_uneven_rows_is_seen_and_rebuilt(tmp_path):
     (finding,) = report.of("clock_drift")
     assert finding.evidence["mean_s"] == pytest.approx(np.mean(step), rel=0.01)
     rebuilt = import_csv(path, mapping=ETH.with_options(clock="velocity")).episode
-    fast = np.abs(foreign.speed(true))[1:] > 0.4
+    fast = np.abs(foreign.speed(true_t))[1:] > 0.4
     np.testing.assert_allclose(np.diff(rebuilt.times_s)[fast], step[fast], atol=1e-4)
 
 
-def test_commands_that_never_change_and_stale_rows(clean, tmp_path):
+def test_constant_command_and_stale_rows_are_found(clean, tmp_path):
     columns = {name: column.copy() for name, column in clean.items()}
     columns["steering"] = np.full_like(columns["steering"], 0.25)
     for name in ("x", "y", "yaw"):
         columns[name][[600, 601]] = columns[name][599]
     assert np.abs(foreign.speed(UNEVEN[599])) > 0.5
-    report = run(tmp_path, columns).report
-    assert ("constant_command", "steering") in grave(report)
+    report = import_drive(tmp_path, columns).report
+    assert ("constant_command", "steering") in warnings_of(report)
     (stale,) = report.of("stale_samples")
     assert stale.rows == (601, 602)
 
 
-def test_an_export_of_either_laboratory_comes_back_as_our_own_layout(shared, tmp_path):
+def test_exported_real_recording_is_read_back_in_the_canonical_layout(shared, tmp_path):
     for path in ("eth_rc_car/train_2.csv.gz", "dart/70_racetrack_lap_v_1_racetrack_lap_v_1.csv.gz"):
         episode = import_csv(shared / "data" / path).episode
         write_csv(episode, tmp_path / "export.csv")
-        back = import_csv(tmp_path / "export.csv")
-        assert back.mapping is CANONICAL
-        np.testing.assert_array_equal(back.episode.states, episode.states)
-        np.testing.assert_array_equal(back.episode.sent, episode.sent)
+        reimported = import_csv(tmp_path / "export.csv")
+        assert reimported.mapping is CANONICAL
+        np.testing.assert_array_equal(reimported.episode.states, episode.states)
+        np.testing.assert_array_equal(reimported.episode.sent, episode.sent)
 
 
 class TestRealRecordings:
-    """What is so in the files, found beforehand by hand: see the comments of the presets."""
+    """Known properties of the files, determined by hand; see the comments of the presets."""
 
     @pytest.mark.parametrize(
-        ("name", "rows", "spikes", "spiked"), [("train_1", 9029, 14, 22), ("train_2", 3791, 9, 16)]
+        ("name", "rows", "n_spikes", "n_spike_rows"), [("train_1", 9029, 14, 22), ("train_2", 3791, 9, 16)]
     )
-    def test_eth(self, shared, name, rows, spikes, spiked):
+    def test_eth_recording_has_its_known_faults(self, shared, name, rows, n_spikes, n_spike_rows):
         imported = import_csv(shared / "data" / "eth_rc_car" / f"{name}.csv.gz")
         episode, report = imported.episode, imported.report
         assert imported.mapping is ETH
         assert episode.ticks == rows - 1
         (finding,) = report.of("yaw_wrap_spikes")
-        assert (finding.evidence["spikes"], finding.count) == (spikes, spiked)
+        assert (finding.evidence["spikes"], finding.count) == (n_spikes, n_spike_rows)
         assert finding.evidence["share_ccw"] == 1.0
         assert np.abs(episode.states[:, 5]).max() < 12.0
         assert report.of("clock_drift")[0].evidence["mean_s"] == pytest.approx(0.0337, abs=1e-4)
@@ -246,7 +246,7 @@ class TestRealRecordings:
         assert report.of("command_delay", "throttle")[0].evidence["gain"] > 5.0
         assert report.worst is Severity.WARNING
 
-    def test_eth_read_as_body_velocities_is_refuted_with_both_residuals(self, shared):
+    def test_wrong_velocity_frame_is_found_with_both_residuals(self, shared):
         mapping = ETH.with_options(velocity_frame="body", repair_yaw_rate=False)
         report = import_csv(shared / "data" / "eth_rc_car" / "train_1.csv.gz", mapping=mapping).report
         (finding,) = report.of("wrong_frame", "vx, vy")
@@ -254,7 +254,7 @@ class TestRealRecordings:
         assert finding.evidence["remainder_world_mps"] < 0.1 < finding.evidence["remainder_body_mps"]
         assert report.of("yaw_wrap_spikes")[0].option == "--repair-yaw-rate"
 
-    def test_every_dart_file(self, shared):
+    def test_dart_recordings_have_their_known_faults(self, shared):
         files = sorted((shared / "data" / "dart").glob("*.csv.gz"))
         assert len(files) == 9
         for path in files:
@@ -279,7 +279,7 @@ class TestRealRecordings:
             assert bool(report.of("outliers")) == path.name.startswith("70_")
             assert report.worst == (Severity.FAULT if path.name.startswith("70_") else report.worst)
 
-    def test_dart_lap_loses_its_car(self, shared):
+    def test_dart_lap_has_pose_jumps_and_a_frozen_pose(self, shared):
         path = next((shared / "data" / "dart").glob("70_*.csv.gz"))
         report = import_csv(path).report
         (jumps,) = report.of("outliers")

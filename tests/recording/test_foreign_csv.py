@@ -1,4 +1,4 @@
-"""Foreign files whose every number is known in closed form, and files with each kind of bad input."""
+"""Import of foreign CSV files: files with exactly known values, and refusal of each kind of invalid input."""
 
 import gzip
 import importlib.util
@@ -30,21 +30,21 @@ def jittered(rng, rate_hz, seconds):
 
 
 class TestConversion:
-    def test_canonical_file_comes_through_number_for_number(self, clean, tmp_path):
+    def test_canonical_file_is_imported_exactly(self, clean, tmp_path):
         imported = import_csv(foreign.write(tmp_path / "run.csv", clean))
         episode = imported.episode
         assert episode.ticks == len(EVEN) - 1
         np.testing.assert_array_equal(episode.times_s, EVEN)
-        wanted = np.column_stack([clean[name] for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate")])
-        np.testing.assert_array_equal(episode.states, wanted)
+        expected = np.column_stack([clean[name] for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate")])
+        np.testing.assert_array_equal(episode.states, expected)
         commands = np.column_stack([clean["steering"], clean["throttle"]])
         np.testing.assert_array_equal(episode.sent, commands[:-1])
         np.testing.assert_array_equal(episode.requested, commands[:-1])
-        np.testing.assert_array_equal(episode.poses, np.column_stack([EVEN, wanted[:, :3]]))
+        np.testing.assert_array_equal(episode.poses, np.column_stack([EVEN, expected[:, :3]]))
         assert "canonical" in imported.announcement
         assert "recognised" in imported.announcement
 
-    def test_gzip_and_semicolons_and_byte_order_mark(self, clean, tmp_path):
+    def test_gzip_semicolons_and_byte_order_mark_are_accepted(self, clean, tmp_path):
         plain = foreign.write(tmp_path / "run.csv", clean, delimiter=";")
         packed = tmp_path / "run.csv.gz"
         packed.write_bytes(gzip.compress(b"\xef\xbb\xbf" + plain.read_bytes()))
@@ -53,7 +53,7 @@ class TestConversion:
             import_csv(foreign.write(tmp_path / "commas.csv", clean)).episode.states,
         )
 
-    def test_every_unit_sign_and_name_by_a_mapping_file(self, clean, tmp_path):
+    def test_mapping_file_converts_names_units_and_signs(self, clean, tmp_path):
         columns = {
             "stamp": clean["t"] * 1e3 + 5e6,
             "east": clean["x"] * 1e3,
@@ -84,8 +84,8 @@ class TestConversion:
         path = foreign.write(tmp_path / "run.csv", columns)
         imported = import_csv(path, mapping=load_mapping(tmp_path / "map.toml"))
         episode = imported.episode
-        wanted = np.column_stack([clean[name] for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate")])
-        np.testing.assert_allclose(episode.states, wanted, atol=1e-9)
+        expected = np.column_stack([clean[name] for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate")])
+        np.testing.assert_allclose(episode.states, expected, atol=1e-9)
         np.testing.assert_allclose(episode.sent[:, 0], clean["steering"][:-1], atol=1e-12)
         np.testing.assert_allclose(episode.sent[:, 1], clean["throttle"][:-1], atol=1e-12)
         np.testing.assert_allclose(episode.times_s, EVEN, atol=1e-6)
@@ -94,8 +94,8 @@ class TestConversion:
         assert imported.report.worst <= Severity.INFO
         assert "workshop logger" in imported.announcement
 
-    def test_world_velocities_are_rotated_by_the_yaw_of_their_own_moment(self, tmp_path):
-        """Velocities that are late by half a row, as backward differences are, turn with the car of that moment."""
+    def test_world_velocities_are_rotated_by_the_yaw_at_their_time(self, tmp_path):
+        """Backward differences are late by half a row; they are rotated by the yaw of half a row before."""
         t = EVEN
         columns = foreign.drive(t)
         late = t - 0.5 / 30.0
@@ -112,7 +112,7 @@ class TestConversion:
         assert float(imported.episode.metadata["velocity_delay_s"]) == pytest.approx(1 / 60, rel=1e-5)
 
     @pytest.mark.parametrize("rate_hz", [30.0, 100.0])
-    def test_velocities_from_a_noisy_pose_at_uneven_stamps_across_wraps(self, rng, rate_hz, tmp_path):
+    def test_velocities_from_a_noisy_pose_have_the_expected_error_and_no_delay(self, rng, rate_hz, tmp_path):
         t = jittered(rng, rate_hz, 25.0)
         columns = foreign.drive(t)
         for name, std in (("x", 3e-4), ("y", 3e-4), ("yaw", 1e-3)):
@@ -131,13 +131,13 @@ class TestConversion:
         assert np.std(error[:, 0]) < 1.5 * 3e-4 * gain + 0.002
         assert np.std(error[:, 2]) < 1.5 * 1e-3 * gain + 0.002
         assert np.abs(error).max() < 0.2
-        # No delay: a late estimate would correlate with the derivative of the truth.
-        late_s = np.dot(error[:, 0], foreign.acceleration(t)[inner]) / np.sum(foreign.acceleration(t)[inner] ** 2)
-        assert abs(late_s) < 2e-3
+        # A delayed estimate correlates with the derivative of the true velocity.
+        delay_s = np.dot(error[:, 0], foreign.acceleration(t)[inner]) / np.sum(foreign.acceleration(t)[inner] ** 2)
+        assert abs(delay_s) < 2e-3
         assert "no delay" in episode.metadata["velocity_source"]
         assert episode.metadata["velocity_delay_s"] == "0"
 
-    def test_throttle_gate_keeps_what_was_asked_and_what_arrived(self, clean, tmp_path):
+    def test_throttle_gate_gives_requested_and_sent_throttle(self, clean, tmp_path):
         gate = np.where((EVEN > 10) & (EVEN < 12), 0.0, 1.0)
         columns = {
             "vicon time": clean["t"] + 1.7e9,
@@ -151,7 +151,7 @@ class TestConversion:
         imported = import_csv(foreign.write(tmp_path / "run.csv", columns))
         assert imported.mapping == DART
         episode = imported.episode
-        # That logger is 0.05 s late on average: at 30 Hz, a row's command is the one that the next row holds.
+        # The logger of DART has a mean delay of 0.05 s: at 30 Hz the command of a row is in the next row.
         np.testing.assert_array_equal(episode.requested[:, 1], clean["throttle"][1:])
         np.testing.assert_array_equal(episode.sent[:, 1], (clean["throttle"] * gate)[1:])
         assert imported.report.of("column_shift")[0].evidence["lag_s"] == 0.05
@@ -162,7 +162,7 @@ class TestConversion:
         with pytest.raises(DataError, match="'safety_value' has no number in 1 of 900 rows, the first in row 51"):
             import_csv(foreign.write(tmp_path / "hole.csv", columns))
 
-    def test_dead_reckoning_of_a_file_without_a_pose_drives_a_circle(self, tmp_path):
+    def test_dead_reckoning_without_a_pose_reproduces_a_circle(self, tmp_path):
         """1.5 m/s and 0.75 rad/s: a circle of 2 m radius about (0, 2)."""
         t = np.arange(200) * 0.05
         columns = {
@@ -179,7 +179,7 @@ class TestConversion:
         assert len(episode.poses) == 0
         assert "not measured" in episode.metadata["pose_source"]
 
-    def test_file_without_time_by_its_rate_and_other_axes(self, clean, tmp_path):
+    def test_file_without_time_is_imported_with_its_rate_and_swapped_axes(self, clean, tmp_path):
         columns = {name: clean[name] for name in ("steering", "throttle")}
         columns |= {"north": clean["x"], "east": -clean["y"], "compass": -clean["yaw"]}
         mapping = ColumnMapping(
@@ -198,7 +198,7 @@ class TestConversion:
         np.testing.assert_allclose(episode.states[:, 1], clean["y"], atol=1e-12)
         np.testing.assert_allclose(episode.states[10:-10, 3], clean["vx"][10:-10], atol=5e-3)
 
-    def test_text_column_is_left_out_and_said(self, clean, tmp_path):
+    def test_text_column_is_dropped_and_reported(self, clean, tmp_path):
         columns = {**clean, "driver": np.array(["anna"] * len(EVEN))}
         imported = import_csv(foreign.write(tmp_path / "run.csv", columns))
         assert "driver" not in imported.episode.extra
@@ -222,7 +222,7 @@ def test_short_and_still_recordings_import_without_a_warning(rows, still, clean,
 
 
 class TestRefusal:
-    """Each fault: one clear sentence that names the place and the next step."""
+    """Each fault is refused in one sentence with its place and the next step."""
 
     def refuse(self, tmp_path, columns, *parts, mapping=None):
         path = foreign.write(tmp_path / "run.csv", columns)
@@ -234,15 +234,15 @@ class TestRefusal:
         assert "\n" not in message
         return message
 
-    def test_missing_column_names_the_likely_one(self, clean, tmp_path):
+    def test_missing_column_is_refused_with_the_similar_name(self, clean, tmp_path):
         columns = {("heading_yaw" if k == "yaw" else k): v for k, v in clean.items()}
         self.refuse(tmp_path, columns, "no column yaw", "'heading_yaw'", "mapping")
 
-    def test_missing_column_of_a_mapping(self, clean, tmp_path):
+    def test_missing_column_of_a_mapping_is_refused(self, clean, tmp_path):
         mapping = CANONICAL.with_options(columns={"yaw": {"name": "psi"}})
         self.refuse(tmp_path, clean, "psi (for yaw)", mapping=mapping)
 
-    def test_not_a_number_and_leaving_those_rows_out(self, clean, tmp_path):
+    def test_nan_is_refused_or_its_rows_are_dropped(self, clean, tmp_path):
         x = clean["x"].copy()
         x[[41, 300]] = np.nan
         self.refuse(tmp_path, {**clean, "x": x}, "'x'", "2 of 900 rows", "row 42", "--missing drop")
@@ -251,29 +251,29 @@ class TestRefusal:
         assert np.isfinite(imported.episode.states).all()
         assert EVEN[41] not in imported.episode.times_s
 
-    def test_infinity_is_not_a_number_either(self, clean, tmp_path):
+    def test_infinity_is_refused(self, clean, tmp_path):
         throttle = clean["throttle"].copy()
         throttle[7] = np.inf
         self.refuse(tmp_path, {**clean, "throttle": throttle}, "'throttle'", "row 8")
 
-    def test_damage_that_is_a_number_is_refused_too(self, clean, tmp_path):
+    def test_implausible_number_is_refused(self, clean, tmp_path):
         vx = clean["vx"].copy()
         vx[20] = 1e300
         self.refuse(tmp_path, {**clean, "vx": vx}, "'vx'", "row 21")
 
-    def test_last_command_may_be_missing(self, clean, tmp_path):
+    def test_missing_last_command_is_accepted(self, clean, tmp_path):
         steering = clean["steering"].copy()
         steering[-1] = np.nan
         imported = import_csv(foreign.write(tmp_path / "run.csv", {**clean, "steering": steering}))
         assert np.isfinite(imported.episode.sent).all()
         assert not imported.report.of("not_a_number")
 
-    def test_text_in_a_number_column(self, clean, tmp_path):
+    def test_text_in_a_number_column_is_refused(self, clean, tmp_path):
         y = clean["y"].astype(object)
         y[12] = "12,5"
         self.refuse(tmp_path, {**clean, "y": y}, "Row 13", "'y'", "'12,5'")
 
-    def test_gap_and_splitting_there_loses_nothing(self, clean, tmp_path):
+    def test_gap_is_refused_split_or_kept_without_loss_of_rows(self, clean, tmp_path):
         kept = np.ones(len(EVEN), dtype=bool)
         kept[400:430] = False
         columns = {name: column[kept] for name, column in clean.items()}
@@ -284,11 +284,11 @@ class TestRefusal:
         np.testing.assert_array_equal(np.concatenate([first.times_s, second.times_s]), EVEN[kept])
         with pytest.raises(DataError, match="2 episodes"):
             _ = imported.episode
-        whole = import_csv(tmp_path / "run.csv", mapping=CANONICAL.with_options(gaps="keep")).episode
-        assert whole.ticks == 869
-        assert set(np.unique(whole.extra["segment"])) == {0.0, 1.0}
+        with_gap = import_csv(tmp_path / "run.csv", mapping=CANONICAL.with_options(gaps="keep")).episode
+        assert with_gap.ticks == 869
+        assert set(np.unique(with_gap.extra["segment"])) == {0.0, 1.0}
 
-    def test_time_that_goes_back_or_stands(self, clean, tmp_path):
+    def test_repeated_and_decreasing_stamps_are_refused_or_dropped(self, clean, tmp_path):
         t = clean["t"].copy()
         t[100] = t[99]
         t[500] = t[400]
@@ -297,37 +297,37 @@ class TestRefusal:
         assert imported.episode.ticks == 897
         assert np.all(np.diff(imported.episode.times_s) > 0)
 
-    def test_degrees_where_radians_belong(self, clean, tmp_path):
+    def test_yaw_in_degrees_is_refused_or_converted(self, clean, tmp_path):
         columns = {**clean, "yaw": np.rad2deg(clean["yaw"])}
         self.refuse(tmp_path, columns, "'yaw'", "degrees", "--yaw-unit deg")
         mapping = CANONICAL.with_options(columns={"yaw": {"unit": "deg"}})
         episode = import_csv(tmp_path / "run.csv", mapping=mapping).episode
         np.testing.assert_allclose(episode.states[:, 2], clean["yaw"], atol=1e-12)
 
-    def test_degrees_a_second(self, clean, tmp_path):
+    def test_yaw_rate_in_degrees_per_second_is_refused(self, clean, tmp_path):
         columns = {**clean, "yaw_rate": np.rad2deg(clean["yaw_rate"])}
         self.refuse(tmp_path, columns, "57.3 times", "--yaw-rate-unit deg/s")
 
-    def test_millimetres(self, clean, tmp_path):
+    def test_position_in_millimetres_is_refused(self, clean, tmp_path):
         columns = {**clean, "x": 1e3 * clean["x"], "y": 1e3 * clean["y"]}
         self.refuse(tmp_path, columns, "mm", "--x-unit mm --y-unit mm")
 
-    def test_speed_in_kilometres_an_hour(self, clean, tmp_path):
+    def test_speed_in_kilometres_per_hour_is_refused(self, clean, tmp_path):
         columns = {**clean, "vx": 3.6 * clean["vx"], "vy": 3.6 * clean["vy"]}
         self.refuse(tmp_path, columns, "times the speed of the pose", "km/h", "--vx-unit km/h")
 
-    def test_commands_of_another_range(self, clean, tmp_path):
+    def test_commands_beyond_one_are_refused(self, clean, tmp_path):
         steering = 25 * clean["steering"] / np.abs(clean["steering"]).max()
         self.refuse(tmp_path, {**clean, "steering": steering}, "reaches 25", "--steering-scale 0.04")
 
-    def test_several_faults_are_told_at_once(self, clean, tmp_path):
+    def test_several_faults_are_reported_together(self, clean, tmp_path):
         columns = {**clean, "steering": 25 * clean["steering"], "yaw_rate": np.rad2deg(clean["yaw_rate"])}
         with pytest.raises(DataError, match="2 faults") as caught:
             import_csv(foreign.write(tmp_path / "run.csv", columns))
         assert str(caught.value).count("\n  - ") == 2
 
     @pytest.mark.parametrize(
-        ("content", "said"),
+        ("content", "message"),
         [
             (b"", "is empty"),
             (b"t,x,y,yaw,steering,throttle\n", "has 0 rows"),
@@ -338,20 +338,20 @@ class TestRefusal:
             (gzip.compress(b"t,x,y\n" * 1000, mtime=0)[:-20], "not a whole gzip file"),
         ],
     )
-    def test_files_that_are_no_recording(self, content, said, tmp_path):
+    def test_files_that_are_no_recording_are_refused(self, content, message, tmp_path):
         path = tmp_path / "run.csv"
         path.write_bytes(content)
-        with pytest.raises(DataError, match=said):
+        with pytest.raises(DataError, match=message):
             import_csv(path)
 
-    def test_no_such_file(self, tmp_path):
+    def test_missing_file_is_reported(self, tmp_path):
         with pytest.raises(DataError, match="check the path"):
             import_csv(tmp_path / "nowhere.csv")
 
 
 class TestMappingFile:
     @pytest.mark.parametrize(
-        ("text", "said"),
+        ("text", "message"),
         [
             ("velocity_frane = 'world'\n[columns]\nt = 't'\n", "did you mean 'velocity_frame'"),
             ("[columns.yawrate]\nname = 'w'\n", "did you mean 'yaw_rate'"),
@@ -361,12 +361,12 @@ class TestMappingFile:
             ("layout = 'x'\n", "names no columns"),
         ],
     )
-    def test_mistakes_are_named(self, text, said, tmp_path):
+    def test_mistakes_in_a_mapping_file_are_named(self, text, message, tmp_path):
         (tmp_path / "map.toml").write_text(text)
-        with pytest.raises(ConfigError, match=said):
+        with pytest.raises(ConfigError, match=message):
             load_mapping(tmp_path / "map.toml")
 
-    def test_options_of_a_copy_are_checked(self):
+    def test_options_of_a_changed_mapping_are_checked(self):
         with pytest.raises(ConfigError, match="did you mean 'velocities'"):
             CANONICAL.with_options(velocitys="pose")
         changed = CANONICAL.with_options(columns={"steering": {"sign": -1}}, velocities="pose")

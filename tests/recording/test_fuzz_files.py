@@ -1,6 +1,6 @@
-"""Damaged and hostile files: nothing but carlab's own errors leaves the readers, each one sentence that names the file.
+"""Damaged and hostile files: the readers raise only errors of carlab, each in one sentence with the name of the file.
 
-Cases are drawn from a fixed seed, so that a failure repeats; the number in the message is the case.
+Cases are drawn with a fixed seed; the file name in a message contains the number of the case.
 """
 
 import gzip
@@ -30,26 +30,26 @@ JSON_TEXTS += ["1e999", "-1", "9" * 5000, '{"a": "b"}', '{"a": null}', "[{}, {},
 
 
 def damaged(rng, content):
-    """Bytes cut short, overwritten, inserted, or with a stretch removed."""
+    """Content with random truncations, overwritten, inserted or removed bytes."""
     content = bytearray(content)
     for _ in range(int(rng.integers(1, 6))):
-        at = int(rng.integers(len(content)))
+        position = int(rng.integers(len(content)))
         match int(rng.integers(4)):
             case 0:
-                content = content[: max(at, 1)]
+                content = content[: max(position, 1)]
             case 1:
-                content[at] = int(rng.integers(256))
+                content[position] = int(rng.integers(256))
             case 2:
-                content[at:at] = rng.bytes(int(rng.integers(1, 9)))
+                content[position:position] = rng.bytes(int(rng.integers(1, 9)))
             case _:
-                del content[at : at + int(rng.integers(1, 40))]
+                del content[position : position + int(rng.integers(1, 40))]
         if not content:
             return b"\x00"
     return bytes(content)
 
 
 def refusal(read, path):
-    """The error that reading raises, None where the file can be read; any error but carlab's own is a failure."""
+    """Message of the CarlabError that ``read`` raises; None if the file can be read. Other errors are not caught."""
     try:
         read(path)
     except CarlabError as error:
@@ -65,7 +65,7 @@ def rows():
 
 @pytest.mark.filterwarnings("error")
 class TestCsv:
-    def test_damaged_bytes(self, rows, tmp_path):
+    def test_damaged_csv_is_read_or_refused(self, rows, tmp_path):
         rng = np.random.default_rng(1)
         plain = "\n".join(",".join(row) for row in rows).encode()
         refused = 0
@@ -75,7 +75,7 @@ class TestCsv:
             refused += refusal(import_csv, path) is not None
         assert refused > 20
 
-    def test_damaged_gzip_is_refused(self, rows, tmp_path):
+    def test_damaged_gzip_is_read_or_refused(self, rows, tmp_path):
         rng = np.random.default_rng(2)
         packed = gzip.compress("\n".join(",".join(row) for row in rows).encode())
         for case in range(50):
@@ -83,14 +83,14 @@ class TestCsv:
             path.write_bytes(damaged(rng, packed))
             refusal(import_csv, path)
 
-    def test_cells_of_another_kind(self, rows, tmp_path):
+    def test_cells_of_another_type_are_read_or_refused(self, rows, tmp_path):
         rng = np.random.default_rng(3)
         for case in range(80):
             changed = [list(row) for row in rows]
             column = int(rng.integers(len(rows[0])))
-            whole = rng.random() < 0.3
+            is_whole_column = rng.random() < 0.3
             cell = str(rng.choice(CELLS))
-            for row in range(1, len(rows)) if whole else rng.integers(0, len(rows), 4).tolist():
+            for row in range(1, len(rows)) if is_whole_column else rng.integers(0, len(rows), 4).tolist():
                 changed[row][column] = cell
             path = tmp_path / f"{case}.csv"
             path.write_text("\n".join(",".join(row) for row in changed), encoding="utf-8")
@@ -98,7 +98,7 @@ class TestCsv:
 
 
 def recording_with(path, documents, monkeypatch, key, text):
-    """A recording with ticks, whose record of the episode's end has ``text`` under ``key``."""
+    """Write a recording whose end record has ``text`` under ``key``."""
     with monkeypatch.context() as patch:
         record = {**ended_to_metadata(documents[-1]), key: text}
         patch.setattr("carlab.recording.mcap.sink.ended_to_metadata", lambda _: record)
@@ -109,7 +109,7 @@ def recording_with(path, documents, monkeypatch, key, text):
 
 
 def metadata_file(path, record, config=b""):
-    """A complete MCAP file with one metadata record of an episode and no message."""
+    """Write a complete MCAP file with one episode record and no message."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(library="carlab 1")
@@ -120,40 +120,40 @@ def metadata_file(path, record, config=b""):
 
 
 class TestMcap:
-    def test_damaged_bytes(self, make_documents, tmp_path):
+    def test_damaged_mcap_is_read_or_refused(self, make_documents, tmp_path):
         rng = np.random.default_rng(4)
-        whole = tmp_path / "whole.mcap"
-        with Recorder([McapSink(whole)]) as recorder:
+        complete = tmp_path / "complete.mcap"
+        with Recorder([McapSink(complete)]) as recorder:
             for document in make_documents(20):
                 recorder.emit(document)
-        content = whole.read_bytes()
+        content = complete.read_bytes()
         for case in range(100):
             path = tmp_path / f"{case}.mcap"
             path.write_bytes(damaged(rng, content))
             refusal(read_episode, path)
 
-    def test_metadata_of_another_kind_is_refused_by_name_of_the_file(self, make_documents, tmp_path):
+    def test_metadata_of_another_type_is_refused_with_the_name_of_the_file(self, make_documents, tmp_path):
         documents = make_documents(3)
         record = {**started_to_metadata(documents[0]), **ended_to_metadata(documents[-1])}
         for key in ("episode", "start_t_s", "reality", "goal", "arena_m", "end_reason", "statistics"):
             for case, text in enumerate(JSON_TEXTS):
                 path = metadata_file(tmp_path / f"{case}.mcap", {**record, key: text})
                 message = refusal(read_episode, path)
-                assert message is not None  # it holds no tick
+                assert message is not None  # the file has no tick
                 assert str(path) in message, (key, text[:20])
                 assert len(message) < 600, (key, text[:20])
 
-    def test_configuration_that_is_not_text(self, make_documents, tmp_path):
+    def test_configuration_that_is_not_text_is_refused(self, make_documents, tmp_path):
         path = metadata_file(tmp_path / "c.mcap", started_to_metadata(make_documents(3)[0]), b"\xff\xfe")
         assert str(path) in refusal(read_episode, path)
 
-    def test_goal_with_too_few_numbers(self, make_documents, tmp_path):
+    def test_goal_with_too_few_numbers_is_refused(self, make_documents, tmp_path):
         record = started_to_metadata(make_documents(3)[0]) | {"goal": json.dumps([1.0])}
         message = refusal(read_episode, metadata_file(tmp_path / "goal.mcap", record))
         assert schemas.EPISODE_RECORD in message
 
     @pytest.mark.parametrize("text", ["[1]", "3", "null", '{"a": "b"}', '{"a": null}', '{"a": [1]}'])
-    def test_statistics_that_are_not_numbers_by_name(self, make_documents, tmp_path, monkeypatch, text):
+    def test_statistics_that_are_not_numbers_are_refused(self, make_documents, tmp_path, monkeypatch, text):
         path = recording_with(tmp_path / "end.mcap", make_documents(3), monkeypatch, "statistics", text)
         message = refusal(read_episode, path)
         assert message is not None

@@ -1,3 +1,5 @@
+"""Summary pictures of episodes, and export to CSV and Parquet."""
+
 import csv
 import dataclasses
 import gzip
@@ -20,7 +22,7 @@ def episode(make_documents):
     return episode_from_documents(make_documents(60))
 
 
-def test_the_outline_is_a_car_that_points_where_it_drives():
+def test_outline_has_the_size_and_heading_of_the_car():
     shape = outline(1.0, 2.0, math.pi / 2)
     nose = shape[np.argmax(shape[:, 1])]
     np.testing.assert_allclose(nose, (1.0, 2.21), atol=1e-12)
@@ -28,33 +30,33 @@ def test_the_outline_is_a_car_that_points_where_it_drives():
     np.testing.assert_array_equal(shape[0], shape[-1])
 
 
-def test_the_picture_shows_goal_and_car_where_they_are(tmp_path, episode):
+def test_picture_shows_the_goal_only_if_the_metadata_has_one(tmp_path, episode):
     save_summary([episode], tmp_path / "one.png")
     pixels = imread(tmp_path / "one.png")[:, :, :3]
     assert pixels.shape[1] > 1200
     goal_green = (np.abs(pixels - np.array([0, 158, 115]) / 255) < 0.06).all(axis=2)
     assert goal_green.sum() > 100
-    bare = dataclasses.replace(episode, metadata={})
-    save_summary([bare], tmp_path / "bare.png", "No surroundings")
-    left = imread(tmp_path / "bare.png")[:, : pixels.shape[1] // 2, :3]
-    assert not (np.abs(left - np.array([0, 158, 115]) / 255) < 0.02).all(axis=2).sum() > 100
+    without_metadata = dataclasses.replace(episode, metadata={})
+    save_summary([without_metadata], tmp_path / "bare.png", "No surroundings")
+    plan = imread(tmp_path / "bare.png")[:, : pixels.shape[1] // 2, :3]
+    assert not (np.abs(plan - np.array([0, 158, 115]) / 255) < 0.02).all(axis=2).sum() > 100
 
 
 @pytest.mark.parametrize("count", [2, 12])
-def test_several_episodes_and_awkward_ones_make_one_picture(tmp_path, episode, count):
-    odd = dataclasses.replace(
+def test_picture_of_several_episodes_accepts_missing_data(tmp_path, episode, count):
+    incomplete = dataclasses.replace(
         episode,
         rewards=np.full(episode.ticks, np.nan),
         requested=np.full_like(episode.requested, np.nan),
         metadata={},
         extra={},
     )
-    save_summary([episode] * (count - 1) + [odd], tmp_path / "many.svg", "Many")
+    save_summary([episode] * (count - 1) + [incomplete], tmp_path / "many.svg", "Many")
     assert (tmp_path / "many.svg").read_text().startswith("<?xml")
-    save_summary([odd], tmp_path / "odd.png")
+    save_summary([incomplete], tmp_path / "odd.png")
 
 
-def test_what_cannot_be_drawn_or_written_says_why(tmp_path, episode):
+def test_picture_or_table_that_cannot_be_written_is_reported(tmp_path, episode):
     with pytest.raises(DataError, match="no episode"):
         save_summary([], tmp_path / "x.png")
     with pytest.raises(DataError, match=r"use \.png"):
@@ -67,14 +69,14 @@ def test_what_cannot_be_drawn_or_written_says_why(tmp_path, episode):
             write(episode, tmp_path / "file" / "x")
 
 
-def test_goal_and_arena_come_back_from_the_metadata(episode):
+def test_goal_and_arena_are_read_from_the_metadata(episode):
     assert goal_of(episode.metadata) == (0.0, 0.0, math.pi)
     np.testing.assert_array_equal(polygon_of(episode.metadata, "arena_m")[2], (2.8, 1.5))
     assert goal_of({}) is None
     assert polygon_of({}, "path_m").shape == (0, 2)
 
 
-def test_csv_has_the_agreed_columns_and_every_bit_of_every_number(tmp_path, episode):
+def test_csv_has_the_documented_columns_with_exact_numbers(tmp_path, episode):
     write_csv(episode, tmp_path / "episode.csv")
     with (tmp_path / "episode.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
@@ -91,7 +93,7 @@ def test_csv_has_the_agreed_columns_and_every_bit_of_every_number(tmp_path, epis
     assert list(tmp_path.iterdir()) == [tmp_path / "episode.csv"]
 
 
-def test_a_packed_csv_is_the_same_text_and_always_the_same_bytes(tmp_path, episode):
+def test_compressed_csv_has_the_same_text_and_reproducible_bytes(tmp_path, episode):
     write_csv(episode, tmp_path / "plain.csv")
     write_csv(episode, tmp_path / "a.csv.gz")
     write_csv(episode, tmp_path / "b.csv.gz")
@@ -99,7 +101,7 @@ def test_a_packed_csv_is_the_same_text_and_always_the_same_bytes(tmp_path, episo
     assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
 
 
-def test_parquet_carries_units_and_metadata(tmp_path, episode):
+def test_parquet_contains_units_and_metadata(tmp_path, episode):
     write_parquet(episode, tmp_path / "episode.parquet")
     table = pq.read_table(tmp_path / "episode.parquet")
     units = {field.name: field.metadata[b"unit"].decode() for field in table.schema}
@@ -109,7 +111,7 @@ def test_parquet_carries_units_and_metadata(tmp_path, episode):
     assert table.column_names == list(table_of(episode))
 
 
-def test_an_extra_column_never_hides_a_standard_one(episode):
+def test_extra_column_does_not_replace_a_standard_one(episode):
     table = table_of(dataclasses.replace(episode, extra={"yaw": np.ones(61)}))
     np.testing.assert_array_equal(table["yaw"], episode.states[:, 2])
     np.testing.assert_array_equal(table["extra_yaw"], np.ones(61))

@@ -1,3 +1,5 @@
+"""The recorder: order and loss of documents, failing disks, and files after a crash or a kill."""
+
 import errno
 import logging
 import os
@@ -22,7 +24,7 @@ from carlab.recording.sink import Sink
 
 
 class MemorySink(Sink):
-    """Keeps documents; may wait for a gate or raise an error at the n-th document."""
+    """Keeps documents; waits for ``gate`` if given, and raises ``error`` at document number ``at``."""
 
     def __init__(self, gate=None, error=None, at=0):
         super().__init__()
@@ -50,7 +52,7 @@ class MemorySink(Sink):
         self.complete = True
 
 
-def test_documents_reach_every_sink_in_order_and_the_file_is_finished_at_the_end(make_documents):
+def test_documents_reach_every_sink_in_order_and_sinks_are_finished(make_documents):
     documents = make_documents(30)
     first, second = MemorySink(), MemorySink()
     with Recorder([first, second]) as recorder:
@@ -63,7 +65,7 @@ def test_documents_reach_every_sink_in_order_and_the_file_is_finished_at_the_end
     assert recorder.failed is None
 
 
-def test_constructing_does_nothing(tmp_path):
+def test_constructor_starts_no_thread_and_writes_no_file(tmp_path):
     before = threading.active_count()
     recorder = Recorder([McapSink(tmp_path / "runs" / "0001.mcap")])
     assert threading.active_count() == before
@@ -73,10 +75,10 @@ def test_constructing_does_nothing(tmp_path):
         recorder.emit(SafetyEvent(0.0, "clip", ""))
 
 
-def test_a_blocked_sink_never_blocks_the_loop_and_what_must_not_be_lost_is_not(make_documents):
+def test_blocked_sink_blocks_no_emit_and_loses_no_event(make_documents):
     gate = threading.Event()
-    slow = MemorySink(gate)
-    recorder = Recorder([slow], capacity=50)
+    blocked = MemorySink(gate)
+    recorder = Recorder([blocked], capacity=50)
     recorder.open()
     documents = make_documents(400)
     emitted = threading.Event()
@@ -92,24 +94,24 @@ def test_a_blocked_sink_never_blocks_the_loop_and_what_must_not_be_lost_is_not(m
     documents, end = documents[:-1], documents[-1]
     thread = threading.Thread(target=loop)
     thread.start()
-    assert emitted.wait(20.0), "emit blocked although the sink did"
+    assert emitted.wait(20.0), "emit was blocked by the sink"
     thread.join()
     recorder.emit(end)
     gate.set()
     recorder.close()
     assert recorder.dropped > 700
-    assert isinstance(slow.items[0], EpisodeStarted)
-    assert sum(isinstance(d, SafetyEvent) for d in slow.items) == 201
-    assert isinstance(slow.items[-1], EpisodeEnded)
-    assert slow.items[-1].reason is EndReason.GOAL_REACHED
-    assert slow.items[-1].statistics["recorder_dropped"] == recorder.dropped
-    kept = sum(isinstance(d, (Tick, Transition)) for d in slow.items)
+    assert isinstance(blocked.items[0], EpisodeStarted)
+    assert sum(isinstance(d, SafetyEvent) for d in blocked.items) == 201
+    assert isinstance(blocked.items[-1], EpisodeEnded)
+    assert blocked.items[-1].reason is EndReason.GOAL_REACHED
+    assert blocked.items[-1].statistics["recorder_dropped"] == recorder.dropped
+    kept = sum(isinstance(d, (Tick, Transition)) for d in blocked.items)
     assert kept + recorder.dropped == sum(not isinstance(d, (EpisodeStarted, SafetyEvent)) for d in documents) - sum(
-        type(d).__name__ == "HealthReading" for d in slow.items
+        type(d).__name__ == "HealthReading" for d in blocked.items
     )
 
 
-def test_close_gives_up_on_a_disk_that_hangs_and_says_so(make_documents):
+def test_close_ends_and_reports_a_disk_that_hangs(make_documents):
     gate = threading.Event()
     recorder = Recorder([MemorySink(gate)])
     recorder.open()
@@ -128,32 +130,32 @@ def test_close_gives_up_on_a_disk_that_hangs_and_says_so(make_documents):
         (ValueError("a bug"), "a bug", True),
     ],
 )
-def test_a_sink_that_raises_is_left_out_and_the_others_go_on(make_documents, caplog, error, words, finished):
+def test_failed_sink_is_closed_and_the_others_continue(make_documents, caplog, error, words, finished):
     documents = make_documents(20)
-    broken, sound = MemorySink(error=error, at=9), MemorySink()
-    with caplog.at_level(logging.CRITICAL), Recorder([broken, sound]) as recorder:
+    failing, intact = MemorySink(error=error, at=9), MemorySink()
+    with caplog.at_level(logging.CRITICAL), Recorder([failing, intact]) as recorder:
         for document in documents:
             recorder.emit(document)
-    assert sound.items == documents
+    assert intact.items == documents
     assert words in recorder.failed
     assert "\n" not in recorder.failed
-    assert broken.finished
+    assert failing.finished
     if not finished:
-        assert not broken.complete
+        assert not failing.complete
 
 
-def test_a_disk_that_fills_up_leaves_a_partial_file_that_can_be_read(tmp_path, make_documents, monkeypatch):
+def test_full_disk_leaves_a_readable_partial_file(tmp_path, make_documents, monkeypatch):
     sink = McapSink(tmp_path / "0001.mcap")
     documents = make_documents(60)
     sink.open()
     for document in documents[:60]:
         sink.write(document)
     sink.flush()
-    room = sink._file
+    file = sink._file
 
     class FullDisk:
         def __getattr__(self, name):
-            return getattr(room, name)
+            return getattr(file, name)
 
         def write(self, data):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -172,7 +174,7 @@ def test_a_disk_that_fills_up_leaves_a_partial_file_that_can_be_read(tmp_path, m
     assert episode.metadata["end_reason"] == "CRASHED"
 
 
-def test_a_file_that_cannot_be_made_is_told_before_anything_moves(tmp_path, make_documents):
+def test_file_that_cannot_be_created_is_reported_when_the_recorder_opens(tmp_path, make_documents):
     (tmp_path / "taken").write_text("")
     (tmp_path / "0002.mcap").write_text("")
     first = McapSink(tmp_path / "0001.mcap")
@@ -186,7 +188,7 @@ def test_a_file_that_cannot_be_made_is_told_before_anything_moves(tmp_path, make
     assert sorted(p.name for p in tmp_path.iterdir()) == ["0002.mcap", "taken"]
 
 
-def test_a_disk_without_room_is_told_before_anything_moves(tmp_path, monkeypatch):
+def test_disk_without_space_is_reported_when_the_recorder_opens(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr("carlab.recording.sink.shutil.disk_usage", lambda path: usage._replace(free=1_000_000))
     for sink in (McapSink(tmp_path / "0001.mcap"), RerunSink(tmp_path / "0001.rrd")):
@@ -195,7 +197,7 @@ def test_a_disk_without_room_is_told_before_anything_moves(tmp_path, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
-def test_closing_without_an_end_marks_the_file_as_crashed(tmp_path, make_documents):
+def test_close_without_an_end_marks_the_file_as_crashed(tmp_path, make_documents):
     path = tmp_path / "0001.mcap"
 
     def loop():
@@ -214,7 +216,7 @@ def test_closing_without_an_end_marks_the_file_as_crashed(tmp_path, make_documen
     assert read_documents(path)[-1].total_reward == pytest.approx(sum(0.1 * k for k in range(30)))
 
 
-def test_the_first_end_wins_and_finishes_the_file_while_the_loop_hangs(tmp_path, make_documents):
+def test_first_end_is_kept_and_finishes_the_file_while_the_loop_hangs(tmp_path, make_documents):
     path = tmp_path / "0001.mcap"
     documents = make_documents(30)
     recorder = Recorder([McapSink(path)])
@@ -230,14 +232,14 @@ def test_the_first_end_wins_and_finishes_the_file_while_the_loop_hangs(tmp_path,
     thread.start()
     thread.join(30.0)
     assert path.exists()
-    for document in documents[40:]:  # the loop wakes up again and knows nothing of this
+    for document in documents[40:]:  # the loop resumes and emits its own end
         recorder.emit(document)
     recorder.close()
     assert read_episode(path).metadata["end_reason"] == "LOOP_HUNG"
     assert sum(isinstance(d, EpisodeEnded) for d in read_documents(path)) == 1
 
 
-def test_log_lines_and_early_events_get_into_the_recording(tmp_path, make_documents):
+def test_log_lines_and_early_events_are_recorded(tmp_path, make_documents):
     path = tmp_path / "0001.mcap"
     documents = make_documents(5)
     logger = logging.getLogger("carlab.test_recording")
@@ -250,14 +252,14 @@ def test_log_lines_and_early_events_get_into_the_recording(tmp_path, make_docume
             recorder.emit(SafetyEvent(1.0, "armed", "before the start"))
             for document in documents[:-1]:
                 recorder.emit(document)
-            logger.error("the link %s", "stutters")
+            logger.error("the link %s", "is slow")
             recorder.emit(documents[-1])
         logger.error("afterwards")
     finally:
         logger.removeHandler(handler)
     recording = read_recording(path)
     assert [(line.level, line.name, line.message) for line in recording.log if line.name == logger.name] == [
-        (logging.ERROR, logger.name, "the link stutters")
+        (logging.ERROR, logger.name, "the link is slow")
     ]
     assert recording.documents[1] == SafetyEvent(1.0, "armed", "before the start")
 
@@ -299,13 +301,13 @@ def test_sigkill_loses_at_most_half_a_second(tmp_path, request):
     episode = read_episode(path.with_name("0001.mcap.partial"))
     assert episode.metadata["end_reason"] == "CRASHED"
     assert episode.metadata["recovered"] == "true"
-    # Half a second and, on a machine shared with others, a stall of the writer thread of another half.
+    # A flush interval of half a second, and half a second for a delayed writer thread on a busy machine.
     safe = [step for step, t_s in emitted if t_s < emitted[-1][1] - 1.0]
     assert episode.ticks >= len(safe) > 20
     np.testing.assert_array_equal(episode.sent[:, 0], np.sin(0.3 * np.arange(episode.ticks)))
 
 
-FULL = """
+WRITER_WITH_SIZE_LIMIT = """
 import resource, sys
 import importlib.util
 spec = importlib.util.spec_from_file_location("documents_of_a_test", sys.argv[1])
@@ -325,17 +327,24 @@ print(recorder.failed)
 """
 
 
-@pytest.mark.parametrize("room", [40_000, 150_000])
-def test_a_file_system_that_takes_no_more_ends_in_a_sentence_and_readable_pieces(tmp_path, request, room):
-    command = [sys.executable, "-c", FULL, str(request.path.with_name("conftest.py")), str(tmp_path), str(room)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-    assert " could not be written: File too large" in done.stdout
-    assert "Traceback" not in done.stdout + done.stderr
+@pytest.mark.parametrize("max_bytes", [40_000, 150_000])
+def test_file_size_limit_gives_one_sentence_and_readable_partial_files(tmp_path, request, max_bytes):
+    command = [
+        sys.executable,
+        "-c",
+        WRITER_WITH_SIZE_LIMIT,
+        str(request.path.with_name("conftest.py")),
+        str(tmp_path),
+        str(max_bytes),
+    ]
+    writer = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert " could not be written: File too large" in writer.stdout
+    assert "Traceback" not in writer.stdout + writer.stderr
     assert sorted(p.name for p in tmp_path.iterdir()) == ["1.mcap.partial", "1.rrd.partial", "2.mcap.partial"]
     assert read_episode(tmp_path / "1.mcap.partial").ticks > 10
 
 
-def test_flushes_come_by_time_also_when_nothing_more_is_emitted(make_documents):
+def test_sinks_are_flushed_periodically_without_new_documents(make_documents):
     sink = MemorySink()
     with Recorder([sink], flush_interval_s=0.01) as recorder:
         recorder.emit(make_documents(1)[0])

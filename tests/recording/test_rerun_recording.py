@@ -1,3 +1,5 @@
+"""Rerun recordings: entities, values, properties, incomplete files and screenshots."""
+
 import subprocess
 import sys
 from pathlib import Path
@@ -11,14 +13,14 @@ from carlab.core.errors import DataError, NotReadyError
 from carlab.core.outcome import EndReason
 from carlab.recording.episode_builder import episode_from_documents
 from carlab.recording.recorder import Recorder
-from carlab.recording.rerun import blueprint as look
+from carlab.recording.rerun import blueprint
 from carlab.recording.rerun.screenshot import has_vulkan_driver, save_screenshot
 from carlab.recording.rerun.sink import RerunSink, episode_to_rrd
 
 RERUN = Path(sys.executable).with_name("rerun")
 needs_rerun = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed beside this Python")
 
-MOVING = {"map/base_link", "map/trail", *look.SERIES}
+MOVING = {"map/base_link", "map/trail", *blueprint.SERIES}
 LIVE = MOVING | {"mocap/pose", "safety/state", "safety/event", "car/health/battery_v", "episode/end", "log"}
 STILL = {"map", "map/arena", "map/path", "map/goal", "map/goal/pose", "map/goal/heading", "map/base_link/body"}
 
@@ -37,7 +39,7 @@ def entities(path):
 
 
 def rows_of(path):
-    """Rows by entity and, for series, the values by time: read chunk by chunk, without the viewer's query engine."""
+    """Values by entity and time [s], read chunk by chunk without the query engine of the viewer."""
     values: dict[str, dict[float, np.ndarray]] = {}
     for chunk in RrdReader(str(path)).stream().to_chunks():
         batch = chunk.to_record_batch()
@@ -57,12 +59,12 @@ def rows_of(path):
 
 
 def verify(path):
-    done = subprocess.run([RERUN, "rrd", "verify", path], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    verification = subprocess.run([RERUN, "rrd", "verify", path], capture_output=True, text=True, check=False)
+    assert verification.returncode == 0, verification.stdout + verification.stderr
 
 
 @needs_rerun
-def test_a_live_recording_verifies_and_has_the_entities_of_the_layout(tmp_path, make_documents):
+def test_live_recording_is_valid_and_has_the_entities_of_the_layout(tmp_path, make_documents):
     path = record(tmp_path / "0001.rrd", make_documents(60))
     assert [p.name for p in tmp_path.iterdir()] == ["0001.rrd"]
     verify(path)
@@ -72,12 +74,12 @@ def test_a_live_recording_verifies_and_has_the_entities_of_the_layout(tmp_path, 
     assert len(reader.blueprints()) == 1
 
 
-def test_values_and_times_are_what_was_emitted(tmp_path, make_documents):
+def test_values_and_times_equal_the_emitted_ones(tmp_path, make_documents):
     documents = make_documents(60)
     episode = episode_from_documents(documents)
     rows = rows_of(record(tmp_path / "0001.rrd", documents))
     times_s = episode.times_s - documents[0].t_s
-    for name, wanted, count in (
+    for name, expected, count in (
         ("car/action_sent/steering", episode.sent[:, 0], 60),
         ("car/action_requested/throttle", episode.requested[:, 1], 60),
         ("car/state/yaw_rate_radps", episode.states[:, 5], 61),
@@ -86,27 +88,31 @@ def test_values_and_times_are_what_was_emitted(tmp_path, make_documents):
     ):
         assert len(rows[name]) == count, name
         keys = sorted(rows[name])
-        at = times_s[1:] if name.endswith("reward") else times_s[:count]
-        np.testing.assert_allclose(keys, at, atol=2e-9, err_msg=name)
-        np.testing.assert_array_equal([float(rows[name][k]) for k in keys], wanted, err_msg=name)
-    places = [rows["map/base_link"][t] for t in sorted(rows["map/base_link"])]
-    np.testing.assert_allclose(np.array(places)[:, :2], episode.states[:, :2], atol=1e-6)
+        expected_times_s = times_s[1:] if name.endswith("reward") else times_s[:count]
+        np.testing.assert_allclose(keys, expected_times_s, atol=2e-9, err_msg=name)
+        np.testing.assert_array_equal([float(rows[name][k]) for k in keys], expected, err_msg=name)
+    positions = [rows["map/base_link"][t] for t in sorted(rows["map/base_link"])]
+    np.testing.assert_allclose(np.array(positions)[:, :2], episode.states[:, :2], atol=1e-6)
     trail = [rows["map/trail"][t] for t in sorted(rows["map/trail"])]
-    for before, piece, after in zip(places, trail[1:], places[1:], strict=False):
-        np.testing.assert_array_equal(piece, [before, after])
+    for previous, segment, current in zip(positions, trail[1:], positions[1:], strict=False):
+        np.testing.assert_array_equal(segment, [previous, current])
 
 
 @needs_rerun
-def test_arrays_give_the_same_entities_as_the_live_sink_and_overlays_come_on_top(tmp_path, make_documents):
+def test_converted_episode_has_the_entities_of_a_live_one_and_its_overlays(tmp_path, make_documents):
     episode = episode_from_documents(make_documents(60))
     predicted = episode.states + 0.1
     predicted[:4] = np.nan
     path = tmp_path / "view.rrd"
     episode_to_rrd(episode, path, "recorded and predicted", {"sim model": predicted})
     verify(path)
-    found = entities(path)
-    assert found >= MOVING | STILL
-    assert found >= {"map/overlay/sim_model/trail", "map/overlay/sim_model/base_link", "overlay/sim_model/vx_mps"}
+    entity_paths = entities(path)
+    assert entity_paths >= MOVING | STILL
+    assert entity_paths >= {
+        "map/overlay/sim_model/trail",
+        "map/overlay/sim_model/base_link",
+        "overlay/sim_model/vx_mps",
+    }
     rows = rows_of(path)
     assert len(rows["overlay/sim_model/vx_mps"]) == 57
     last = max(rows["overlay/sim_model/vx_mps"])
@@ -118,28 +124,34 @@ def test_arrays_give_the_same_entities_as_the_live_sink_and_overlays_come_on_top
 
 
 def properties(path):
-    """The newest value of each property, as the viewer shows them."""
-    found = {}
+    """Newest value of each property."""
+    newest = {}
     for chunk in RrdReader(str(path)).stream().to_chunks():
         if chunk.entity_path.startswith("/__properties"):
             batch = chunk.to_record_batch()
             for name in batch.schema.names[1:]:
                 cells = zip(batch.column(0).to_pylist(), batch.column(name).to_pylist(), strict=True)
                 rows = [(row, cell[0]) for row, cell in cells if cell]
-                found[name] = max([*rows, *([found[name]] if name in found else [])], key=lambda pair: pair[0])
-    return {name: value for name, (_, value) in found.items()}
+                newest[name] = max([*rows, *([newest[name]] if name in newest else [])], key=lambda pair: pair[0])
+    return {name: value for name, (_, value) in newest.items()}
 
 
-def test_how_it_ended_and_what_the_car_was_are_properties(tmp_path, make_documents):
+def test_end_reason_and_car_are_properties(tmp_path, make_documents):
     ended = properties(record(tmp_path / "ended.rrd", make_documents(5)))
-    wanted = {"reality": "emulated", "car": "paper car", "reason": "GOAL_REACHED", "steps": 5, "detail": "within 0.1 m"}
-    assert wanted.items() <= ended.items()
+    expected = {
+        "reality": "emulated",
+        "car": "paper car",
+        "reason": "GOAL_REACHED",
+        "steps": 5,
+        "detail": "within 0.1 m",
+    }
+    assert expected.items() <= ended.items()
     assert ended["RecordingInfo:name"] == "Episode 7: circle on paper car, EMULATED"
     crashed = properties(record(tmp_path / "crashed.rrd", make_documents(5, end=False)))
     assert crashed["reason"] == "CRASHED"
 
 
-def test_a_killed_recording_says_crashed_because_nothing_else_was_ever_written(tmp_path, make_documents):
+def test_end_reason_of_a_killed_recording_is_crashed(tmp_path, make_documents):
     sink = RerunSink(tmp_path / "0001.rrd")
     sink.open()
     for document in make_documents(20, end=False):
@@ -156,7 +168,7 @@ def test_a_killed_recording_says_crashed_because_nothing_else_was_ever_written(t
 
 
 @needs_rerun
-def test_an_episode_without_any_tick_is_a_sound_file_too(tmp_path, make_documents):
+def test_episode_without_a_tick_is_a_valid_file(tmp_path, make_documents):
     started = make_documents(1)[0]
     documents = [
         started,
@@ -168,7 +180,7 @@ def test_an_episode_without_any_tick_is_a_sound_file_too(tmp_path, make_document
 
 @pytest.mark.skipif(not has_vulkan_driver(), reason="no Vulkan driver (apt-get install mesa-vulkan-drivers libvulkan1)")
 @needs_rerun
-def test_the_viewer_draws_a_picture_without_a_window(tmp_path, make_documents):
+def test_screenshot_is_made_without_a_window_and_the_viewer_ends(tmp_path, make_documents):
     path = record(tmp_path / "0001.rrd", make_documents(60))
     save_screenshot(path, tmp_path / "picture.png", size=(800, 600))
     data = (tmp_path / "picture.png").read_bytes()
@@ -177,13 +189,13 @@ def test_the_viewer_draws_a_picture_without_a_window(tmp_path, make_documents):
 
     pixels = imread(tmp_path / "picture.png")
     assert pixels.shape[:2] == (600, 800)
-    sky = np.array(look.SKY) / 255.0
+    sky = np.array(blueprint.SKY) / 255.0
     running = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True).stdout
-    assert str(path) not in running, "the viewer was left running"
+    assert str(path) not in running, "the viewer still runs"
     assert (np.abs(pixels[:, :, :3] - sky).max(axis=2) < 0.1).sum() > 50  # the car, its trail and its series
 
 
-def test_without_a_driver_the_sentence_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_vulkan_driver_is_reported_with_the_package_to_install(tmp_path, monkeypatch):
     (tmp_path / "0001.rrd").write_bytes(b"")
     monkeypatch.setattr("carlab.recording.rerun.screenshot.has_vulkan_driver", lambda: False)
     monkeypatch.setattr("carlab.recording.rerun.screenshot.rerun_program", lambda: RERUN)

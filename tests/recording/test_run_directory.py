@@ -1,3 +1,5 @@
+"""The folder of a run: its files, episode numbers, log, results and the git state."""
+
 import json
 import logging
 import re
@@ -9,26 +11,26 @@ from carlab.core.errors import DataError
 from carlab.recording.run_folder import RunDirectory, environment, git_state
 
 
-def test_a_new_run_has_its_folders_configuration_and_environment(tmp_path):
+def test_new_run_has_its_folders_configuration_and_environment(tmp_path):
     run = RunDirectory.create(
         tmp_path / "runs", "Parking in the lab!", config_toml="seed = 3\n", metadata={"note": "n"}
     )
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d{6}_Parking-in-the-lab", run.path.name)
     assert {p.name for p in run.path.iterdir()} == {"config.toml", "environment.json", "episodes", "models", "policy"}
     assert run.config_toml == "seed = 3\n"
-    found = json.loads((run.path / "environment.json").read_text())
-    assert found["note"] == "n"
-    assert found["packages"].keys() >= {"numpy", "mcap"}
-    assert found["python"].startswith("3.")
+    environment_file = json.loads((run.path / "environment.json").read_text())
+    assert environment_file["note"] == "n"
+    assert environment_file["packages"].keys() >= {"numpy", "mcap"}
+    assert environment_file["python"].startswith("3.")
     assert RunDirectory.open_existing(run.path).path == run.path
 
 
-def test_two_runs_of_the_same_second_do_not_share_a_folder(tmp_path):
+def test_runs_of_the_same_second_have_different_folders(tmp_path):
     runs = [RunDirectory.create(tmp_path, "again").path for _ in range(4)]
     assert len(set(runs)) == 4
 
 
-def test_episodes_are_counted_from_the_files_unfinished_ones_too(tmp_path):
+def test_next_episode_number_counts_finished_and_partial_files(tmp_path):
     run = RunDirectory.create(tmp_path, "count")
     assert run.next_episode() == 1
     for name in ("0001.mcap", "0001.rrd", "0003.mcap.partial", "0007.rrd.partial", "notes.txt", "0099.txt"):
@@ -40,7 +42,7 @@ def test_episodes_are_counted_from_the_files_unfinished_ones_too(tmp_path):
     assert [p.name for p in run.recordings(partial=True)] == ["0001.mcap", "0003.mcap.partial"]
 
 
-def test_the_log_is_one_json_object_a_line(tmp_path):
+def test_log_has_one_json_object_per_line(tmp_path):
     run = RunDirectory.create(tmp_path, "log")
     handler = run.log_handler()
     logger = logging.getLogger("carlab.test_run_directory")
@@ -60,14 +62,14 @@ def test_the_log_is_one_json_object_a_line(tmp_path):
     assert "RuntimeError: why" in lines[1]["traceback"]
 
 
-def test_the_result_is_written_whole(tmp_path):
+def test_result_is_written_without_a_partial_file(tmp_path):
     run = RunDirectory.create(tmp_path, "result")
     run.write_result({"episodes": 3, "path": tmp_path})
     assert json.loads((run.path / "result.json").read_text()) == {"episodes": 3, "path": str(tmp_path)}
     assert not list(run.path.glob("*.partial"))
 
 
-def test_a_folder_that_cannot_be_made_gives_one_sentence(tmp_path):
+def test_folder_that_cannot_be_created_is_reported_in_one_sentence(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="a file has the path of its folder") as caught:
         RunDirectory.create(tmp_path / "file" / "runs", "x")
@@ -76,7 +78,7 @@ def test_a_folder_that_cannot_be_made_gives_one_sentence(tmp_path):
         RunDirectory.open_existing(tmp_path)
 
 
-def test_git_state_tells_a_changed_tree_from_a_clean_one(tmp_path):
+def test_git_state_distinguishes_changed_and_clean_trees(tmp_path):
     def git(*arguments):
         identity = ("-c", "user.name=n", "-c", "user.email=e@example.org")
         subprocess.run(["git", *identity, "-C", tmp_path, *arguments], check=True, capture_output=True)
