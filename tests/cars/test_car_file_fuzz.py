@@ -22,7 +22,7 @@ VALUES = (
 )  # fmt: skip
 
 
-def seeds() -> list[str]:
+def valid_car_files() -> list[str]:
     block = re.search(r"<!-- test: car file -->\n```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
     assert block is not None
     presets = (resources.files("sim_backends") / "presets").iterdir()
@@ -31,7 +31,7 @@ def seeds() -> list[str]:
     return [block[1] + noise, *(p.read_text(encoding="utf-8") for p in presets if p.name.endswith(".toml"))]
 
 
-def mutated(text: str, rng: random.Random) -> str:
+def mutate(text: str, rng: random.Random) -> str:
     """Change one to three values, keys, table headers, lines or characters."""
     for _ in range(rng.randint(1, 3)):
         lines = text.split("\n")
@@ -56,11 +56,11 @@ def mutated(text: str, rng: random.Random) -> str:
 
 
 def test_loader_raises_only_config_errors(tmp_path: Path) -> None:
-    rng, files = random.Random(0), seeds()
+    rng, files = random.Random(0), valid_car_files()
     path = tmp_path / "car.toml"
     refused = 0
     for _ in range(ROUNDS):
-        text = mutated(rng.choice(files), rng)
+        text = mutate(rng.choice(files), rng)
         path.write_text(text, encoding="utf-8")
         try:
             load_car_file(path)
@@ -76,7 +76,7 @@ def test_loader_raises_only_config_errors(tmp_path: Path) -> None:
     "corners", ["[[0, 0], [1], [1, 1]]", '[["a", 0], [1, 0], [1, 1]]', "[[0, 0], [1, 0], {a = 1}]", "3", "[]"]
 )
 def test_invalid_corners_are_refused_with_one_sentence(corners: str, tmp_path: Path) -> None:
-    text = re.sub(r"corners_m = .*", f"corners_m = {corners}", seeds()[0])
+    text = re.sub(r"corners_m = .*", f"corners_m = {corners}", valid_car_files()[0])
     path = tmp_path / "car.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=r"corners_m .* must be at least three corners"):
@@ -86,7 +86,7 @@ def test_invalid_corners_are_refused_with_one_sentence(corners: str, tmp_path: P
 def test_recording_noise_is_read_and_checked(tmp_path: Path) -> None:
     """A negative or a missing standard deviation is refused; a car file without the table has no noise."""
     path = tmp_path / "car.toml"
-    text = seeds()[0]
+    text = valid_car_files()[0]
     path.write_text(text, encoding="utf-8")
     noise = load_car_file(path).recording_noise
     assert noise is not None

@@ -41,8 +41,8 @@ def emulated() -> Iterator[EmulatedCar]:
 @pytest.fixture(scope="module")
 def latency(emulated: EmulatedCar) -> LatencyParts:
     parts = measure_latency(emulated)
-    for name, p50, p99, top, count in parts.rows():
-        print(f"{name:20s} p50 {p50:6.2f} ms  p99 {p99:6.2f} ms  max {top:6.2f} ms  ({count})")
+    for name, p50, p99, maximum, count in parts.rows():
+        print(f"{name:20s} p50 {p50:6.2f} ms  p99 {p99:6.2f} ms  max {maximum:6.2f} ms  ({count})")
     return parts
 
 
@@ -56,9 +56,9 @@ def drive(car: Car, policy: Policy, seed: int) -> EpisodeData:
 def test_same_policy_ends_at_the_same_state(emulated: EmulatedCar, latency: LatencyParts) -> None:
     policy = ReverseParkingPolicy.for_car(default_car().simulator)
     extra_pose_s = latency.pose_s - default_car().simulator.mocap.latency_s
-    apart_m, apart_rad = [], []
+    distances_m, yaw_differences_rad = [], []
     for seed in SEEDS:
-        wire = drive(emulated, policy, seed)
+        emulated_episode = drive(emulated, policy, seed)
         simulated = SimulatedCar(
             default_car().simulator,
             seed=seed,
@@ -66,14 +66,14 @@ def test_same_policy_ends_at_the_same_state(emulated: EmulatedCar, latency: Late
             extra_pose_latency_s=max(extra_pose_s, 0.0),
         )
         with simulated:
-            process = drive(simulated, policy, seed)
-        assert wire.ticks == process.ticks == 100, wire.metadata
-        end, expected = wire.states[-1], process.states[-1]
-        apart_m.append(math.hypot(*(end[:2] - expected[:2])))
-        apart_rad.append(abs(difference(end[2], expected[2])))
-    print("apart [m]", np.round(apart_m, 4), "[rad]", np.round(apart_rad, 4))
-    assert np.median(apart_m) <= 0.05
-    assert np.median(apart_rad) <= 0.05
+            simulated_episode = drive(simulated, policy, seed)
+        assert emulated_episode.ticks == simulated_episode.ticks == 100, emulated_episode.metadata
+        end, expected = emulated_episode.states[-1], simulated_episode.states[-1]
+        distances_m.append(math.hypot(*(end[:2] - expected[:2])))
+        yaw_differences_rad.append(abs(difference(end[2], expected[2])))
+    print("difference [m]", np.round(distances_m, 4), "[rad]", np.round(yaw_differences_rad, 4))
+    assert np.median(distances_m) <= 0.05
+    assert np.median(yaw_differences_rad) <= 0.05
 
 
 @pytest.mark.realtime

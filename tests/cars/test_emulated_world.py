@@ -73,7 +73,7 @@ def test_car_closes_and_reopens_after_its_world_was_killed() -> None:
             car.place(CarState())
         car.stop(planned=False)
         car.close()
-        assert_gone(first)
+        assert_no_process(first)
         car.open()
         assert car.world.addresses["pid"] != first
         car.arm()
@@ -84,14 +84,14 @@ def test_car_closes_and_reopens_after_its_world_was_killed() -> None:
 def test_failed_opening_leaves_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
     pids: list[int] = []
 
-    def broken(self: EmulatedCar, there: dict[str, int]) -> None:
-        pids.append(there["pid"])
+    def interrupted_driver(self: EmulatedCar, addresses: dict[str, int]) -> None:
+        pids.append(addresses["pid"])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(EmulatedCar, "_driver", broken)
+    monkeypatch.setattr(EmulatedCar, "_driver", interrupted_driver)
     with pytest.raises(KeyboardInterrupt):
         EmulatedCar(default_car()).open()
-    assert_gone(pids[0])
+    assert_no_process(pids[0])
 
 
 OPENER = """
@@ -130,29 +130,29 @@ def test_kill_during_opening_or_placing_leaves_no_process(after_s: float | None)
         if process.stdout is not None:
             process.stdout.close()
     end_s = time.monotonic() + TIMEOUT_S
-    while left := marked(marker):
-        assert time.monotonic() < end_s, f"processes still running: {left}"
+    while remaining := pids_with(marker):
+        assert time.monotonic() < end_s, f"processes still running: {remaining}"
         time.sleep(0.05)
 
 
-def marked(marker: str) -> list[int]:
+def pids_with(marker: str) -> list[int]:
     """Ids of processes with the marker in their environment."""
-    found = []
+    pids = []
     for environment in Path("/proc").glob("[0-9]*/environ"):
         with contextlib.suppress(OSError):
             if marker.encode() in environment.read_bytes():
-                found.append(int(environment.parent.name))
-    return found
+                pids.append(int(environment.parent.name))
+    return pids
 
 
-def assert_gone(pid: int) -> None:
+def assert_no_process(pid: int) -> None:
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 
 
 @pytest.mark.realtime
-def test_a_frozen_pose_with_fresh_stamps_ends_the_episode() -> None:
-    """Motion capture repeats one pose while the wheels turn: the gate stops the car within about half a second."""
+def test_frozen_pose_with_new_stamps_ends_the_episode() -> None:
+    """Motion capture repeats one pose while the wheels turn: the safety gate stops the car in about half a second."""
     events: list[SafetyEvent] = []
     with EmulatedCar(default_car()) as car:
         car.place(CarState())

@@ -13,7 +13,13 @@ from carlab.core.quantities import Action, CarState, Reality
 from sim_backends.car_parameters import SimulatorConfig
 
 CARS = ("eth_rc_car", "dart_jetracer", "dart_jetracer_linear")
-FACTS = ("vehicle.mass", "vehicle.front_axle", "vehicle.rear_axle", "timing.control_period", "timing.command_delay")
+MEASURED_PARAMETERS = (
+    "vehicle.mass",
+    "vehicle.front_axle",
+    "vehicle.rear_axle",
+    "timing.control_period",
+    "timing.command_delay",
+)
 
 
 @pytest.mark.parametrize("name", CARS)
@@ -29,15 +35,15 @@ def test_preset_is_loaded_by_name_and_by_path(name):
 @pytest.mark.parametrize("name", CARS)
 def test_measured_parameters_are_fixed_and_unknown_ones_have_a_range(name):
     config = SimulatorConfig.from_preset(name)
-    for fact in FACTS:
-        assert fact not in config.priors
-    guessed = {n for n in config.values() if n.startswith(("tyre.", "motor.", "steering."))} | {"vehicle.yaw_inertia"}
-    assert guessed == set(config.priors)
+    for parameter in MEASURED_PARAMETERS:
+        assert parameter not in config.priors
+    uncertain = {n for n in config.values() if n.startswith(("tyre.", "motor.", "steering."))} | {"vehicle.yaw_inertia"}
+    assert uncertain == set(config.priors)
     for low, high in config.priors.values():
         assert high > 1.5 * low
 
 
-def test_preset_numbers_equal_the_published_facts():
+def test_preset_parameters_equal_the_published_values():
     eth = SimulatorConfig.from_preset("eth_rc_car").parameters
     assert (eth.mass_kg, eth.front_axle_m, eth.rear_axle_m) == (1.65, 0.13, 0.17)
     dart = SimulatorConfig.from_preset("dart_jetracer").parameters
@@ -47,10 +53,10 @@ def test_preset_numbers_equal_the_published_facts():
 
 
 def test_linear_preset_differs_only_in_its_tyre_model():
-    plain, linear = (SimulatorConfig.from_preset(n) for n in ("dart_jetracer", "dart_jetracer_linear"))
-    assert (plain.kind, linear.kind) == ("dynamic", "linear_tyre")
-    assert plain.values() == linear.values()
-    assert plain.priors == linear.priors
+    dynamic, linear = (SimulatorConfig.from_preset(n) for n in ("dart_jetracer", "dart_jetracer_linear"))
+    assert (dynamic.kind, linear.kind) == ("dynamic", "linear_tyre")
+    assert dynamic.values() == linear.values()
+    assert dynamic.priors == linear.priors
 
 
 @pytest.mark.parametrize("name", CARS)

@@ -20,9 +20,9 @@ VECTORS = Path(__file__).resolve().parents[2].parent / "shared" / "reference" / 
 def vesc_vectors() -> list[dict[str, Any]]:
     """The VESC entries of the shared vectors, made by independent implementations."""
     if not VECTORS.exists():
-        pytest.skip(f"{VECTORS} is not there")
-    found = json.loads(VECTORS.read_text(encoding="utf-8"))["vectors"]
-    return [v for v in found if v["protocol"].startswith("vesc-")]
+        pytest.skip(f"{VECTORS} does not exist")
+    vectors = json.loads(VECTORS.read_text(encoding="utf-8"))["vectors"]
+    return [v for v in vectors if v["protocol"].startswith("vesc-")]
 
 
 @pytest.fixture

@@ -70,7 +70,7 @@ def config_for(interface: str, channel: str, **changes: Any) -> ActuatorConfig:
 def until(condition: Callable[[], bool]) -> None:
     end_s = time.monotonic() + TIMEOUT_S
     while not condition():
-        assert time.monotonic() < end_s, "waited in vain"
+        assert time.monotonic() < end_s, "the condition was not met in time"
         time.sleep(0.002)
 
 
@@ -85,7 +85,7 @@ def multicast_channel() -> str:
 
 @pytest.mark.parametrize("status_rate_hz", [0.0, 50.0])
 @pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
-def test_drive_and_stop(interface: str, status_rate_hz: float) -> None:
+def test_drive_reaches_the_firmware_and_ends_in_neutral(interface: str, status_rate_hz: float) -> None:
     channel = channel_name() if interface == "virtual" else multicast_channel()
     firmware = VescFirmware(CommandLog(), motor_timeout_s=0.4)
     with CanFirmware(firmware, interface, channel, status_rate_hz=status_rate_hz) as served:
@@ -102,7 +102,7 @@ def test_drive_and_stop(interface: str, status_rate_hz: float) -> None:
         last_moving = max(e.t_s for e in motor if e.value)
         neutral = [e for e in motor if e.t_s > last_moving]
         assert {e.name for e in neutral} == {"current"}
-        assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+        assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # times of reception: a busy machine receives several at once
         assert served.log.entries("servo")[-1].value == 0.5
         assert served.log.wait_for("motor_timeout", TIMEOUT_S) is not None
 
@@ -136,9 +136,9 @@ def test_ping_is_answered() -> None:
         link = CanLink("virtual", channel)
         link.open()
         link.write(vesc_can_codec.ping(23, 42))
-        heard: list[CanFrame] = []
-        until(lambda: bool(heard.extend(link.read()) or heard))
-        assert heard == [CanFrame(0x122A, b"\x17\x00")]
+        replies: list[CanFrame] = []
+        until(lambda: bool(replies.extend(link.read()) or replies))
+        assert replies == [CanFrame(0x122A, b"\x17\x00")]
         link.close()
 
 
@@ -267,7 +267,7 @@ def test_killed_process_ends_in_neutral_or_firmware_timeout(tmp_path: Path, vict
     if victim == "main":
         neutral = [e for e in motor if e.t_s > max(m.t_s for m in motor if m.value)]
         assert len(neutral) >= 3
-        assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+        assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # times of reception: a busy machine receives several at once
         assert [e.value for e in entries if e.name == "servo"][-3:] == [0.5] * 3
     else:
         assert motor[-1].value == 3.0, "no process is left to send neutral: the firmware's time-out stops the motor"

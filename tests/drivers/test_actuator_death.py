@@ -1,4 +1,4 @@
-"""Kill tests: however main process or sender end, the firmware's log ends in neutral or its time-out."""
+"""Kill tests: after any end of main process or sender, the log of the firmware ends in neutral or in its time-out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MOTOR_TIMEOUT_S = 0.4
 
 CHILD = """
 import os, signal, sys, threading, time
-# Signals that the shell which started the tests ignores (nohup, a job in the background) would be ignored here, too.
+# The shell may start the tests with ignored signals (nohup, background job); restore their handlers.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 from carlab.core.errors import CarlabError
@@ -34,11 +34,11 @@ from drivers.actuator import Actuator
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 
-port, way = sys.argv[1:3]
+port, failure = sys.argv[1:3]
 actuator = Actuator(ActuatorConfig(port=port, watchdog_s=0.4, latch_s=1.0), ActuatorCalibration())
 
-def say(*words):
-    print(*words, flush=True)
+def report(*values):
+    print(*values, flush=True)
 
 def drive():
     n = 0
@@ -47,35 +47,35 @@ def drive():
         actuator.command(Action(0.5, 0.3))
         time.sleep(0.02)
         if n == 20:
-            if way == "exception":
-                raise RuntimeError("planted")
-            if way == "os_exit":
+            if failure == "exception":
+                raise RuntimeError("injected")
+            if failure == "os_exit":
                 os._exit(7)
-            if way == "sys_exit":
+            if failure == "sys_exit":
                 sys.exit(3)
-            if way == "hang":
-                say("hanging")
+            if failure == "hang":
+                report("hanging")
                 time.sleep(1.6)
-            if way == "fork":
+            if failure == "fork":
                 pid = os.fork()
                 if pid == 0:
                     try:
                         actuator.command(Action(0.5, 0.3))
                     except CarlabError as error:
-                        say("forked", type(error).__name__)
+                        report("forked", type(error).__name__)
                     actuator.close()
                     os._exit(0)
                 os.waitpid(pid, 0)
-            if way == "forked_worker_then_sigkill":
+            if failure == "forked_worker_then_sigkill":
                 worker = os.fork()
                 if worker == 0:
                     time.sleep(60.0)
                     os._exit(0)
-                say(worker)
+                report(worker)
                 os.kill(os.getpid(), 9)
 
 def main():
-    if way == "no_close":
+    if failure == "no_close":
         actuator.open()
         actuator.arm()
         for _ in range(20):
@@ -84,19 +84,19 @@ def main():
         return
     with actuator:
         actuator.arm()
-        say("sender", actuator._sender.pid)
+        report("sender", actuator._sender.pid)
         try:
             drive()
         except CarlabError as error:
-            say("error", type(error).__name__, str(error).replace(chr(10), " "))
-            if way == "retry_on_request":
+            report("error", type(error).__name__, str(error).replace(chr(10), " "))
+            if failure == "retry_on_request":
                 sys.stdin.readline()
             for retry in (actuator.arm, lambda: actuator.command(Action(0.5, 0.3))):
                 try:
                     retry()
-                    say("took it")
-                except CarlabError as again:
-                    say("refused", type(again).__name__)
+                    report("accepted")
+                except CarlabError as retry_error:
+                    report("refused", type(retry_error).__name__)
 
 main()
 """
@@ -105,10 +105,10 @@ main()
 class Drive:
     """A child process that drives at 50 Hz, and its emulated firmware."""
 
-    def __init__(self, firmware: SerialFirmware, way: str) -> None:
+    def __init__(self, firmware: SerialFirmware, failure: str) -> None:
         self.log = firmware.log
         self.process = subprocess.Popen(
-            [sys.executable, "-c", CHILD, firmware.port, way],
+            [sys.executable, "-c", CHILD, firmware.port, failure],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -117,19 +117,19 @@ class Drive:
         )
         assert self.process.stdout is not None
         self.lines = self.process.stdout
-        self.sender_pid = int(self.lines.readline().split()[1]) if way != "no_close" else 0
+        self.sender_pid = int(self.lines.readline().split()[1]) if failure != "no_close" else 0
         wait_for(lambda: any(e.value == 3.0 for e in self.log.motor()))
 
     def end(self) -> str:
         """Wait for the child to end and return its remaining output."""
-        said, _ = self.process.communicate(timeout=TIMEOUT_S)
-        return str(said)
+        output, _ = self.process.communicate(timeout=TIMEOUT_S)
+        return str(output)
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
     end_s = time.monotonic() + TIMEOUT_S
     while not condition():
-        assert time.monotonic() < end_s, "waited in vain"
+        assert time.monotonic() < end_s, "the condition was not met in time"
         time.sleep(0.005)
 
 
@@ -148,23 +148,25 @@ def assert_ended_in_neutral(log: CommandLog) -> list[LogEntry]:
     neutral = motor[last_moving + 1 :]
     assert len(neutral) >= 3
     assert all((e.name, e.value) == ("current", 0.0) for e in neutral)
-    assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+    assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # times of reception: a busy machine receives several at once
     servo = log.entries("servo")
     assert [e.value for e in servo[-3:]] == [0.5] * 3
-    assert log.wait_for("motor_timeout", TIMEOUT_S) is not None, "then the firmware releases the motor"
+    assert log.wait_for("motor_timeout", TIMEOUT_S) is not None, "the firmware did not release the motor"
     return neutral
 
 
-@pytest.mark.parametrize("way", ["exception", "os_exit", "sys_exit", "no_close", "fork", "forked_worker_then_sigkill"])
-def test_every_exit_of_the_main_process_ends_in_neutral(firmware: SerialFirmware, way: str) -> None:
+@pytest.mark.parametrize(
+    "failure", ["exception", "os_exit", "sys_exit", "no_close", "fork", "forked_worker_then_sigkill"]
+)
+def test_every_exit_of_the_main_process_ends_in_neutral(firmware: SerialFirmware, failure: str) -> None:
     with firmware:
-        drive = Drive(firmware, way)
-        if way == "fork":
+        drive = Drive(firmware, failure)
+        if failure == "fork":
             assert drive.lines.readline().split() == ["forked", "NotOpenError"]
             t_s = time.monotonic()
             wait_for(lambda: len([e for e in firmware.log.motor(t_s) if e.value == 3.0]) > 20)
             drive.process.send_signal(signal.SIGINT)
-        if way == "forked_worker_then_sigkill":
+        if failure == "forked_worker_then_sigkill":
             worker = int(drive.lines.readline())
             drive.process.wait(TIMEOUT_S)
         else:
@@ -172,7 +174,7 @@ def test_every_exit_of_the_main_process_ends_in_neutral(firmware: SerialFirmware
         try:
             assert_ended_in_neutral(firmware.log)
         finally:
-            if way == "forked_worker_then_sigkill":
+            if failure == "forked_worker_then_sigkill":
                 os.kill(worker, signal.SIGKILL)
                 drive.end()
 
@@ -195,24 +197,24 @@ def test_suspended_main_process_ends_in_neutral_and_is_refused_after_resuming(fi
         time.sleep(1.7)
         moving = [e.t_s for e in firmware.log.motor() if e.value != 0.0]
         neutral = [e for e in firmware.log.motor() if e.t_s > moving[-1]]
-        assert len(neutral) >= 20, "neutral goes on while the main process is stopped"
+        assert len(neutral) >= 20, "neutral is sent while the main process is suspended"
         t_resumed_s = time.monotonic()
         drive.process.send_signal(signal.SIGCONT)
-        said = drive.end()
-        assert "error ActuatorFaultError no command arrived" in said
-        assert said.count("refused ActuatorFaultError") == 2
-        assert "took it" not in said
+        output = drive.end()
+        assert "error ActuatorFaultError no command arrived" in output
+        assert output.count("refused ActuatorFaultError") == 2
+        assert "accepted" not in output
         assert all(e.value == 0.0 for e in firmware.log.motor(t_resumed_s))
 
 
-def test_a_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: SerialFirmware) -> None:
+def test_hung_main_thread_ends_in_neutral_and_a_latched_fault(firmware: SerialFirmware) -> None:
     with firmware:
         drive = Drive(firmware, "hang")
         assert drive.lines.readline().strip() == "hanging"
         t_s = time.monotonic()
-        said = drive.end()
-        assert "error ActuatorFaultError no command arrived" in said
-        assert said.count("refused ActuatorFaultError") == 2
+        output = drive.end()
+        assert "error ActuatorFaultError no command arrived" in output
+        assert output.count("refused ActuatorFaultError") == 2
         later = [e for e in firmware.log.motor() if e.t_s > t_s + 1.0]
         assert len(later) >= 20
         assert all(e.value == 0.0 for e in later)
@@ -223,9 +225,9 @@ def test_firmware_timeout_stops_the_motor_after_the_sender_is_killed(firmware: S
         drive = Drive(firmware, "forever")
         os.kill(drive.sender_pid, signal.SIGKILL)
         t_s = time.monotonic()
-        said = drive.end()
-        assert "error ActuatorFaultError The sender process has ended" in said
-        assert said.count("refused ActuatorFaultError") == 2
+        output = drive.end()
+        assert "error ActuatorFaultError The sender process has ended" in output
+        assert output.count("refused ActuatorFaultError") == 2
         timeout = firmware.log.wait_for("motor_timeout", TIMEOUT_S)
         assert timeout is not None
         assert not [e for e in firmware.log.motor() if e.t_s > max(timeout.t_s, t_s + 0.5)]
@@ -242,9 +244,9 @@ def test_suspended_sender_is_detected_and_cannot_move_the_car_later(firmware: Se
         os.kill(drive.sender_pid, signal.SIGCONT)
         wait_for(lambda: len(firmware.log.motor(t_s)) > 10)
         assert drive.process.stdin is not None
-        drive.process.stdin.write("go on\n")
-        said = drive.end()
-        assert said.count("refused ActuatorFaultError") == 2
+        drive.process.stdin.write("continue\n")
+        output = drive.end()
+        assert output.count("refused ActuatorFaultError") == 2
         assert all(e.value == 0.0 for e in firmware.log.motor(t_s))
 
 
@@ -252,10 +254,10 @@ def test_unplugging_latches_a_fault_and_the_firmware_times_out(firmware: SerialF
     with firmware:
         drive = Drive(firmware, "forever")
         firmware.unplug()
-        said = drive.end()
-        assert "error ActuatorFaultError" in said
-        assert "was lost" in said
-        assert said.count("refused ActuatorFaultError") == 2
+        output = drive.end()
+        assert "error ActuatorFaultError" in output
+        assert "was lost" in output
+        assert output.count("refused ActuatorFaultError") == 2
         assert firmware.log.wait_for("motor_timeout", TIMEOUT_S) is not None
         unplugged_s = firmware.log.entries("unplug")[0].t_s
         assert not [e for e in firmware.log.motor() if e.t_s > unplugged_s + 0.5]

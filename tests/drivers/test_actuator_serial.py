@@ -50,7 +50,7 @@ def until(condition: Callable[[], bool]) -> None:
     """Wait for a condition; fail after ``TIMEOUT_S``."""
     end_s = time.monotonic() + TIMEOUT_S
     while not condition():
-        assert time.monotonic() < end_s, "waited in vain"
+        assert time.monotonic() < end_s, "the condition was not met in time"
         time.sleep(0.002)
 
 
@@ -78,15 +78,15 @@ def test_commands_arrive_as_returned_and_stop_ends_in_neutral(
     neutral = after[first_neutral:]
     assert all((e.name, e.value) == ("current", 0.0) for e in neutral)
     assert len(neutral) >= 3
-    assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # as received: a busy machine squeezes them together
+    assert neutral[-1].t_s - neutral[0].t_s >= 0.02  # times of reception: a busy machine receives several at once
     assert log.entries("servo")[-1].value == 0.5
     with pytest.raises(NotArmedError):
         actuator.command(MOVING)
     assert actuator.command(NEUTRAL) == NEUTRAL
 
 
-def test_a_command_is_on_the_wire_before_the_next_deadline(serial_firmware: SerialFirmware) -> None:
-    """At 10 Hz a command that waits for a deadline is 50 ms late on average; it is sent at the wake-up instead."""
+def test_command_is_written_before_the_next_deadline(serial_firmware: SerialFirmware) -> None:
+    """At 10 Hz the next deadline is 50 ms away on average; a new command wakes the sender before it."""
     with Actuator(config_for(serial_firmware, rate_hz=10.0, telemetry_rate_hz=10.0), CALIBRATION) as actuator:
         actuator.arm()
         delays = []
@@ -121,7 +121,7 @@ def test_nan_command_is_never_sent(actuator: Actuator, serial_firmware: SerialFi
     assert all(abs(e.value) <= 10.0 for e in serial_firmware.log.motor())
 
 
-def test_watchdog_then_latch_then_reset_and_arm(serial_firmware: SerialFirmware) -> None:
+def test_watchdog_fault_is_latched_until_reset_and_arm(serial_firmware: SerialFirmware) -> None:
     config = config_for(serial_firmware, watchdog_s=0.15, latch_s=0.5)
     with Actuator(config, CALIBRATION) as actuator:
         actuator.arm()
@@ -177,10 +177,10 @@ def test_missing_telemetry_gives_neutral_then_a_fault(serial_firmware: SerialFir
         actuator.arm()
         until(lambda: not actuator.command(MOVING).is_neutral)
         serial_firmware.faults.drops_replies = True
-        said: list[tuple[float, bool]] = []
+        returned: list[tuple[float, bool]] = []
         while actuator.status().state == SenderState.ARMED:
             try:
-                said.append((time.monotonic(), actuator.command(MOVING).is_neutral))
+                returned.append((time.monotonic(), actuator.command(MOVING).is_neutral))
             except ActuatorFaultError:
                 break
             time.sleep(0.01)
@@ -189,12 +189,12 @@ def test_missing_telemetry_gives_neutral_then_a_fault(serial_firmware: SerialFir
         moving = [e.t_s for e in serial_firmware.log.motor() if e.value == 3.0]
         neutral = [e for e in serial_firmware.log.motor() if e.t_s > moving[-1]]
         assert neutral[-1].t_s - neutral[0].t_s > 0.4, "neutral is sent well before the fault"
-        neutral_from_s = next(t_s for t_s, is_neutral in said if is_neutral)
-        assert all(is_neutral for t_s, is_neutral in said if t_s > neutral_from_s)
+        neutral_from_s = next(t_s for t_s, is_neutral in returned if is_neutral)
+        assert all(is_neutral for t_s, is_neutral in returned if t_s > neutral_from_s)
         assert abs(neutral_from_s - moving[-1]) < 0.25, "the reported command is neutral from then on, too"
 
 
-def test_unplugged_then_plugged_in_again(serial_firmware: SerialFirmware) -> None:
+def test_replugged_device_gets_neutral_until_reset_and_arm(serial_firmware: SerialFirmware) -> None:
     serial_firmware.firmware.motor_timeout_s = 0.3
     with Actuator(config_for(serial_firmware), CALIBRATION) as actuator:
         actuator.arm()
@@ -221,7 +221,7 @@ def test_unplugged_then_plugged_in_again(serial_firmware: SerialFirmware) -> Non
         until(lambda: any(e.value == 3.0 for e in serial_firmware.log.motor(t_replug_s)))
 
 
-def test_another_board_on_the_same_port_stays_a_fault(serial_firmware: SerialFirmware) -> None:
+def test_another_board_on_the_same_port_is_not_used(serial_firmware: SerialFirmware) -> None:
     with Actuator(config_for(serial_firmware), CALIBRATION) as actuator:
         serial_firmware.unplug()
         until(lambda: actuator.status().state == SenderState.FAULT)
@@ -244,7 +244,7 @@ def test_device_that_stops_reading_is_a_fault(serial_firmware: SerialFirmware) -
         assert "accepts no more bytes" in actuator.status().fault
 
 
-def test_a_suspended_process_is_no_fault_if_the_port_takes_the_bytes(
+def test_suspended_process_is_no_fault_if_the_port_accepts_the_bytes(
     serial_firmware: SerialFirmware, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The process sleeps longer than the write time-out while it writes."""
@@ -303,7 +303,7 @@ def test_readings_are_those_of_the_firmware(tmp_path: Path) -> None:
         assert actuator.status().hardware == "EMULATED"
 
 
-def test_wrong_port_lists_what_exists(tmp_path: Path) -> None:
+def test_wrong_port_is_reported_without_traceback(tmp_path: Path) -> None:
     missing = tmp_path / "nothing"
     with pytest.raises(NotReadyError, match="does not exist") as caught:
         Actuator(ActuatorConfig(port=str(missing)), CALIBRATION).open()
@@ -311,7 +311,7 @@ def test_wrong_port_lists_what_exists(tmp_path: Path) -> None:
     assert "\nTraceback" not in str(caught.value)
 
 
-def test_port_in_use_port_without_device_and_old_firmware(serial_firmware: SerialFirmware) -> None:
+def test_port_in_use_missing_device_and_old_firmware_are_not_ready(serial_firmware: SerialFirmware) -> None:
     with Actuator(config_for(serial_firmware), CALIBRATION), pytest.raises(NotReadyError, match="another program"):
         Actuator(config_for(serial_firmware), CALIBRATION).open()
     serial_firmware.faults.drops_replies = True

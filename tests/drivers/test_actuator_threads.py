@@ -20,7 +20,7 @@ MOVING = Action(0.5, 0.3)
 TIMEOUT_S = 20.0
 
 
-def make(firmware: SerialFirmware) -> Actuator:
+def make_actuator(firmware: SerialFirmware) -> Actuator:
     config = ActuatorConfig(
         port=firmware.port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0
     )
@@ -29,23 +29,23 @@ def make(firmware: SerialFirmware) -> Actuator:
 
 @pytest.fixture
 def actuator(serial_firmware: SerialFirmware) -> Iterator[Actuator]:
-    with make(serial_firmware) as opened:
+    with make_actuator(serial_firmware) as opened:
         yield opened
 
 
 def test_arming_does_not_overwrite_a_stop_of_another_thread(actuator: Actuator) -> None:
     """The stop comes between the check in arm() and its order; the sender's slot holds the newest order only."""
-    waited = actuator._await
+    original_await = actuator._await
 
-    def stopped_meanwhile(*arguments: object) -> object:
-        found = waited(*arguments)  # type: ignore[arg-type]
-        actuator._await = waited  # type: ignore[method-assign]
+    def await_and_stop(*arguments: object) -> object:
+        result = original_await(*arguments)  # type: ignore[arg-type]
+        actuator._await = original_await  # type: ignore[method-assign]
         thread = threading.Thread(target=actuator.stop, kwargs={"planned": False})
         thread.start()
         thread.join()
-        return found
+        return result
 
-    actuator._await = stopped_meanwhile  # type: ignore[method-assign,assignment]
+    actuator._await = await_and_stop  # type: ignore[method-assign,assignment]
     with pytest.raises(ActuatorFaultError, match="stopped for safety"):
         actuator.arm()
     assert actuator.status().state == SenderState.FAULT
@@ -53,12 +53,12 @@ def test_arming_does_not_overwrite_a_stop_of_another_thread(actuator: Actuator) 
 
 def test_concurrent_close_raises_only_documented_errors(serial_firmware: SerialFirmware) -> None:
     for _ in range(3):
-        actuator = make(serial_firmware)
+        actuator = make_actuator(serial_firmware)
         actuator.open()
         actuator.arm()
-        strange: list[BaseException] = []
+        unexpected: list[BaseException] = []
 
-        def use(actuator: Actuator = actuator, strange: list[BaseException] = strange) -> None:
+        def use(actuator: Actuator = actuator, unexpected: list[BaseException] = unexpected) -> None:
             try:
                 while True:
                     actuator.command(MOVING)
@@ -67,7 +67,7 @@ def test_concurrent_close_raises_only_documented_errors(serial_firmware: SerialF
             except CarlabError:
                 return
             except BaseException as error:
-                strange.append(error)
+                unexpected.append(error)
 
         thread = threading.Thread(target=use)
         thread.start()
@@ -75,5 +75,5 @@ def test_concurrent_close_raises_only_documented_errors(serial_firmware: SerialF
         actuator.close()
         thread.join(TIMEOUT_S)
         assert not thread.is_alive()
-        assert strange == []
+        assert unexpected == []
         assert serial_firmware.log.motor()[-1].value == 0.0

@@ -34,7 +34,7 @@ def calibrations(draw: st.DrawFn) -> ActuatorCalibration:
     )
 
 
-def test_device_steps_against_hand_calculation() -> None:
+def test_device_steps_equal_a_hand_calculation() -> None:
     calibration = ActuatorCalibration(
         servo_centre=0.53, servo_range_left=0.3, servo_range_right=0.25, steering_sign=-1, max_current_a=20.0
     )
@@ -44,7 +44,7 @@ def test_device_steps_against_hand_calculation() -> None:
     assert calibration.to_device(Action(-1.0, -0.5)) == DeviceCommand(MotorKind.CURRENT, -10000, 780)
 
 
-def test_modes_signs_and_dead_band_against_hand_calculation() -> None:
+def test_modes_signs_and_dead_band_equal_a_hand_calculation() -> None:
     duty = ActuatorCalibration(throttle_mode="duty", max_duty=0.5, throttle_sign=-1, throttle_dead_band=0.2)
     assert duty.to_device(Action(0.0, 0.5)) == DeviceCommand(MotorKind.DUTY, -30000, 500)  # -(0.2 + 0.8 / 2) / 2
     assert duty.to_device(Action(0.0, 0.0)).motor_steps == 0
@@ -91,7 +91,7 @@ def test_any_number_stays_within_limits_or_is_refused(calibration: ActuatorCalib
         DeviceCommand(MotorKind.DUTY, 100, 500),
     ],
 )
-def test_limit_check_refuses(command: DeviceCommand) -> None:
+def test_commands_beyond_the_limits_are_detected(command: DeviceCommand) -> None:
     assert not ActuatorCalibration().is_within_limits(command)
 
 

@@ -11,7 +11,7 @@ FULL = Path("/dev/full")
 
 
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full, a device whose every write fails with ENOSPC")
-def test_a_full_disk_is_reported_once_and_the_log_goes_on(caplog: pytest.LogCaptureFixture) -> None:
+def test_full_disk_is_reported_once_and_entries_stay_in_memory(caplog: pytest.LogCaptureFixture) -> None:
     log = CommandLog(FULL)
     log.open()
     with caplog.at_level(logging.WARNING):
@@ -23,7 +23,7 @@ def test_a_full_disk_is_reported_once_and_the_log_goes_on(caplog: pytest.LogCapt
     assert "No space left on device" in caplog.messages[0]
 
 
-def test_a_folder_that_is_missing_is_reported_and_the_log_goes_on(
+def test_missing_folder_is_reported_and_entries_stay_in_memory(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     log = CommandLog(tmp_path / "missing" / "firmware.jsonl")

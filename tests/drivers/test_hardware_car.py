@@ -30,13 +30,13 @@ from drivers.hardware_car import HardwareCar
 from drivers.vesc.payloads import MotorValues
 
 
-class HandPoses:
+class ScriptedPoses:
     """A pose source with samples scripted by the test."""
 
     def __init__(self) -> None:
         self.samples: list[PoseSample] = []
         self.failure: NotReadyError | None = None
-        self.on_their_way = 0
+        self.n_delayed = 0
         self.closes = 0
 
     def show(self, x_m: float = 0.0, *, age_s: float = 0.0, tracked: bool = True, sequence: int | None = None) -> None:
@@ -44,7 +44,7 @@ class HandPoses:
         number = len(self.samples) + 1 if sequence is None else sequence
         self.samples.append(PoseSample(number, now_s - 0.005, now_s, x_m, 1.0, 0.5, tracked=tracked))
 
-    def stand(self) -> None:
+    def show_at_rest(self) -> None:
         """Three poses of a car at rest: the number that a speed estimate needs."""
         for age_s in (0.02, 0.01, 0.0):
             self.show(age_s=age_s)
@@ -60,8 +60,8 @@ class HandPoses:
         return tuple(s for s in self.samples if s.sequence > sequence)
 
     def wait_for(self, sequence: int, timeout_s: float) -> PoseSample | None:
-        if self.on_their_way:
-            self.on_their_way -= 1
+        if self.n_delayed:
+            self.n_delayed -= 1
             self.show()
         newest = self.latest()
         return newest if newest is not None and newest.sequence > sequence else None
@@ -81,11 +81,11 @@ class HandPoses:
 
 
 @pytest.fixture
-def poses() -> HandPoses:
-    return HandPoses()
+def poses() -> ScriptedPoses:
+    return ScriptedPoses()
 
 
-def make_car(port: str, poses: HandPoses, **options: Any) -> HardwareCar:
+def make_car(port: str, poses: ScriptedPoses, **options: Any) -> HardwareCar:
     config = ActuatorConfig(port=port, watchdog_s=2.0, latch_s=30.0, telemetry_stale_s=5.0, telemetry_lost_s=10.0)
     hardware = HardwareConfig(config, arm_max_pose_age_s=2.0)
     return HardwareCar(
@@ -100,13 +100,13 @@ def make_car(port: str, poses: HandPoses, **options: Any) -> HardwareCar:
 
 
 @pytest.fixture
-def car(serial_firmware: SerialFirmware, poses: HandPoses) -> Iterator[HardwareCar]:
+def car(serial_firmware: SerialFirmware, poses: ScriptedPoses) -> Iterator[HardwareCar]:
     assert isinstance(poses, PoseSource)
     with make_car(serial_firmware.port, poses) as opened:
         yield opened
 
 
-def test_observation_before_and_after_the_first_pose(car: HardwareCar, poses: HandPoses) -> None:
+def test_observation_needs_a_tracked_pose_and_keeps_the_last_one(car: HardwareCar, poses: ScriptedPoses) -> None:
     with pytest.raises(PoseLostError, match="not seen the body yet"):
         car.observe()
     poses.show(1.0, tracked=False)
@@ -125,7 +125,7 @@ def test_observation_before_and_after_the_first_pose(car: HardwareCar, poses: Ha
     assert car.observe().poses == ()
 
 
-def test_restarted_sequence_numbers_are_accepted(car: HardwareCar, poses: HandPoses) -> None:
+def test_restarted_sequence_numbers_are_accepted(car: HardwareCar, poses: ScriptedPoses) -> None:
     poses.show(1.0, sequence=5000)
     car.observe()
     poses.samples.clear()
@@ -133,7 +133,7 @@ def test_restarted_sequence_numbers_are_accepted(car: HardwareCar, poses: HandPo
     assert car.observe().state.x_m == 3.0
 
 
-def test_arming_reports_every_reason(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
+def test_arming_reports_every_reason(car: HardwareCar, poses: ScriptedPoses, serial_firmware: SerialFirmware) -> None:
     serial_firmware.firmware.readings = lambda t_s: MotorValues(erpm=3000.0, input_v=11.0)
     end_s = time.monotonic() + 20.0
     while not car.actuator.status().erpm > 200.0:
@@ -156,7 +156,7 @@ def test_arming_reports_every_reason(car: HardwareCar, poses: HandPoses, serial_
     ],
 )
 def test_arming_needs_a_fresh_tracked_pose_at_rest(
-    car: HardwareCar, poses: HandPoses, samples: list[tuple[float, float, bool]], reason: str
+    car: HardwareCar, poses: ScriptedPoses, samples: list[tuple[float, float, bool]], reason: str
 ) -> None:
     for x_m, age_s, tracked in samples:
         poses.show(x_m, age_s=age_s, tracked=tracked)
@@ -164,25 +164,25 @@ def test_arming_needs_a_fresh_tracked_pose_at_rest(
         car.arm()
 
 
-def test_arming_waits_for_late_poses(car: HardwareCar, poses: HandPoses) -> None:
+def test_arming_waits_for_late_poses(car: HardwareCar, poses: ScriptedPoses) -> None:
     poses.show(age_s=5.0)  # too old, and too few for a speed
-    poses.on_their_way = 4
+    poses.n_delayed = 4
     car.arm()
-    assert poses.on_their_way == 1, "a speed estimate needs three poses"
+    assert poses.n_delayed == 1, "a speed estimate needs three poses"
     assert car.command(Action(0.1, 0.2)).throttle == pytest.approx(0.2)
 
 
 def test_car_without_measured_motor_speed_is_not_armed(
-    car: HardwareCar, poses: HandPoses, monkeypatch: pytest.MonkeyPatch
+    car: HardwareCar, poses: ScriptedPoses, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    poses.stand()
-    silent = replace(car.actuator.status(), erpm=float("nan"))
-    monkeypatch.setattr(car.actuator, "status", lambda: silent)
+    poses.show_at_rest()
+    status_without_speed = replace(car.actuator.status(), erpm=float("nan"))
+    monkeypatch.setattr(car.actuator, "status", lambda: status_without_speed)
     with pytest.raises(NotReadyError, match="reports no motor speed"):
         car.arm()
 
 
-def test_velocities_are_marked_as_unknown_until_there_are_three_poses(car: HardwareCar, poses: HandPoses) -> None:
+def test_velocities_are_unknown_before_the_third_pose(car: HardwareCar, poses: ScriptedPoses) -> None:
     for age_s, known in ((0.02, False), (0.01, False), (0.0, True)):
         poses.show(1.0, age_s=age_s)
         assert car.observe().velocity_valid is known
@@ -190,12 +190,14 @@ def test_velocities_are_marked_as_unknown_until_there_are_three_poses(car: Hardw
     assert not car.observe().velocity_valid
 
 
-def test_sequence_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmware: SerialFirmware) -> None:
+def test_commands_need_arming_and_a_fault_needs_a_reset(
+    car: HardwareCar, poses: ScriptedPoses, serial_firmware: SerialFirmware
+) -> None:
     assert car.reality is Reality.REAL
     assert car.command(NEUTRAL) == NEUTRAL
     with pytest.raises(NotArmedError):
         car.command(Action(0.1, 0.1))
-    poses.stand()
+    poses.show_at_rest()
     car.arm()
     assert car.command(Action(0.1, 0.2)).throttle == pytest.approx(0.2)
     with pytest.raises(ActionOutOfRangeError, match="beyond the car's limit"):
@@ -208,19 +210,19 @@ def test_sequence_of_an_episode(car: HardwareCar, poses: HandPoses, serial_firmw
     car.stop(planned=True)
     with pytest.raises(NotArmedError):
         car.command(Action(0.1, 0.1))
-    poses.stand()
+    poses.show_at_rest()
     car.arm()
     car.stop(planned=False)
     with pytest.raises(ActuatorFaultError):
         car.arm()
     assert not car.health().ready
     car.reset_fault()
-    poses.stand()
+    poses.show_at_rest()
     car.arm()
     assert not car.place(CarState())
 
 
-def test_opening_reports_the_reasons_of_actuator_and_mocap(tmp_path: Path, poses: HandPoses) -> None:
+def test_opening_reports_the_reasons_of_actuator_and_mocap(tmp_path: Path, poses: ScriptedPoses) -> None:
     poses.failure = NotReadyError("Motion capture is not ready", ("nobody answers at 10.0.0.1; start it.",))
     car = make_car(str(tmp_path / "missing"), poses)
     with pytest.raises(NotReadyError) as caught:
@@ -232,7 +234,7 @@ def test_opening_reports_the_reasons_of_actuator_and_mocap(tmp_path: Path, poses
     car.close()
 
 
-def test_closed_car(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
+def test_closed_car_raises_not_open(serial_firmware: SerialFirmware, poses: ScriptedPoses) -> None:
     car: Car = make_car(serial_firmware.port, poses)
     car.stop(planned=False)
     for use in (car.observe, car.arm, car.reset_fault, lambda: car.command(NEUTRAL)):
@@ -243,7 +245,9 @@ def test_closed_car(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
     car.close()
 
 
-def test_place_asks_the_emulator(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
+def test_place_is_passed_to_the_emulator_and_clears_old_poses(
+    serial_firmware: SerialFirmware, poses: ScriptedPoses
+) -> None:
     placed: list[CarState] = []
     with make_car(serial_firmware.port, poses, place=lambda s: not placed.append(s), reality=Reality.EMULATED) as car:
         poses.show(1.0)
@@ -254,12 +258,12 @@ def test_place_asks_the_emulator(serial_firmware: SerialFirmware, poses: HandPos
             car.observe()
         poses.show(1.0, age_s=0.001)
         with pytest.raises(PoseLostError):
-            car.observe()  # taken before the car was placed, and late
+            car.observe()  # captured before the placement, received after it
         poses.show(2.0, age_s=-0.1)
         assert car.observe().state == CarState(2.0, 1.0, 0.5)
 
 
-def test_dry_run_observes_and_discards_commands(serial_firmware: SerialFirmware, poses: HandPoses) -> None:
+def test_dry_run_observes_and_discards_commands(serial_firmware: SerialFirmware, poses: ScriptedPoses) -> None:
     inner = make_car(serial_firmware.port, poses)
     calibration = replace(inner.config.calibration)
     with DryRunCar(inner, lambda a: calibration.from_device(calibration.to_device(a))) as car:

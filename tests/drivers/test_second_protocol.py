@@ -28,8 +28,8 @@ TIMEOUT_S = 20.0
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(DEVICE_KINDS, "toy", toy_protocol.TOY)
-    here = str(Path(toy_protocol.__file__).parent)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in (here, os.environ.get("PYTHONPATH", "")) if p))
+    folder = str(Path(toy_protocol.__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in (folder, os.environ.get("PYTHONPATH", "")) if p))
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_firmware_fault_latches_with_its_message(firmware: ToyFirmware) -> None:
 
 
 @pytest.mark.realtime
-def test_the_motor_stops_where_the_sender_is_killed(firmware: ToyFirmware) -> None:
+def test_motor_stops_after_the_sender_is_killed(firmware: ToyFirmware) -> None:
     with Actuator(config_for(firmware.port), CALIBRATION) as actuator:
         actuator.arm()
         actuator.command(MOVING)

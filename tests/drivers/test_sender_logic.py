@@ -99,7 +99,7 @@ def test_old_firmware_gets_no_command() -> None:
     assert "older than 3.07" in bench.logic.fault
 
 
-def test_watchdog_at_its_boundary_then_recovery_then_latch() -> None:
+def test_watchdog_gives_neutral_then_latches_until_reset_and_arm() -> None:
     bench = armed()
     bench.command()
     assert bench.tick(0.149) == MOVING
@@ -178,12 +178,12 @@ def test_stop_settles_after_three_neutrals_over_sixty_milliseconds() -> None:
         assert bench.logic.is_neutral_settled
 
 
-@pytest.mark.parametrize("way", ["request", "main lost"])
-def test_shutdown_sends_three_neutrals_over_sixty_milliseconds(way: str) -> None:
+@pytest.mark.parametrize("cause", ["request", "main lost"])
+def test_shutdown_sends_three_neutrals_over_sixty_milliseconds(cause: str) -> None:
     bench = armed()
     bench.command()
     assert bench.tick() == MOVING
-    if way == "request":
+    if cause == "request":
         bench.send_request(Request.SHUT_DOWN)
     else:
         bench.logic.main_lost()
@@ -208,12 +208,12 @@ def test_unplanned_stop_latches_and_planned_stop_keeps_a_fault() -> None:
 def test_stale_telemetry_gives_neutral_and_lost_telemetry_a_fault() -> None:
     bench = armed()
     bench.is_answering = False
-    seen = []
+    commands = []
     for _ in range(110):
         bench.command()
-        seen.append(bench.tick())
-    assert seen[:24] == [MOVING] * 24
-    assert seen[26:] == [NEUTRAL] * 84
+        commands.append(bench.tick())
+    assert commands[:24] == [MOVING] * 24
+    assert commands[26:] == [NEUTRAL] * 84
     assert bench.logic.state == SenderState.FAULT
     assert "stopped answering" in bench.logic.fault
     bench.send_request(Request.RESET_FAULT)
@@ -250,7 +250,7 @@ def test_another_board_after_a_lost_link_stays_a_fault() -> None:
     assert bench.tick() is None
 
 
-def test_the_same_board_after_a_lost_link_gets_neutral_until_reset_and_armed() -> None:
+def test_same_board_after_a_lost_link_gets_neutral_until_reset_and_armed() -> None:
     bench = armed()
     bench.command()
     bench.logic.link_failed("unplugged")

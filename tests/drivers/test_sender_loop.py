@@ -21,7 +21,7 @@ CONFIG = ActuatorConfig(rate_hz=100.0, watchdog_s=0.15, latch_s=0.5)
 CALIBRATION = ActuatorCalibration(max_current_a=10.0, servo_min=0.2, servo_max=0.8)
 MOVING = DeviceCommand(MotorKind.CURRENT, 3000, 600)
 HEALTHY = MotorValues(erpm=0.0, input_v=11.1, fault_code=0, status_bits=0)
-STOPPED_S = 0.18
+SUSPENDED_S = 0.18
 
 
 class FakeDevice:
@@ -84,7 +84,7 @@ class Bench:
     def order(self, epoch: int, request: Request, number: int) -> None:
         self.orders.write(Order(epoch, request, number, self.time.now_s, MOVING).pack())
 
-    def stop_process_after_decision(self, meanwhile: Callable[[], None] = lambda: None) -> None:
+    def suspend_process_after_decision(self, meanwhile: Callable[[], None] = lambda: None) -> None:
         """Suspend the process after the next decision while the main process runs ``meanwhile``."""
         decide = self.loop.logic.decide
 
@@ -92,7 +92,7 @@ class Bench:
             decided = decide(now_s)
             self.loop.logic.decide = decide  # type: ignore[method-assign]
             meanwhile()
-            self.time.now_s += STOPPED_S
+            self.time.now_s += SUSPENDED_S
             return decided
 
         self.loop.logic.decide = decide_then_pause  # type: ignore[method-assign]
@@ -114,25 +114,25 @@ class Bench:
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    made = Bench(monkeypatch)
-    yield made
-    made.close()
+    armed_bench = Bench(monkeypatch)
+    yield armed_bench
+    armed_bench.close()
 
 
-def test_a_fresh_command_is_written(bench: Bench) -> None:
+def test_fresh_command_is_written(bench: Bench) -> None:
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == MOVING
 
 
 def test_command_that_is_too_old_at_the_write_is_not_written(bench: Bench) -> None:
-    bench.stop_process_after_decision()
+    bench.suspend_process_after_decision()
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == CALIBRATION.neutral
     assert MOVING not in bench.device.written
 
 
 def test_stop_between_decision_and_write_takes_effect(bench: Bench) -> None:
-    bench.stop_process_after_decision(lambda: bench.order(2, Request.STOP_AND_LATCH, 0))
+    bench.suspend_process_after_decision(lambda: bench.order(2, Request.STOP_AND_LATCH, 0))
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == CALIBRATION.neutral
     assert MOVING not in bench.device.written
@@ -143,11 +143,11 @@ def test_newer_command_between_decision_and_write_is_written(bench: Bench) -> No
     newer = DeviceCommand(MotorKind.CURRENT, 1000, 500)
 
     def meanwhile() -> None:
-        issued_s = bench.time.now_s + STOPPED_S - 0.02
+        issued_s = bench.time.now_s + SUSPENDED_S - 0.02
         bench.orders.write(Order(1, Request.ARM, 2, issued_s, newer).pack())
         bench.loop.logic.telemetry(issued_s, HEALTHY)
 
-    bench.stop_process_after_decision(meanwhile)
+    bench.suspend_process_after_decision(meanwhile)
     bench.loop._tick(bench.time.now_s)
     assert bench.device.written[-1] == newer
 

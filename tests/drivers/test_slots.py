@@ -67,15 +67,15 @@ def test_no_mixed_value_with_a_concurrent_or_killed_writer() -> None:
     command = [sys.executable, "-c", WRITER, str(slot.descriptor)]
     process = subprocess.Popen(command, cwd=ROOT, pass_fds=(slot.descriptor,))
     try:
-        seen = [0]
-        while len(seen) < 2000:
+        sequence_numbers = [0]
+        while len(sequence_numbers) < 2000:
             newest = slot.read()
             if newest is None:
                 continue
             numbers = struct.unpack("<256Q", newest[1])
             assert set(numbers) == {newest[0]}
-            if newest[0] > seen[-1]:
-                seen.append(newest[0])
+            if newest[0] > sequence_numbers[-1]:
+                sequence_numbers.append(newest[0])
     finally:
         process.kill()
         process.wait()

@@ -21,7 +21,7 @@ from drivers.vesc.can_codec import CanReassembler, Packet, ReplyMode
 SHARED_DBC = Path(__file__).resolve().parents[2].parent / "shared" / "reference" / "vesc.dbc"
 
 
-def test_transmit_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_encoded_commands_equal_the_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     tested = 0
     for vector in (v for v in vesc_vectors if v["protocol"] == "vesc-can" and v["kind"] == "tx"):
         meaning, expected = vector["meaning"], bytes.fromhex(vector["hex"])
@@ -45,12 +45,12 @@ def test_transmit_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     assert tested == 7
 
 
-def test_documented_servo_example() -> None:
+def test_servo_frame_equals_the_documented_example() -> None:
     frame = codec.set_servo_position(23, 0x2A, 0.5)
     assert frame == CanFrame(0x0817, bytes.fromhex("2A020C01F4"))
 
 
-def test_status_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_status_frames_equal_the_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     expected = {
         0x917: {"erpm": -12345, "motor_current_a": -1.0, "duty": 0.321},
         0x1017: {"temp_fet_c": 32.5, "temp_motor_c": -1.5, "input_current_a": 1.3, "pid_position_deg": 100.0},
@@ -68,15 +68,19 @@ def test_status_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
 
 @pytest.mark.skipif(not SHARED_DBC.exists(), reason="the shared DBC is missing")
 @pytest.mark.parametrize("controller_id", [0, 23, 254])
-def test_agrees_with_the_other_dbc_for_any_controller(controller_id: int) -> None:
-    other = cantools.database.load_file(SHARED_DBC)
-    ours = codec.database()
-    assert isinstance(other, cantools.database.Database)
-    for message in other.messages:
-        mine = ours.get_message_by_frame_id((message.frame_id & ~0xFF) | controller_id, force_extended_id=True)
-        assert mine.name == message.name
-        layout = [(s.start, s.length, s.is_signed, s.byte_order, s.scale, s.offset) for s in message.signals]
-        assert [(s.start, s.length, s.is_signed, s.byte_order, s.scale, s.offset) for s in mine.signals] == layout
+def test_database_agrees_with_the_shared_dbc_for_any_controller(controller_id: int) -> None:
+    shared_dbc = cantools.database.load_file(SHARED_DBC)
+    database = codec.database()
+    assert isinstance(shared_dbc, cantools.database.Database)
+    for shared_message in shared_dbc.messages:
+        own_message = database.get_message_by_frame_id(
+            (shared_message.frame_id & ~0xFF) | controller_id, force_extended_id=True
+        )
+        assert own_message.name == shared_message.name
+        layout = [(s.start, s.length, s.is_signed, s.byte_order, s.scale, s.offset) for s in shared_message.signals]
+        assert [
+            (s.start, s.length, s.is_signed, s.byte_order, s.scale, s.offset) for s in own_message.signals
+        ] == layout
 
 
 @pytest.mark.parametrize("encode", [codec.set_current, codec.set_duty, codec.set_rpm, codec.set_current_brake])
@@ -103,8 +107,8 @@ def test_transport_round_trip_of_any_payload(payload: bytes) -> None:
     assert all(len(f.data) <= 8 and codec.controller_of(f) == 23 for f in frames)
     assert len(frames) == 1 if len(payload) <= 6 else codec.packet_of(frames[-1]) == Packet.PROCESS_RX_BUFFER
     receiver = CanReassembler(23)
-    found = [p for f in frames if (p := receiver.feed(f)) is not None]
-    assert [(p.sender_id, p.send, p.payload) for p in found] == [(42, ReplyMode.IS_REPLY, payload)]
+    packets = [p for f in frames if (p := receiver.feed(f)) is not None]
+    assert [(p.sender_id, p.send, p.payload) for p in packets] == [(42, ReplyMode.IS_REPLY, payload)]
 
 
 def test_reply_in_captured_form_is_reassembled() -> None:
@@ -112,9 +116,9 @@ def test_reply_in_captured_form_is_reassembled() -> None:
     receiver = CanReassembler(42)
     frames = [CanFrame(0x052A, bytes.fromhex(p)) for p in ("00320020a180ffff", "07cfc70094ffffff", "0eb30701")]
     assert all(receiver.feed(f) is None for f in frames)
-    done = receiver.feed(CanFrame(0x072A, bytes.fromhex("17010011b9eb")))
-    assert done is not None
-    assert payloads.decode_reply(done.payload) == payloads.MotorValues(
+    packet = receiver.feed(CanFrame(0x072A, bytes.fromhex("17010011b9eb")))
+    assert packet is not None
+    assert payloads.decode_reply(packet.payload) == payloads.MotorValues(
         erpm=-12345.0, input_v=14.8, tachometer_steps=-77.0, fault_code=7, status_bits=1
     )
 
@@ -129,7 +133,7 @@ def test_lost_frame_drops_only_its_packet(lost: int) -> None:
     assert [p.payload for f in frames if (p := receiver.feed(f))] == [bytes(range(20))]
 
 
-def test_a_wrong_crc_and_short_frames_are_dropped() -> None:
+def test_frames_with_a_wrong_crc_or_length_are_dropped() -> None:
     receiver = CanReassembler(42)
     frames = codec.encode_payload(42, 23, bytes(range(20)), ReplyMode.IS_REPLY)
     end = frames[-1]
@@ -142,7 +146,7 @@ def test_a_wrong_crc_and_short_frames_are_dropped() -> None:
         codec.decode_status(CanFrame(0x0917, b"\x00\x01"))
 
 
-def test_frames_for_others_are_ignored() -> None:
+def test_frames_for_other_receivers_are_ignored() -> None:
     receiver = CanReassembler(42)
     assert [receiver.feed(f) for f in codec.encode_payload(43, 23, b"abc", ReplyMode.IS_REPLY)] == [None]
     assert codec.decode_status(CanFrame(0x0117, bytes(4))) is None

@@ -64,10 +64,10 @@ def test_replies_have_the_real_layout(vesc_vectors: list[dict[str, Any]]) -> Non
     assert values.erpm == 0.0
 
 
-@pytest.mark.parametrize("nonsense", [b"", b"\x06\x00", b"\x0c", b"\xff\x00", b"\x32\x00"])
-def test_invalid_payloads_are_ignored(nonsense: bytes) -> None:
+@pytest.mark.parametrize("payload", [b"", b"\x06\x00", b"\x0c", b"\xff\x00", b"\x32\x00"])
+def test_invalid_payloads_are_ignored(payload: bytes) -> None:
     firmware = VescFirmware(CommandLog())
-    assert firmware.handle(nonsense, 0.0) is None
+    assert firmware.handle(payload, 0.0) is None
     assert firmware.log.motor() == []
 
 

@@ -26,9 +26,9 @@ FIELD_NAMES = {
 
 
 def of_kind(vectors: list[dict[str, Any]], *kinds: str) -> list[dict[str, Any]]:
-    found = [v for v in vectors if v["protocol"] == "vesc-serial" and v["kind"] in kinds]
-    assert found
-    return found
+    selected = [v for v in vectors if v["protocol"] == "vesc-serial" and v["kind"] in kinds]
+    assert selected
+    return selected
 
 
 def one_payload(data: bytes) -> bytes:
@@ -40,7 +40,7 @@ def test_crc_is_xmodem() -> None:
     assert crc16(b"123456789") == 0x31C3
 
 
-def test_encode_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_encoded_frames_equal_the_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     encoders = {
         "SET_DUTY": payloads.set_duty,
         "SET_CURRENT": payloads.set_current,
@@ -68,7 +68,7 @@ def test_encode_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     assert tested >= 15
 
 
-def test_raw_and_long_frames(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_raw_and_long_frames_equal_the_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     for vector in of_kind(vesc_vectors, "raw", "long"):
         data = bytes.fromhex(vector["hex"])
         assert encode_frame(one_payload(data)) == data
@@ -76,7 +76,7 @@ def test_raw_and_long_frames(vesc_vectors: list[dict[str, Any]]) -> None:
     assert encode_frame(long).hex() == of_kind(vesc_vectors, "long")[0]["hex"]
 
 
-def test_get_values_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_get_values_replies_of_all_firmware_versions_are_decoded(vesc_vectors: list[dict[str, Any]]) -> None:
     lengths = set()
     for vector in of_kind(vesc_vectors, "get_values"):
         payload = one_payload(bytes.fromhex(vector["hex"]))
@@ -96,7 +96,7 @@ def test_get_values_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     assert lengths == {54, 58, 59, 65, 73, 74}
 
 
-def test_selective_vector(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_selective_reply_is_decoded(vesc_vectors: list[dict[str, Any]]) -> None:
     (vector,) = of_kind(vesc_vectors, "get_values_selective")
     values = payloads.decode_reply(one_payload(bytes.fromhex(vector["hex"])))
     assert values == payloads.MotorValues(
@@ -106,7 +106,7 @@ def test_selective_vector(vesc_vectors: list[dict[str, Any]]) -> None:
     assert not values.kill_switch_active
 
 
-def test_firmware_version_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_firmware_version_replies_are_decoded(vesc_vectors: list[dict[str, Any]]) -> None:
     full, short = of_kind(vesc_vectors, "fw_version")
     version = payloads.decode_reply(one_payload(bytes.fromhex(full["hex"])))
     assert isinstance(version, payloads.FirmwareVersion)
@@ -121,13 +121,13 @@ def test_old_firmware_is_refused_with_the_remedy(major: int, minor: int, is_refu
     assert refusal is None or "update it with VESC Tool" in refusal
 
 
-def test_resynchronisation_like_the_firmware(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_decoder_resynchronises_like_the_firmware(vesc_vectors: list[dict[str, Any]]) -> None:
     for vector in of_kind(vesc_vectors, "resync"):
         for chunk in (1, 1000):
             decoder = VescFrameDecoder(inter_byte_timeout_s=None)
             data = bytes.fromhex(vector["hex"])
-            found = [p for i in range(0, len(data), chunk) for p in decoder.feed(data[i : i + chunk], 0.0)]
-            assert [p.hex() for p in found] == vector["payloads_fw"], vector["meaning"]
+            decoded_payloads = [p for i in range(0, len(data), chunk) for p in decoder.feed(data[i : i + chunk], 0.0)]
+            assert [p.hex() for p in decoded_payloads] == vector["payloads_fw"], vector["meaning"]
 
 
 @pytest.mark.parametrize("hidden", ["02ff020100000003", "030100020104408403"])
@@ -140,7 +140,7 @@ def test_inter_byte_timeout_decodes_frames_behind_a_false_header(hidden: str) ->
     assert (decoder.timeouts, decoder.pending_bytes) == (1, 0)
 
 
-def test_half_frame_then_silence_then_a_frame() -> None:
+def test_frame_after_an_incomplete_frame_is_decoded() -> None:
     frame = encode_frame(payloads.get_values())
     decoder = VescFrameDecoder(inter_byte_timeout_s=0.03)
     assert decoder.feed(frame[:3], 0.0) == []
@@ -148,35 +148,35 @@ def test_half_frame_then_silence_then_a_frame() -> None:
     assert decoder.timeouts == 1
 
 
-def test_ten_kilobytes_of_garbage_cost_no_frame_and_no_memory() -> None:
+def test_frame_after_ten_kilobytes_of_garbage_is_decoded() -> None:
     garbage = bytes((i * 73 + i // 7) & 255 for i in range(10_000))
     decoder = VescFrameDecoder()
     frame = encode_frame(payloads.get_firmware_version())
-    found = decoder.feed(garbage, 0.0) + decoder.feed(b"", 1.0) + decoder.feed(frame, 1.0)
-    assert found[-1] == payloads.get_firmware_version()
-    assert decoder.garbage_bytes == len(garbage) - sum(len(encode_frame(p)) for p in found[:-1])
+    decoded_payloads = decoder.feed(garbage, 0.0) + decoder.feed(b"", 1.0) + decoder.feed(frame, 1.0)
+    assert decoded_payloads[-1] == payloads.get_firmware_version()
+    assert decoder.garbage_bytes == len(garbage) - sum(len(encode_frame(p)) for p in decoded_payloads[:-1])
     assert decoder.pending_bytes == 0
 
 
 @given(st.lists(st.binary(min_size=1, max_size=300), max_size=4), st.data())
 @settings(max_examples=60, deadline=None)
-def test_frames_survive_any_split(messages: list[bytes], data: st.DataObject) -> None:
+def test_frames_are_decoded_with_any_split_of_the_stream(messages: list[bytes], data: st.DataObject) -> None:
     stream = b"".join(encode_frame(m) for m in messages)
     decoder = VescFrameDecoder()
-    found: list[bytes] = []
+    decoded_payloads: list[bytes] = []
     while stream:
         size = data.draw(st.integers(1, len(stream)))
-        found += decoder.feed(stream[:size], 0.0)
+        decoded_payloads += decoder.feed(stream[:size], 0.0)
         stream = stream[size:]
-    assert found == messages
+    assert decoded_payloads == messages
 
 
 @given(st.binary(max_size=80), st.binary(min_size=1, max_size=40))
 @settings(max_examples=100, deadline=None)
-def test_a_frame_behind_garbage_is_found_at_the_latest_after_silence(garbage: bytes, message: bytes) -> None:
+def test_frame_after_garbage_is_decoded_at_the_latest_after_the_timeout(garbage: bytes, message: bytes) -> None:
     decoder = VescFrameDecoder()
-    found = decoder.feed(garbage + encode_frame(message), 0.0) + decoder.feed(b"", 1.0)
-    assert message in found
+    decoded_payloads = decoder.feed(garbage + encode_frame(message), 0.0) + decoder.feed(b"", 1.0)
+    assert message in decoded_payloads
 
 
 @given(st.floats(allow_nan=True, allow_infinity=True))
@@ -206,7 +206,7 @@ def test_wrong_layouts_are_refused() -> None:
     assert payloads.decode_reply(b"\x15hello") is None
 
 
-def test_telemetry_encoding_is_what_the_vectors_hold(vesc_vectors: list[dict[str, Any]]) -> None:
+def test_encoded_telemetry_equals_the_vectors(vesc_vectors: list[dict[str, Any]]) -> None:
     newest = next(v for v in of_kind(vesc_vectors, "get_values") if "6.00" in v["meaning"])
     payload = one_payload(bytes.fromhex(newest["hex"]))
     assert payloads.encode_values(payloads.decode_get_values(payload), payloads.FULL_MASK) == payload[1:]

@@ -1,4 +1,4 @@
-"""Packets captured from Motive 2.1 (github.com/mje-nz/python_natnet, BSD-3-Clause) against independent facts."""
+"""Packets captured from Motive 2.1 (github.com/mje-nz/python_natnet, BSD-3-Clause), and their known contents."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ CLOCK_HZ = 3312787  # from the captured server info
 def captures(shared: Path) -> dict[str, bytes]:
     folder = shared / "reference" / "natnet-captures"
     if not folder.is_dir():
-        pytest.skip(f"{folder} with the captured packets is not there")
+        pytest.skip(f"{folder} with the captured packets does not exist")
     return {path.name.removesuffix("_packet_v3.bin"): path.read_bytes() for path in folder.glob("*_packet_v3.bin")} | {
         "occluded": (folder / "mocapframe_packet_occluded_v3.bin").read_bytes()
     }
@@ -62,7 +62,7 @@ def test_every_capture_is_decoded(captures: dict[str, bytes]) -> None:
     assert ids["mocapframe"] == ids["occluded"] == 7
 
 
-def test_server_info(captures: dict[str, bytes]) -> None:
+def test_server_info_is_decoded_and_encoded(captures: dict[str, bytes]) -> None:
     _, info = decode_datagram(captures["serverinfo"], V3)
     # In the capture garbage follows the name; it must not become part of the name.
     assert info == ServerInfo("Motive", (2, 1, 0, 0), (3, 0, 0, 0), CLOCK_HZ, 1511, True, "239.255.42.99")
@@ -73,7 +73,7 @@ def test_server_info(captures: dict[str, bytes]) -> None:
     assert written[260:] == captures["serverinfo"][260:]
 
 
-def test_connect_and_discovery(captures: dict[str, bytes]) -> None:
+def test_connect_and_discovery_are_decoded_and_encoded(captures: dict[str, bytes]) -> None:
     for name, message_id in (("connect", 0), ("discovery", 14)):
         _, connect = decode_datagram(captures[name], V3)
         assert connect == Connect("NatNetLib", (3, 0, 0, 0), (3, 0, 0, 0), None, False)
@@ -83,7 +83,7 @@ def test_connect_and_discovery(captures: dict[str, bytes]) -> None:
         assert encode_message(message_id, payload) == captures[name]
 
 
-def test_echo(captures: dict[str, bytes]) -> None:
+def test_echo_request_and_response_are_decoded(captures: dict[str, bytes]) -> None:
     _, stamp = decode_datagram(captures["echorequest"], V3)
     _, echo = decode_datagram(captures["echoresponse"], V3)
     assert isinstance(echo, EchoResponse)
@@ -91,7 +91,7 @@ def test_echo(captures: dict[str, bytes]) -> None:
     assert echo.server_ticks == 0x149CDE48504
 
 
-def test_frame_values(captures: dict[str, bytes]) -> None:
+def test_frame_has_the_known_values(captures: dict[str, bytes]) -> None:
     frame = frame_of(captures, "mocapframe")
     assert frame.frame_number == 162734
     assert frame.timestamp_s == pytest.approx(162734 / 120.0, abs=1e-9)  # the recording ran at 120 Hz
@@ -111,32 +111,32 @@ def test_frame_values(captures: dict[str, bytes]) -> None:
 def test_body_pose_and_definition_agree_with_the_labelled_markers(captures: dict[str, bytes]) -> None:
     """Position, quaternion order and marker positions agree only if all three are decoded correctly.
 
-    This Motive sends the marker positions of its definition with x mirrored: the distances among them are those seen,
-    and no rotation brings one onto the other. With -x all five lie within a millimetre.
+    This Motive sends the marker positions of its definition with x mirrored: their mutual distances equal the measured
+    ones, but no rotation maps one set to the other. With -x all five agree within a millimetre.
     """
     frame = frame_of(captures, "mocapframe")
     _, models = decode_datagram(captures["modeldef"], V3)
     assert isinstance(models, tuple)
     description = next(m for m in models if isinstance(m, RigidBodyDescription))
     (body,) = frame.rigid_bodies
-    turn = Rotation.from_quat([body.qx, body.qy, body.qz, body.qw])
+    rotation = Rotation.from_quat([body.qx, body.qy, body.qz, body.qw])
     markers_in_body_m = np.array(description.marker_positions_m) * [-1.0, 1.0, 1.0]
-    expected = turn.apply(markers_in_body_m) + np.array([body.x_m, body.y_m, body.z_m])
-    seen = np.array([(m.x_m, m.y_m, m.z_m) for m in frame.labelled_markers[:5]])
-    assert np.abs(expected - seen).max() < 2e-3
+    expected = rotation.apply(markers_in_body_m) + np.array([body.x_m, body.y_m, body.z_m])
+    measured = np.array([(m.x_m, m.y_m, m.z_m) for m in frame.labelled_markers[:5]])
+    assert np.abs(expected - measured).max() < 2e-3
 
 
-def test_model_definitions(captures: dict[str, bytes]) -> None:
+def test_model_definitions_are_decoded(captures: dict[str, bytes]) -> None:
     _, models = decode_datagram(captures["modeldef"], V3)
     assert isinstance(models, tuple)
-    body, one, everything = models
+    body, marker_set, all_markers = models
     assert isinstance(body, RigidBodyDescription)
     assert (body.name, body.id, body.parent_id, len(body.marker_positions_m)) == ("RaceQuad", 2, -1, 5)
-    assert one == MarkerSetDescription("RaceQuad", tuple(f"Marker{i}" for i in range(1, 6)))
-    assert everything == MarkerSetDescription("all", tuple(f"RaceQuad_{i}" for i in range(1, 6)))
+    assert marker_set == MarkerSetDescription("RaceQuad", tuple(f"Marker{i}" for i in range(1, 6)))
+    assert all_markers == MarkerSetDescription("all", tuple(f"RaceQuad_{i}" for i in range(1, 6)))
 
 
-def test_occluded_marker(captures: dict[str, bytes]) -> None:
+def test_occluded_marker_is_decoded(captures: dict[str, bytes]) -> None:
     frame = frame_of(captures, "occluded")
     assert frame.frame_number == 269007
     assert [s.name for s in frame.marker_sets] == ["FakeTree", "all"]
@@ -159,17 +159,17 @@ def test_captured_frame_fits_only_its_layout(captures: dict[str, bytes]) -> None
 def test_independent_decoder_agrees_on_the_captures(captures: dict[str, bytes]) -> None:
     for name in ("mocapframe", "occluded"):
         payload = split_message(captures[name])[1]
-        ours, theirs = decode_frame(payload, V3), DataFrame.read_from_buffer(PacketBuffer(payload), Version(3, 0))
-        assert ours.frame_number == theirs.prefix.frame_number
-        assert [b[1:4] for b in ours.rigid_bodies] == [b.pos for b in theirs.rigid_bodies]
-        assert [b[4:8] for b in ours.rigid_bodies] == [b.rot for b in theirs.rigid_bodies]
-        assert [(m.id, m[1:4], m.residual_m) for m in ours.labelled_markers] == [
-            (m.id_num, m.pos, m.residual) for m in theirs.labeled_markers
+        decoded, reference = decode_frame(payload, V3), DataFrame.read_from_buffer(PacketBuffer(payload), Version(3, 0))
+        assert decoded.frame_number == reference.prefix.frame_number
+        assert [b[1:4] for b in decoded.rigid_bodies] == [b.pos for b in reference.rigid_bodies]
+        assert [b[4:8] for b in decoded.rigid_bodies] == [b.rot for b in reference.rigid_bodies]
+        assert [(m.id, m[1:4], m.residual_m) for m in decoded.labelled_markers] == [
+            (m.id_num, m.pos, m.residual) for m in reference.labeled_markers
         ]
-        assert ours.mid_exposure_ticks == theirs.suffix.stamp_camera_mid_exposure
+        assert decoded.mid_exposure_ticks == reference.suffix.stamp_camera_mid_exposure
     payload = split_message(captures["modeldef"])[1]
-    theirs_models = DataDescriptions.read_from_buffer(PacketBuffer(payload), Version(3, 0))
+    reference_models = DataDescriptions.read_from_buffer(PacketBuffer(payload), Version(3, 0))
     _, models = decode_datagram(captures["modeldef"], V3)
     assert isinstance(models, tuple)
     assert isinstance(models[0], RigidBodyDescription)
-    assert list(models[0].marker_positions_m) == [m.pos for m in theirs_models.rigid_bodies[0].markers]
+    assert list(models[0].marker_positions_m) == [m.pos for m in reference_models.rigid_bodies[0].markers]

@@ -75,10 +75,10 @@ class Peer:
     def send(self, message_id: int, payload: bytes = b"") -> None:
         self.socket.sendto(encode_message(message_id, payload), self.to)
 
-    def receive(self, wanted: int) -> bytes:
+    def receive(self, expected_id: int) -> bytes:
         while True:
             message_id, payload = split_message(self.socket.recv(65536))
-            if message_id == wanted:
+            if message_id == expected_id:
                 return payload
 
     def __enter__(self) -> Peer:
@@ -92,7 +92,7 @@ def median(values: list[float]) -> float:
     return sorted(values)[len(values) // 2]
 
 
-def bound_s(numbers: Mapping[str, float]) -> float:
+def tolerance_s(numbers: Mapping[str, float]) -> float:
     """Tolerance [s]: a millisecond, or half the shortest round trip on a busy machine."""
     return max(1e-3, 0.5e-3 * numbers["round_trip_min_ms"])
 
@@ -102,7 +102,7 @@ def bound_s(numbers: Mapping[str, float]) -> float:
 
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
 @pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
-def test_handshake_models_and_frames(
+def test_client_receives_models_and_frames_of_every_version(
     serve: Serve, configure: Configure, until: Until, mode: str, version: BitstreamVersion
 ) -> None:
     server = serve(mode=mode, version=version)
@@ -139,7 +139,7 @@ class RequestOnlyServer(NatNetServer):
         return super()._answer(message_id, payload, address, now_s)
 
 
-def test_the_bitstream_changes_in_flight(serve: Serve, configure: Configure, until: Until) -> None:
+def test_bitstream_changes_while_frames_arrive(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(kind=RequestOnlyServer, version="4.1", faults=ServerFaults(latency_s=0.05))
     received = Received()
     with NatNetClient(configure(server, bitstream="3.0"), received) as client:
@@ -154,11 +154,11 @@ def test_the_bitstream_changes_in_flight(serve: Serve, configure: Configure, unt
 
 
 @pytest.fixture
-def quick_to_reconnect(monkeypatch: pytest.MonkeyPatch) -> None:
+def short_reconnect_period(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mocap.natnet.message_schedule.RECONNECT_PERIOD_S", 0.5)
 
 
-@pytest.mark.usefixtures("quick_to_reconnect")
+@pytest.mark.usefixtures("short_reconnect_period")
 def test_version_is_requested_again_after_a_server_restart(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(kind=RequestOnlyServer, version="4.1", client_timeout_s=0.6)
     received = Received()
@@ -181,11 +181,11 @@ def test_frames_in_flight_are_decoded_in_both_versions() -> None:
     assert switch.version == V41
     assert switch.decode_frame(encode_frame(frame, V30)) == frame
     assert (switch.version, switch.pending) == (V30, None)
-    alike = BitstreamSwitch(V40, pending=V30)
-    assert alike.decode_frame(encode_frame(frame, V40)) == frame
-    assert alike.version == V40
-    alike.decode_frame(encode_frame(frame._replace(params=FRAME_BITSTREAM_CHANGED), V30))
-    assert alike.version == V30
+    equal_layouts = BitstreamSwitch(V40, pending=V30)
+    assert equal_layouts.decode_frame(encode_frame(frame, V40)) == frame
+    assert equal_layouts.version == V40
+    equal_layouts.decode_frame(encode_frame(frame._replace(params=FRAME_BITSTREAM_CHANGED), V30))
+    assert equal_layouts.version == V30
 
 
 def test_first_frame_of_a_new_version_has_the_changed_flag(serve: Serve) -> None:
@@ -203,7 +203,7 @@ def test_first_frame_of_a_new_version_has_the_changed_flag(serve: Serve) -> None
         assert peer.receive(MessageId.RESPONSE) != bytes(4)
 
 
-def test_two_clients_with_different_versions(serve: Serve, configure: Configure, until: Until) -> None:
+def test_clients_of_different_versions_receive_the_same_poses(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(version="4.1")
     old, new = Received(), Received()
     with (
@@ -241,12 +241,12 @@ def test_client_without_keepalives_is_dropped(serve: Serve, configure: Configure
 
 def test_changed_models_are_requested_again(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve()
-    seen: list[tuple[Any, ...]] = []
-    with NatNetClient(configure(server), on_models=seen.append) as client:
+    received_models: list[tuple[Any, ...]] = []
+    with NatNetClient(configure(server), on_models=received_models.append) as client:
         assert client.models is not None
         server.set_bodies((EmulatedBody("lorry", 12),))
         until(lambda: client.models is not None and client.models[0][:2] == ("lorry", 12))
-    assert [models[0].name for models in (seen[0], seen[-1])] == ["car", "lorry"]
+    assert [models[0].name for models in (received_models[0], received_models[-1])] == ["car", "lorry"]
 
 
 def test_lost_requests_for_models_are_sent_again(serve: Serve, configure: Configure, until: Until) -> None:
@@ -260,7 +260,7 @@ def test_lost_requests_for_models_are_sent_again(serve: Serve, configure: Config
         until(lambda: client.models is not None and client.models[0][:2] == ("lorry", 12))
 
 
-@pytest.mark.usefixtures("quick_to_reconnect")
+@pytest.mark.usefixtures("short_reconnect_period")
 @pytest.mark.parametrize("mode", ["unicast", "multicast"])
 def test_client_reconnects_to_a_restarted_server(serve: Serve, configure: Configure, until: Until, mode: str) -> None:
     received = Received()
@@ -278,7 +278,7 @@ def test_client_reconnects_to_a_restarted_server(serve: Serve, configure: Config
     assert numbers["clock_resets"] >= 1.0
     assert received.sequences == sorted(set(received.sequences))
     settled = received.errors_s(len(received.frames) - 25)
-    assert abs(median(settled)) < bound_s(numbers)
+    assert abs(median(settled)) < tolerance_s(numbers)
     assert all(capture_s <= received_s + 5e-3 for _, _, capture_s, received_s in received.frames)
 
 
@@ -295,7 +295,7 @@ def test_clock_step_of_the_server_is_detected_and_poses_never_get_newer(
         until(lambda: len(received.frames) >= count + 60)
         numbers = client.statistics()
     assert numbers["mistimed"] > 0.0
-    assert abs(median(received.errors_s(count + 10))) < bound_s(numbers)
+    assert abs(median(received.errors_s(count + 10))) < tolerance_s(numbers)
     assert all(capture_s <= received_s + 5e-3 for _, _, capture_s, received_s in received.frames)
 
 
@@ -306,7 +306,7 @@ def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, 
     with NatNetClient(configure(server), received) as client:
         until(lambda: len(received.frames) >= 200)
         numbers = client.statistics()
-    assert abs(median(received.errors_s())) < bound_s(numbers)
+    assert abs(median(received.errors_s())) < tolerance_s(numbers)
     assert 0.0 < numbers["round_trip_min_ms"] < 50.0
     assert numbers["latency_p50_ms"] >= 3.0  # the exposure is 3 ms before a frame is due
     assert numbers["latency_p50_ms"] - numbers["server_latency_p50_ms"] < 50.0
@@ -328,8 +328,8 @@ def test_network_faults_are_tolerated_and_counted(serve: Serve, configure: Confi
         numbers = client.statistics()
         assert client.failure is None
         assert client.last_error.endswith(".")
-    for fate in ("malformed", "lost", "repeated", "out_of_order"):
-        assert numbers[fate] > 0.0, fate
+    for counter in ("malformed", "lost", "repeated", "out_of_order"):
+        assert numbers[counter] > 0.0, counter
     assert received.sequences == sorted(set(received.sequences))
     for frame, *_ in received.frames:
         assert frame.rigid_bodies[0].y_m == 0.25
@@ -338,13 +338,13 @@ def test_network_faults_are_tolerated_and_counted(serve: Serve, configure: Confi
 def test_foreign_datagrams_are_counted_and_ignored(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(rate_hz=30.0)
     received = Received()
-    fake = encode_message(MessageId.FRAMEOFDATA, encode_frame(Frame(10**6), V41))
+    foreign_frame = encode_message(MessageId.FRAMEOFDATA, encode_frame(Frame(10**6), V41))
     with NatNetClient(configure(server), received) as client:
         until(lambda: bool(received.frames))
         (address,) = server.clients
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-            stranger.bind(("127.0.0.2", 0))
-            stranger.sendto(fake, address)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as foreign_socket:
+            foreign_socket.bind(("127.0.0.2", 0))
+            foreign_socket.sendto(foreign_frame, address)
         until(lambda: client.statistics()["foreign"] == 1.0)
         assert client.foreign_address == "127.0.0.2"
         count = len(received.frames)
@@ -386,10 +386,10 @@ def test_no_open_files_or_threads_remain_after_close(serve: Serve, configure: Co
         client.open()
         client.close()
         client.close()
-    wrong = NatNetClient(configure(server, mode="unicast"))
+    failing_client = NatNetClient(configure(server, mode="unicast"))
     with pytest.raises(NotReadyError):
-        wrong.open()
-    wrong.close()
+        failing_client.open()
+    failing_client.close()
     assert (threading.active_count(), len(os.listdir(folder))) == (threads, files)
     server.close()
     server.close()

@@ -29,17 +29,17 @@ def reason(config: MocapConfig) -> str:
 
 
 def test_missing_connection_is_reported_with_the_reason(serve: Serve, configure: Configure) -> None:
-    deaf = serve(faults=ServerFaults(no_answers=True))
-    text = reason(configure(deaf, timeout_s=0.3))
-    assert f"127.0.0.1:{deaf.command_port}" in text
+    silent_server = serve(faults=ServerFaults(no_answers=True))
+    text = reason(configure(silent_server, timeout_s=0.3))
+    assert f"127.0.0.1:{silent_server.command_port}" in text
     assert "Motive" in text
     text = reason(configure(serve(mode="multicast"), mode="unicast"))
     assert 'mode = "multicast"' in text
     text = reason(configure(serve(mode="unicast"), mode="multicast"))
     assert 'mode = "unicast"' in text
-    newer = serve(mode="multicast", faults=ServerFaults(no_frames=True))
-    newer.version = V42
-    text = reason(configure(newer))
+    newer_server = serve(mode="multicast", faults=ServerFaults(no_frames=True))
+    newer_server.version = V42
+    text = reason(configure(newer_server))
     for word in ("4.2", "2.6 to 4.1", "Transmission Type", "Unicast"):
         assert word in text
     for host in ("no-such-host.invalid", "two..dots", "::1"):
@@ -58,7 +58,7 @@ def test_host_names_are_resolved(serve: Serve, configure: Configure, until: Unti
         until(lambda: client.statistics()["frames"] > 0.0)
 
 
-def test_a_request_the_server_does_not_know(serve: Serve, configure: Configure) -> None:
+def test_unknown_and_unanswered_requests_are_reported(serve: Serve, configure: Configure) -> None:
     server = serve()
     with NatNetClient(configure(server)) as client:
         with pytest.raises(NotReadyError, match="does not know the request 'FrameRat'"):
@@ -68,10 +68,10 @@ def test_a_request_the_server_does_not_know(serve: Serve, configure: Configure) 
             client.request("FrameRate", timeout_s=0.2)
 
 
-def test_a_port_in_use(serve: Serve) -> None:
-    taken = serve().command_port
-    with pytest.raises(NotReadyError, match=f"{taken} cannot be used .*close the program"):
-        serve(command_port=taken)
+def test_port_in_use_is_reported(serve: Serve) -> None:
+    used_port = serve().command_port
+    with pytest.raises(NotReadyError, match=f"{used_port} cannot be used .*close the program"):
+        serve(command_port=used_port)
 
 
 def test_error_in_the_poses_ends_the_server_and_is_stored(serve: Serve, until: Until) -> None:

@@ -123,32 +123,32 @@ PLATE = ForcePlateDescription(
 def test_independent_decoder_reads_encoded_frames(version: BitstreamVersion) -> None:
     frame = full_frame(version)
     buffer = PacketBuffer(encode_frame(frame, version))
-    theirs = DataFrame.read_from_buffer(buffer, Version(*version))
-    # It ignores the end-of-data tag and, in 4.1, the precision timestamp of 8 bytes, so it stops before them.
+    reference = DataFrame.read_from_buffer(buffer, Version(*version))
+    # The reference decoder ignores the end-of-data tag and, in 4.1, the precision timestamp of 8 bytes.
     assert len(buffer.data) - buffer.pointer == (12 if version >= V41 else 4)
-    assert theirs.prefix.frame_number == frame.frame_number
-    assert [(s.model_name, s.marker_pos_list) for s in theirs.marker_sets] == [tuple(s) for s in frame.marker_sets]
-    assert theirs.unlabeled_marker_pos == frame.other_markers_m
+    assert reference.prefix.frame_number == frame.frame_number
+    assert [(s.model_name, s.marker_pos_list) for s in reference.marker_sets] == [tuple(s) for s in frame.marker_sets]
+    assert reference.unlabeled_marker_pos == frame.other_markers_m
 
     def numbers(b: object) -> tuple[object, ...]:
         return (b.id_num, *b.pos, *b.rot, b.marker_error, int(b.tracking_valid))  # type: ignore[attr-defined]
 
-    assert [numbers(b) for b in theirs.rigid_bodies] == [tuple(b) for b in frame.rigid_bodies]
-    assert [[numbers(b) for b in s.rigid_bodies] for s in theirs.skeletons] == [
+    assert [numbers(b) for b in reference.rigid_bodies] == [tuple(b) for b in frame.rigid_bodies]
+    assert [[numbers(b) for b in s.rigid_bodies] for s in reference.skeletons] == [
         [tuple(b) for b in s.bones] for s in frame.skeletons
     ]
-    assert [(m.id_num, *m.pos, m.size, m.param, m.residual) for m in theirs.labeled_markers] == [
+    assert [(m.id_num, *m.pos, m.size, m.param, m.residual) for m in reference.labeled_markers] == [
         tuple(m) for m in frame.labelled_markers
     ]
-    assert [(p.id_num, p.channel_arrays) for p in theirs.force_plates] == [tuple(p) for p in frame.force_plates]
-    assert [(p.id_num, p.channel_arrays) for p in theirs.devices] == [tuple(p) for p in frame.devices]
+    assert [(p.id_num, p.channel_arrays) for p in reference.force_plates] == [tuple(p) for p in frame.force_plates]
+    assert [(p.id_num, p.channel_arrays) for p in reference.devices] == [tuple(p) for p in frame.devices]
     if version >= V41:
-        (asset,) = theirs.assets
+        (asset,) = reference.assets
         assert asset.asset_id == 9
         assert [(m.marker_id, *m.pos, m.marker_size, m.marker_params, m.residual) for m in asset.markers] == [
             tuple(m) for m in frame.assets[0].markers
         ]
-    end = theirs.suffix
+    end = reference.suffix
     assert (end.timecode, end.timecode_sub, end.timestamp) == (0x01020304, 5, 12.5)
     assert (end.stamp_camera_mid_exposure, end.stamp_data_received, end.stamp_transmit) == (
         10**12,
@@ -163,20 +163,24 @@ def test_independent_decoder_reads_encoded_frames(version: BitstreamVersion) -> 
 def test_independent_decoder_reads_encoded_descriptions(version: BitstreamVersion) -> None:
     models = full_models(version)
     buffer = PacketBuffer(encode_model_def(models, version))
-    theirs = DataDescriptions.read_from_buffer(buffer, Version(*version))
+    reference = DataDescriptions.read_from_buffer(buffer, Version(*version))
     assert buffer.pointer == len(buffer.data)
-    ours = models[0]
-    assert isinstance(ours, RigidBodyDescription)
-    (rigid_body,) = theirs.rigid_bodies
-    assert (rigid_body.name, rigid_body.id_num, rigid_body.pos) == (ours.name, ours.id, ours.offset_m)
-    assert [m.pos for m in rigid_body.markers] == list(ours.marker_positions_m)
+    description = models[0]
+    assert isinstance(description, RigidBodyDescription)
+    (rigid_body,) = reference.rigid_bodies
+    assert (rigid_body.name, rigid_body.id_num, rigid_body.pos) == (
+        description.name,
+        description.id,
+        description.offset_m,
+    )
+    assert [m.pos for m in rigid_body.markers] == list(description.marker_positions_m)
     assert [m.active_label for m in rigid_body.markers] == [0, 7]
     assert [m.name for m in rigid_body.markers] == (["m1", "m2"] if version >= V40 else [None, None])
-    assert theirs.marker_sets[0].marker_names == ("a", "b")
-    assert [b.name for b in theirs.skeletons[0].rigid_body_descriptions] == ["bone1", "bone2"]
-    assert theirs.devices[0].channel_names == ("ch1",)
+    assert reference.marker_sets[0].marker_names == ("a", "b")
+    assert [b.name for b in reference.skeletons[0].rigid_body_descriptions] == ["bone1", "bone2"]
+    assert reference.devices[0].channel_names == ("ch1",)
     if version >= V41:
-        assert theirs.assets[0].marker_descriptions[0].position == (1.0, 0.5, 0.25)
+        assert reference.assets[0].marker_descriptions[0].position == (1.0, 0.5, 0.25)
 
 
 @pytest.mark.parametrize("version", SERVED_BITSTREAMS, ids=str)
@@ -261,12 +265,12 @@ def test_errors_name_the_byte_and_the_section() -> None:
 def test_every_truncation_is_refused(version: BitstreamVersion) -> None:
     frame = encode_frame(full_frame(version), version)
     models = encode_model_def((*full_models(version), PLATE), version)
-    for cut in range(len(frame)):
+    for size in range(len(frame)):
         with pytest.raises(ProtocolError):
-            decode_frame(frame[:cut], version)
-    for cut in range(len(models)):
+            decode_frame(frame[:size], version)
+    for size in range(len(models)):
         with pytest.raises(ProtocolError):
-            decode_model_def(models[:cut], version)
+            decode_model_def(models[:size], version)
     with pytest.raises(ProtocolError, match="left over"):
         decode_frame(frame + b"\0", version)
 
@@ -305,12 +309,12 @@ def test_unknown_descriptions_are_skipped_by_their_size() -> None:
     known = full_models(V41)
     models = (known[0], UnknownDescription(42, b"from the future"), known[1])
     assert decode_model_def(encode_model_def(models, V41), V41) == models
-    stranger = struct.pack("<ii", 1, 42) + b"from the future"
+    unknown_description = struct.pack("<ii", 1, 42) + b"from the future"
     with pytest.raises(ProtocolError, match="type 42 is unknown"):
-        decode_model_def(stranger, V40)
+        decode_model_def(unknown_description, V40)
 
 
-def test_connect_of_every_known_client() -> None:
+def test_connect_messages_of_known_clients_are_decoded() -> None:
     options = b"\0" + bytes((4, 0, 0, 0))
     name = b"Ping".ljust(256, b"\0") + bytes(8)
     assert decode_connect(b"").bitstream is None
@@ -323,7 +327,7 @@ def test_connect_of_every_known_client() -> None:
     assert len(encode_connect("carlab", bitstream=V41)) == 269
 
 
-def test_servers_before_3_0_send_264_bytes() -> None:
+def test_server_info_before_version_3_0_is_decoded() -> None:
     info = decode_server_info(b"Motive".ljust(256, b"\0") + bytes((1, 10, 0, 0, 2, 10, 0, 0)))
     assert (info.name, info.bitstream, info.clock_hz) == ("Motive", (2, 10), 0)
 
@@ -342,7 +346,7 @@ def test_numbers_that_do_not_fit_are_refused() -> None:
         encode_frame(Frame(1), BitstreamVersion(2, 9))
 
 
-def test_speed_is_measured() -> None:
+def test_decode_speed_is_measured() -> None:
     speed = natnet_decode_speed(seconds=0.05)
     assert set(speed) == {"captured_3_0_hz", "captured_4_1_hz", "ten_bodies_4_1_hz"}
     assert all(value > 1000.0 for value in speed.values())

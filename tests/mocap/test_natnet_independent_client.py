@@ -75,8 +75,8 @@ def check_frame(frame: DataFrame, truth: list[RigidBodySample | None], server: N
     # Y up on the wire: (x, y, z) of the map is (x, z, -y).
     assert car.pos == pytest.approx((0.001 * number, 0.125, 1.5), abs=1e-6)
     heading = Rotation.from_quat(car.rot).apply([1.0, 0.0, 0.0])
-    turned = Rotation.from_euler("y", 0.01 * (number % 300)).apply([1.0, 0.0, 0.0])
-    assert heading == pytest.approx(turned, abs=1e-5)
+    expected_heading = Rotation.from_euler("y", 0.01 * (number % 300)).apply([1.0, 0.0, 0.0])
+    assert heading == pytest.approx(expected_heading, abs=1e-5)
     suffix = frame.suffix
     assert suffix.stamp_camera_mid_exposure == server.ticks(first.t_capture_s)
     assert suffix.stamp_camera_mid_exposure <= suffix.stamp_data_received <= suffix.stamp_transmit
@@ -117,7 +117,7 @@ def test_independent_client_receives_the_frames(
     assert numbers == sorted(set(numbers))
     between = [n for n in list(sent) if numbers[0] <= n <= numbers[-1]]
     assert len(numbers) > 0.95 * len(between)
-    # It takes 0.1 s or more to connect, and the server skips frames on a busy machine.
+    # The client needs 0.1 s or more to connect, and the server skips frames on a busy machine.
     assert 100.0 < len(numbers) / elapsed_s < 260.0
 
     for frame in frames:

@@ -36,32 +36,32 @@ Until = Callable[[Callable[[], bool]], None]
 UP = Rotation.from_euler("x", 90, degrees=True)
 numbers = st.floats(-3.0, 3.0)
 vectors = st.tuples(numbers, numbers, numbers)
-turns = st.tuples(numbers, numbers, numbers).map(Rotation.from_rotvec)
+rotations = st.tuples(numbers, numbers, numbers).map(Rotation.from_rotvec)
 
 
 # -- axes, against scipy --------------------------------------------------------------------------------------------
 
 
-@given(vectors, turns)
+@given(vectors, rotations)
 @settings(max_examples=100, deadline=None)
-def test_axes_agree_with_scipy(vector: Any, turn: Rotation) -> None:
-    q = tuple(map(float, turn.as_quat()))
-    assert axes.rotate(q, vector) == pytest.approx(turn.apply(vector), abs=1e-9)  # type: ignore[arg-type]
+def test_axes_agree_with_scipy(vector: Any, rotation: Rotation) -> None:
+    q = tuple(map(float, rotation.as_quat()))
+    assert axes.rotate(q, vector) == pytest.approx(rotation.apply(vector), abs=1e-9)  # type: ignore[arg-type]
     assert axes.z_up_vector(vector) == pytest.approx(UP.apply(vector), abs=1e-9)
     assert axes.y_up_vector(axes.z_up_vector(vector)) == vector
-    turned = Rotation.from_quat(axes.z_up_quaternion(q))  # type: ignore[arg-type]
-    assert (turned * (UP * turn * UP.inv()).inv()).magnitude() < 1e-7
+    rotated = Rotation.from_quat(axes.z_up_quaternion(q))  # type: ignore[arg-type]
+    assert (rotated * (UP * rotation * UP.inv()).inv()).magnitude() < 1e-7
     assert axes.y_up_quaternion(axes.z_up_quaternion(q)) == q  # type: ignore[arg-type]
-    lean = math.acos(np.clip(turn.apply([0.0, 0.0, 1.0])[2], -1.0, 1.0))
-    assert axes.tilt_rad(q) == pytest.approx(lean, abs=1e-6)  # type: ignore[arg-type]
+    tilt_rad = math.acos(np.clip(rotation.apply([0.0, 0.0, 1.0])[2], -1.0, 1.0))
+    assert axes.tilt_rad(q) == pytest.approx(tilt_rad, abs=1e-6)  # type: ignore[arg-type]
 
 
-@given(vectors, turns, st.floats(-math.pi, math.pi), vectors)
+@given(vectors, rotations, st.floats(-math.pi, math.pi), vectors)
 @settings(max_examples=100, deadline=None)
-def test_base_link_agrees_with_scipy(position: Any, turn: Rotation, yaw_offset_rad: float, pivot: Any) -> None:
-    q = tuple(map(float, turn.as_quat()))
+def test_base_link_agrees_with_scipy(position: Any, rotation: Rotation, yaw_offset_rad: float, pivot: Any) -> None:
+    q = tuple(map(float, rotation.as_quat()))
     origin, yaw_rad = axes.base_link_pose(position, q, yaw_offset_rad, pivot)  # type: ignore[arg-type]
-    base = turn * Rotation.from_euler("z", yaw_offset_rad)
+    base = rotation * Rotation.from_euler("z", yaw_offset_rad)
     # The pivot, transformed from the found base_link, is at the body's position.
     assert np.asarray(origin) + base.apply(pivot) == pytest.approx(position, abs=1e-9)
     forward = base.apply([1.0, 0.0, 0.0])
@@ -82,13 +82,13 @@ def pose(sample: PoseSample | None) -> tuple[float, ...]:
 
 
 @pytest.mark.parametrize("up_axis", ["y", "z"])
-def test_the_pose_of_base_link(serve: Serve, configure: Configure, up_axis: str) -> None:
+def test_pose_of_base_link_includes_yaw_offset_and_pivot(serve: Serve, configure: Configure, up_axis: str) -> None:
     base, yaw_rad = np.array([1.5, -0.75, 0.0]), 2.5
     pivot, yaw_offset_rad = (0.1, 0.02, 0.06), -1.2
-    frame = Rotation.from_euler("z", yaw_rad)
-    body = frame * Rotation.from_euler("z", -yaw_offset_rad)
-    place = base + frame.apply(pivot)
-    sample = RigidBodySample(0.0, tuple(place), tuple(body.as_quat()))
+    heading = Rotation.from_euler("z", yaw_rad)
+    body = heading * Rotation.from_euler("z", -yaw_offset_rad)
+    position_m = base + heading.apply(pivot)
+    sample = RigidBodySample(0.0, tuple(position_m), tuple(body.as_quat()))
     server = serve(lambda t_s: [RigidBodySample(t_s, sample.position_m, sample.quaternion)], up_axis=up_axis)
     config = configure(server, up_axis=up_axis, yaw_offset_rad=yaw_offset_rad, pivot_in_base_link_m=pivot)
     with RigidBodyPoseSource(config) as source:
@@ -98,10 +98,10 @@ def test_the_pose_of_base_link(serve: Serve, configure: Configure, up_axis: str)
 
 
 def test_wrong_up_axis_is_reported(serve: Serve, configure: Configure, until: Until) -> None:
-    def tumbled(t_s: float) -> list[RigidBodySample]:
+    def tilted(t_s: float) -> list[RigidBodySample]:
         return [RigidBodySample(t_s, (0.0, 0.0, 0.5), tuple(Rotation.from_euler("x", 60, degrees=True).as_quat()))]
 
-    with RigidBodyPoseSource(configure(serve(tumbled))) as source:
+    with RigidBodyPoseSource(configure(serve(tilted))) as source:
         until(lambda: source.statistics()["tracked"] >= 5.0)
         (text,) = source.problems()
         assert "tilted" in text
@@ -131,7 +131,7 @@ def test_capture_times_equal_the_true_times(serve: Serve, configure: Configure, 
     assert all(s.t_receive_s - s.t_capture_s > 0.02 for s in samples)
 
 
-def test_latest_since_and_wait_for(serve: Serve, configure: Configure, until: Until) -> None:
+def test_latest_since_and_wait_for_return_new_samples(serve: Serve, configure: Configure, until: Until) -> None:
     source = RigidBodyPoseSource(configure(serve()), max_samples=16)
     assert source.latest() is None
     assert source.since(-1) == ()
@@ -152,19 +152,19 @@ def test_latest_since_and_wait_for(serve: Serve, configure: Configure, until: Un
     assert source.latest() is not None  # received samples stay readable
 
 
-def test_several_threads_can_wait(serve: Serve, configure: Configure) -> None:
+def test_several_threads_can_wait_for_a_pose(serve: Serve, configure: Configure) -> None:
     with RigidBodyPoseSource(configure(serve())) as source:
-        found: list[PoseSample | None] = []
-        threads = [threading.Thread(target=lambda: found.append(source.wait_for(20, 30.0))) for _ in range(4)]
+        samples: list[PoseSample | None] = []
+        threads = [threading.Thread(target=lambda: samples.append(source.wait_for(20, 30.0))) for _ in range(4)]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-    assert len(found) == 4
-    assert all(sample is not None and sample.sequence > 20 for sample in found)
+    assert len(samples) == 4
+    assert all(sample is not None and sample.sequence > 20 for sample in samples)
 
 
-def test_tracking_lost_holds_the_last_pose(serve: Serve, configure: Configure, until: Until) -> None:
+def test_last_pose_is_kept_while_tracking_is_lost(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(standing())
     with RigidBodyPoseSource(configure(server)) as source:
         assert source.latest() is not None
@@ -192,7 +192,7 @@ def test_invalid_pose_is_not_tracked(serve: Serve, configure: Configure, until: 
         assert "invalid pose" in source.problems()[0]
 
 
-def test_a_body_that_disappears_and_returns(serve: Serve, configure: Configure, until: Until) -> None:
+def test_body_that_disappears_is_reported_and_found_again(serve: Serve, configure: Configure, until: Until) -> None:
     server = serve(standing())
     with RigidBodyPoseSource(configure(server, body="car")) as source:
         server.set_bodies((EmulatedBody("lorry", 5),))
@@ -204,7 +204,7 @@ def test_a_body_that_disappears_and_returns(serve: Serve, configure: Configure, 
         assert source.problems() == ()
 
 
-def test_the_body_is_chosen_by_name_or_id(serve: Serve, configure: Configure) -> None:
+def test_body_is_selected_by_name_or_id(serve: Serve, configure: Configure) -> None:
     bodies = (EmulatedBody("car", 3), EmulatedBody("trailer", 4))
 
     def poses(t_s: float) -> Sequence[RigidBodySample]:
@@ -232,7 +232,7 @@ def test_missing_body_and_duplicate_names_are_reported() -> None:
     assert select_body(twins, MocapConfig(body_id=2)) is twins[1]
 
 
-def test_close_and_open_again(serve: Serve, configure: Configure) -> None:
+def test_source_can_be_closed_and_opened_again(serve: Serve, configure: Configure) -> None:
     source = RigidBodyPoseSource(configure(serve(standing())))
     source.close()
     for _ in range(3):
@@ -245,7 +245,7 @@ def test_close_and_open_again(serve: Serve, configure: Configure) -> None:
         source.close()
 
 
-def no_pose(config: MocapConfig) -> str:
+def reason_for_missing_pose(config: MocapConfig) -> str:
     source = RigidBodyPoseSource(config)
     with pytest.raises(NotReadyError) as caught:
         source.open()
@@ -256,9 +256,9 @@ def no_pose(config: MocapConfig) -> str:
 
 def test_missing_pose_is_reported_with_the_reason(serve: Serve, configure: Configure) -> None:
     server = serve(faults=ServerFaults(no_frames=True))
-    assert "no frame came within 0.3 s" in no_pose(configure(server, timeout_s=0.3))
+    assert "no frame came within 0.3 s" in reason_for_missing_pose(configure(server, timeout_s=0.3))
     server.faults = ServerFaults(frame_version=BitstreamVersion(3, 0))
-    text = no_pose(configure(server, timeout_s=0.5))
+    text = reason_for_missing_pose(configure(server, timeout_s=0.5))
     for word in ("3.0, 3.1 or 4.0", "not 4.1", "2.6 to 4.1", "Motive's Data Streaming pane", 'bitstream = "3.0"'):
         assert word in text
     server.faults = ServerFaults()
@@ -273,25 +273,25 @@ def test_frames_from_another_address_are_named(serve: Serve, configure: Configur
     port = server._data.getsockname()[1]
     server._data.close()
     server._data = udp_socket("127.0.0.3", port)
-    text = no_pose(configure(server, timeout_s=0.5))
+    text = reason_for_missing_pose(configure(server, timeout_s=0.5))
     assert "127.0.0.3" in text
     assert "server_address" in text
 
 
-def test_a_failed_receiver_is_a_problem(
+def test_failed_receiver_is_reported_as_a_problem(
     serve: Serve, configure: Configure, until: Until, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(*arguments: object) -> None:
+    def failing_sample(*arguments: object) -> None:
         raise RuntimeError("out of order")
 
     with RigidBodyPoseSource(configure(serve())) as source:
-        monkeypatch.setattr(source, "_sample", broken)
+        monkeypatch.setattr(source, "_sample", failing_sample)
         until(lambda: bool(source.problems()))
         assert "out of order" in source.problems()[0]
         assert "open it again" in source.problems()[0]
 
 
-def test_importing_the_package_loads_nothing_heavy() -> None:
+def test_import_loads_no_heavy_modules() -> None:
     code = """if True:
         import sys
         import mocap
@@ -302,5 +302,5 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
         except AttributeError as error:
             print(error)
     """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "'nothing'" in done.stdout
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "'nothing'" in process.stdout

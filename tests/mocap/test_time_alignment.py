@@ -46,7 +46,7 @@ def test_error_of_one_echo_is_at_most_half_the_round_trip(offset_s: float, out_s
 
 
 @pytest.mark.parametrize("ppm", [-30.0, 0.0, 30.0])
-def test_drift_and_jitter(rng: np.random.Generator, ppm: float) -> None:
+def test_clock_error_is_small_with_drift_and_jitter(rng: np.random.Generator, ppm: float) -> None:
     """100 s of echoes at 4 Hz; each way takes 0.2 ms plus an exponential queueing delay of 1 ms in the mean."""
     clock, alignment = ServerClock(1234.5, ppm), ClockAlignment(CLOCK_HZ)
     errors_s = []
@@ -93,7 +93,7 @@ def test_impossible_echoes_are_ignored() -> None:
     assert not alignment.is_aligned
 
 
-def test_exposure() -> None:
+def test_exposure_time_uses_the_valid_stamps() -> None:
     clock, alignment = ServerClock(500.0, 0.0), ClockAlignment(CLOCK_HZ)
     exposed, sent = clock.ticks(30.0), clock.ticks(30.004)
     assert ClockAlignment(0.0).exposure(exposed, sent, 30.005).capture_s == 30.005
@@ -137,9 +137,9 @@ def test_lost_late_and_repeated_frames_are_counted() -> None:
 def test_sequence_numbers_increase_after_a_restarted_count(before: int) -> None:
     """Sequence numbers keep increasing, also if the new numbers look like those of late frames."""
     sequences, counts = accepted([*range(before), *range(30)])
-    given = [s for s in sequences if s is not None]
-    assert given == sorted(set(given))
-    assert given[-1] > before
+    accepted_sequences = [s for s in sequences if s is not None]
+    assert accepted_sequences == sorted(set(accepted_sequences))
+    assert accepted_sequences[-1] > before
     assert counts["restarts"] == 1.0
     assert counts["lost"] == 0.0
 
@@ -149,7 +149,7 @@ def test_repeats_of_every_frame_are_no_restart() -> None:
     assert (counts["frames"], counts["repeated"], counts["restarts"]) == (200.0, 200.0, 0.0)
 
 
-def test_latency_percentiles() -> None:
+def test_latency_percentiles_are_those_of_the_window() -> None:
     statistics = StreamStatistics(window=100)
     empty = statistics.as_mapping()
     assert math.isnan(empty["latency_p50_ms"])
@@ -170,7 +170,7 @@ def sent_in(schedule: MessageSchedule, start_s: float, stop_s: float, **state: b
     return [m for t in np.arange(start_s, stop_s, 0.01) for m in schedule.due(float(t), **state)]
 
 
-def test_message_schedule() -> None:
+def test_messages_are_sent_on_schedule() -> None:
     schedule = MessageSchedule(keepalives=True)
     sent = sent_in(schedule, 100.0, 103.995, has_clock=True, settled=True)
     assert sent.count(MessageId.KEEPALIVE) == 4
