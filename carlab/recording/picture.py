@@ -1,6 +1,6 @@
 """Summary picture of one or several episodes (matplotlib without a window), for reports and ``carlab view``.
 
-Colours are from Okabe and Ito's palette and the viridis map, which suit colour-blind readers.
+Colours are those of the Okabe-Ito palette and the viridis map, which colour-blind readers can distinguish.
 """
 
 from __future__ import annotations
@@ -22,23 +22,24 @@ CAR_LENGTH_M = 0.42
 CAR_WIDTH_M = 0.19
 _OUTLINE_COUNT = 9
 _PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8c6d1f")
-_INK, _FAINT = "#333333", "#b8b8b8"
-_MAX_LABELS = 8
+_TEXT_COLOUR, _LIGHT_GREY = "#333333", "#b8b8b8"
+_MAX_PATH_LABELS = 8
 
 
 def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str = "") -> None:
     """Draw episodes into one picture: plan view, commands, speeds, yaw rate and latencies or reward.
 
-    One episode is coloured by time in the plan, with the car's outline at even intervals; several get one colour each
-    and the outlines of their start and end. Arena, goal and path come from the metadata of the first that has them.
+    In the plan view, one episode is coloured by time with the car's outline at even intervals. Several episodes have
+    one colour each and the outlines of their start and end. Arena, goal and path are those of the first episode with
+    them.
 
     Args:
-        episodes: Episodes to draw; at least one.
-        path: The picture; its suffix (.png, .svg, .pdf) selects the format. Overwritten.
-        title: Title of the picture; by default car, reality and policy of the first episode.
+        episodes: at least one episode.
+        path: the picture; its suffix (.png, .svg, .pdf) selects the format. Overwritten.
+        title: title of the picture; by default policy, car and reality of the first episode.
 
     Raises:
-        DataError: There is no episode, or the picture cannot be written.
+        DataError: there is no episode, or the picture cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -51,17 +52,17 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
     plan = figure.add_subplot(grid[:, 0])
     axes = [figure.add_subplot(grid[0, 1])]
     axes += [figure.add_subplot(grid[row, 1], sharex=axes[0]) for row in (1, 2, 3)]
-    if len(episodes) == 1 and (end := _end_of(episodes[0])):
+    if len(episodes) == 1 and (end := _end_reason(episodes[0])):
         title = f"{title or _title(episodes[0])} ({end})"
-    figure.suptitle(title or _title(episodes[0]), fontsize=14, color=_INK, fontweight="bold", x=0.01, ha="left")
-    _draw_surroundings(plan, episodes)
+    figure.suptitle(title or _title(episodes[0]), fontsize=14, color=_TEXT_COLOUR, fontweight="bold", x=0.01, ha="left")
+    _draw_arena_path_and_goal(plan, episodes)
     if len(episodes) == 1:
-        _draw_by_time(figure, plan, episodes[0])
+        _draw_path_by_time(figure, plan, episodes[0])
     else:
-        _draw_many(plan, episodes)
+        _draw_paths(plan, episodes)
     _draw_commands(axes[0], episodes)
     _draw_velocities(axes[1], axes[2], episodes)
-    _draw_below(axes[3], episodes)
+    _draw_latencies_or_rewards(axes[3], episodes)
     _finish_axes(plan, axes)
     try:
         figure.savefig(Path(path), dpi=130)
@@ -72,14 +73,14 @@ def save_summary(episodes: Sequence[EpisodeData], path: Path | str, title: str =
 
 
 def _title(episode: EpisodeData) -> str:
-    texts = episode.metadata
-    reality = texts.get("reality", "").upper()
-    parts = (texts.get("policy", ""), texts.get("car", ""), reality)
+    metadata = episode.metadata
+    reality = metadata.get("reality", "").upper()
+    parts = (metadata.get("policy", ""), metadata.get("car", ""), reality)
     return " - ".join(part for part in parts if part not in ("", "unknown")) or "Episode"
 
 
-def _end_of(episode: EpisodeData) -> str:
-    """Reason for the end of an episode, for example ``goal reached``."""
+def _end_reason(episode: EpisodeData) -> str:
+    """End reason of an episode as text, for example ``goal reached``."""
     return episode.metadata.get("end_reason", "").replace("_", " ").lower()
 
 
@@ -94,30 +95,30 @@ def outline(x_m: float, y_m: float, yaw_rad: float) -> FloatArray:
     return np.asarray(corners @ np.array([[cos, sin], [-sin, cos]]) + np.array([x_m, y_m]))
 
 
-def _draw_surroundings(plan: Any, episodes: Sequence[EpisodeData]) -> None:
+def _draw_arena_path_and_goal(plan: Any, episodes: Sequence[EpisodeData]) -> None:
     arena = next((a for e in episodes if len(a := polygon_of(e.metadata, "arena_m"))), np.zeros((0, 2)))
     path = next((p for e in episodes if len(p := polygon_of(e.metadata, "path_m"))), np.zeros((0, 2)))
     goal = next((g for e in episodes if (g := goal_of(e.metadata)) is not None), None)
     if len(arena):
         closed = np.vstack([arena, arena[:1]])
         plan.fill(*arena.T, facecolor="#f6f6f4", zorder=0)
-        plan.plot(*closed.T, color=_INK, linewidth=1.6, label="arena", zorder=1)
+        plan.plot(*closed.T, color=_TEXT_COLOUR, linewidth=1.6, label="arena", zorder=1)
     if len(path):
-        plan.plot(*path.T, color=_FAINT, linewidth=4, solid_capstyle="round", label="path", zorder=1)
+        plan.plot(*path.T, color=_LIGHT_GREY, linewidth=4, solid_capstyle="round", label="path", zorder=1)
     if goal is not None:
         shape = outline(*goal)
         plan.fill(*shape.T, facecolor="#009E73", alpha=0.25, zorder=2)
         plan.plot(*shape.T, color="#009E73", linewidth=2.2, linestyle=(0, (3, 1.5)), label="goal", zorder=6)
 
 
-def _draw_by_time(figure: Any, plan: Any, episode: EpisodeData) -> None:
+def _draw_path_by_time(figure: Any, plan: Any, episode: EpisodeData) -> None:
     from matplotlib.collections import LineCollection
     from matplotlib.colors import Normalize
 
     t_s = episode.times_s - episode.times_s[0]
-    places = episode.states[:, :2]
-    pieces = LineCollection(
-        list(np.stack([places[:-1], places[1:]], axis=1)),
+    positions = episode.states[:, :2]
+    segments = LineCollection(
+        list(np.stack([positions[:-1], positions[1:]], axis=1)),
         array=t_s[:-1],
         cmap="viridis",
         norm=Normalize(0.0, max(float(t_s[-1]), 1e-9)),
@@ -125,94 +126,109 @@ def _draw_by_time(figure: Any, plan: Any, episode: EpisodeData) -> None:
         capstyle="round",
         zorder=4,
     )
-    plan.add_collection(pieces)
-    for k in _even_rows(t_s):
-        color = pieces.to_rgba(t_s[k])
+    plan.add_collection(segments)
+    for k in _outline_rows(t_s):
+        color = segments.to_rgba(t_s[k])
         shape = outline(*episode.states[k, :3])
         plan.fill(*shape.T, facecolor=color, alpha=0.18, zorder=3)
         plan.plot(*shape.T, color=color, linewidth=1.3, zorder=5)
-    _mark(plan, episode, _INK, first=True)
-    bar = figure.colorbar(pieces, ax=plan, orientation="horizontal", shrink=0.6, aspect=40, pad=0.02)
-    bar.set_label("time [s]", color=_INK)
+    _draw_start_and_end(plan, episode, _TEXT_COLOUR, first=True)
+    bar = figure.colorbar(segments, ax=plan, orientation="horizontal", shrink=0.6, aspect=40, pad=0.02)
+    bar.set_label("time [s]", color=_TEXT_COLOUR)
     bar.outline.set_visible(False)
 
 
-def _even_rows(t_s: FloatArray) -> list[int]:
-    wanted = np.linspace(0.0, float(t_s[-1]), _OUTLINE_COUNT)
-    return sorted({int(k) for k in np.minimum(np.searchsorted(t_s, wanted), len(t_s) - 1)})
+def _outline_rows(t_s: FloatArray) -> list[int]:
+    times_s = np.linspace(0.0, float(t_s[-1]), _OUTLINE_COUNT)
+    return sorted({int(k) for k in np.minimum(np.searchsorted(t_s, times_s), len(t_s) - 1)})
 
 
-def _draw_many(plan: Any, episodes: Sequence[EpisodeData]) -> None:
+def _draw_paths(plan: Any, episodes: Sequence[EpisodeData]) -> None:
     for k, episode in enumerate(episodes):
         color = _color(k)
         number = episode.metadata.get("episode", str(k + 1))
-        label = " ".join(filter(None, (number, _end_of(episode)))) if k < _MAX_LABELS else None
+        label = " ".join(filter(None, (number, _end_reason(episode)))) if k < _MAX_PATH_LABELS else None
         plan.plot(*episode.states[:, :2].T, color=color, linewidth=1.9, alpha=0.9, label=label, zorder=4)
         shape = outline(*episode.states[-1, :3])
         plan.fill(*shape.T, facecolor=color, alpha=0.35, zorder=3)
         plan.plot(*shape.T, color=color, linewidth=1.5, zorder=5)
         start = outline(*episode.states[0, :3])
         plan.plot(*start.T, color=color, linewidth=0.8, linestyle=":", zorder=5)
-        _mark(plan, episode, color, first=k == 0)
+        _draw_start_and_end(plan, episode, color, first=k == 0)
 
 
-def _mark(plan: Any, episode: EpisodeData, color: str, *, first: bool) -> None:
+def _draw_start_and_end(plan: Any, episode: EpisodeData, color: str, *, first: bool) -> None:
     start, end = episode.states[0, :2], episode.states[-1, :2]
-    look = {"linestyle": "none", "markersize": 7, "markeredgecolor": color, "markerfacecolor": "white", "zorder": 7}
-    plan.plot(*start, marker="o", label="start" if first else None, **look)
-    plan.plot(*end, marker="s", label="end" if first else None, **look)
+    marker_style = {
+        "linestyle": "none",
+        "markersize": 7,
+        "markeredgecolor": color,
+        "markerfacecolor": "white",
+        "zorder": 7,
+    }
+    plan.plot(*start, marker="o", label="start" if first else None, **marker_style)
+    plan.plot(*end, marker="s", label="end" if first else None, **marker_style)
 
 
 def _draw_commands(axis: Any, episodes: Sequence[EpisodeData]) -> None:
     for k, episode in enumerate(episodes):
         t_s = (episode.times_s - episode.times_s[0])[:-1]
-        alone = len(episodes) == 1
+        is_single = len(episodes) == 1
         for channel, (name, style) in enumerate((("steering", "-"), ("throttle", (0, (4, 1.5))))):
-            color = _PALETTE[channel] if alone else _color(k)
-            if alone:
-                asked = episode.requested[:, channel]
-                axis.step(t_s, asked, where="post", color=_FAINT, linewidth=3.0, label="requested" if channel else None)
+            color = _PALETTE[channel] if is_single else _color(k)
+            if is_single:
+                requested = episode.requested[:, channel]
+                axis.step(
+                    t_s,
+                    requested,
+                    where="post",
+                    color=_LIGHT_GREY,
+                    linewidth=3.0,
+                    label="requested" if channel else None,
+                )
             label = name if k == 0 else None
             axis.step(
                 t_s, episode.sent[:, channel], where="post", color=color, linestyle=style, linewidth=1.3, label=label
             )
     commands = np.vstack([np.abs(a) for e in episodes for a in (e.sent, e.requested)])
-    most = float(np.nanmax(commands, initial=1.0, where=np.isfinite(commands)))
-    axis.set_ylim(-1.15 * min(most, 2.0), 1.15 * min(most, 2.0))
+    max_command = float(np.nanmax(commands, initial=1.0, where=np.isfinite(commands)))
+    axis.set_ylim(-1.15 * min(max_command, 2.0), 1.15 * min(max_command, 2.0))
     axis.set_ylabel("command sent")
 
 
-def _draw_velocities(speeds: Any, turns: Any, episodes: Sequence[EpisodeData]) -> None:
-    alone = len(episodes) == 1
+def _draw_velocities(velocity_axis: Any, yaw_rate_axis: Any, episodes: Sequence[EpisodeData]) -> None:
+    is_single = len(episodes) == 1
     for k, episode in enumerate(episodes):
         t_s = episode.times_s - episode.times_s[0]
         vx, vy, yaw_rate = episode.states[:, 3:].T
-        color = _PALETTE[0] if alone else _color(k)
-        speeds.plot(t_s, vx, color=color, linewidth=1.5, label="vx" if k == 0 else None)
-        second = _PALETTE[1] if alone else color
-        speeds.plot(t_s, vy, color=second, linewidth=1.2, linestyle=(0, (4, 1.5)), label="vy" if k == 0 else None)
-        turns.plot(t_s, yaw_rate, color=color, linewidth=1.5)
-    speeds.set_ylabel("velocity [m/s]")
-    turns.set_ylabel("yaw rate [rad/s]")
+        color = _PALETTE[0] if is_single else _color(k)
+        velocity_axis.plot(t_s, vx, color=color, linewidth=1.5, label="vx" if k == 0 else None)
+        vy_color = _PALETTE[1] if is_single else color
+        velocity_axis.plot(
+            t_s, vy, color=vy_color, linewidth=1.2, linestyle=(0, (4, 1.5)), label="vy" if k == 0 else None
+        )
+        yaw_rate_axis.plot(t_s, yaw_rate, color=color, linewidth=1.5)
+    velocity_axis.set_ylabel("velocity [m/s]")
+    yaw_rate_axis.set_ylabel("yaw rate [rad/s]")
 
 
-def _draw_below(axis: Any, episodes: Sequence[EpisodeData]) -> None:
-    """Draw latencies of one episode or rewards of several; the speed over ground if neither was recorded."""
+def _draw_latencies_or_rewards(axis: Any, episodes: Sequence[EpisodeData]) -> None:
+    """Draw the latencies of one episode or the rewards of several; the speed if these were not recorded."""
     first = episodes[0]
     columns = ((POSE_AGE, "age of the pose"), (LATE, "lateness of the tick"), (POLICY_TIME, "time of the policy"))
-    known = [(first.extra[name], label) for name, label in columns if name in first.extra]
-    if len(episodes) == 1 and known:
+    latencies = [(first.extra[name], label) for name, label in columns if name in first.extra]
+    if len(episodes) == 1 and latencies:
         t_s = first.times_s - first.times_s[0]
-        for (values_s, label), color in zip(known, _PALETTE, strict=False):
+        for (values_s, label), color in zip(latencies, _PALETTE, strict=False):
             axis.plot(t_s, 1e3 * values_s, color=color, linewidth=1.3, label=label)
         axis.set_ylabel("latency [ms]")
         return
-    rewarded = any(np.isfinite(episode.rewards).any() for episode in episodes)
+    has_rewards = any(np.isfinite(episode.rewards).any() for episode in episodes)
     for k, episode in enumerate(episodes):
         t_s = episode.times_s - episode.times_s[0]
-        values = episode.rewards if rewarded else np.hypot(episode.states[1:, 3], episode.states[1:, 4])
+        values = episode.rewards if has_rewards else np.hypot(episode.states[1:, 3], episode.states[1:, 4])
         axis.plot(t_s[1:], values, color=_color(k), linewidth=1.5)
-    axis.set_ylabel("reward" if rewarded else "speed [m/s]")
+    axis.set_ylabel("reward" if has_rewards else "speed [m/s]")
 
 
 def _finish_axes(plan: Any, axes: Sequence[Any]) -> None:
@@ -223,12 +239,12 @@ def _finish_axes(plan: Any, axes: Sequence[Any]) -> None:
     for axis in (plan, *axes):
         axis.grid(color="#e6e6e6", linewidth=0.8)
         axis.set_axisbelow(True)
-        axis.tick_params(colors=_INK, labelsize=9)
+        axis.tick_params(colors=_TEXT_COLOUR, labelsize=9)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.spines[["left", "bottom"]].set_color(_FAINT)
+        axis.spines[["left", "bottom"]].set_color(_LIGHT_GREY)
     for axis in axes:
         axis.margins(x=0.01)
-        axis.axhline(0.0, color=_FAINT, linewidth=0.8, zorder=0)
+        axis.axhline(0.0, color=_LIGHT_GREY, linewidth=0.8, zorder=0)
         if axis.get_legend_handles_labels()[1]:
             axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=9, frameon=False)
     for axis in axes[:-1]:

@@ -127,7 +127,7 @@ def test_damaged_data_file_is_named(tmp_path, content):
     np.savez(path, x=np.zeros((5, 4)))
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(DataError, match=r"pendulum_seed0_n5\.npz does not hold the arrays x, y, x_test and y_test"):
+    with pytest.raises(DataError, match=r"pendulum_seed0_n5\.npz does not contain the arrays x, y, x_test and y_test"):
         list(run_study("pendulum", rows=(5,), seeds=1, methods=("ridge",), data=tmp_path))
 
 

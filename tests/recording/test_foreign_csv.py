@@ -335,7 +335,7 @@ class TestRefusal:
             (b"t,x,y,yaw,steering,throttle\n0,0,0,0,0,0\n1,1,1\n2,2,2,2,2,2\n", "Row 2"),
             (b"t,t,y,yaw,steering,throttle\n0,0,0,0,0,0\n1,1,1,1,1,1\n", "two columns named 't'"),
             (b"\x89PNG\r\n\x1a\n\xff\xd8", "not a text file"),
-            (gzip.compress(b"t,x,y\n" * 1000, mtime=0)[:-20], "not a whole gzip file"),
+            (gzip.compress(b"t,x,y\n" * 1000, mtime=0)[:-20], "not a complete gzip file"),
         ],
     )
     def test_files_that_are_no_recording_are_refused(self, content, message, tmp_path):

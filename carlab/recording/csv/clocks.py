@@ -1,4 +1,4 @@
-"""Reconstructed clocks: from distance over speed, and from the constant frame rate of a camera."""
+"""Reconstruction of stamps: from distance over speed, or as the constant frame rate of a camera."""
 
 from __future__ import annotations
 
@@ -19,58 +19,66 @@ _MEDIAN_FILTER_ROWS = 51
 
 
 def rebuilt_clock(channels: Channels) -> tuple[FloatArray, str]:
-    """Stamps (N,) [s] from distance over speed (below 0.3 m/s the median period), and a note about them."""
+    """Stamps (N,) [s] from distance over speed, with the median period below 0.3 m/s, and a note about them."""
     if "vx" not in channels.values or "vy" not in channels.values:
         raise DataError("The clock cannot be rebuilt without vx and vy columns; use --clock column.")
-    periods = channels.periods_s()
-    median = float(np.nanmedian(periods)) if np.isfinite(periods).any() else float("nan")
-    # Periods outside 0.5 to 3 medians are due to wrong speeds (an impact, a stale row), not to the clock.
-    plausible = (periods > 0.5 * median) & (periods < 3 * median)
-    if plausible.sum() < 100:
+    periods_s = channels.periods_s()
+    median_s = float(np.nanmedian(periods_s)) if np.isfinite(periods_s).any() else float("nan")
+    # A period outside 0.5 to 3 medians is due to a wrong speed (an impact, a stale row), not to the clock.
+    is_plausible = (periods_s > 0.5 * median_s) & (periods_s < 3 * median_s)
+    if is_plausible.sum() < 100:
         raise DataError("The car hardly moves: the clock cannot be rebuilt by distance over speed; use --clock column.")
-    broken = np.diff(channels.segment) != 0
-    steps = np.where(plausible, periods, np.where(broken, np.diff(channels.t_s), median))
-    note = f"rebuilt from distance over speed for {int(plausible.sum())} of {len(steps)} periods, median elsewhere"
-    return np.concatenate([[0.0], np.cumsum(steps)]), note
+    is_break = np.diff(channels.segment) != 0
+    steps_s = np.where(is_plausible, periods_s, np.where(is_break, np.diff(channels.t_s), median_s))
+    note = f"rebuilt from distance over speed for {int(is_plausible.sum())} of {len(steps_s)} periods, median elsewhere"
+    return np.concatenate([[0.0], np.cumsum(steps_s)]), note
 
 
 def even_clock(t_s: FloatArray) -> tuple[FloatArray, list[Finding]]:
-    """Frame times of a source with constant rate, from arrival stamps (N,) [s] with jitter.
+    """Estimate the frame times of a source with constant rate from its arrival stamps.
 
-    The times are a straight line through each part without a gap. A permanent step by an integer number of periods is a
-    lost frame and remains. Parts of less than ``_MIN_ROWS`` rows keep their stamps.
+    Fits a straight line to the stamps of each part without a gap. A permanent step by an integer number of periods is a
+    lost frame and is kept. Parts of less than ``_MIN_ROWS`` rows keep their stamps.
+
+    Args:
+        t_s: arrival stamps (N,) [s] with jitter.
+
+    Returns:
+        Frame times (N,) [s] from 0 and a finding; the stamps and no finding if every part is too short.
     """
-    even = t_s.copy()
-    edges = [0, *gap_rows(t_s).tolist(), len(t_s)]
-    moved = 0
-    for first, last in pairwise(edges):
+    frame_times_s = t_s.copy()
+    bounds = [0, *gap_rows(t_s).tolist(), len(t_s)]
+    n_changed = 0
+    for first, last in pairwise(bounds):
         if last - first < _MIN_ROWS:
             continue
-        stamps = t_s[first:last]
+        stamps_s = t_s[first:last]
         frame = np.arange(last - first, dtype=np.float64)
-        span = min(500, (last - first) // 4)  # Most spans have no lost frame; the median is that of a span without.
-        period, start = float(np.median(stamps[span:] - stamps[:-span])) / span, stamps[0]
+        span = min(500, (last - first) // 4)  # The median span has no lost frame.
+        period_s, start_s = float(np.median(stamps_s[span:] - stamps_s[:-span])) / span, stamps_s[0]
         for _ in range(8):
-            late = median_filter(stamps - (start + period * frame), _MEDIAN_FILTER_ROWS, mode="nearest")
-            step = np.round((late - late.min()) / period)
-            step = np.minimum.accumulate(step[::-1])[::-1]  # A temporary step is a late arrival, not a lost frame.
-            frame += step
-            period, start = np.polyfit(frame, stamps, 1)
-            if not step.any():
+            delay_s = median_filter(stamps_s - (start_s + period_s * frame), _MEDIAN_FILTER_ROWS, mode="nearest")
+            lost_frames = np.round((delay_s - delay_s.min()) / period_s)
+            # A temporary step is a delayed arrival, not a lost frame.
+            lost_frames = np.minimum.accumulate(lost_frames[::-1])[::-1]
+            frame += lost_frames
+            period_s, start_s = np.polyfit(frame, stamps_s, 1)
+            if not lost_frames.any():
                 break
-        even[first:last] = start + period * frame
-        moved += last - first
-    if not moved:
+        frame_times_s[first:last] = start_s + period_s * frame
+        n_changed += last - first
+    if not n_changed:
         return t_s, []
-    off = even - t_s
-    jitter_s = robust_std(off)
+    correction_s = frame_times_s - t_s
+    jitter_s = robust_std(correction_s)
     finding = Finding(
         "arrival_stamps",
         "t",
         Severity.REPAIRED,
-        f"The stamps of {moved} rows are those of arrival and jitter by {jitter_s * 1e3:.2f} ms (up to "
-        f"{float(np.abs(off).max()) * 1e3:.1f} ms) about an even beat; the beat was taken.",
-        moved,
-        evidence={"jitter_s": jitter_s, "largest_s": float(np.abs(off).max())},
+        f"The stamps of {n_changed} rows are arrival times with a jitter of {jitter_s * 1e3:.2f} ms (up to "
+        f"{float(np.abs(correction_s).max()) * 1e3:.1f} ms) about a constant frame rate; they were replaced by the "
+        "frame times.",
+        n_changed,
+        evidence={"jitter_s": jitter_s, "largest_s": float(np.abs(correction_s).max())},
     )
-    return even - even[0], [finding]
+    return frame_times_s - frame_times_s[0], [finding]

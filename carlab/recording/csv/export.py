@@ -1,4 +1,4 @@
-"""Export of an episode as CSV or Parquet, for other programs.
+"""Export of an episode as CSV or Parquet.
 
 Columns: ``t,x,y,yaw,vx,vy,yaw_rate,steering,throttle`` in s, m, rad, m/s, rad/s (velocities in the body frame) and
 commands in [-1, 1], sent at the row's time and held until the next row; then every extra column. The last row repeats
@@ -28,7 +28,7 @@ _UNIT_SUFFIXES = {"_s": "s", "_m": "m", "_rad": "rad", "_mps": "m/s", "_radps": 
 
 
 def table_of(episode: EpisodeData) -> dict[str, FloatArray]:
-    """Columns by name, each (T + 1,); an extra column with the name of a standard one has the prefix ``extra_``."""
+    """Columns by name, each (T + 1,); an extra column with the name of a standard one gets the prefix ``extra_``."""
     commands = np.vstack([episode.sent, episode.sent[-1:]]) if episode.ticks else np.full((1, 2), np.nan)
     columns: dict[str, FloatArray] = {"t": episode.times_s}
     columns |= {name: episode.states[:, k] for k, name in enumerate(STATE_NAMES)}
@@ -44,7 +44,7 @@ def table_of(episode: EpisodeData) -> dict[str, FloatArray]:
 
 
 def unit_of(column: str) -> str:
-    """Unit of a column by its name; empty if unknown."""
+    """Unit of a column by its name; an empty string if it is unknown."""
     if column in COLUMN_UNITS:
         return COLUMN_UNITS[column]
     if column.removeprefix("requested_") in ACTION_NAMES or column == "reward":
@@ -55,7 +55,7 @@ def unit_of(column: str) -> str:
 def write_csv(episode: EpisodeData, path: Path | str) -> None:
     """Write an episode as CSV with round-trip precision and empty cells for NaN, replacing an existing file.
 
-    A name that ends in ``.gz`` gives a compressed file, with the same bytes for the same episode.
+    A name that ends in ``.gz`` gives a compressed file; equal episodes give equal bytes.
 
     Raises:
         DataError: The file cannot be written.
@@ -77,11 +77,11 @@ def write_csv(episode: EpisodeData, path: Path | str) -> None:
 @contextlib.contextmanager
 def _text_file(path: Path) -> Iterator[TextIO]:
     if path.suffix == ".gz":
-        # Without time and name in the gzip header, equal episodes give equal files.
+        # The gzip header has no time and no name, so that equal episodes give equal bytes.
         with (
             partial_path(path).open("wb") as file,
-            gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as packed,
-            io.TextIOWrapper(packed, encoding="utf-8", newline="") as text,
+            gzip.GzipFile(filename="", mode="wb", fileobj=file, mtime=0) as compressed,
+            io.TextIOWrapper(compressed, encoding="utf-8", newline="") as text,
         ):
             yield text
     else:

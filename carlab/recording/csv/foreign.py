@@ -1,4 +1,4 @@
-"""Import of a foreign CSV: converts units, signs and axes of the mapping, and audits the columns."""
+"""Import of a foreign CSV: converts units, signs and axes by the mapping, and audits the columns."""
 
 from __future__ import annotations
 
@@ -32,9 +32,13 @@ from carlab.recording.pose_velocity import BoolArray, pose_jumps, pose_motion
 
 @dataclass(frozen=True, slots=True)
 class ImportedRecording:
-    """An imported file: one episode, or several if it was split, with the audit report.
+    """An imported file with its audit report.
 
-    ``announcement`` is a sentence about the recognised or declared layout and the conversions.
+    Attributes:
+        episodes: one episode, or several if the file was split.
+        report: findings of the audit.
+        mapping: the mapping that was used.
+        announcement: sentence about the recognised or declared layout and the conversions.
     """
 
     episodes: tuple[EpisodeData, ...]
@@ -44,40 +48,44 @@ class ImportedRecording:
 
     @property
     def episode(self) -> EpisodeData:
-        """The episode of a recording that was not split. Raises DataError if there are several."""
+        """The only episode. Raises DataError if the recording was split into several."""
         if len(self.episodes) != 1:
             raise DataError(f"{self.report.source} was split into {len(self.episodes)} episodes; choose one of them.")
         return self.episodes[0]
 
 
 def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> ImportedRecording:
-    """Import a .csv or .csv.gz. Without ``mapping`` the layout is recognised by its header.
+    """Import a .csv or .csv.gz file.
 
-    Commands are sent at their row's time and held until the next row, so N rows become N states and N - 1 commands; the
-    last row's command is dropped. Times start at the first row. The row rate is unchanged.
+    A command is sent at the time of its row and held until the next row: N rows give N states and N - 1 commands. The
+    command of the last row is dropped. Times start at the first row. The row rate is unchanged.
+
+    Args:
+        path: the file.
+        mapping: meaning of the columns; by default recognised by the header.
 
     Raises:
         DataError: the file is not a CSV, a column is missing, a cell is not a number, time does not increase or has
-            gaps, undeclared units are evidently not SI, or commands exceed [-1, 1]. Other findings are only reported.
+            gaps, undeclared units are evidently not SI, or commands exceed [-1, 1]. Other findings are reported only.
     """
     table = read_csv(path)
     source = table.path.name
-    mapping, how = _layout(table, mapping)
+    mapping, layout_note = _layout(table, mapping)
     values, extra, findings = _usable_rows(table, mapping)
     origin_s = float(values["t"][0])
     t_s = values["t"] - origin_s
     findings += check_stamps(t_s, mapping)
     if mapping.clock == "even":
-        t_s, found = even_clock(t_s)
-        findings += found
+        t_s, new_findings = even_clock(t_s)
+        findings += new_findings
     if not mapping.dead_reckoning:
         findings += check_heading(t_s, values, mapping)
     raise_errors(source, findings)
 
-    channels, found = _segmented(t_s, values, extra, mapping)
-    findings += found
-    found, spikes = audit_channels(channels, mapping)
-    findings += found
+    channels, new_findings = _channels(t_s, values, extra, mapping)
+    findings += new_findings
+    new_findings, spikes = audit_channels(channels, mapping)
+    findings += new_findings
     raise_errors(source, findings)
     states, notes = _states(channels, mapping, spikes)
     if mapping.clock == "velocity":
@@ -92,22 +100,22 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
         "units": "s, m, rad, m/s, rad/s; velocities in the body frame; commands in [-1, 1] held from their row on",
         **notes,
     }
-    episodes, found = _episodes(t_s, states, channels, mapping, metadata)
-    findings += found
-    announcement = f"{how}; {_conversions(mapping)}."
+    episodes, new_findings = _episodes(t_s, states, channels, mapping, metadata)
+    findings += new_findings
+    announcement = f"{layout_note}; {_conversions(mapping)}."
     return ImportedRecording(episodes, AuditReport(source, mapping.layout, tuple(findings)), mapping, announcement)
 
 
 def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMapping, str]:
-    """The mapping of the table, and how it was chosen. Raises DataError if columns are missing."""
+    """The mapping of the table and a note about its choice. Raises DataError if columns are missing."""
     source = table.path.name
     if mapping is None:
         mapping = recognise_layout(table.header, source)
         return mapping, f"{source}: recognised the {mapping.layout} layout by its header"
-    lacking = missing_columns(mapping, table.header)
-    if lacking:
+    missing = missing_columns(mapping, table.header)
+    if missing:
         raise DataError(
-            f"{source} has no column {', '.join(lacking)}; it holds {', '.join(table.header)}; correct the mapping."
+            f"{source} has no column {', '.join(missing)}; it holds {', '.join(table.header)}; correct the mapping."
         )
     return mapping, f"{source}: read with mapping '{mapping.layout}'"
 
@@ -115,26 +123,28 @@ def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMappi
 def _usable_rows(
     table: CsvTable, mapping: ColumnMapping
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], list[Finding]]:
-    """Channels and other columns in rows with a number in each channel and an increasing stamp."""
+    """Channels, extra columns and findings of the rows with a number in each channel and an increasing stamp."""
     source = table.path.name
-    findings = _text_columns(table, mapping)
-    values, extra = _declared(table, mapping)
+    findings = _text_column_findings(table, mapping)
+    values, extra = _converted_columns(table, mapping)
     gate = {mapping.throttle_gate: extra[mapping.throttle_gate]} if mapping.throttle_gate in extra else {}
-    found, whole = check_missing({**values, **gate}, mapping)
-    findings += found
+    new_findings, is_complete = check_missing({**values, **gate}, mapping)
+    findings += new_findings
     raise_errors(source, findings)
-    found, advances = check_order(values["t"][whole], mapping)
-    findings += found
+    new_findings, is_increasing = check_order(values["t"][is_complete], mapping)
+    findings += new_findings
     raise_errors(source, findings)
-    kept = np.flatnonzero(whole)[advances]
-    if len(kept) < 3:
-        raise DataError(f"{source} has {len(kept)} usable rows; a recording needs at least three.")
-    usable, others = ({name: column[kept] for name, column in columns.items()} for columns in (values, extra))
-    return usable, others, findings
+    usable_rows = np.flatnonzero(is_complete)[is_increasing]
+    if len(usable_rows) < 3:
+        raise DataError(f"{source} has {len(usable_rows)} usable rows; a recording needs at least three.")
+    usable_values, usable_extra = (
+        {name: column[usable_rows] for name, column in columns.items()} for columns in (values, extra)
+    )
+    return usable_values, usable_extra, findings
 
 
-def _declared(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Channels in SI by the declared units, signs, axes and offset, and all other numeric columns."""
+def _converted_columns(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Channels converted to SI by the declared units, signs, axes and offset, and all other numeric columns."""
     values: dict[str, FloatArray] = {}
     if mapping.rate_hz is not None:
         values["t"] = np.arange(table.rows) / mapping.rate_hz
@@ -154,14 +164,14 @@ def _declared(table: CsvTable, mapping: ColumnMapping) -> tuple[dict[str, FloatA
     return values, extra
 
 
-def _text_columns(table: CsvTable, mapping: ColumnMapping) -> list[Finding]:
+def _text_column_findings(table: CsvTable, mapping: ColumnMapping) -> list[Finding]:
     used = {source.name for source in mapping.columns.values()}
     return [
         Finding(
             "text_column",
             name,
             Severity.INFO,
-            f"Column '{name}' holds text ({cell!r} in row {row}) and is not kept: extra columns are numbers.",
+            f"Column '{name}' contains text ({cell!r} in row {row}) and is dropped: extra columns must be numbers.",
             1,
             (row,),
         )
@@ -170,7 +180,7 @@ def _text_columns(table: CsvTable, mapping: ColumnMapping) -> list[Finding]:
     ]
 
 
-def _segmented(
+def _channels(
     t_s: FloatArray, values: Mapping[str, FloatArray], extra: Mapping[str, FloatArray], mapping: ColumnMapping
 ) -> tuple[Channels, list[Finding]]:
     gaps = gap_rows(t_s)
@@ -184,7 +194,7 @@ def _segmented(
 
 
 def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tuple[FloatArray, dict[str, str]]:
-    """States (N, 6) with body velocities, and notes about their sources."""
+    """States (N, 6) with velocities in the body frame, and notes about their sources."""
     t_s, values, motion = channels.t_s, channels.values, channels.motion
     if motion is None:
         return _dead_reckoned(t_s, values["vx"], values["yaw_rate"]), {
@@ -199,8 +209,8 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
         vx, vy = values["vx"], values["vy"]
         sources.append(f"vx, vy: columns in the {mapping.velocity_frame} frame")
         if mapping.velocity_frame == "world":
-            yaw_then = np.interp(t_s - lag, t_s, motion.yaw_unwrapped)
-            c, s = np.cos(yaw_then), np.sin(yaw_then)
+            delayed_yaw = np.interp(t_s - lag, t_s, motion.yaw_unwrapped)
+            c, s = np.cos(delayed_yaw), np.sin(delayed_yaw)
             vx, vy = c * vx + s * vy, c * vy - s * vx
             sources[-1] += f", rotated by the yaw of {lag * 1e3:.1f} ms before"
     else:
@@ -219,12 +229,12 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
 
 
 def _dead_reckoned(t_s: FloatArray, vx: FloatArray, yaw_rate: FloatArray) -> FloatArray:
-    """Integrate speed and turn rate, held over each period, by the midpoint heading. Returns states (N, 6)."""
-    step = np.diff(t_s)
-    yaw = np.concatenate([[0.0], np.cumsum(yaw_rate[:-1] * step)])
-    middle = 0.5 * (yaw[1:] + yaw[:-1])
-    x = np.concatenate([[0.0], np.cumsum(vx[:-1] * step * np.cos(middle))])
-    y = np.concatenate([[0.0], np.cumsum(vx[:-1] * step * np.sin(middle))])
+    """Integrate speed and yaw rate, held over each period, with the heading at mid-period. Returns states (N, 6)."""
+    step_s = np.diff(t_s)
+    yaw = np.concatenate([[0.0], np.cumsum(yaw_rate[:-1] * step_s)])
+    mid_yaw = 0.5 * (yaw[1:] + yaw[:-1])
+    x = np.concatenate([[0.0], np.cumsum(vx[:-1] * step_s * np.cos(mid_yaw))])
+    y = np.concatenate([[0.0], np.cumsum(vx[:-1] * step_s * np.sin(mid_yaw))])
     return np.column_stack([x, y, yaw, vx, np.zeros_like(vx), yaw_rate])
 
 
@@ -232,7 +242,7 @@ def _episodes(
     t_s: FloatArray, states: FloatArray, channels: Channels, mapping: ColumnMapping, metadata: Mapping[str, str]
 ) -> tuple[tuple[EpisodeData, ...], list[Finding]]:
     requested, sent, findings = _commands(t_s, channels, mapping)
-    parts, found = _parts(channels.segment, mapping)
+    parts, row_findings = _episode_rows(channels.segment, mapping)
     extra = dict(channels.extra)
     if mapping.gaps != "split" and np.ptp(channels.segment) > 0:
         extra["segment"] = channels.segment
@@ -253,7 +263,7 @@ def _episodes(
                 extra={name: column[part] for name, column in extra.items()},
             )
         )
-    return tuple(episodes), findings + found
+    return tuple(episodes), findings + row_findings
 
 
 def _commands(
@@ -274,58 +284,58 @@ def _commands(
         "column_shift",
         "steering, throttle",
         Severity.REPAIRED,
-        f"Commands were logged {mapping.command_lag_s * 1e3:.0f} ms after they were sent, by what the mapping "
-        "declares; they were taken that much earlier.",
+        f"By the mapping, commands were logged {mapping.command_lag_s * 1e3:.0f} ms after they were sent; they were "
+        "shifted by this lag.",
         len(t_s),
         evidence={"lag_s": mapping.command_lag_s},
     )
     return requested, sent, [finding]
 
 
-def _parts(segment: FloatArray, mapping: ColumnMapping) -> tuple[list[slice], list[Finding]]:
+def _episode_rows(segment: FloatArray, mapping: ColumnMapping) -> tuple[list[slice], list[Finding]]:
     """Rows of each episode: all rows, or the parts of ``segment`` (N,) if the mapping splits at gaps."""
     numbers = np.unique(segment)
     if mapping.gaps != "split" or len(numbers) == 1:
         return [slice(0, len(segment))], []
     bounds = [*(int(np.argmax(segment == n)) for n in numbers), len(segment)]
-    stretches = [slice(first, end) for first, end in pairwise(bounds)]
-    parts = [part for part in stretches if part.stop - part.start >= 2]
-    short = [part for part in stretches if part.stop - part.start < 2]
+    ranges = [slice(first, end) for first, end in pairwise(bounds)]
+    parts = [part for part in ranges if part.stop - part.start >= 2]
+    isolated = [part for part in ranges if part.stop - part.start < 2]
     if not parts:
-        raise DataError("No two consecutive rows are without a gap or jump between them; check the time column.")
-    if not short:
+        raise DataError("A gap or a pose jump separates every row from the next; check the time column.")
+    if not isolated:
         return parts, []
     finding = Finding(
         "short_part",
         "t",
         Severity.INFO,
-        f"{len(short)} rows stand alone between two breaks and hold no transition; they are left out.",
-        len(short),
-        tuple(part.start + 1 for part in short[:20]),
+        f"{len(isolated)} rows are isolated between two breaks and have no transition; they were dropped.",
+        len(isolated),
+        tuple(part.start + 1 for part in isolated[:20]),
     )
     return parts, [finding]
 
 
 def _conversions(mapping: ColumnMapping) -> str:
-    done = []
+    conversions = []
     for channel, source in mapping.columns.items():
         factor = source.factor(channel)
         if factor != 1.0 or source.name != channel:
-            done.append(f"{channel} from '{source.name}'" + ("" if factor == 1.0 else f" times {factor:.6g}"))
+            conversions.append(f"{channel} from '{source.name}'" + ("" if factor == 1.0 else f" times {factor:.6g}"))
     if mapping.velocity_frame == "world":
-        done.append("velocities rotated from the world into the body frame")
+        conversions.append("velocities rotated from the world into the body frame")
     if mapping.swap_xy:
-        done.append("x and y exchanged")
+        conversions.append("x and y swapped")
     if mapping.yaw_offset_rad:
-        done.append(f"yaw plus {mapping.yaw_offset_rad:.4f} rad")
+        conversions.append(f"yaw plus {mapping.yaw_offset_rad:.4f} rad")
     if mapping.repair_yaw_rate:
-        done.append("wrap spikes of yaw_rate repaired from the pose")
+        conversions.append("wrap spikes of yaw_rate repaired from the pose")
     if mapping.throttle_gate:
-        done.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
+        conversions.append(f"throttle sent = throttle times '{mapping.throttle_gate}'")
     if mapping.command_lag_s:
-        done.append(f"commands taken {mapping.command_lag_s * 1e3:.0f} ms earlier")
+        conversions.append(f"commands shifted {mapping.command_lag_s * 1e3:.0f} ms earlier")
     if mapping.clock == "even":
-        done.append("rows put on an even clock")
+        conversions.append("stamps replaced by those of an even clock")
     if mapping.dead_reckoning:
-        done.append("pose integrated from speed and turn rate")
-    return ", ".join(done) if done else "nothing needed conversion"
+        conversions.append("pose integrated from speed and turn rate")
+    return ", ".join(conversions) if conversions else "nothing needed conversion"

@@ -1,4 +1,4 @@
-"""Import of a foreign CSV with automatic repair: applies the options that the audit proposes."""
+"""Import of a foreign CSV with automatic repair by the options that the audit proposes."""
 
 from __future__ import annotations
 
@@ -20,17 +20,21 @@ _MAX_ITERATIONS = 6
 
 @dataclass(frozen=True, slots=True)
 class RepairedImport:
-    """The imported recording, and the repaired findings that would have prevented the import."""
+    """The imported recording, and the repaired findings that prevented its import."""
 
     imported: ImportedRecording
     repaired: tuple[Finding, ...]
 
 
 def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -> RepairedImport:
-    """Import a CSV; errors for which the audit proposes an option are repaired.
+    """Import a CSV and repair errors for which the audit proposes a safe option.
 
-    Repairs: units of pose and velocities are declared, rows with a missing value or a stamp that does not increase are
-    dropped, gaps in time are kept (``segment`` in ``extra`` numbers the parts between them).
+    Repairs: declares the units of pose and velocities, drops rows with a missing value or a stamp that does not
+    increase, and keeps gaps in time (``segment`` in ``extra`` numbers the parts between them).
+
+    Args:
+        path: a .csv or .csv.gz file.
+        mapping: meaning of the columns; by default recognised by the header.
 
     Raises:
         DataError: the file cannot be read, or has an error without such a repair.
@@ -39,20 +43,20 @@ def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -
     for _ in range(_MAX_ITERATIONS):
         try:
             return RepairedImport(import_csv(path, mapping=mapping), tuple(repaired))
-        except RefusedError as refused:
+        except RefusedError as refusal:
             if mapping is None:
                 mapping = recognise_layout(read_csv(path).header, Path(path).name)
-            for finding in refused.findings:
-                changed = None if finding.option is None else _with_option(mapping, finding.option)
-                if changed is None or changed == mapping:
+            for finding in refusal.findings:
+                repaired_mapping = None if finding.option is None else _with_option(mapping, finding.option)
+                if repaired_mapping is None or repaired_mapping == mapping:
                     raise
-                mapping = changed
+                mapping = repaired_mapping
                 repaired.append(finding)
     raise DataError(f"{path} has too many faults for the automatic repair; import it with carlab import.")
 
 
 def _with_option(mapping: ColumnMapping, option: str) -> ColumnMapping | None:
-    """The mapping with an option of the audit (``--yaw-unit deg``); None if automatic use of the option is unsafe."""
+    """The mapping with an option of the audit (``--yaw-unit deg``); None if its automatic use is unsafe."""
     words = shlex.split(option)
     columns: dict[str, dict[str, Any]] = {}
     options: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Reading .csv and .csv.gz into named columns, with errors that name the row and the column."""
+"""Reading of .csv and .csv.gz files into named columns; errors name the row and the column."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def read_csv(path: Path | str) -> CsvTable:
     """Read a comma- or semicolon-separated file with one header line; ``.gz`` is decompressed.
 
     Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Raises DataError if the file is missing, empty,
-    truncated or not text, or has a row of another length than its header.
+    truncated or not text, or if a row has another number of cells than the header.
     """
     path = Path(path)
     text = _read_text(path)
@@ -64,14 +64,14 @@ def read_csv(path: Path | str) -> CsvTable:
     header = tuple(name.strip().lstrip("\ufeff") for name in lines[0])
     if all(_is_number(cell) for cell in header):
         raise DataError(f"{path.name} begins with numbers; add a header line with the column names.")
-    doubled = sorted({name for name in header if header.count(name) > 1})
-    if doubled:
-        raise DataError(f"{path.name} has two columns named '{doubled[0]}'; rename one in the header.")
+    duplicates = sorted({name for name in header if header.count(name) > 1})
+    if duplicates:
+        raise DataError(f"{path.name} has two columns named '{duplicates[0]}'; rename one in the header.")
     for number, row in enumerate(lines[1:], start=1):
         if len(row) != len(header):
             raise DataError(
                 f"Row {number} of {path.name} has {len(row)} cells where the header has {len(header)}; "
-                "the file may be cut short there: correct or remove that row."
+                "the file may be truncated there; correct or remove that row."
             )
     if len(lines) < 3:
         raise DataError(f"{path.name} has {len(lines) - 1} rows; a recording needs at least two.")
@@ -81,8 +81,8 @@ def read_csv(path: Path | str) -> CsvTable:
         try:
             columns[name] = np.array(cells, dtype=np.float64)
         except ValueError:
-            bad = next(k for k, cell in enumerate(cells) if not _is_number(cell))
-            texts[name] = (bad + 1, cells[bad])
+            first_text = next(k for k, cell in enumerate(cells) if not _is_number(cell))
+            texts[name] = (first_text + 1, cells[first_text])
     return CsvTable(path, header, columns, texts)
 
 
@@ -93,7 +93,7 @@ def _read_text(path: Path) -> str:
             content = gzip.decompress(content)
         return content.decode("utf-8-sig")
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise DataError(f"{path.name} is not a whole gzip file ({error}); fetch it again.") from error
+        raise DataError(f"{path.name} is not a complete gzip file ({error}); copy it again.") from error
     except UnicodeDecodeError as error:
         raise DataError(
             f"{path.name} is not a text file: byte {error.start} is not UTF-8; export it as CSV."

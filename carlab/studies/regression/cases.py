@@ -1,7 +1,7 @@
-"""Cases of the regression study: training rows, simulator and units.
+"""Cases of the regression study: data, simulator and units.
 
-Each is the paper's (Rothfuss et al., arXiv 2403.16644, section 6.1) with the domains, priors and units of the authors'
-public code. Data is drawn here, or read from arrays that their code made.
+The cases are those of the paper (Rothfuss et al., arXiv 2403.16644, section 6.1) with the domains, priors and units of
+the authors' public code. Data is drawn by a simulator here, or read from arrays of the authors' code.
 """
 
 from __future__ import annotations
@@ -28,9 +28,14 @@ MIN_NOISE = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Data:
-    """Training and test rows: inputs (n, D), and outputs (n, O), which are changes of a state.
+    """Training and test rows.
 
-    ``test_yaw`` (n,) is the heading of the car at the test rows [rad], if it is known.
+    Attributes:
+        inputs: training inputs (n, D).
+        outputs: training outputs (n, O): changes of the state.
+        test_inputs: test inputs (m, D).
+        test_outputs: test outputs (m, O).
+        test_yaw: heading of the car at the test rows (m,) [rad]; None if it is unknown.
     """
 
     inputs: Tensor
@@ -40,37 +45,35 @@ class Data:
     test_yaw: Tensor | None = None
 
     def to(self, device: torch.device | str) -> Data:
-        """The same on a device."""
+        """The same data on a device."""
         moved = Data(*(v.to(device) for v in (self.inputs, self.outputs, self.test_inputs, self.test_outputs)))
         return moved if self.test_yaw is None else replace(moved, test_yaw=self.test_yaw.to(device))
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One case.
+    """A case of the study; standard deviations are in raw units.
 
     Attributes:
-        name: as on the command line, and of the authors' arrays.
-        prior: the simulator that is known.
-        prior_with_discrepancy: the same with a discrepancy process inside its dynamics, as the prior of Sim-FSVGD;
-            where it is None, ``prior`` and a discrepancy on its outputs.
-        truth: the simulator that makes the data, with a distribution of its parameters; None where only the authors'
-            arrays have it.
-        counts: numbers of rows.
-        noise_std: of the measured outputs (O,), raw.
-        likelihood_std: the authors' noise at the start of a fit (O,), raw.
-        fit_noise: whether it is fitted.
+        name: name on the command line and in the file names of the authors' arrays.
+        prior: simulator that the methods know.
+        prior_with_discrepancy: the same simulator with a discrepancy inside its dynamics, as the prior of Sim-FSVGD;
+            None: ``prior`` with a discrepancy of its outputs.
+        truth: simulator that generates the data, with a distribution of its parameters; None: the authors' arrays only.
+        counts: numbers of training rows.
+        noise_std: standard deviation of the measurement noise of the outputs (O,).
+        likelihood_std: initial standard deviation of the noise in the authors' fits (O,).
+        fit_noise: whether the noise is fitted.
         input_std: units of the inputs (D,).
         output_std: units of the outputs (O,).
-        discrepancy_std: of the authors' Gaussian process between simulator and reality (O,), raw; None: the simulator
-            is exact.
-        discrepancy_lengthscale: of that process on raw inputs.
-        function_lengthscale: of the Gaussian-process prior of FSVGD and of GreyBox, on normalised inputs.
-        prior_discrepancy: prior size of the discrepancy where the way is ``ours``, in units of the outputs; None: the
+        discrepancy_std: standard deviation of the authors' discrepancy process (O,); None: the simulator is exact.
+        discrepancy_lengthscale: lengthscale of that process on raw inputs.
+        function_lengthscale: lengthscale of the Gaussian-process prior of FSVGD and GreyBox on normalised inputs.
+        prior_discrepancy: prior size of the discrepancy with ``--way ours``, in units of the outputs; None: the
             simulator is exact.
-        ours: the same case in the coordinates of the way ``ours``, where these are others.
-        in_body_frame: whether rows are transformed into the frame of the step's start.
-        comparison_note: sentence that a table of this case needs where the way is ``ours``.
+        ours: the same case in other coordinates for ``--way ours``; None: the same coordinates.
+        in_body_frame: whether rows are transformed to the car's frame at the start of the step.
+        comparison_note: sentence below the table of this case with ``--way ours``.
     """
 
     name: str
@@ -93,36 +96,38 @@ class Case:
 
     @property
     def prior_noise_std(self) -> tuple[float, ...]:
-        """Twice the sensor's noise, and at least ``MIN_NOISE`` of the output's unit (O,), raw."""
+        """Twice the measurement noise, but at least ``MIN_NOISE`` times the unit of the output (O,), in raw units."""
         return tuple(max(2.0 * n, MIN_NOISE * o) for n, o in zip(self.noise_std, self.output_std, strict=True))
 
     def prior_discrepancy_for(self, count: int) -> float | tuple[float, ...] | None:
-        """Prior size of the discrepancy with so many rows, in units of all outputs or of each (O,); None: exact."""
+        """Prior size of the discrepancy with ``count`` rows, in units of all outputs or of each (O,); None: exact."""
         return self.prior_discrepancy
 
     @property
     def normaliser(self) -> Normaliser:
-        """Of inputs and outputs; fixed, not of the data."""
+        """Normalisation of inputs and outputs by the fixed units of the case."""
         inputs, outputs = torch.tensor(self.input_std), torch.tensor(self.output_std)
         return Normaliser(torch.zeros_like(inputs), inputs, torch.zeros_like(outputs), outputs)
 
     def discrepancy(self) -> RbfCovariance | None:
-        """Covariance of the authors' discrepancy, in normalised outputs on raw inputs."""
+        """Covariance of the authors' discrepancy process: normalised outputs, raw inputs."""
         if self.discrepancy_std is None:
             return None
         scales = [g / o for g, o in zip(self.discrepancy_std, self.output_std, strict=True)]
         return RbfCovariance(tuple(scales), (self.discrepancy_lengthscale,))
 
     def data(self, count: int, seed: int) -> Data:
-        """Draw ``count`` rows of one true system and ``TEST_ROWS`` others of the same.
+        """Draw ``count`` training rows and ``TEST_ROWS`` test rows of one true system.
 
-        Noise is added to the outputs, which are changes: the state before is known exactly, as in the authors' data.
+        Noise is added to the outputs only: the state before a step is known exactly, as in the authors' data.
 
         Raises:
-            DataError: this case has no true system here.
+            DataError: the case has no simulator of the true system.
         """
         if self.truth is None:
-            raise DataError(f"The rows of '{self.name}' are the authors' arrays alone; give their folder with --data.")
+            raise DataError(
+                f"Data of '{self.name}' cannot be drawn; give the folder of the authors' arrays with --data."
+            )
         generator = torch.Generator().manual_seed(10_000 + seed)
         system = draw_parameters(self.truth, 1, generator)
         inputs = self.truth.inputs(count + TEST_ROWS, generator)
@@ -131,7 +136,7 @@ class Case:
         return Data(inputs[:count], outputs[:count], inputs[count:], outputs[count:])
 
     def recorded(self, folder: Path, count: int, seed: int) -> Data:
-        """The authors' arrays of this case. Raises DataError where there is no such file."""
+        """Read the authors' arrays of this case. Raises DataError if the file is missing or damaged."""
         name = "sinusoid_n2" if self.name == "1d" else f"{self.name}_seed{seed}_n{count}"
         path = folder / f"{name}.npz"
         if not path.is_file():
@@ -143,7 +148,7 @@ class Case:
             with np.load(path) as arrays:
                 x, y, tx, ty = (torch.from_numpy(arrays[k].astype(np.float32)) for k in ("x", "y", "x_test", "y_test"))
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path} does not hold the arrays x, y, x_test and y_test; make it anew.") from error
+            raise DataError(f"{path} does not contain the arrays x, y, x_test and y_test; create it again.") from error
         if self.name == "1d":
             return Data(x, y, tx, ty)
         width = y.shape[1]
@@ -153,16 +158,16 @@ class Case:
 
 
 def in_body_frame(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of a car in the frame of each step's start.
+    """Transform rows of a car to the body frame at the start of each step.
 
-    Pairs of outputs are rotated, which preserves volumes: the likelihood is the same in both frames.
+    Outputs are rotated in pairs. A rotation preserves volumes, so the likelihood is the same in both frames.
 
     Args:
-        before: x, y, sin, cos of yaw, vx, vy in the world, yaw rate, and commands (n, 7 + 2).
-        after: the first seven a step later (n, 7).
+        before: x, y, sin and cos of yaw, vx, vy in the world frame, yaw rate, and two commands (n, 9).
+        after: the first seven columns one step later (n, 7).
 
     Returns:
-        The same inputs for a car at the origin that heads along x, and changes (n, 7).
+        The inputs of the same car at the origin that heads along x (n, 9), and the changes of the state (n, 7).
     """
     sin, cos = before[:, 2], before[:, 3]
 
@@ -170,13 +175,15 @@ def in_body_frame(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
         return cos * x + sin * y, cos * y - sin * x
 
     change = after - before[:, :7]
-    zero = torch.zeros_like(sin)
-    inputs = torch.stack([zero, zero, zero, zero + 1.0, *rotated(before[:, 4], before[:, 5]), *before[:, 6:].T], dim=1)
-    cos_change, sin_change = rotated(after[:, 3], after[:, 2])
+    zeros = torch.zeros_like(sin)
+    inputs = torch.stack(
+        [zeros, zeros, zeros, zeros + 1.0, *rotated(before[:, 4], before[:, 5]), *before[:, 6:].T], dim=1
+    )
+    cos_of_turn, sin_of_turn = rotated(after[:, 3], after[:, 2])
     outputs = [
         *rotated(change[:, 0], change[:, 1]),
-        sin_change,
-        cos_change - 1.0,
+        sin_of_turn,
+        cos_of_turn - 1.0,
         *rotated(change[:, 4], change[:, 5]),
         change[:, 6],
     ]
@@ -185,33 +192,33 @@ def in_body_frame(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, slots=True)
 class BodyFrame:
-    """A car's domain model with its inputs in the car's frame."""
+    """A domain model of the car with inputs in the body frame."""
 
     model: KinematicCar
 
     @property
     def size(self) -> int:
-        """As the model."""
+        """Number of parameters."""
         return self.model.size
 
     def inputs(self, count: int, generator: torch.Generator) -> Tensor:
-        """The model's, in the car's frame."""
+        """Inputs of the model (count, 9), transformed to the body frame."""
         drawn = self.model.inputs(count, generator)
         return in_body_frame(drawn, drawn[:, :7])[0]
 
     def parameters(self, normal: Tensor) -> Tensor:
-        """As the model."""
+        """Parameters from standard normal numbers, by the model."""
         return self.model.parameters(normal)
 
     def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
-        """Changes; the car heads along x, so that world and body frame agree."""
+        """Changes of the state; the car heads along x, so that world and body frame agree."""
         return self.model(inputs, parameters)
 
 
 _CAR_NOISE = (0.0011, 0.0011, 0.0018, 0.0018, 0.0082, 0.0082, 0.0368)
 
 CAR_HISTORY = 3
-"""Commands before the last one; the delay of 80 ms is two and a half periods."""
+"""Number of past commands in the input besides the last one; the delay of 80 ms is 2.5 control periods."""
 _NO_LATENCY = MocapParameters(latency_s=0.0)
 PACEJKA = SimulatorConfig(mocap=_NO_LATENCY)
 PACEJKA_RANGES = {
@@ -231,7 +238,7 @@ KINEMATIC_RANGES = {
     "steering.max_angle": (0.3, 0.7),
 }
 
-_WORLD = Case(
+_RACECAR_WORLD_FRAME = Case(
     name="racecar",
     prior=KinematicCar(place_m=4.0, speed_mps=6.0, rate_radps=8.0),
     prior_with_discrepancy=None,
@@ -246,15 +253,15 @@ _WORLD = Case(
     discrepancy_lengthscale=10.0,
     function_lengthscale=0.4,
 )
-_BODY = replace(
-    _WORLD,
+_RACECAR_BODY_FRAME = replace(
+    _RACECAR_WORLD_FRAME,
     prior=BodyFrame(KinematicCar()),
     input_std=(3.0, 3.0, 1.0, 1.0, 1.5, 1.5, 2.0, 0.6, 0.6),
     output_std=(0.1, 0.06, 0.1, 0.03, 1.0, 1.0, 3.0),
     function_lengthscale=2.0,
     in_body_frame=True,
 )
-_RACECAR = replace(_WORLD, ours=_BODY)
+_RACECAR = replace(_RACECAR_WORLD_FRAME, ours=_RACECAR_BODY_FRAME)
 
 _PENDULUM = Case(
     name="pendulum",
@@ -277,8 +284,8 @@ _PENDULUM = Case(
         "20 / 50."
     ),
 )
-# Prior sizes without data. Rate: as with the other pendulum, at the fastest rate about the size of gravity. Sign of the
-# rate: a tenth of that. Motor: half of either command.
+# Sizes of the discrepancy, chosen without data. Friction by the rate: as for the pendulum, about gravity at the highest
+# rate. Friction by the sign of the rate: a tenth of that. Motor: half of each command.
 _PENDULUM_MOTOR = replace(
     _PENDULUM,
     name="pendulum_motor",
