@@ -107,7 +107,7 @@ def test_malformed_frames_are_counted_and_ignored(carlab: Carlab, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("table", "words"),
+    ("table", "parts"),
     [
         ("[vehicle]\nmas = 1.6\n", ["'mas'", "did you mean 'mass'?"]),
         ("[vehicle]\nmass = -1.0\n", ["mass"]),
@@ -118,14 +118,14 @@ def test_malformed_frames_are_counted_and_ignored(carlab: Carlab, tmp_path: Path
     ],
 )
 def test_invalid_car_file_is_refused_with_the_name_of_the_key(
-    carlab: Carlab, tmp_path: Path, table: str, words: list[str]
+    carlab: Carlab, tmp_path: Path, table: str, parts: list[str]
 ) -> None:
     path = tmp_path / "wrong.toml"
     path.write_text(table, encoding="utf-8")
     code, text = carlab("drive", "--car", path, "--out", tmp_path / "runs")
     assert code == 2
-    for word in words:
-        assert word in text
+    for part in parts:
+        assert part in text
     assert not (tmp_path / "runs").exists()
 
 
@@ -154,7 +154,7 @@ def damaged(kind: str, data: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "words", "option"),
+    ("kind", "parts", "option"),
     [
         ("gap", ["gap"], ["--gaps", "split"]),
         ("nan", ["51"], ["--missing", "drop"]),
@@ -164,15 +164,15 @@ def damaged(kind: str, data: np.ndarray) -> tuple[np.ndarray, str]:
     ],
 )
 def test_damaged_csv_is_refused_with_an_option_that_repairs_it(
-    carlab: Carlab, tmp_path: Path, kind: str, words: list[str], option: list[str] | None
+    carlab: Carlab, tmp_path: Path, kind: str, parts: list[str], option: list[str] | None
 ) -> None:
     path, data = canonical_csv(tmp_path)
     write(path, *damaged(kind, data))
     out = tmp_path / "drive.mcap"
     code, text = carlab("import", path, "--out", out)
     assert code == 1
-    for word in words:
-        assert word in text
+    for part in parts:
+        assert part in text
     assert not list(tmp_path.glob("*.mcap*"))
     if option is not None:
         assert " ".join(option) in text
@@ -221,7 +221,7 @@ def test_misspelt_option_is_refused_with_a_suggestion(carlab: Carlab) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "words"),
+    ("command", "parts"),
     [
         ("drive --seed -1", ["--seed"]),
         ("drive --ticks 0", ["--ticks"]),
@@ -239,14 +239,14 @@ def test_misspelt_option_is_refused_with_a_suggestion(carlab: Carlab) -> None:
     ],
 )
 def test_invalid_option_is_refused_before_a_file_is_written(
-    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, words: list[str]
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, parts: list[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write(*canonical_csv(tmp_path))
     code, text = carlab(*command.split())
     assert code == 2
-    for word in words:
-        assert word in text
+    for part in parts:
+        assert part in text
     assert [entry.name for entry in tmp_path.iterdir()] == ["drive.csv"]
 
 

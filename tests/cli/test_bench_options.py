@@ -57,7 +57,7 @@ def test_option_is_accepted_or_refused_as_listed(
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ("speed --case pendulum", "--case has no effect in 'bench speed'; use it with 'bench regression'."),
         ("speed --runs elsewhere", "--runs has no effect in 'bench speed'; use it with 'bench parking'."),
@@ -75,11 +75,11 @@ def test_option_is_accepted_or_refused_as_listed(
     ],
 )
 def test_refusal_names_the_studies_in_which_the_option_has_an_effect(
-    options: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    options: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(["bench", *options.split()]) == 2
-    assert words in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())
     assert list(tmp_path.iterdir()) == []
 
 

@@ -106,7 +106,7 @@ def predicts_nan(task: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("method", "words"),
+    ("method", "message"),
     [
         (failing_cholesky, "linalg.cholesky"),
         (singular_inverse, "Singular matrix"),
@@ -115,11 +115,11 @@ def predicts_nan(task: Any) -> Any:
     ],
 )
 def test_numerical_error_fails_only_its_own_fit(
-    monkeypatch: pytest.MonkeyPatch, method: Callable[[Any], Any], words: str
+    monkeypatch: pytest.MonkeyPatch, method: Callable[[Any], Any], message: str
 ) -> None:
     replace_sysid(monkeypatch, method)
     sysid, ridge = run_study("pendulum", rows=(5,), seeds=1, methods=("SysID", "ridge"))
-    assert words in str(sysid.failed)
+    assert message in str(sysid.failed)
     assert "\n" not in str(sysid.failed)
     assert math.isnan(sysid.nll)
     assert ridge.failed is None

@@ -140,7 +140,7 @@ def test_missing_data_is_reported_before_the_first_fit(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ("regression --out none/x.json", "--out none/x.json: there is no folder none; create it first."),
         ("regression --out x.png", "--out x.png: name a file that ends in .json."),
@@ -148,13 +148,13 @@ def test_missing_data_is_reported_before_the_first_fit(tmp_path, monkeypatch):
         ("speed --case pendulum", "--case has no effect in 'bench speed'; use it with 'bench regression'."),
     ],
 )
-def test_invalid_options_are_refused_before_the_study(tmp_path, monkeypatch, capsys, options, words):
+def test_invalid_options_are_refused_before_the_study(tmp_path, monkeypatch, capsys, options, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder.json").mkdir()
     monkeypatch.setattr("carlab.studies.regression.study.run_study", lambda *a, **k: pytest.fail("measured"))
     assert run(["bench", *options.split()]) == 2
     printed = capsys.readouterr()
-    assert words in " ".join((printed.out + printed.err).split())
+    assert message in " ".join((printed.out + printed.err).split())
 
 
 @pytest.mark.parametrize(("case", "way", "has_note"), [("pendulum", "ours", True), ("pendulum", "authors", False)])

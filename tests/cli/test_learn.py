@@ -67,7 +67,7 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ("--episodes 0", "--episodes 0: give a number above zero."),
         ("--history -1", "--history -1: give at least 0."),
@@ -84,13 +84,13 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
     ],
 )
 def test_invalid_options_are_refused_and_write_nothing(
-    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str, words: str
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str, message: str
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     monkeypatch.chdir(tmp_path)
     code, text = carlab("learn", *options.split())
     assert code == 2
-    assert words in text
+    assert message in text
     assert list(tmp_path.iterdir()) == []
 
 
@@ -113,7 +113,7 @@ def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Pat
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         (
             "--method fsvgd",
@@ -124,11 +124,11 @@ def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Pat
     ],
 )
 def test_resume_refuses_changed_options(
-    carlab: Carlab, learned: tuple[int, str, Path], options: str, words: str
+    carlab: Carlab, learned: tuple[int, str, Path], options: str, message: str
 ) -> None:
     code, text = carlab("learn", "--resume", learned[2], *options.split())
     assert code == 2
-    assert words in text
+    assert message in text
 
 
 def test_model_of_another_version_is_trained_again_after_its_folder_is_removed(

@@ -28,8 +28,8 @@ LOGGING_DIAGNOSIS = """
 import json, os, runpy, sys
 from pathlib import Path
 root, fake_diagnosis = sys.argv[1:3]
-seen = Path(root, "seen.jsonl")
-with seen.open("a") as file:
+log = Path(root, "diagnosis_log.jsonl")
+with log.open("a") as file:
     threads = os.environ.get("OMP_NUM_THREADS")
     print(json.dumps({"sealed": Path(root, "seal.json").exists(), "threads": threads}), file=file)
 sys.argv = sys.argv[2:]
@@ -49,7 +49,7 @@ def proof_dir(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def diagnosis_log(root: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (root / "seen.jsonl").read_text().splitlines()]
+    return [json.loads(line) for line in (root / "diagnosis_log.jsonl").read_text().splitlines()]
 
 
 def test_proof_is_sealed_scored_and_not_repeated(proof_dir: Path, carlab: Carlab) -> None:

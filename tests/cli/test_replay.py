@@ -48,7 +48,7 @@ def test_given_holdout_share_and_horizon_are_used(carlab: Carlab, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         (("--holdout-share", "0.7"), "at most 0.5"),
         (("--horizon", "60"), "shorter horizon"),
@@ -57,8 +57,8 @@ def test_given_holdout_share_and_horizon_are_used(carlab: Carlab, tmp_path: Path
     ],
 )
 def test_invalid_options_are_refused_in_one_sentence(
-    carlab: Carlab, tmp_path: Path, options: tuple[str, ...], words: str
+    carlab: Carlab, tmp_path: Path, options: tuple[str, ...], message: str
 ) -> None:
     code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), *options)
     assert code != 0
-    assert words in text
+    assert message in text

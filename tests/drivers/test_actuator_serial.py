@@ -341,7 +341,9 @@ def test_calls_on_a_closed_or_partly_opened_actuator_are_safe(serial_firmware: S
     actuator.close()
 
 
-def test_sender_imports_little_and_ignores_signals(actuator: Actuator, serial_firmware: SerialFirmware) -> None:
+def test_sender_imports_no_heavy_modules_and_ignores_signals(
+    actuator: Actuator, serial_firmware: SerialFirmware
+) -> None:
     pid = actuator._sender.pid  # type: ignore[union-attr]
     assert os.getsid(pid) == pid, "the sender has a separate session: a terminal's ^C does not reach it"
     mapped = Path(f"/proc/{pid}/maps").read_text(encoding="ascii")

@@ -238,7 +238,7 @@ def test_firmware_faults_latch(values: MotorValues, text: str) -> None:
     assert bench.logic.state == SenderState.CONNECTED
 
 
-def test_another_board_after_a_lost_link_stays_a_fault() -> None:
+def test_fault_stays_latched_if_another_board_replaces_the_lost_one() -> None:
     bench = armed()
     bench.logic.link_failed("unplugged")
     assert bench.tick() is None

@@ -80,7 +80,7 @@ def read_some(descriptor: int, count: int) -> bytes:
     return data
 
 
-def test_bytes_on_the_terminal_and_reconnecting_hosts(tmp_path: Path, vesc_vectors: list[dict[str, Any]]) -> None:
+def test_reconnecting_host_with_captured_bytes_is_answered(tmp_path: Path, vesc_vectors: list[dict[str, Any]]) -> None:
     """A minimal host that uses captured bytes instead of this project's encoder."""
     log = CommandLog(tmp_path / "log.jsonl")
     request = bytes.fromhex("020100000003")

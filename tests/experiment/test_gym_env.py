@@ -15,9 +15,9 @@ from carlab.experiment.episodes.gym_env import CarEnv
 
 @pytest.fixture(params=["carlab/Parking-v0", "carlab/Path-v0"])
 def env(request: pytest.FixtureRequest) -> Iterator[gym.Env]:
-    made = gym.make(request.param)
-    yield made
-    made.close()
+    new_env = gym.make(request.param)
+    yield new_env
+    new_env.close()
 
 
 def test_environment_checkers_pass_without_a_warning(env: gym.Env) -> None:

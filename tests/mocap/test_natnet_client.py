@@ -282,7 +282,7 @@ def test_client_reconnects_to_a_restarted_server(serve: Serve, configure: Config
     assert all(capture_s <= received_s + 5e-3 for _, _, capture_s, received_s in received.frames)
 
 
-def test_clock_step_of_the_server_is_detected_and_poses_never_get_newer(
+def test_clock_step_of_the_server_is_detected_and_no_pose_is_in_the_future(
     serve: Serve, configure: Configure, until: Until
 ) -> None:
     server = serve(faults=ServerFaults(clock_offset_s=10.0))

@@ -84,7 +84,7 @@ def test_error_in_the_poses_ends_the_server_and_is_stored(serve: Serve, until: U
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ({"version": "2.9"}, "bitstream 2.9"),
         ({"rate_hz": 0.0}, "rate"),
@@ -92,13 +92,13 @@ def test_error_in_the_poses_ends_the_server_and_is_stored(serve: Serve, until: U
         ({"multicast_group": "10.0.0.1"}, "224.0.0.0"),
     ],
 )
-def test_invalid_server_options_are_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
+def test_invalid_server_options_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         NatNetServer(lambda t_s: [None], **options)
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ({"server_address": " "}, "server_address"),
         ({"command_port": 0}, "command_port"),
@@ -115,8 +115,8 @@ def test_invalid_server_options_are_refused(options: dict[str, Any], words: str)
         ({"pivot_in_base_link_m": (0.0, float("nan"), 0.0)}, "pivot_in_base_link_m"),
     ],
 )
-def test_invalid_configurations_are_refused(options: dict[str, Any], words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
+def test_invalid_configurations_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         MocapConfig(**options)
 
 

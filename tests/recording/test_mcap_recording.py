@@ -179,13 +179,13 @@ def test_rerun_accepts_the_file(tmp_path, make_documents):
 
 def test_truncated_file_gives_its_complete_ticks_or_one_sentence(tmp_path, make_documents):
     documents = make_documents(90)
-    sink = McapSink(tmp_path / "whole.mcap")
+    sink = McapSink(tmp_path / "complete.mcap")
     sink.open()
     for k, document in enumerate(documents):
         sink.write(document)
         if k % 12 == 0 and not sink.finished:
             sink.flush()
-    complete = (tmp_path / "whole.mcap").read_bytes()
+    complete = (tmp_path / "complete.mcap").read_bytes()
     truncated = tmp_path / "cut.mcap"
     rng = np.random.default_rng(0)
     sizes = sorted(
@@ -225,20 +225,20 @@ def test_damaged_byte_never_gives_wrong_numbers(tmp_path, make_documents):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "parts"),
     [
         (b"", ("empty", "carlab import")),
         (b"t,x,y,yaw\n0,0,0,0\n", ("not an MCAP file", "carlab import")),
         (b"\x89MCAP0\r\n", ("no complete tick",)),
     ],
 )
-def test_file_that_is_no_recording_is_refused_with_the_next_step(tmp_path, content, words):
-    path = tmp_path / "thing.mcap"
+def test_file_that_is_no_recording_is_refused_with_the_next_step(tmp_path, content, parts):
+    path = tmp_path / "invalid.mcap"
     path.write_bytes(content)
     with pytest.raises(DataError) as caught:
         read_episode(path)
-    for word in ("thing.mcap", *words):
-        assert word in str(caught.value)
+    for part in ("invalid.mcap", *parts):
+        assert part in str(caught.value)
 
 
 def test_mcap_of_another_program_is_refused(tmp_path):

@@ -123,21 +123,21 @@ def test_close_ends_and_reports_a_disk_that_hangs(make_documents):
 
 
 @pytest.mark.parametrize(
-    ("error", "words", "finished"),
+    ("error", "message", "finished"),
     [
         (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "disk is full; free some space", False),
         (PermissionError(errno.EACCES, os.strerror(errno.EACCES)), "check the permissions", False),
         (ValueError("a bug"), "a bug", True),
     ],
 )
-def test_failed_sink_is_closed_and_the_others_continue(make_documents, caplog, error, words, finished):
+def test_failed_sink_is_closed_and_the_others_continue(make_documents, caplog, error, message, finished):
     documents = make_documents(20)
     failing, intact = MemorySink(error=error, at=9), MemorySink()
     with caplog.at_level(logging.CRITICAL), Recorder([failing, intact]) as recorder:
         for document in documents:
             recorder.emit(document)
     assert intact.items == documents
-    assert words in recorder.failed
+    assert message in recorder.failed
     assert "\n" not in recorder.failed
     assert failing.finished
     if not finished:

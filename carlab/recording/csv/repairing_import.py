@@ -57,10 +57,10 @@ def import_repaired(path: Path | str, *, mapping: ColumnMapping | None = None) -
 
 def _with_option(mapping: ColumnMapping, option: str) -> ColumnMapping | None:
     """The mapping with an option of the audit (``--yaw-unit deg``); None if its automatic use is unsafe."""
-    words = shlex.split(option)
+    tokens = shlex.split(option)
     columns: dict[str, dict[str, Any]] = {}
     options: dict[str, Any] = {}
-    for flag, value in zip(words[::2], words[1::2], strict=True):
+    for flag, value in zip(tokens[::2], tokens[1::2], strict=True):
         name = flag.removeprefix("--").replace("-", "_")
         channel, _, part = name.rpartition("_")
         if part == "unit" and channel in _CHANNELS:
