@@ -24,17 +24,16 @@ CAR = SimulatorConfig.from_preset()
 def record(path: Path, seed: int, ticks: int = 180) -> None:
     """Record a drive of the simulated car without extra effects as CSV."""
     rng = np.random.default_rng(seed)
-    plant, period, rows = Plant(CAR), CAR.control_period_s, []
+    plant, period_s, rows = Plant(CAR), CAR.control_period_s, []
     plant.reset(CarState(0.0, 0.0, 0.0, 1.0, 0.0, 0.0), 0.0)
-    held = (0.0, 0.0)
+    command = (0.0, 0.0)
     for tick in range(ticks):
         if tick % 6 == 0:
-            held = (float(rng.uniform(-1, 1)), float(rng.uniform(0.1, 0.6)))
-        s = plant.advance(tick * period)
+            command = (float(rng.uniform(-1, 1)), float(rng.uniform(0.1, 0.6)))
+        state = plant.advance(tick * period_s)
         noise = rng.normal(size=6) * [3e-4, 3e-4, 1e-3, 5e-3, 5e-3, 0.02]
-        state = np.array([s.x_m, s.y_m, s.yaw_rad, s.vx_mps, s.vy_mps, s.yaw_rate_radps]) + noise
-        rows.append([tick * period, *state, *held])
-        plant.command(tick * period, Action(*held))
+        rows.append([tick * period_s, *(state.to_array() + noise), *command])
+        plant.command(tick * period_s, Action(*command))
     write_csv(path, dict(zip(COLUMNS, np.array(rows).T, strict=True)))
 
 
