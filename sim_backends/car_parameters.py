@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from carlab.core.errors import ConfigError
 from carlab.core.tables import check_keys, number
-from sim_backends.effects import EFFECTS, DelayEffect
+from sim_backends.effects import EFFECTS, DelayEffect, MeasuredCurve
 from sim_backends.effects.base import GRAVITY_MPS2, MODEL_KINDS, ModelKind
 from sim_backends.registry import REGISTRY, ParameterInfo, section
 
@@ -196,9 +196,9 @@ class SimulatorConfig:
         """Tables for TOML, without unknown values; the inverse of ``from_tables``."""
         tables: dict[str, Any] = {}
         for name, value in self.values().items():
-            if name in self.unknown:
-                continue
             *path, key = name.split(".")
+            if name in self.unknown or (path[0] == "effects" and isinstance(EFFECTS[path[1]], MeasuredCurve)):
+                continue
             table = tables
             for part in path:
                 table = table.setdefault(part, {})
@@ -212,8 +212,18 @@ class SimulatorConfig:
                 table[key] = choices[int(value)]
             else:
                 table[key] = value
+        for effect_id in self.effects:
+            if isinstance(curve := EFFECTS[effect_id], MeasuredCurve):
+                tables.setdefault("effects", {})[effect_id] = self._curve_table(curve)
         tables["model"] = {"kind": self.kind}
         return tables
+
+    def _curve_table(self, curve: MeasuredCurve) -> dict[str, Any]:
+        values, own = self.values(), f"effects.{curve.id}."
+        table = {"values": curve.table({p.name: values[own + p.name] for p in curve.parameters})}
+        if any(name.startswith(own) for name in self.parameter_std):
+            table["std"] = curve.table({p.name: self.parameter_std.get(own + p.name, 0.0) for p in curve.parameters})
+        return table
 
     @classmethod
     def from_preset(cls, name: str = "rc_car") -> Self:
@@ -247,7 +257,27 @@ def _sections(tables: Mapping[str, Any], where: str) -> Iterator[tuple[str, Mapp
     effects = _table(tables, "effects", where)
     check_keys(effects, EFFECTS, f"[effects] of {where}")
     for effect_id in effects:
-        yield f"effects.{effect_id}", _table(effects, effect_id, f"[effects] of {where}")
+        table = _table(effects, effect_id, f"[effects] of {where}")
+        effect = EFFECTS[effect_id]
+        yield f"effects.{effect_id}", _curve(effect, table, where) if isinstance(effect, MeasuredCurve) else table
+
+
+def _curve(curve: MeasuredCurve, table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Entries by number of the table of a measured curve: lists ``values`` and ``std`` over its knots."""
+    place = f"[effects.{curve.id}] of {where}"
+    check_keys(table, ("values", "std"), place)
+    entries: dict[str, Any] = {}
+    for key, entry in (("values", "value"), ("std", "std")):
+        if key not in table:
+            continue
+        numbers = curve.numbers_of_table(table[key])
+        if numbers is None:
+            shape = " lists of ".join(str(len(axis.knots)) for axis in curve.axes)
+            raise ConfigError(f"'{key}' in {place} must be a list of {shape} finite numbers, one for each knot.")
+        for name, value in numbers.items():
+            if key == "values" or value != 0.0:  # a standard deviation of 0 means that it is unknown
+                entries.setdefault(name, {"value": 0.0})[entry] = value
+    return {name: e if "std" in e else e["value"] for name, e in entries.items()}
 
 
 def _number(entry: Any, where: str) -> tuple[float, tuple[float, float] | None, float | None]:

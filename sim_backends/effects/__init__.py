@@ -23,6 +23,7 @@ from sim_backends.effects.base import (
     ObservationEffect,
 )
 from sim_backends.effects.body import LateralBias, RoadSlope, TorqueSteer, YawDamping
+from sim_backends.effects.curves import CURVES, MeasuredCurve
 from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
 from sim_backends.effects.drive import BatterySag, BrakeAsymmetry, MotorSaturation, TractionLimit
 from sim_backends.effects.lags import MotorLag, SteeringLag
@@ -89,8 +90,8 @@ _ALL: tuple[Effect, ...] = (
 )
 CATALOGUE: dict[str, Effect] = {effect.id: effect for effect in _ALL}
 """The effects that a diagnosis names, by id, in the order of the catalogue."""
-EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in UNCATALOGUED}}
-"""All effects: the catalogue, then uncatalogued physics. ``register`` adds to both."""
+EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in (*UNCATALOGUED, *CURVES)}}
+"""All effects: the catalogue, then uncatalogued physics and measured curves. ``register`` adds to both."""
 
 
 def separation(one: str, other: str) -> Confusable | None:
@@ -111,6 +112,7 @@ def confusable_effects() -> dict[str, tuple[str, ...]]:
 
 __all__ = [
     "CATALOGUE",
+    "CURVES",
     "EFFECTS",
     "ActuatorEffect",
     "Confusable",
@@ -119,6 +121,7 @@ __all__ = [
     "Effect",
     "EffectParameter",
     "Forces",
+    "MeasuredCurve",
     "ObservationEffect",
     "confusable_effects",
     "separation",

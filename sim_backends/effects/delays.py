@@ -10,6 +10,7 @@ class CommandDelay(DelayEffect):
     """Both commands act ``extra_delay`` later; may be negative as long as the total delay is not."""
 
     id = "command_delay"
+    fitted_with_curves = True
     name = "a command delay that is not the car file's"
     summary = "Both commands act later than the car file states."
     sentence = "both commands act {extra_delay:size} {extra_delay:later|earlier} than the car file states"

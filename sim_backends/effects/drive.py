@@ -42,6 +42,7 @@ class BrakeAsymmetry(DynamicsEffect):
     """``drive force * gain_ratio`` where drive force and vx have opposite signs."""
 
     id = "brake_asymmetry"
+    represented_by = "drive_map"
     command = "throttle"
     name = "a brake gain that differs from the drive gain"
     summary = "The motor's gain differs between braking and driving."
@@ -60,6 +61,7 @@ class MotorSaturation(DynamicsEffect):
     """Drive force clipped to ``+-force``, before damping."""
 
     id = "motor_saturation"
+    represented_by = "drive_map"
     command = "throttle"
     name = "a limit of the motor's force"
     summary = "The motor's drive force is limited."
@@ -88,6 +90,7 @@ class TractionLimit(DynamicsEffect):
     """
 
     id = "traction_limit"
+    represented_by = "drive_map"
     command = "throttle"
     name = "a limit of traction"
     summary = "The force of the driven wheels is limited by their grip."

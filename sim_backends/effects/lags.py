@@ -34,6 +34,7 @@ class SteeringLag(FirstOrderLag):
     """The wheel angle follows the steering servo's command with a lag."""
 
     id = "steering_lag"
+    fitted_with_curves = True
     name = "a lag of the steering servo"
     summary = "The steering servo lags behind its command."
     sentence = "the steering servo lags by {time_constant}"
@@ -64,6 +65,7 @@ class MotorLag(FirstOrderLag):
     """The drive force follows the throttle with a lag."""
 
     id = "motor_lag"
+    fitted_with_curves = True
     name = "a lag of the motor"
     summary = "The motor's force lags behind the throttle."
     sentence = "the motor's force lags behind the throttle by {time_constant}"

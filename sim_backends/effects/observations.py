@@ -71,6 +71,7 @@ class MocapYawMisalignment(ObservationEffect):
     """
 
     id = "mocap_yaw_misalignment"
+    fitted_with_curves = True
     name = "a yaw misalignment of motion capture"
     summary = "Motion capture's forward axis of the car is not the car's."
     sentence = "motion capture sees the car turned {angle:size} to the {angle:left|right} of where it points"

@@ -21,6 +21,7 @@ class SteeringDeadband(ActuatorEffect):
     """``d = d_cmd - clip(d_cmd, -width/2, width/2)``."""
 
     id = "steering_deadband"
+    represented_by = "steering_curve"
     name = "a dead band of the steering"
     summary = "The steering servo ignores small commands around straight ahead."
     sentence = "the steering ignores small commands around straight ahead, in a band {width} wide"
@@ -120,6 +121,7 @@ class SteeringAsymmetry(ActuatorEffect):
     """``d = d_cmd (1 + gain sign(d_cmd))``."""
 
     id = "steering_asymmetry"
+    represented_by = "steering_curve"
     name = "an asymmetry of the steering"
     summary = "The wheels turn farther to one side than to the other."
     sentence = (
@@ -147,6 +149,7 @@ class SteeringNonlinearity(ActuatorEffect):
     """``d = saturation tanh(d_cmd / saturation)``."""
 
     id = "steering_nonlinearity"
+    represented_by = "steering_curve"
     name = "a nonlinearity of the steering towards full lock"
     summary = "The wheel angle grows less than the command towards full lock."
     sentence = "the wheel angle grows ever less than its command and would never exceed {saturation}"
@@ -173,6 +176,7 @@ class SteeringOffset(ActuatorEffect):
     """``d = d_cmd + angle``."""
 
     id = "steering_offset"
+    fitted_with_curves = True
     name = "an offset of the steering"
     summary = "The wheels are not straight when the steering command is zero."
     sentence = "with a steering command of zero the wheels point {angle:size} to the {angle:left|right}"

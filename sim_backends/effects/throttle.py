@@ -15,6 +15,7 @@ class ThrottleDeadband(ActuatorEffect):
     """``u = sign(u_t) max(|u_t| - width, 0) / (1 - width)``."""
 
     id = "throttle_deadband"
+    represented_by = "drive_map"
     name = "a dead band of the throttle"
     summary = "The motor does not respond to small throttle commands."
     sentence = "the motor does not respond to throttle commands smaller than {width:percent} of full"
@@ -41,6 +42,7 @@ class ThrottleNonlinearity(ActuatorEffect):
     """``u = sign(u_t) |u_t|^exponent``."""
 
     id = "throttle_nonlinearity"
+    represented_by = "drive_map"
     name = "a curved throttle response"
     summary = "The motor's force is not proportional to the throttle command."
     sentence = "the motor's force grows as the throttle to the power of {exponent}, not in proportion to it"

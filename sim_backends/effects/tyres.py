@@ -145,6 +145,7 @@ class FrictionEllipse(DynamicsEffect):
     """
 
     id = "friction_ellipse"
+    represented_by = "rear_force_sharing"
     name = "grip shared between driving and cornering"
     summary = "Driving and braking take side force from the rear tyres."
     sentence = (

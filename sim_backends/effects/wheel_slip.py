@@ -34,6 +34,7 @@ class LongitudinalSlip(DynamicsEffect):
     """
 
     id = "longitudinal_slip"
+    represented_by = "drive_map"
     command = "throttle"
     name = "slipping driven wheels"
     summary = "The driven wheels slip: they spin up before the car does, and pass on no more than their grip."

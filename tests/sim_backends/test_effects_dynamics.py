@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import RegularGridInterpolator
 
 from carlab.core.quantities import Action, CarState
 from sim_backends.car_parameters import SimulatorConfig
@@ -21,8 +22,19 @@ TYPICAL = {
     for name, effect in EFFECTS.items()
     if isinstance(effect, DynamicsEffect)
 }
+
+
+def curve_values(name, size):
+    """Random deviations, up to ``size`` typical ones, at all knots of a measured curve."""
+    curve = EFFECTS[name]
+    drawn = np.random.default_rng(0).uniform(-size, size, len(curve.parameters)) * curve.typical
+    return {name: {p.name: float(v) for p, v in zip(curve.parameters, drawn, strict=True)}}
+
+
+CURVE_SIZES = {"drive_map": 1.0, "front_tyre_curve": 0.3, "rear_tyre_curve": 0.3, "rear_force_sharing": 2.0}
 CASES = {
     **TYPICAL,
+    **{name: curve_values(name, size) for name, size in CURVE_SIZES.items()},
     "battery_sag": {"battery_sag": {"rate": 0.4}},
     "friction_drift": {"friction_drift": {"rate": -0.5}},
     "traction_limit_all": {"traction_limit": {"share": 0.5, "axle": "all"}},
@@ -48,6 +60,23 @@ CASES = {
 }
 
 
+THROTTLES, SPEEDS = (-1, -0.6, -0.3, -0.1, 0, 0.1, 0.3, 0.6, 1), (-1, 0, 0.5, 1, 2, 3, 4.5)
+SLIPS, ACCELERATIONS = (0, 0.04, 0.1, 0.2, 0.4, 0.8), (-8, -4, 0, 4, 8)
+
+
+def curve_at(e, name, knots, x):
+    """A one-dimensional measured curve by NumPy's interpolation; its deviation is 0 at the knot 0."""
+    values = iter(e[name].values())
+    return float(np.interp(x, knots, [0.0 if k == 0 else next(values) for k in knots]))
+
+
+def drive_map_at(e, throttle, speed):
+    """The drive map by scipy's interpolation on a regular grid."""
+    grid = np.array(list(e["drive_map"].values())).reshape(len(THROTTLES), len(SPEEDS))
+    within = [np.clip(throttle, -1, 1), np.clip(speed, SPEEDS[0], SPEEDS[-1])]
+    return float(RegularGridInterpolator((THROTTLES, SPEEDS), grid)(within)[0])
+
+
 def reference_rates(t, s, d, u, p, e):
     """[x, y, yaw, vx, vy, r, F_front, F_rear, rim speed, roll, roll rate] by the catalogue's equations."""
     x, y, yaw, vx, vy, r, lag_front, lag_rear, rim, roll, roll_rate = s
@@ -70,6 +99,8 @@ def reference_rates(t, s, d, u, p, e):
         drive *= 1 - e["battery_sag"]["rate"] * t
     if has("brake_asymmetry") and drive * vx < 0:
         drive *= e["brake_asymmetry"]["gain_ratio"]
+    if has("drive_map"):
+        drive += m * drive_map_at(e, u, vx)
     if has("motor_saturation"):
         drive = min(max(drive, -e["motor_saturation"]["force"]), e["motor_saturation"]["force"])
     demand = drive - p.damping_nspm * vx
@@ -125,6 +156,12 @@ def reference_rates(t, s, d, u, p, e):
         transferred_load = m_ax * height / (a + b)
     z_front, z_rear = z_front - transferred_load, z_rear + transferred_load
     f_front, f_rear = front_each * z_front, rear_each * z_rear
+    if has("front_tyre_curve"):
+        f_front -= z_front * curve_at(e, "front_tyre_curve", SLIPS, abs(slip_front)) * math.copysign(1.0, slip_front)
+    if has("rear_tyre_curve"):
+        f_rear -= z_rear * curve_at(e, "rear_tyre_curve", SLIPS, abs(slip_rear)) * math.copysign(1.0, slip_rear)
+    if has("rear_force_sharing"):
+        f_rear *= max(1 + curve_at(e, "rear_force_sharing", ACCELERATIONS, force / m), 0.0)
     rim_rate = 0.0
     if has("longitudinal_slip"):
         q = e["longitudinal_slip"]

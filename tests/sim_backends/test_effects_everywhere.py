@@ -12,7 +12,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.core.quantities import Action, CarState
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CATALOGUE, EFFECTS
+from sim_backends.effects import CATALOGUE, EFFECTS, MeasuredCurve
 from sim_backends.plant import Plant
 
 NAMES = list(EFFECTS)
@@ -197,7 +197,8 @@ def test_gradients_by_the_effects_numbers_equal_finite_differences(name):
         perturbed[key] += torch.tensor([step, -step], dtype=torch.float64)
         up, down = losses(perturbed).tolist()
         assert float(leaves[key].grad) == pytest.approx((up - down) / (2 * step), rel=5e-4, abs=1e-6), key
-        assert abs(up - down) > 1e-12, key
+        if not isinstance(EFFECTS[name], MeasuredCurve):  # a short drive does not reach all knots of a curve
+            assert abs(up - down) > 1e-12, key
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -246,6 +247,8 @@ def test_mirror_symmetry(name):
     start, commands = some()
     original = rollout(SimulatorConfig(effects={name: typical(name)}), start, commands, history=past(), measured=True)
     other = {k: -v if k in MIRRORED.get(name, ()) else v for k, v in typical(name).items()}
+    if name == "steering_curve":
+        other = {k: -v for k, v in zip(other, reversed(other.values()), strict=True)}
     mirror = torch.tensor([-1.0, 1.0], dtype=torch.float64)
     image = rollout(
         SimulatorConfig(effects={name: other}),

@@ -172,6 +172,8 @@ def test_mirrored_commands_and_effects_give_mirrored_angles(name):
     mirrored = {"steering_offset": -1.0, "steering_asymmetry": -1.0}
     typical = {p.name: p.typical for p in EFFECTS[name].parameters}
     other = {k: v * mirrored.get(name, 1.0) for k, v in typical.items()}
+    if name == "steering_curve":
+        other = {k: -v for k, v in zip(other, reversed(other.values()), strict=True)}
     rng = np.random.default_rng(0)
     commands = rng.uniform(-1, 1, 60)
     right = angles({name: other}, -commands)

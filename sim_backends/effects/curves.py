@@ -1,0 +1,351 @@
+"""Measured curves: a curve of the base model plus a deviation that recordings determine at fixed knots.
+
+Between knots the deviation is linear, in two dimensions bilinear; beyond the last knot it is constant. All deviations
+are 0 for the car file's own curve. A diagnosis fits curves where the effects of the catalogue do not explain a
+recording; their roughness is penalised (``MeasuredCurve.roughness``; penalised splines: Eilers and Marx 1996).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from sim_backends.array_ops import Ops, Value
+from sim_backends.effects.base import (
+    ActuatorEffect,
+    DynamicsEffect,
+    Effect,
+    EffectParameter,
+    Forces,
+    Parameters,
+)
+
+SLIP_FLOOR_MPS = 0.3
+"""Minimum speed in the denominator of a slip angle [m/s], as in the base model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """An input of a curve: name, symbol, unit and knots in ascending order.
+
+    ``anchor`` is a knot at which the deviation is always 0.
+    """
+
+    name: str
+    unit: str
+    knots: tuple[float, ...]
+    anchor: float | None = None
+
+
+class MeasuredCurve(Effect):
+    """Base of measured curves. The parameters are the deviations at the knots, ``value_3`` or ``value_3_2``."""
+
+    axes: ClassVar[tuple[Axis, ...]]
+    unit: ClassVar[str]
+    quantity: ClassVar[str]
+    """What the curve gives, a noun phrase."""
+    typical: ClassVar[float]
+    """Deviation that counts as one unit of the roughness penalty."""
+    bound: ClassVar[float]
+    """Largest deviation."""
+    catalogued: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "axes" in cls.__dict__:
+            cls.parameters = tuple(
+                EffectParameter(_name(place), cls.unit, 0.0, -cls.bound, cls.bound, cls.typical)
+                for place in free_knots(cls.axes)
+            )
+
+    def numbers(self, values: Mapping[str, Value]) -> dict[str, Value]:
+        """Coefficients of ``deviation`` by place, from numbers by dotted name; computed once for a rollout."""
+        return self.coefficients({p.name: values[f"effects.{self.id}.{p.name}"] for p in self.parameters})
+
+    def coefficients(self, deviations: Mapping[str, Value]) -> dict[str, Value]:
+        """Coefficients of the products of clipped coordinates, from deviations by name.
+
+        In one dimension ``c(x) = a_0 + sum_k s_k clip(x, x_k, x_k+1)`` with the slopes ``s_k`` between knots; in two
+        dimensions this holds along each axis in turn. Each term costs one multiplication and addition.
+        """
+        grid: dict[tuple[int, ...], Value] = {place: deviations[_name(place)] for place in free_knots(self.axes)}
+        for axis, description in enumerate(self.axes):
+            rows: dict[tuple[int, ...], dict[int, Value]] = {}
+            for place, value in grid.items():
+                rows.setdefault((*place[:axis], *place[axis + 1 :]), {})[place[axis]] = value
+            grid = {
+                (*rest[:axis], k, *rest[axis:]): value
+                for rest, row in rows.items()
+                for k, value in enumerate(_slopes(row, description.knots))
+            }
+        return {_name(place): value for place, value in grid.items()}
+
+    def deviation(self, ops: Ops, coordinates: Sequence[Value], coefficients: Mapping[str, Value]) -> Value:
+        """The deviation at ``coordinates``, one value for each axis."""
+        clipped = [
+            [ops.clip(x, low, high) for low, high in itertools.pairwise(axis.knots)]
+            for x, axis in zip(coordinates, self.axes, strict=True)
+        ]
+        if len(clipped) == 1:
+            return _polynomial(ops, clipped[0], [coefficients[_name((k,))] for k in range(len(clipped[0]) + 1)])
+        columns = [
+            _polynomial(ops, clipped[0], [coefficients[_name((k, j))] for k in range(len(clipped[0]) + 1)])
+            for j in range(len(clipped[1]) + 1)
+        ]
+        return _polynomial(ops, clipped[1], columns)
+
+    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
+        """The base model's curve at ``coordinates``, from numbers by dotted name."""
+        raise NotImplementedError
+
+    def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
+        """The inputs of the curve for a state of the car."""
+        raise NotImplementedError
+
+    def table(self, values: Mapping[str, float]) -> list[Any]:
+        """Deviations at all knots as a list, or a list of rows, from numbers by name; 0 at anchors."""
+        grid = np.zeros([len(axis.knots) for axis in self.axes])
+        for place in free_knots(self.axes):
+            grid[place] = values[_name(place)]
+        return list(grid.tolist())
+
+    @classmethod
+    def numbers_of_table(cls, table: object) -> dict[str, float] | None:
+        """Numbers by name from the list of ``table``; None if its shape is wrong or an entry is not a number."""
+        try:
+            grid = np.array(table, dtype=np.float64)
+        except (TypeError, ValueError):
+            return None
+        if grid.shape != tuple(len(axis.knots) for axis in cls.axes) or not np.isfinite(grid).all():
+            return None
+        return {_name(place): float(grid[place]) for place in free_knots(cls.axes)}
+
+    @classmethod
+    def roughness(cls) -> FloatArray:
+        """Rows (r, n) whose products with the n deviations are changes of slope, in units of the deviation.
+
+        A row is ``h ((c_k+1 - c_k) / h_k - (c_k - c_k-1) / h_k-1)`` for neighbouring knots along one axis, with the
+        distances h_k between them and their mean h.
+        """
+        places = {place: k for k, place in enumerate(free_knots(cls.axes))}
+        rows = []
+        for axis, others in enumerate(itertools.repeat(cls.axes, len(cls.axes))):
+            ranges = [range(len(a.knots)) for k, a in enumerate(others) if k != axis]
+            knots = cls.axes[axis].knots
+            for rest, k in itertools.product(itertools.product(*ranges), range(1, len(knots) - 1)):
+                before, after = knots[k] - knots[k - 1], knots[k + 1] - knots[k]
+                mean = 0.5 * (before + after)
+                row = np.zeros(len(places))
+                for j, weight in ((k - 1, 1 / before), (k, -1 / before - 1 / after), (k + 1, 1 / after)):
+                    place = (*rest[:axis], j, *rest[axis:])
+                    if place in places:  # otherwise the deviation is 0 there
+                        row[places[place]] = mean * weight
+                rows.append(row)
+        return np.array(rows)
+
+
+def free_knots(axes: Sequence[Axis]) -> list[tuple[int, ...]]:
+    """Indices of the knots of a grid, in row-major order, without anchors."""
+    ranges = [[k for k, x in enumerate(axis.knots) if x != axis.anchor] for axis in axes]
+    return list(itertools.product(*ranges))
+
+
+def _slopes(row: Mapping[int, Value], knots: Sequence[float]) -> list[Value]:
+    """``a_0`` and the slopes of a row of deviations by knot; a missing deviation is 0."""
+    values = [row.get(k, 0.0) for k in range(len(knots))]
+    slopes = [
+        (after - before) * (1.0 / (high - low))
+        for (before, after), (low, high) in zip(itertools.pairwise(values), itertools.pairwise(knots), strict=True)
+    ]
+    first = values[0]
+    for slope, low in zip(slopes, knots[:-1], strict=True):
+        first = first - slope * low
+    return [first, *slopes]
+
+
+def _polynomial(ops: Ops, clipped: Sequence[Value], coefficients: Sequence[Value]) -> Value:
+    """``a_0 + sum_k s_k clipped_k``."""
+    total = coefficients[0]
+    for x, slope in zip(clipped, coefficients[1:], strict=True):
+        total = ops.fma(slope, x, total)
+    return total
+
+
+def weights(ops: Ops, x: Value, knots: Sequence[float]) -> list[Value]:
+    """Weights of the knots for linear interpolation at ``x``, constant beyond the last knots; they add up to 1."""
+    shares = [ops.clip((x - low) * (1.0 / (high - low)), 0.0, 1.0) for low, high in itertools.pairwise(knots)]
+    return [1.0 - shares[0], *(a - b for a, b in itertools.pairwise(shares)), shares[-1]]
+
+
+def _name(place: Sequence[int]) -> str:
+    return "_".join(("value", *map(str, place)))
+
+
+class DriveMap(MeasuredCurve, DynamicsEffect):
+    """``F_x += m a(throttle, vx)``: the motor's force, per mass of the car, over throttle and speed.
+
+    The base model has ``F_x = drive_gain u - damping vx``. A motor controller that holds a speed, brakes when the
+    throttle is released, or saturates has another map.
+    """
+
+    id = "drive_map"
+    quantity = "acceleration by the motor"
+    summary = "The motor's force is a measured map over throttle and speed."
+    class_statement = "a map of the drive force over throttle and speed"
+    command = "throttle"
+    order = 25
+    unit, typical, bound = "m/s2", 1.0, 40.0
+    axes = (
+        Axis("throttle", "1", (-1.0, -0.6, -0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0)),
+        Axis("speed", "m/s", (-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 4.5)),
+    )
+
+    def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
+        """Throttle and vx."""
+        return forces.throttle, forces.vx
+
+    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
+        """Gain minus damping, per mass [m/s2]."""
+        throttle, vx = coordinates
+        force = values["motor.drive_gain"] * throttle - values["motor.damping"] * vx
+        return np.asarray(force / values["vehicle.mass"])
+
+    def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Add."""
+        added = self.deviation(ops, self.coordinates(ops, forces), values)
+        forces.drive = forces.drive + forces.mass * added
+
+
+class SteeringCurve(MeasuredCurve, ActuatorEffect):
+    """``d = d_cmd + a(d_cmd)`` with the wheel angle ``d_cmd = max_angle command`` of the base model."""
+
+    id = "steering_curve"
+    quantity = "wheel angle"
+    summary = "The wheel angle is a measured curve over its command."
+    class_statement = "a curve of the wheel angle over its command"
+    command = "steering"
+    order = 65
+    unit, typical, bound = "rad", 0.03, 0.6
+    axes = (Axis("commanded angle", "rad", (-0.5, -0.35, -0.2, -0.1, 0.0, 0.1, 0.2, 0.35, 0.5), anchor=0.0),)
+
+    def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
+        """The commanded wheel angle."""
+        return (forces.wheel_angle,)
+
+    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
+        """The commanded angle itself [rad]."""
+        return np.asarray(coordinates[0])
+
+    def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
+        """Add."""
+        return command + self.deviation(ops, (command,), values)
+
+
+class _SideForceCurve(MeasuredCurve, DynamicsEffect):
+    """Side force of one axle per load over the slip angle, odd in it."""
+
+    axle: ClassVar[str]
+    order = 5
+    base_models = ("dynamic", "linear_tyre", "blend")
+    quantity = "side force per axle load"
+
+    def slip_rad(self, ops: Ops, forces: Forces) -> Value:
+        """Slip angle of the axle's wheels, positive where the force is to the right."""
+        raise NotImplementedError
+
+    def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
+        """Size of the slip angle."""
+        return (ops.abs(self.slip_rad(ops, forces)),)
+
+    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
+        """Pacejka's curve ``mu sin(C atan(B a))`` [1]."""
+        mu, b, c = (values[f"tyre.{self.axle}.{k}"] for k in ("mu", "B", "C"))
+        return np.asarray(mu * np.sin(c * np.arctan(b * coordinates[0])))
+
+    def added(self, ops: Ops, forces: Forces, values: Parameters) -> Value:
+        """Side force per load to the left."""
+        slip = self.slip_rad(ops, forces)
+        return -ops.sign(slip) * self.deviation(ops, (ops.abs(slip),), values)
+
+
+_SLIP_AXIS = (Axis("slip angle", "rad", (0.0, 0.04, 0.1, 0.2, 0.4, 0.8), anchor=0.0),)
+
+
+class FrontTyreCurve(_SideForceCurve):
+    """``F_y,front -= F_z a(|slip|) sign(slip)`` in the front wheels' frame."""
+
+    id = "front_tyre_curve"
+    axle = "front"
+    summary = "The front side force is a measured curve over the slip angle."
+    class_statement = "a curve of the front side force over the slip angle"
+    unit, typical, bound = "1", 0.1, 3.0
+    axes = _SLIP_AXIS
+
+    def slip_rad(self, ops: Ops, forces: Forces) -> Value:
+        """As in the base model."""
+        front = forces.vy + forces.front_axle * forces.yaw_rate
+        along = forces.vx * forces.wheel_cos + front * forces.wheel_sin
+        across = front * forces.wheel_cos - forces.vx * forces.wheel_sin
+        return ops.slope_angle(across, ops.floor(ops.abs(along), SLIP_FLOOR_MPS))
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Add."""
+        forces.side_front = forces.side_front + forces.load_front * self.added(ops, forces, values)
+
+
+class RearTyreCurve(_SideForceCurve):
+    """``F_y,rear -= F_z a(|slip|) sign(slip)``."""
+
+    id = "rear_tyre_curve"
+    axle = "rear"
+    summary = "The rear side force is a measured curve over the slip angle."
+    class_statement = "a curve of the rear side force over the slip angle"
+    unit, typical, bound = "1", 0.1, 3.0
+    axes = _SLIP_AXIS
+
+    def slip_rad(self, ops: Ops, forces: Forces) -> Value:
+        """As in the base model."""
+        rear = forces.vy - forces.rear_axle * forces.yaw_rate
+        return ops.slope_angle(rear, ops.floor(ops.abs(forces.vx), SLIP_FLOOR_MPS))
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Add."""
+        forces.side_rear = forces.side_rear + forces.load_rear * self.added(ops, forces, values)
+
+
+class RearForceSharing(MeasuredCurve, DynamicsEffect):
+    """``F_y,rear *= max(1 + a(F_x / m), 0)``: side force that driving and braking leave to the rear tyres.
+
+    F_x is that of the driven axle. A friction ellipse is one such curve (Pacejka 2012, ch. 1).
+    """
+
+    id = "rear_force_sharing"
+    quantity = "share of the rear side force that remains"
+    summary = "The rear side force is scaled by a measured curve over the longitudinal force."
+    class_statement = "a curve of the rear side force over the longitudinal force"
+    command = "throttle"
+    order = 6
+    base_models = ("dynamic", "linear_tyre", "blend")
+    unit, typical, bound = "1", 0.2, 1.0
+    axes = (Axis("longitudinal force per mass", "m/s2", (-8.0, -4.0, 0.0, 4.0, 8.0), anchor=0.0),)
+
+    def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
+        """Force of the driven axle per mass."""
+        return (forces.axle_force / forces.mass,)
+
+    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
+        """One: the base model does not share the force."""
+        return np.ones_like(coordinates[0])
+
+    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
+        """Scale."""
+        factor = 1.0 + self.deviation(ops, self.coordinates(ops, forces), values)
+        forces.side_rear = forces.side_rear * ops.floor(factor, 0.0)
+
+
+CURVES = (DriveMap(), SteeringCurve(), FrontTyreCurve(), RearTyreCurve(), RearForceSharing())
