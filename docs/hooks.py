@@ -53,6 +53,25 @@ def _effects() -> str:
     return "\n".join(_effect(EFFECTS[name]) for name in CATALOGUE)
 
 
+def _curves() -> str:
+    from sim_backends.effects import CURVES
+
+    return "\n".join(_curve(curve) for curve in CURVES)
+
+
+def _curve(curve: Any) -> str:
+    axes = "\n".join(
+        f"| {axis.name} | {axis.unit} | {', '.join(f'{knot:g}' for knot in axis.knots)} | "
+        f"{'' if axis.anchor is None else f'{axis.anchor:g}'} |"
+        for axis in curve.axes
+    )
+    equation = (type(curve).__doc__ or "").split("\n\n")[0]
+    return (
+        f"### {curve.id}\n\n{curve.summary} {equation} Values in {curve.unit}.\n\n"
+        f"| over | unit | knots | deviation is 0 at |\n| --- | --- | --- | --- |\n{axes}\n"
+    )
+
+
 def _effect(effect: Any) -> str:
     from sim_backends.effects import confusable_effects
 
@@ -75,4 +94,4 @@ def _effect(effect: Any) -> str:
     )
 
 
-SECTIONS = {"cli": _command_line, "effects": _effects, "decisions": _decisions}
+SECTIONS = {"cli": _command_line, "effects": _effects, "curves": _curves, "decisions": _decisions}

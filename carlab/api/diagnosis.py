@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import html
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from carlab.cars import CarFile
     from carlab.core.episode_data import EpisodeData
     from carlab.core.recording_noise import RecordingNoise
+    from carlab.diagnosis.diagnose import Outcome
     from carlab.diagnosis.findings import (
         DataFault,
         Diagnosis,
@@ -45,12 +46,16 @@ class DiagnosisReport:
         exhibits: data of the report's pictures.
         model: the car file with the identified parameters and effects; ``model.save("model.toml")`` writes it.
         is_conclusive: False if the recordings are not sufficient for a verdict; ``sentence`` states what to record.
+        outcome: all models with the held-out prediction windows; None if the recordings are not sufficient.
+        held_out_names: name of the recording of each held-out episode.
     """
 
     diagnosis: Diagnosis
     exhibits: Exhibits = field(repr=False)
     model: CarFile = field(repr=False)
     is_conclusive: bool = True
+    outcome: Outcome | None = field(default=None, repr=False)
+    held_out_names: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -125,9 +130,10 @@ class DiagnosisReport:
 
 @dataclass(slots=True)
 class Material:
-    """Episodes with their data faults; ``notes`` are sentences about the conversion of files."""
+    """Episodes with the names of their recordings and data faults; ``notes`` are sentences about conversions."""
 
     episodes: list[EpisodeData] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
     faults: list[DataFault] = field(default_factory=list)
     uses: list[RecordingUse] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -140,6 +146,8 @@ def diagnose(
     held_out: RecordingLike | Iterable[RecordingLike] = (),
     holdout_share: float | None = None,
     effects: Sequence[str] = (),
+    curves: bool = False,
+    ceiling: bool = False,
     seed: int = 0,
     out: Path | str | None = None,
     progress: Callable[[str, float], None] = lambda activity, share: None,
@@ -154,7 +162,10 @@ def diagnose(
         held_out: recordings for validation only; by default the last part of each recording is held out.
         holdout_share: size of that part, above 0 and at most 0.5; 0.3 by default.
         effects: restrict the search to these effects of the catalogue.
-        seed: written into the report; a diagnosis draws no random numbers.
+        curves: fit measured curves (drive force, steering, tyres) where named effects leave more than a tenth of the
+            error; takes minutes.
+        ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
+        seed: seed of the black box; the rest of a diagnosis draws no random numbers.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
         stop: once it returns true, the search ends and the report covers the findings so far.
@@ -176,21 +187,15 @@ def diagnose(
     latency_s = file.simulator.mocap.latency_s
     fit = read_material(to_fit, "fit", latency_s)
     validation = read_material(to_validate, "held out", latency_s)
-    report = _diagnosed(fit, validation, file, holdout_share, effects, seed, progress, stop)
+    options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
+    report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})
     if out is not None:
         report.save(out)
     return report
 
 
 def _diagnosed(
-    fit: Material,
-    validation: Material,
-    file: CarFile,
-    holdout_share: float | None,
-    effects: Sequence[str],
-    seed: int,
-    progress: Callable[[str, float], None],
-    stop: Callable[[], bool],
+    fit: Material, validation: Material, file: CarFile, seed: int, options: Mapping[str, Any]
 ) -> DiagnosisReport:
     from carlab.diagnosis.diagnose import Inconclusive
     from carlab.diagnosis.diagnose import diagnose as search
@@ -209,11 +214,8 @@ def _diagnosed(
             Texts(effect_sentence, separating_drive, confusable_effects()),
             uses=uses,
             data_faults=faults,
-            effects=tuple(effects) or None,
-            holdout_share=holdout_share,
             seed=seed,
-            progress=progress,
-            stop=stop,
+            **options,
         )
     except Inconclusive as error:
         known = error.data_faults or faults
@@ -224,7 +226,8 @@ def _diagnosed(
         undecided = Diagnosis(error.verdict, why, (), {}, 1.0, {}, None, tuple(known), uses, seed, 0.0, why)
         return DiagnosisReport(undecided, Exhibits(), _as_car_file(undecided, file.simulator, file.name), False)
     model = _as_car_file(outcome.diagnosis, outcome.model, file.name, outcome.exhibits.noise)
-    return DiagnosisReport(completed(outcome.diagnosis), outcome.exhibits, model)
+    names = tuple(validation.names or fit.names)
+    return DiagnosisReport(completed(outcome.diagnosis), outcome.exhibits, model, True, outcome, names)
 
 
 def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: RecordingNoise | None = None) -> CarFile:
@@ -292,28 +295,33 @@ def _path_of(item: RecordingLike) -> Path | None:
 
 def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Material:
     """Read episodes for a diagnosis: CSV files are repaired, states of MCAP files get one known age."""
+    material = Material()
+    for item in items:
+        material.uses.append(_read_item(item, role, latency_s, material))
+        material.names += [material.uses[-1].path] * (len(material.episodes) - len(material.names))
+    return material
+
+
+def _read_item(item: RecordingLike, role: str, latency_s: float, material: Material) -> RecordingUse:
+    """Add the episodes of one recording."""
     from carlab.api.recordings import load
     from carlab.diagnosis.findings import RecordingUse
     from carlab.diagnosis.state_alignment import align_states
 
-    material = Material()
-    for item in items:
-        path = _path_of(item)
-        if path is None:
-            material.episodes.append(align_states(item, latency_s))
-            digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
-            material.uses.append(RecordingUse(str(item.metadata.get("source", "episode")), digest, role))
-            continue
-        if is_csv(required_file(path)):
-            _read_csv(path, item.mapping if isinstance(item, Recording) else None, material)
-        else:
-            read = item if isinstance(item, Recording) else load(path)
-            material.episodes += [align_states(episode, latency_s) for episode in read.episodes]
-            if read.is_recovered:
-                ticks = read.episode.ticks
-                material.notes.append(f"{path} is an incomplete recording; {ticks} complete ticks were recovered.")
-        material.uses.append(RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role))
-    return material
+    path = _path_of(item)
+    if path is None:
+        material.episodes.append(align_states(item, latency_s))
+        digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
+        return RecordingUse(str(item.metadata.get("source", "episode")), digest, role)
+    if is_csv(required_file(path)):
+        _read_csv(path, item.mapping if isinstance(item, Recording) else None, material)
+    else:
+        read = item if isinstance(item, Recording) else load(path)
+        material.episodes += [align_states(episode, latency_s) for episode in read.episodes]
+        if read.is_recovered:
+            ticks = read.episode.ticks
+            material.notes.append(f"{path} is an incomplete recording; {ticks} complete ticks were recovered.")
+    return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
 
 
 def _read_csv(path: Path, mapping: Any, material: Material) -> None:

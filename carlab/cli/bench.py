@@ -29,6 +29,10 @@ class Bench(BenchOptions):
             seeds=self.seeds, steps=self.steps, episodes=self.episodes, updates=self.updates,
             **{"rows": min(self.rows)} if self.rows else {},
         )  # fmt: skip
+        if self.what == "realcars":
+            from carlab.cli.bench_realcars import run_realcars
+
+            return run_realcars(self)
         if self.what == "priors":
             from carlab.cli.bench_priors import run_priors
 

@@ -16,11 +16,13 @@ from carlab.core.errors import ConfigError
 class BenchOptions:
     """Options of all uses of ``carlab bench``."""
 
-    what: Positional[Literal["speed", "regression", "priors", "parking"]] = "speed"
+    what: Positional[Literal["speed", "regression", "priors", "parking", "realcars"]] = "speed"
     """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios within one run.
     regression: Sim-FSVGD and its baselines on the cases of the paper. priors: Sim-FSVGD without a prior and with the
     kinematic, the nominal and the diagnosed prior, on a simulated car with two concealed effects or on the recordings
-    in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are continued."""
+    in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are continued.
+    realcars: prediction errors on held-out drives of a real car in --data, for constant velocity, the car file, refit,
+    diagnosis, measured curves and a black box."""
 
     out: Path | None = None
     """Write the figures to FILE.json (regression and priors after each fit). All but speed also draw FILE.png; priors
@@ -51,11 +53,17 @@ class BenchOptions:
 
     data: Path | None = None
     """regression: folder with the authors' arrays (pendulum_seed0_n5.npz and so on); by default rows are generated.
-    realcar and priors: folder with recordings, the last one held out."""
+    realcar and priors: folder with recordings, the last one held out. realcars: folder with recordings."""
+
+    held_out: tuple[str, ...] = ()
+    """realcars: parts of the names of the held-out recordings; by default the last recording."""
+
+    fit: tuple[str, ...] = ()
+    """realcars: parts of the names of the recordings to fit; by default all that are not held out."""
 
     car: Path = Path("eth_rc_car")
     """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. priors with
-    --data: car file of the nominal simulator, which is diagnosed."""
+    --data, and realcars: car file of the nominal simulator, which is diagnosed."""
 
     history: int | None = None
     """realcar and priors: number of past commands; by default estimated from the recordings (the paper has 3)."""
@@ -109,6 +117,7 @@ PRIORS = Place("'bench priors'", lambda given: given.what == "priors")
 READ = Place("'bench priors --data FOLDER'", lambda given: PRIORS.holds(given) and given.data is not None)
 CONCEALED = Place("'bench priors' without --data", lambda given: PRIORS.holds(given) and given.data is None)
 PARKING = Place("'bench parking'", lambda given: given.what == "parking")
+REALCARS = Place("'bench realcars'", lambda given: given.what == "realcars")
 
 EVERYWHERE = frozenset({"what", "out", "device", "verbose"})
 PLACES = {
@@ -118,8 +127,10 @@ PLACES = {
     "seeds": (REGRESSION, PRIORS, PARKING),
     "methods": (REGRESSION, PARKING),
     "way": (REGRESSION,),
-    "data": (REGRESSION, PRIORS),
-    "car": (REALCAR, READ),
+    "data": (REGRESSION, PRIORS, REALCARS),
+    "held_out": (REALCARS,),
+    "fit": (REALCARS,),
+    "car": (REALCAR, READ, REALCARS),
     "history": (REALCAR, PRIORS),
     "diagnosed": (PRIORS,),
     "pair": (CONCEALED,),

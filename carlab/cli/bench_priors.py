@@ -78,17 +78,20 @@ def check_unseen(model: Path, held_out: Path) -> None:
         )
 
 
+def recordings_in(folder: Path) -> list[Path]:
+    """Recordings of a folder, sorted by name. Raises ConfigError or DataError for less than two."""
+    if not folder.is_dir():
+        raise ConfigError(f"--data {folder} is not a folder; name a folder with at least two recordings (MCAP or CSV).")
+    files = sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
+    if len(files) < 2:
+        raise DataError(f"{folder} has {len(files)} recordings; add some (two or more are needed).")
+    return files
+
+
 def _recordings(options: BenchOptions, work: Path) -> tuple[Path, list[Path], str]:
     """Car file, recordings (the last one is held out), and a title."""
     if options.data is not None:
-        if not options.data.is_dir():
-            raise ConfigError(
-                f"--data {options.data} is not a folder; name a folder with at least two recordings (MCAP or CSV)."
-            )
-        files = sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
-        if len(files) < 2:
-            raise DataError(f"{options.data} has {len(files)} recordings; add some (two or more are needed).")
-        return options.car, files, options.data.name
+        return options.car, recordings_in(options.data), options.data.name
     from carlab.studies.concealed_recordings import CAR_NAME, HELD_OUT_NAME, TRAINING_NAME, record_pair
 
     folder = work / "recordings"

@@ -44,8 +44,14 @@ class Diagnose:
     effects: tuple[str, ...] = ()
     """Restrict the search to these effects of the catalogue."""
 
+    curves: bool = False
+    """Fit measured curves (drive force, steering, tyres) where named effects leave more than a tenth of the error."""
+
+    ceiling: bool = False
+    """Train a black box, to show how much of the error can be explained at all. Needs 60 s of driving."""
+
     seed: int = 0
-    """Written into the report; a diagnosis draws no random numbers."""
+    """Seed of the black box; the rest of a diagnosis draws no random numbers."""
 
     decisions: bool = False
     """Also write decisions.json: the statistics and thresholds of each decision about an effect."""
@@ -66,6 +72,8 @@ class Diagnose:
                 held_out=self.held_out,
                 holdout_share=self.holdout_share,
                 effects=self.effects,
+                curves=self.curves,
+                ceiling=self.ceiling,
                 seed=self.seed,
                 out=self.out,
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
@@ -80,8 +88,12 @@ class Diagnose:
         return 0
 
     def _print(self, diagnosis: Diagnosis) -> None:
+        from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences
+
         console.print(diagnosis.sentence)
         for effect in diagnosis.effects:
             console.print(f"  {effect.sentence}", markup=False)
+        for sentence in (*curve_sentences(diagnosis), ceiling_sentence(diagnosis)):
+            console.print(f"  {sentence}" if sentence else "", markup=False, end="\n" if sentence else "")
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
         console.print(f"Read {self.out / 'report.html'}; drive the diagnosed car with --car {self.out / 'model.toml'}.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,9 @@ import numpy as np
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.ceiling import ceiling_of
+from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
+from carlab.diagnosis.curves.support import curve_findings
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import (
     ScoredSearch,
@@ -20,7 +23,7 @@ from carlab.diagnosis.evidence import (
     unexplained_share,
     verdict_of,
 )
-from carlab.diagnosis.findings import DataFault, Diagnosis, Exhibits, RecordingUse
+from carlab.diagnosis.findings import Ceiling, DataFault, Diagnosis, Exhibits, FitErrors, RecordingUse
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -33,8 +36,9 @@ from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
 from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.diagnosis.unexplained.vibration import find_vibration
-from carlab.prediction.predict import ConstantVelocity
-from carlab.prediction.windows import tracks_of
+from carlab.prediction.black_box import BlackBoxSettings, check_duration, train_black_box
+from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
+from carlab.prediction.windows import PredictionWindows, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
 
@@ -47,11 +51,13 @@ SEARCH_PROGRESS = (0.05, 0.75)
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The diagnosis, the data of its figures, and the corrected simulator."""
+    """The diagnosis, the data of its figures, the corrected simulator, and all models with the held-out windows."""
 
     diagnosis: Diagnosis
     exhibits: Exhibits
     model: SimulatorConfig
+    models: Mapping[str, PredictiveModel]
+    held_out_windows: PredictionWindows
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,8 @@ class Request:
     held_out_share: float
     seed: int
     settings: DiagnosisSettings
+    curves: bool
+    ceiling: bool
 
 
 def diagnose(
@@ -80,6 +88,8 @@ def diagnose(
     holdout_share: float | None = None,
     seed: int = 0,
     settings: DiagnosisSettings = DEFAULT,
+    curves: bool = False,
+    ceiling: bool = False,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Outcome:
@@ -95,30 +105,35 @@ def diagnose(
         effects: candidate effects, the whole catalogue by default. Given effects are not withdrawn.
         holdout_share: last share of each recording that is held out if ``held_out`` is empty, above 0 and at most
             0.5; by default that of the settings.
-        seed: seed for the report; a diagnosis uses no random numbers.
+        seed: seed of the black box; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
+        curves: fit measured curves where named effects leave a residual.
+        ceiling: train a black box, and compare with its error.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
 
     Raises:
         Inconclusive: the recordings do not allow a verdict; the message states why and what to record.
         ConfigError: the simulator cannot integrate, or the held-out share is out of range.
+        DataError: a ceiling of recordings that are too short for a black box.
     """
     if holdout_share is None:
         holdout_share = settings.windows.default_held_out_share
     check_held_out_share(holdout_share, settings.windows)
     began_s = MonotonicClock().now_s()
     nominal = with_known_latency(nominal, (*fit, *held_out))
-    request = Request(nominal, texts, uses, data_faults, effects, holdout_share, seed, settings)
+    request = Request(nominal, texts, uses, data_faults, effects, holdout_share, seed, settings, curves, ceiling)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append)
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
+    if ceiling:
+        check_duration(recordings.fit_tracks, BlackBoxSettings())
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
     scored, naming = _search_effects(recordings, noise, request, control)
-    outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), progress)
+    outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
     seconds = MonotonicClock().now_s() - began_s
     exhibits = replace(outcome.exhibits, decisions=tuple(decisions))
-    return Outcome(replace(outcome.diagnosis, seconds=seconds), exhibits, outcome.model)
+    return replace(outcome, diagnosis=replace(outcome.diagnosis, seconds=seconds), exhibits=exhibits)
 
 
 def _prepare_recordings(
@@ -182,10 +197,10 @@ def _search_effects(
 
 
 def _assemble_result(
-    scored: ScoredSearch, naming: NamingResult, recordings: SplitRecordings, request: Request, progress: Progress
+    scored: ScoredSearch, naming: NamingResult, recordings: SplitRecordings, request: Request, control: RunControl
 ) -> Outcome:
-    """Compute evidence, unexplained residual, verdict and figure data."""
-    held_out = scored.held_out
+    """Compute evidence, unexplained residual, measured curves, ceiling, verdict and figure data."""
+    held_out, progress = scored.held_out, control.progress
     findings = effect_findings(
         scored, request.texts, lambda share: progress("refitting without each effect", 0.82 + 0.1 * share)
     )
@@ -195,16 +210,18 @@ def _assemble_result(
         error = scored.errors["with_effects"]
         unexplained, model = describe_unexplained(scored.problem, naming, share, error, held_out)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
+    measured = _measured_curves(scored, share, request, control)
+    models = _models(scored, measured, recordings, request, control)
+    model = model if measured is None else measured.fit.config
     progress("preparing the report", 0.95)
-    held_out_errors = {name: held_out.summary(error) for name, error in scored.errors.items()} | {
-        "constant_velocity": held_out.summary(held_out.final_error(ConstantVelocity())),
-        "noise_floor": held_out.floor_summary(),
-    }
+    held_out_errors = {name: held_out.summary(held_out.final_error(each)) for name, each in models.items()}
+    held_out_errors["noise_floor"] = held_out.floor_summary()
+    tracks, settings = recordings.fit_tracks, request.settings.curves
     diagnosis = Diagnosis(
         verdict=verdict,
         sentence="",
         effects=findings if verdict == "mismatch" else (),
-        parameters=base_estimates(scored),
+        parameters=base_estimates(scored if measured is None else replace(scored, fit=measured.fit)),
         horizon_s=request.settings.windows.held_out_window_s,
         held_out=held_out_errors,
         unexplained=unexplained,
@@ -212,10 +229,55 @@ def _assemble_result(
         recordings=tuple(request.uses),
         seed=request.seed,
         seconds=0.0,
+        curves=() if measured is None else curve_findings(measured, request.nominal, tracks, settings),
+        ceiling=_ceiling(held_out_errors),
     )
     exhibits = exhibits_of(scored, recordings.held_out_tracks)
     exhibits = replace(exhibits, noise=held_out.recording_noise)
-    return Outcome(diagnosis, exhibits, model or scored.found.best.config)
+    return Outcome(diagnosis, exhibits, model or scored.found.best.config, models, held_out.windows)
+
+
+def _measured_curves(
+    scored: ScoredSearch, unexplained: float, request: Request, control: RunControl
+) -> CurveFit | None:
+    """Measured curves if they are wanted, and named effects leave a residual that a curve may explain."""
+    if not request.curves or unexplained < request.settings.curves.min_unexplained_share or control.stop():
+        return None
+    return fit_curves(scored.problem, scored.found, control)
+
+
+def _models(
+    scored: ScoredSearch,
+    measured: CurveFit | None,
+    recordings: SplitRecordings,
+    request: Request,
+    control: RunControl,
+) -> dict[str, PredictiveModel]:
+    """All models whose held-out errors are reported; a black box is trained on the recordings to fit."""
+    found = scored.found
+    models: dict[str, PredictiveModel] = {
+        "nominal": SimulatorModel(scored.problem.nominal),
+        "refit": SimulatorModel(found.base.config),
+        "with_effects": SimulatorModel(found.best.config),
+    }
+    if measured is not None:
+        models["with_curves"] = SimulatorModel(measured.fit.config)
+    if request.ceiling:
+        models["black_box"] = train_black_box(
+            recordings.fit_tracks,
+            seed=request.seed,
+            velocity_window_s2=recordings.fit_windows.velocity_window_s2,
+            progress=control.progress,
+            stop=control.stop,
+        )
+    return models | {"constant_velocity": ConstantVelocity()}
+
+
+def _ceiling(errors: Mapping[str, FitErrors]) -> Ceiling | None:
+    if "black_box" not in errors:
+        return None
+    model = errors.get("with_curves", errors["with_effects"])
+    return ceiling_of(errors["refit"].score, model.score, errors["black_box"].score)
 
 
 __all__ = ["Inconclusive", "Outcome", "Texts", "diagnose"]

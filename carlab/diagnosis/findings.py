@@ -92,6 +92,59 @@ class Unexplained:
 
 
 @dataclass(frozen=True, slots=True)
+class CurveAxis:
+    """An input of a measured curve with its knots."""
+
+    name: str
+    unit: str
+    knots: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CurveFinding:
+    """A measured curve beside that of the car file, at the knots of its axes (an array with one dimension an axis).
+
+    Attributes:
+        id: id of the curve.
+        quantity: what the curve gives, in ``unit``.
+        unit: its unit.
+        axes: inputs.
+        car_file: the curve of the car file.
+        measured: the curve of the recordings; NaN at knots without data.
+        std: its standard deviations; NaN at knots without data.
+        support_s: driving time near each knot [s].
+    """
+
+    id: str
+    quantity: str
+    unit: str
+    axes: tuple[CurveAxis, ...]
+    car_file: FloatArray
+    measured: FloatArray
+    std: FloatArray
+    support_s: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Ceiling:
+    """How much of the refit's squared excess can be explained from past commands and velocities.
+
+    Shares add up to 1: ``by_model`` is what the diagnosed model explains, ``predictable`` what a black box predicts in
+    addition, ``unpredictable`` what neither predicts.
+    """
+
+    by_model: float
+    predictable: float
+    unpredictable: float
+
+    @property
+    def explained_of_predictable(self) -> float:
+        """Share of the explainable excess that the diagnosed model explains."""
+        explainable = self.by_model + self.predictable
+        return self.by_model / explainable if explainable > 0.0 else 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class DataFault:
     """A fault of a recording."""
 
@@ -112,7 +165,11 @@ class RecordingUse:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Result of a diagnosis. ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor."""
+    """Result of a diagnosis.
+
+    ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; with measured curves also
+    with_curves, with a ceiling also black_box.
+    """
 
     verdict: Verdict
     sentence: str
@@ -126,6 +183,8 @@ class Diagnosis:
     seed: int
     seconds: float
     advice: str = ""
+    curves: tuple[CurveFinding, ...] = ()
+    ceiling: Ceiling | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
@@ -151,12 +210,20 @@ class Diagnosis:
             "parameters": {name: asdict(e) for name, e in self.parameters.items()},
             "fit": {"horizon_s": self.horizon_s, "held_out": {k: asdict(v) for k, v in self.held_out.items()}},
             "unexplained": unexplained,
+            "curves": [_curve_table(curve) for curve in self.curves],
+            "ceiling": None if self.ceiling is None else asdict(self.ceiling),
             "data_faults": [asdict(f) for f in self.data_faults],
             "recordings": [asdict(r) for r in self.recordings],
             "seed": self.seed,
             "seconds": self.seconds,
         }
         return dict(_plain(made))
+
+
+def _curve_table(curve: CurveFinding) -> dict[str, Any]:
+    arrays = ("car_file", "measured", "std", "support_s")
+    plain = {"id": curve.id, "quantity": curve.quantity, "unit": curve.unit, "axes": [asdict(a) for a in curve.axes]}
+    return plain | {name: getattr(curve, name).tolist() for name in arrays}
 
 
 def _plain(value: Any) -> Any:

@@ -79,8 +79,37 @@ class IdentificationSettings:
     """Maximum width [s] of a velocity window, as a box."""
     velocity_z_min: float = 3.0
     """Minimum variance of the velocity window [standard errors]."""
+    curve_std: float = 10.0
+    """Prior standard deviation of a measured curve's deviations, in typical sizes: keeps knots without data at 0."""
+    curve_roughness_std: float = 1.0
+    """The same for its changes of slope. From 0.1 to 1 the error on the last part of ETH train_1 changes by 4 %."""
+    max_batch_sets: int = 24
+    """Maximum number of parameter sets that are simulated in one batch; bounds the memory of a Jacobian."""
     velocity_min_samples: int = 50
     """Minimum number of samples of the regression of the velocity window."""
+
+
+@dataclass(frozen=True, slots=True)
+class CurveSettings:
+    """Fit of measured curves, and what a recording supports."""
+
+    min_unexplained_share: float = 0.1
+    """Share of the refit's squared excess that named effects must leave, so that curves are fitted."""
+    max_windows: int = 200
+    """Number of windows of the first fit and of the removal of curves; the last fit uses all windows."""
+    first_iterations: int = 10
+    iterations: int = 4
+    """Iterations of the first fit, and of the last fit, which begins at the first."""
+    last_iterations: int = 3
+    """Iterations with the updated error scale, and of a fit without one curve."""
+    tolerance: float = 1e-3
+    """Relative fall of the cost at which a fit ends."""
+    keep_z_min: float = 0.0
+    """Minimum rise of the loss on unseen blocks without a curve that is kept [standard errors]; 2 is worse on ETH."""
+    accept_z_min: float = 3.0
+    """Minimum fall of the loss on unseen blocks with all curves [standard errors]."""
+    min_support_s: float = 0.5
+    """Minimum driving time [s] near a knot; without it the curve ends there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,6 +358,10 @@ class QuickSettings:
 class ReportSettings:
     """Contents of the report."""
 
+    reading_z_min: float = 2.0
+    """Minimum difference from the car file's curve at each knot of a reading [standard deviations]."""
+    saturation_share: float = 0.3
+    """A drive force saturates if it grows by less than this share of the car file's growth."""
     score_above_noise: float = 1.5
     """Score (noise floors) above which a verdict without missing physics has a warning."""
     max_traces: int = 3
@@ -353,6 +386,7 @@ class DiagnosisSettings:
 
     windows: WindowSettings = field(default_factory=WindowSettings)
     identification: IdentificationSettings = field(default_factory=IdentificationSettings)
+    curves: CurveSettings = field(default_factory=CurveSettings)
     screening: ScreeningSettings = field(default_factory=ScreeningSettings)
     selection: SelectionSettings = field(default_factory=SelectionSettings)
     rivals: RivalSettings = field(default_factory=RivalSettings)

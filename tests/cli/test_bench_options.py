@@ -65,8 +65,9 @@ def test_option_is_accepted_or_refused_as_listed(
         (
             "regression --car mine.toml",
             "--car has no effect in 'bench regression --case 1d'; use it with 'bench regression --case realcar' and "
-            "'bench priors --data FOLDER'.",
+            "'bench priors --data FOLDER' and 'bench realcars'.",
         ),
+        ("speed --held-out b", "--held-out has no effect in 'bench speed'; use it with 'bench realcars'."),
         (
             "priors --data here --recorded-s 40 20",
             "--recorded-s has no effect in 'bench priors --data here'; use it with 'bench priors' without --data.",

@@ -18,7 +18,7 @@ from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import LATENCY, SimulatorConfig
-from sim_backends.effects import EFFECTS
+from sim_backends.effects import CURVES, EFFECTS
 from sim_backends.registry import REGISTRY
 
 BASE = (
@@ -201,17 +201,30 @@ class Fitter:
         return huber(white, self.settings.huber_delta)
 
     def white(self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray) -> FloatArray:
-        """Whitened errors (P, S, U, 6) at coordinates z (P, n)."""
+        """Whitened errors (P, S, U, 6) at coordinates z (P, n), in batches that bound the memory."""
+        if len(z) > self.settings.max_batch_sets:
+            parts = np.array_split(z, math.ceil(len(z) / self.settings.max_batch_sets))
+            return np.concatenate([self.white(config, free, part) for part in parts])
         values = {f.name: f.value(z[:, k]) for k, f in enumerate(free)}
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
             predicted = simulate_windows(self.windows, config, values)
             white = self.scale.white(prediction_errors(predicted, self.windows))
         return np.asarray(np.nan_to_num(white, nan=1e4, posinf=1e4, neginf=-1e4).clip(-1e4, 1e4))
 
-    @staticmethod
-    def prior(free: Sequence[FitParameter], z: FloatArray) -> FloatArray:
+    def precision(self, free: Sequence[FitParameter]) -> FloatArray:
+        """Precision (n, n) of the Gaussian prior of z; measured curves have a penalty on their roughness."""
+        precision = np.diag([1.0 / f.prior_z**2 for f in free])
+        index = {f.name: k for k, f in enumerate(free)}
+        for curve in CURVES:
+            own = [index[n] for p in curve.parameters if (n := f"effects.{curve.id}.{p.name}") in index]
+            if own:
+                rows = curve.roughness() / self.settings.curve_roughness_std
+                precision[np.ix_(own, own)] += rows.T @ rows + np.eye(len(own)) / self.settings.curve_std**2
+        return precision
+
+    def prior(self, free: Sequence[FitParameter], z: FloatArray) -> FloatArray:
         """Prior loss (P,) at z (P, n)."""
-        return np.asarray(0.5 * ((z / np.array([f.prior_z for f in free])) ** 2).sum(axis=1))
+        return np.asarray(0.5 * np.einsum("pi,ij,pj->p", z, self.precision(free), z))
 
     def loss(
         self,
@@ -249,7 +262,7 @@ class Fitter:
             loss = self.loss(config)
             return Fit(config, (), z, float(loss.sum()), loss)
         free = tuple(free)
-        precision = np.diag([1.0 / f.prior_z**2 for f in free])
+        precision = self.precision(free)
         step = 0.02
         white = self.white(config, free, z[None])[0]
         cost = float(self.huber(white).sum() + self.prior(free, z[None])[0])
@@ -340,7 +353,7 @@ class Fitter:
         """Gauss-Newton matrix (n, n) with the prior, and each window's score (n, S)."""
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
         flat = jacobian.reshape(len(fit.free), -1)
-        normal = (flat * weight.reshape(-1)) @ flat.T + np.diag([1.0 / f.prior_z**2 for f in fit.free])
+        normal = (flat * weight.reshape(-1)) @ flat.T + self.precision(fit.free)
         return normal, (jacobian * (weight * white)[None]).sum(axis=(2, 3))
 
 

@@ -20,6 +20,8 @@ LABELS = {
     "nominal": "car file as given",
     "refit": "parameters refitted",
     "with_effects": "with effects",
+    "with_curves": "with measured curves",
+    "black_box": "black box",
     "constant_velocity": "constant velocity",
     "noise floor": "noise floor",
     "noise_floor": "noise floor",

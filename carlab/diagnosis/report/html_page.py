@@ -11,6 +11,7 @@ from jinja2 import Environment, StrictUndefined
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate, Exhibits
 from carlab.diagnosis.report import figures
 from carlab.diagnosis.report import sentences as text
+from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve_sentences
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import DEFAULT
 
@@ -54,6 +55,9 @@ def page_context(diagnosis: Diagnosis, exhibits: Exhibits) -> dict[str, Any]:
         "driven": bool(exhibits.traces),
         "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: DEFAULT.report.max_candidates]],
         "tried": len(exhibits.candidates),
+        "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
+        "curve_sentences": curve_sentences(diagnosis),
+        "ceiling": ceiling_sentence(diagnosis),
         "rest": rest if rest is not None and rest.share >= DEFAULT.evidence.unexplained_share_min else None,
         "rest_where": text.listed([text.CHANNEL_WORDS.get(c, c) for c in rest.channels]) if rest else "",
         "rest_regime": text.regime_words(rest.regime) if rest else "",
@@ -76,7 +80,7 @@ def _bar(e: Estimate) -> Any:
 
 def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Scores of the models, for the head of the page."""
-    order = ("nominal", "refit", "with_effects", "noise_floor")
+    order = ("nominal", "refit", "with_effects", "with_curves", "noise_floor")
     shown = [k for k in order if k in diagnosis.held_out and (k != "with_effects" or diagnosis.effects)]
     return [{"label": figures.LABELS[k], "errors": diagnosis.held_out[k], "style": k} for k in shown]
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import tomli_w
 
 from carlab.core.errors import DataError
@@ -17,6 +20,7 @@ from carlab.diagnosis.report import sentences as text
 from carlab.recording.atomic_files import write_text
 from carlab.recording.sink import describe_os_error, make_folder
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS, MeasuredCurve
 from sim_backends.registry import REGISTRY
 
 JSON_NAME, HTML_NAME, RRD_NAME, MODEL_NAME = "report.json", "report.html", "report.rrd", "model.toml"
@@ -107,7 +111,12 @@ def model_toml(diagnosis: Diagnosis, model: SimulatorConfig, noise: RecordingNoi
     tables = with_parameter_std(diagnosis, model).to_tables()
     if noise is not None:
         tables = {**tables, "recording_noise": noise.to_table()}
-    return f"{comments}\n{tomli_w.dumps(tables)}"
+    return f"{comments}\n{_compact(tomli_w.dumps(tables))}"
+
+
+def _compact(toml: str) -> str:
+    """Write each list of numbers in one line."""
+    return re.sub(r"\[\s+([^\[\]{}\"]+?),?\s+\]", lambda m: f"[{', '.join(m[1].replace(',', ' ').split())}]", toml)
 
 
 def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> SimulatorConfig:
@@ -121,7 +130,18 @@ def with_parameter_std(diagnosis: Diagnosis, model: SimulatorConfig) -> Simulato
         for name, found in estimates.items()
         if name in known and not REGISTRY[name].choices and 0.0 < found.std < math.inf and math.isfinite(known[name])
     }
-    return replace(model, parameter_std=parameter_std)
+    return replace(model, parameter_std=parameter_std | _curve_std(diagnosis, known))
+
+
+def _curve_std(diagnosis: Diagnosis, known: Mapping[str, float]) -> dict[str, float]:
+    """Standard deviations of measured curves at knots with data, by dotted name."""
+    found: dict[str, float] = {}
+    for curve in diagnosis.curves:
+        effect = EFFECTS[curve.id]
+        if isinstance(effect, MeasuredCurve):
+            own = effect.numbers_of_table(np.nan_to_num(curve.std).tolist()) or {}
+            found |= {f"effects.{curve.id}.{name}": std for name, std in own.items() if std > 0.0}
+    return {name: std for name, std in found.items() if name in known}
 
 
 def _rows(line: str) -> list[str]:

@@ -1,0 +1,54 @@
+"""``carlab bench realcars``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from carlab.cli.bench_output import command, write_figures
+from carlab.cli.bench_priors import recordings_in
+from carlab.cli.console import console, fail, progress, table
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.cli.bench_options import BenchOptions
+
+
+def run_realcars(options: BenchOptions) -> int:
+    """Diagnose the recordings to fit, and print the errors of all models on the held-out recordings."""
+    from carlab.api import diagnose
+    from carlab.cli.diagnose import EXIT_INCONCLUSIVE
+    from carlab.experiment.episodes.interrupts import Interrupts
+    from carlab.studies.real_cars import as_json, real_car_errors, split_by_name
+
+    if options.data is None:
+        raise ConfigError("bench realcars needs --data FOLDER with recordings of one car; add it.")
+    files = {path.name: path for path in recordings_in(options.data)}
+    fit, held_out = split_by_name(list(files), options.held_out, options.fit)
+    with Interrupts() as interrupts, progress() as bar:
+        row = bar.add_task("diagnosis", total=100, note="")
+        report = diagnose(
+            [files[name] for name in fit],
+            options.car,
+            held_out=[files[name] for name in held_out],
+            curves=True,
+            ceiling=True,
+            out=None if options.out is None else options.out.with_suffix(""),
+            progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
+            stop=interrupts.requested.is_set,
+        )
+    if report.outcome is None:
+        fail(report.sentence)
+        return EXIT_INCONCLUSIVE
+    errors = real_car_errors(report.outcome, [Path(name).name for name in report.held_out_names])
+    columns = ["held out", "model", "after [s]", "position rms [m]", "median [m]", "yaw rms [rad]", "windows"]
+    rows = [
+        [e.recording, e.model, f"{e.horizon_s:g}", f"{e.position_rms_m:.3f}", f"{e.position_median_m:.3f}",
+         f"{e.yaw_rms_rad:.3f}", str(e.windows)]
+        for e in errors
+    ]  # fmt: skip
+    table(f"Prediction errors, fitted to {', '.join(fit)}", columns, rows)
+    if options.out is not None:
+        write_figures(options.out, as_json(errors, command(), {"fit": fit, "held_out": held_out}))
+        console.print(f"{options.out}; the report of the diagnosis is in {options.out.with_suffix('')}.")
+    return 0

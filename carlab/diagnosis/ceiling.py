@@ -1,0 +1,22 @@
+"""The explainable ceiling: how much of the excess a black box predicts from past commands and velocities."""
+
+from __future__ import annotations
+
+from carlab.diagnosis.findings import Ceiling
+
+
+def ceiling_of(refit_score: float, model_score: float, black_box_score: float) -> Ceiling | None:
+    """Shares of the refit's squared excess by held-out scores [noise floors]; None if the refit has no excess.
+
+    The best of model and black box is the estimate of what can be explained. It is a lower bound: a larger network or
+    more recordings may predict more.
+    """
+    excess, model, black_box = (max(score**2 - 1.0, 0.0) for score in (refit_score, model_score, black_box_score))
+    if excess <= 0.0:
+        return None
+    model = min(model, excess)
+    best = min(model, black_box)
+    return Ceiling((excess - model) / excess, (model - best) / excess, best / excess)
+
+
+__all__ = ["ceiling_of"]

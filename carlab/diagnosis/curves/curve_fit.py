@@ -1,0 +1,125 @@
+"""Joint fit of measured curves, base parameters and effects; curves that unseen blocks do not need are removed."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.fit import Fit, Scale, clustered_gain
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import CATALOGUE, CURVES, EFFECTS
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class CurveFit:
+    """A fit with measured curves.
+
+    curves            ids of the curves
+    effects           effects of the catalogue in the fit
+    fit               the fit, with covariance
+    standard_errors   fall of the loss on unseen blocks, against the model with named effects only, in standard errors
+    """
+
+    curves: tuple[str, ...]
+    effects: tuple[str, ...]
+    fit: Fit
+    standard_errors: float
+
+
+def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl) -> CurveFit | None:
+    """Fit all applicable curves, remove those that unseen blocks do not need; None if none remains.
+
+    Named effects that a curve contains are omitted. The fit begins on fewer windows, to save time.
+    """
+    curves = tuple(c.id for c in CURVES if is_applicable(problem.nominal, c.id) and c.id not in problem.nominal.effects)
+    effects = _effects_with(problem, found, curves)
+    settings = problem.settings.curves
+    few = replace(problem, windows=problem.windows.thinned(settings.max_windows))
+    control.progress("fitting measured curves", 0.0)
+    fit = _fit(few, (*effects, *curves), _coordinates(found.best), settings.first_iterations, settings.last_iterations)
+    fit, curves = _eliminate(few, fit, effects, curves, control)
+    if not curves or control.stop():
+        return None
+    control.progress("fitting measured curves to all windows", 0.6)
+    effects = _effects_with(problem, found, curves)
+    fit = _fit(problem, (*effects, *curves), _coordinates(fit), settings.iterations, settings.last_iterations)
+    scale = _scale(problem, fit.config)
+    losses = [_unseen_loss(problem, each, scale) for each in (found.best, fit)]
+    gain, error = clustered_gain(losses[0], losses[1], problem.windows)
+    log.info("measured curves %s: unseen gain %.1f standard errors", ", ".join(curves), gain / error)
+    if gain < settings.accept_z_min * error:
+        return None
+    fit = problem.fitter(scale).with_covariance(fit)
+    return CurveFit(curves, effects, fit, gain / error)
+
+
+def _effects_with(problem: SearchProblem, found: SearchResult, curves: tuple[str, ...]) -> tuple[str, ...]:
+    """Accepted effects that no curve contains, and the effects that accompany every curve."""
+    accepted = [e for e in found.effects if EFFECTS[e].represented_by not in curves]
+    added = [
+        e.id for e in CATALOGUE.values() if e.fitted_with_curves and e.id not in accepted and problem.is_candidate(e.id)
+    ]
+    return (*accepted, *added)
+
+
+def _fit(problem: SearchProblem, effects: tuple[str, ...], start: dict[str, float], *iterations: int) -> Fit:
+    """Successive fits with these numbers of iterations, each with the error scale of the one before."""
+    free = problem.free_parameters(effects)
+    z = np.array([start.get(f.name, 0.0) for f in free])
+    config = problem.config_with(effects)
+    fit = None
+    for count in iterations:
+        values = {f.name: float(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
+        scale = _scale(problem, config.with_values(values))
+        fit = problem.fitter(scale).fit(config, free, z, iterations=count, tolerance=problem.settings.curves.tolerance)
+        z = fit.z
+    assert fit is not None
+    return fit
+
+
+def _eliminate(
+    problem: SearchProblem, fit: Fit, effects: tuple[str, ...], curves: tuple[str, ...], control: RunControl
+) -> tuple[Fit, tuple[str, ...]]:
+    """Remove each curve, the last one first, if the loss on unseen blocks does not rise without it."""
+    settings = problem.settings.curves
+    scale = _scale(problem, fit.config)
+    loss = _unseen_loss(problem, fit, scale)
+    for k, name in enumerate(reversed(curves)):
+        if control.stop():
+            break
+        control.progress(f"measured curves without {EFFECTS[name].class_statement}", 0.3 + 0.06 * k)
+        kept = tuple(c for c in curves if c != name)
+        without = _fit(problem, (*effects, *kept), _coordinates(fit), settings.last_iterations)
+        loss_without = _unseen_loss(problem, without, scale)
+        rise, error = clustered_gain(loss_without, loss, problem.windows)
+        log.info("without %s: the loss on unseen blocks rises by %.1f standard errors", name, rise / error)
+        if rise < settings.keep_z_min * error:
+            fit, curves, loss = without, kept, loss_without
+    return fit, curves
+
+
+def _unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
+    """Loss of each window (S,) by a fit without its block."""
+    limit = problem.settings.selection.max_unseen_error
+    return problem.fitter(scale).leave_fold_out_loss(fit, problem.folds(), limit)
+
+
+def _scale(problem: SearchProblem, config: SimulatorConfig) -> Scale:
+    windows = problem.windows
+    error: FloatArray = prediction_errors(simulate_windows(windows, config), windows)[0]
+    return Scale.of(error, problem.floor, settings=problem.settings.identification)
+
+
+def _coordinates(fit: Fit) -> dict[str, float]:
+    return {f.name: float(z) for f, z in zip(fit.free, fit.z, strict=True)}
+
+
+__all__ = ["CurveFit", "fit_curves"]

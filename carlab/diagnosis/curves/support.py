@@ -1,0 +1,100 @@
+"""What recordings say about each knot of a measured curve: driving time near it, value and standard deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.curves.curve_fit import CurveFit
+from carlab.diagnosis.findings import CurveAxis, CurveFinding
+from carlab.diagnosis.settings import CurveSettings
+from carlab.prediction.windows import Track
+from sim_backends.array_ops import ARRAYS
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import EFFECTS, Forces, MeasuredCurve
+from sim_backends.effects.curves import weights
+
+
+def curve_findings(
+    found: CurveFit, nominal: SimulatorConfig, tracks: tuple[Track, ...], settings: CurveSettings
+) -> tuple[CurveFinding, ...]:
+    """Each measured curve beside that of the car file; knots without data have no value."""
+    made = []
+    for curve_id in found.curves:
+        curve = EFFECTS[curve_id]
+        assert isinstance(curve, MeasuredCurve)
+        support_s = driving_time_s(curve, found.fit.config, tracks)
+        grid = np.meshgrid(*(np.array(axis.knots) for axis in curve.axes), indexing="ij")
+        measured = _curve(found, curve, found.fit.z, grid)
+        driven = support_s >= settings.min_support_s
+        made.append(
+            CurveFinding(
+                id=curve.id,
+                quantity=curve.quantity,
+                unit=curve.unit,
+                axes=tuple(CurveAxis(a.name, a.unit, a.knots) for a in curve.axes),
+                car_file=curve.base_curve(nominal.values(), *grid),
+                measured=np.where(driven, measured, np.nan),
+                std=np.where(driven, _std(found, curve, grid), np.nan),
+                support_s=support_s,
+            )
+        )
+    return tuple(made)
+
+
+def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, tracks: tuple[Track, ...]) -> FloatArray:
+    """Driving time [s] near each knot: each row counts with its interpolation weights."""
+    total = np.zeros([len(axis.knots) for axis in curve.axes])
+    for track in tracks:
+        coordinates = curve.coordinates(ARRAYS, recorded_forces(track, config))
+        by_axis = [
+            np.stack(np.broadcast_arrays(*weights(ARRAYS, np.asarray(x), axis.knots)))
+            for x, axis in zip(coordinates, curve.axes, strict=True)
+        ]
+        product = by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] * by_axis[1][None]
+        total += track.period_s * product.sum(axis=-1)
+    return total
+
+
+def recorded_forces(track: Track, config: SimulatorConfig) -> Forces:
+    """State, delayed commands and longitudinal force of a recording, as inputs of curves."""
+    parameters = config.parameters
+    vx, vy, yaw_rate = track.smooth[:, 3:].T
+    commands = [
+        np.roll(column, round(delay_s / track.period_s))
+        for column, delay_s in zip(track.commands.T, config.delays_s(), strict=True)
+    ]
+    angle = parameters.max_angle_rad * commands[0]
+    acceleration = np.gradient(vx, track.period_s) - vy * yaw_rate
+    zero = np.zeros_like(vx)
+    return Forces(
+        t_s=track.t_s, x=zero, y=zero, yaw=zero, vx=vx, vy=vy, yaw_rate=yaw_rate,
+        wheel_angle=angle, wheel_sin=np.sin(angle), wheel_cos=np.cos(angle), throttle=commands[1],
+        mass=parameters.mass_kg, front_axle=parameters.front_axle_m, rear_axle=parameters.rear_axle_m,
+        load_front=zero, load_rear=zero, grip_front=zero, grip_rear=zero,
+        axle_force=parameters.mass_kg * acceleration,
+    )  # fmt: skip
+
+
+def _curve(found: CurveFit, curve: MeasuredCurve, z: FloatArray, grid: Sequence[FloatArray]) -> FloatArray:
+    """The curve at its knots for coordinates z (n,) of the fit: the base model's and the deviation."""
+    values = found.fit.config.values()
+    values |= {f.name: float(f.value(np.asarray(v))) for f, v in zip(found.fit.free, z, strict=True)}
+    own = {p.name: values[f"effects.{curve.id}.{p.name}"] for p in curve.parameters}
+    return np.asarray(curve.base_curve(values, *grid) + np.array(curve.table(own)))
+
+
+def _std(found: CurveFit, curve: MeasuredCurve, grid: Sequence[FloatArray]) -> FloatArray:
+    """Standard deviations of the curve at its knots, with the covariances of base parameters and deviations."""
+    assert found.fit.covariance is not None
+    z, step = found.fit.z, 0.02
+    at_z = _curve(found, curve, z, grid)
+    moved = [_curve(found, curve, z + step * unit, grid) for unit in np.eye(len(z))]
+    jacobian = np.stack([(m - at_z) / step for m in moved]).reshape(len(z), -1)
+    variance = np.einsum("ik,ij,jk->k", jacobian, found.fit.covariance, jacobian)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(at_z.shape))
+
+
+__all__ = ["curve_findings", "driving_time_s", "recorded_forces"]

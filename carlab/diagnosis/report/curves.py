@@ -1,0 +1,123 @@
+"""Sentences and charts of measured curves, and the sentence of the explainable ceiling."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.findings import CurveFinding, Diagnosis
+from carlab.diagnosis.report.figures import Figure
+from carlab.diagnosis.report.sentences import number, percent, unit_text, with_unit
+from carlab.diagnosis.report.svg import Chart, padded
+from carlab.diagnosis.settings import DEFAULT, ReportSettings
+
+MAX_PANELS = 9
+
+
+def curve_sentences(diagnosis: Diagnosis) -> list[str]:
+    """One sentence for each measured curve, and readings of the drive force."""
+    made = []
+    for curve in diagnosis.curves:
+        made.append(_largest_difference(curve))
+        if len(curve.axes) == 2:
+            made += readings_of_drive(curve, DEFAULT.report)
+    return [sentence for sentence in made if sentence]
+
+
+def ceiling_sentence(diagnosis: Diagnosis) -> str:
+    """How much of the excess is explained, can be explained and cannot; empty without a black box."""
+    ceiling = diagnosis.ceiling
+    if ceiling is None:
+        return ""
+    return (
+        f"Of the refit's squared excess the model explains {percent(ceiling.by_model)}; a black box predicts another "
+        f"{percent(ceiling.predictable)} from past commands and velocities; {percent(ceiling.unpredictable)} is "
+        f"predicted by neither. The model explains {percent(ceiling.explained_of_predictable)} of the predictable "
+        "part."
+    )
+
+
+def _largest_difference(curve: CurveFinding) -> str:
+    """The knot with the most significant difference from the car file."""
+    difference = np.abs(curve.measured - curve.car_file) / np.maximum(curve.std, 1e-9)
+    difference[~np.isfinite(difference) | (curve.std <= 0.0)] = -1.0
+    place = np.unravel_index(int(np.argmax(difference)), difference.shape)
+    if difference[place] <= 0.0:
+        return ""
+    at = " and ".join(
+        f"a {axis.name} of {with_unit(axis.knots[k], axis.unit)}" for axis, k in zip(curve.axes, place, strict=True)
+    )
+    value, own = (with_unit(float(v[place]), curve.unit) for v in (curve.measured, curve.car_file))
+    return f"Measured curve: at {at}, the {curve.quantity} is {value}; the car file has {own}."
+
+
+def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str]:
+    """What a drive map shows: braking with released throttle, speeds that a throttle holds, saturation."""
+    throttle, speed = (np.array(axis.knots) for axis in curve.axes)
+    found = []
+    released = int(np.flatnonzero(throttle == 0.0)[0])
+    moving = (speed > 0.0) & np.isfinite(curve.measured[released])
+    braking, own = (-a[released, moving] for a in (curve.measured, curve.car_file))
+    std = curve.std[released, moving]
+    if moving.sum() >= 2 and (braking - own > settings.reading_z_min * std)[:2].all():
+        found.append(
+            f"With the throttle released, the motor brakes with {number(float(braking.min()))} to "
+            f"{number(float(braking.max()))} m/s² from {number(float(speed[moving].min()))} to "
+            f"{number(float(speed[moving].max()))} m/s (car file: {number(float(own.min()))} to "
+            f"{number(float(own.max()))} m/s²)."
+        )
+    held = [(u, v) for u, row in zip(throttle, curve.measured, strict=True) if u > 0.0 if (v := _zero(speed, row))]
+    if len(held) >= 2 and all(a[1] < b[1] for a, b in itertools.pairwise(held)):
+        pairs = ", ".join(f"{number(v)} m/s at throttle {number(u)}" for u, v in held)
+        found.append(f"The motor holds a speed rather than a force: {pairs}.")
+    high, full = curve.measured[-2], curve.measured[-1]
+    driven = (speed >= 0.0) & np.isfinite(high) & np.isfinite(full)
+    growth = (full - high)[driven]
+    expected = (curve.car_file[-1] - curve.car_file[-2])[driven]
+    if driven.sum() >= 2 and float(np.median(growth)) < settings.saturation_share * float(np.median(expected)):
+        found.append(f"Beyond a throttle of {number(float(throttle[-2]))} the drive force hardly grows: it saturates.")
+    return found
+
+
+def _zero(speed: FloatArray, row: FloatArray) -> float | None:
+    """Speed above 0 at which an acceleration falls through 0; None without a crossing between knots with data."""
+    for k in range(len(speed) - 1):
+        before, after = row[k], row[k + 1]
+        if speed[k] >= 0.0 and np.isfinite(before) and np.isfinite(after) and before > 0.0 >= after:
+            return float(speed[k] + (speed[k + 1] - speed[k]) * before / (before - after))
+    return None
+
+
+def curve_charts(curve: CurveFinding) -> list[Figure]:
+    """The measured curve with its 90 % band beside that of the car file; a map as one panel for each first knot."""
+    size = (420, 260) if len(curve.axes) == 1 else (300, 220)
+    rows = [()] if len(curve.axes) == 1 else [(k,) for k in range(len(curve.axes[0].knots))]
+    spread = 1.645 * np.nan_to_num(curve.std)
+    span = padded(
+        np.concatenate([np.ravel(v) for v in (curve.car_file, curve.measured - spread, curve.measured + spread)])
+    )
+    return [_chart(curve, row, span, size) for row in rows[:MAX_PANELS] if np.isfinite(curve.measured[row]).sum() >= 2]
+
+
+def _chart(curve: CurveFinding, row: tuple[int, ...], span: tuple[float, float], size: tuple[int, int]) -> Figure:
+    axis = curve.axes[-1]
+    x = np.array(axis.knots)
+    measured, std, own = (np.asarray(v[row]) for v in (curve.measured, curve.std, curve.car_file))
+    label = f"{curve.quantity} [{unit_text(curve.unit)}]" if curve.unit != "1" else curve.quantity
+    at = "" if not row else f"{curve.axes[0].name} {number(curve.axes[0].knots[row[0]])}"
+    unit = f" [{unit_text(axis.unit)}]" if axis.unit != "1" else ""
+    chart = Chart(f"{curve.quantity} {at}", padded(x), span, size, (f"{axis.name}{unit}", at or label))
+    chart.line(x, own, "nominal")
+    chart.line(x, measured, "with_effects")
+    for sign in (-1.645, 1.645):
+        chart.line(x, measured + sign * std, "limit")
+    chart.dots(x, measured, "with_effects")
+    without = [x[k] for k in range(len(x)) if not np.isfinite(measured[k])]
+    half = 0.5 * np.min(np.diff(x))
+    chart.spans([(v - half, v + half) for v in without], "bound")
+    return Figure(chart.render(), "")
+
+
+__all__ = ["ceiling_sentence", "curve_charts", "curve_sentences", "readings_of_drive"]

@@ -1,0 +1,312 @@
+"""Black-box predictor: an ensemble of small networks, trained on prediction windows with a multi-step loss.
+
+It has no physics, so its error shows how much of a recording can be predicted from past commands and velocities at all.
+Each network maps past commands and the body velocities of the last rows to accelerations; the loss is the error of a
+whole window (simulation error training; Forgione and Piga 2021, "Continuous-time system identification with neural
+networks: Model structures and fitting criteria").
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import ConstantVelocity
+from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+
+Progress = Callable[[str, float], None]
+Weights = tuple[torch.Tensor, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class BlackBoxSettings:
+    """Size and training of the networks. Chosen on the first two thirds of one real recording (ETH train_1)."""
+
+    n_networks: int = 3
+    """Networks of the ensemble; their mean path is the prediction."""
+    hidden_units: int = 64
+    """Units of each of the two hidden layers."""
+    past_s: float = 0.35
+    """Length [s] of the past commands: the delays and lags of small cars are below 0.2 s."""
+    velocity_rows: int = 3
+    """Rows of body velocities, the present one included: their differences show the state of servo and motor."""
+    updates: int = 3000
+    """Gradient steps: about two minutes on one core."""
+    batch_windows: int = 128
+    """Windows of a gradient step."""
+    learning_rate: float = 3e-3
+    """Initial learning rate of AdamW, with cosine decay."""
+    weight_decay: float = 1e-4
+    """Weight decay of AdamW."""
+    horizon_s: float = 1.0
+    """Length [s] of the training windows."""
+    stride_s: float = 0.1
+    """Time [s] between the starts of training windows."""
+    validation_share: float = 0.15
+    """Share of the blocks for early stopping."""
+    check_every: int = 150
+    """Updates between two checks on the validation blocks."""
+    min_duration_s: float = 60.0
+    """Minimum driving time [s] to train on: a network cannot learn a car from less."""
+    huber_delta: float = 1.0
+    """Error, over that of the constant-velocity baseline, from which the loss is linear."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlackBox:
+    """A trained ensemble; a ``PredictiveModel``.
+
+    Attributes:
+        weights: per layer, weights (E, inputs, outputs) and biases (E, 1, outputs) of E networks.
+        period_s: step of the windows.
+        past_rows: past commands that the networks use.
+        velocity_rows: rows of body velocities that the networks use.
+        input_mean, input_std: (inputs,) standardisation.
+        output_std: (3,) unit of the accelerations [m/s2, m/s2, rad/s2].
+    """
+
+    weights: Weights
+    period_s: float
+    past_rows: int
+    velocity_rows: int
+    input_mean: torch.Tensor
+    input_std: torch.Tensor
+    output_std: torch.Tensor
+
+    def predict(self, windows: PredictionWindows) -> FloatArray:
+        """Mean path (S, K + 1, 6) of the networks. Raises DataError for windows with another period."""
+        if not math.isclose(windows.period_s, self.period_s, rel_tol=0.02):
+            raise DataError(
+                f"The black box was trained at {1 / self.period_s:.1f} Hz and the windows have "
+                f"{1 / windows.period_s:.1f} Hz; train it on recordings with the same rate."
+            )
+        with torch.no_grad():
+            paths = _paths(self, _inputs(windows, self, self.input_mean.device))
+        mean = paths.mean(dim=0).double().cpu().numpy()
+        return _in_world(mean, windows)
+
+
+@dataclass(frozen=True, slots=True)
+class _Inputs:
+    """Commands (S, P + K, 2) with P past rows, velocities (S, V, 3) up to the start."""
+
+    commands: torch.Tensor
+    velocities: torch.Tensor
+
+
+def check_duration(tracks: Sequence[Track], settings: BlackBoxSettings) -> None:
+    """Raise DataError if the recordings are too short to train on."""
+    seconds = sum(track.duration_s for track in tracks)
+    if seconds < settings.min_duration_s:
+        raise DataError(
+            f"The recordings to fit contain {seconds:.0f} s of driving; a black box needs at least "
+            f"{settings.min_duration_s:.0f} s. Record more, or omit --ceiling."
+        )
+
+
+def train_black_box(
+    tracks: Sequence[Track],
+    settings: BlackBoxSettings | None = None,
+    *,
+    seed: int = 0,
+    device: str = "cpu",
+    velocity_window_s2: float = 0.0,
+    progress: Progress = lambda activity, share: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> BlackBox:
+    """Train an ensemble on the windows of tracks.
+
+    Args:
+        tracks: recordings to fit, at least ``settings.min_duration_s`` in all.
+        settings: sizes and training.
+        seed: seed of initial weights, batches and validation blocks.
+        device: torch device.
+        velocity_window_s2: variance of the velocity window, for the initial states.
+        progress: callback with the activity and the completed share in [0, 1].
+        stop: callback; if it returns true, the best networks so far are returned.
+
+    Raises:
+        DataError: too little driving.
+    """
+    settings = settings or BlackBoxSettings()
+    check_duration(tracks, settings)
+    windows = cut_windows(tracks, settings.horizon_s, settings.stride_s)
+    windows = replace(windows, velocity_window_s2=velocity_window_s2)
+    return _Training(windows, settings, seed, torch.device(device)).run(progress, stop)
+
+
+@dataclass(slots=True)
+class _Training:
+    """Training of one ensemble."""
+
+    windows: PredictionWindows
+    settings: BlackBoxSettings
+    seed: int
+    device: torch.device
+    _best: tuple[float, Weights] = field(init=False, default=(math.inf, ()))
+
+    def run(self, progress: Progress, stop: Callable[[], bool]) -> BlackBox:
+        settings, windows = self.settings, self.windows
+        generator = torch.Generator().manual_seed(self.seed)
+        model = self._initial(generator)
+        validates = _validation(windows, settings.validation_share, self.seed)
+        target = _target(windows, self.device)
+        scale = _scale(windows.take(~validates), self.device)
+        inputs = _inputs(windows, model, self.device)
+        rows = torch.from_numpy(np.flatnonzero(~validates))
+        held_rows = torch.from_numpy(np.flatnonzero(validates)).to(self.device)
+        optimiser = torch.optim.AdamW(model.weights, settings.learning_rate, weight_decay=settings.weight_decay)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.updates)
+        for update in range(settings.updates):
+            if stop():
+                break
+            if update % settings.check_every == 0:
+                self._check(model, inputs, target, scale, held_rows)
+                progress("training the black box", update / settings.updates)
+            batch = rows[torch.randint(len(rows), (settings.batch_windows,), generator=generator)].to(self.device)
+            steps = _curriculum(update / settings.updates, windows.steps)
+            loss = self._loss(model, inputs, target, scale, batch, steps).mean()
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(model.weights, 1.0)
+            optimiser.step()
+            schedule.step()
+        self._check(model, inputs, target, scale, held_rows)
+        return replace(model, weights=self._best[1])
+
+    def _initial(self, generator: torch.Generator) -> BlackBox:
+        settings, windows = self.settings, self.windows
+        past = min(max(round(settings.past_s / windows.period_s), 1), windows.past_commands.shape[1])
+        n_inputs = 3 * settings.velocity_rows + 2 * (past + 1)
+        sizes = (n_inputs, settings.hidden_units, settings.hidden_units, 3)
+        weights: list[torch.Tensor] = []
+        for layer, (before, after) in enumerate(itertools.pairwise(sizes)):
+            gain = 0.1 if layer == 2 else 1.0
+            drawn = torch.randn(settings.n_networks, before, after, generator=generator) * gain / math.sqrt(before)
+            zeros = torch.zeros(settings.n_networks, 1, after)
+            weights += [drawn.to(self.device).requires_grad_(), zeros.to(self.device).requires_grad_()]
+        velocities = windows.measured[..., 3:].reshape(-1, 3)
+        commands = windows.commands.reshape(-1, 2)
+        repeats = ((velocities, settings.velocity_rows), (commands, past + 1))
+        input_mean = np.concatenate([np.tile(a.mean(axis=0), n) for a, n in repeats])
+        input_std = np.concatenate([np.tile(np.maximum(a.std(axis=0), 1e-3), n) for a, n in repeats])
+        rate = np.diff(windows.measured[..., 3:], axis=1) / windows.period_s
+        unit = np.maximum(1.4826 * np.median(np.abs(rate), axis=(0, 1)), 1e-2)
+        mean, std, output = (torch.from_numpy(v).float().to(self.device) for v in (input_mean, input_std, unit))
+        return BlackBox(tuple(weights), windows.period_s, past, settings.velocity_rows, mean, std, output)
+
+    def _loss(
+        self,
+        model: BlackBox,
+        inputs: _Inputs,
+        target: torch.Tensor,
+        scale: torch.Tensor,
+        rows: torch.Tensor,
+        steps: int,
+    ) -> torch.Tensor:
+        """Huber loss (E,) over the first ``steps`` steps of windows."""
+        count = inputs.commands.shape[1] - target.shape[1] + 1 + steps
+        chosen = _Inputs(inputs.commands[rows, :count], inputs.velocities[rows])
+        white = (_paths(model, chosen)[:, :, 1:] - target[rows, 1 : steps + 1]) / scale[1 : steps + 1]
+        delta = self.settings.huber_delta
+        size = white.abs()
+        loss = torch.where(size <= delta, 0.5 * white**2, delta * size - 0.5 * delta**2)
+        return loss.mean(dim=(1, 2, 3))
+
+    def _check(
+        self, model: BlackBox, inputs: _Inputs, target: torch.Tensor, scale: torch.Tensor, rows: torch.Tensor
+    ) -> None:
+        """Keep the weights with the smallest loss on the validation blocks."""
+        with torch.no_grad():
+            loss = float(self._loss(model, inputs, target, scale, rows, target.shape[1] - 1).mean())
+        if loss < self._best[0]:
+            self._best = (loss, tuple(w.detach().clone() for w in model.weights))
+
+
+def _curriculum(share: float, steps: int) -> int:
+    """Steps of the training windows: a third at first, all of them from half of the training on."""
+    return min(steps, max(2, round(steps * (1.0 / 3.0 + 4.0 / 3.0 * share))))
+
+
+def _paths(model: BlackBox, inputs: _Inputs) -> torch.Tensor:
+    """Paths (E, S, K + 1, 6) of each network from the origin; K is the number of commands after the past ones."""
+    networks = model.weights[0].shape[0]
+    velocities = inputs.velocities.expand(networks, -1, -1, -1)
+    now = velocities[:, :, -1]
+    recent = [velocities[:, :, k] for k in range(velocities.shape[2])]
+    commands = inputs.commands.expand(networks, -1, -1, -1)
+    pose = torch.zeros_like(now)
+    path = [torch.cat([pose, now], dim=-1)]
+    step_s = model.period_s
+    for k in range(commands.shape[2] - model.past_rows):
+        past = commands[:, :, k : k + model.past_rows + 1].flatten(2)
+        features = (torch.cat([*recent, past], dim=-1) - model.input_mean) / model.input_std
+        after = now + step_s * model.output_std * _network(model.weights, features)
+        mean = 0.5 * (now + after)
+        yaw = pose[..., 2] + 0.5 * step_s * mean[..., 2]
+        cos, sin = torch.cos(yaw), torch.sin(yaw)
+        rate = torch.stack([cos * mean[..., 0] - sin * mean[..., 1], sin * mean[..., 0] + cos * mean[..., 1]], dim=-1)
+        pose = pose + step_s * torch.cat([rate, mean[..., 2:]], dim=-1)
+        now = after
+        recent = [*recent[1:], now]
+        path.append(torch.cat([pose, now], dim=-1))
+    return torch.stack(path, dim=2)
+
+
+def _network(weights: Weights, features: torch.Tensor) -> torch.Tensor:
+    for k in range(0, len(weights) - 2, 2):
+        features = torch.tanh(torch.baddbmm(weights[k + 1], features, weights[k]))
+    return torch.baddbmm(weights[-1], features, weights[-2])
+
+
+def _inputs(windows: PredictionWindows, model: BlackBox, device: torch.device) -> _Inputs:
+    past = windows.past_commands[:, windows.past_commands.shape[1] - model.past_rows :]
+    commands = np.concatenate([past, windows.commands], axis=1)
+    before = windows.past_states[:, windows.past_states.shape[1] - model.velocity_rows + 1 :, 3:]
+    velocities = np.concatenate([before, windows.initial_states[:, None, 3:]], axis=1)
+    return _Inputs(*(torch.from_numpy(v).float().to(device) for v in (commands, velocities)))
+
+
+def _target(windows: PredictionWindows, device: torch.device) -> torch.Tensor:
+    """Measured path (S, K + 1, 6) with the pose in the frame of the initial pose."""
+    zero = np.zeros_like(windows.measured)
+    zero[..., :3] = windows.initial_states[:, None, :3]
+    path = -prediction_errors(zero, windows)
+    return torch.from_numpy(path).float().to(device)
+
+
+def _scale(windows: PredictionWindows, device: torch.device) -> torch.Tensor:
+    """Median error (K + 1, 6) of the constant-velocity baseline, at least a tenth of that of its last step."""
+    error = np.abs(prediction_errors(ConstantVelocity().predict(windows), windows))
+    spread = 1.4826 * np.median(error, axis=0)
+    return torch.from_numpy(np.maximum(spread, np.maximum(0.1 * spread[-1], 1e-4))).float().to(device)
+
+
+def _validation(windows: PredictionWindows, share: float, seed: int) -> np.ndarray:
+    """Windows (S,) in randomly chosen blocks; at least one block."""
+    blocks = np.unique(windows.block)
+    count = max(round(share * len(blocks)), 1)
+    chosen = np.random.default_rng(seed).permutation(blocks)[:count]
+    return np.isin(windows.block, chosen)
+
+
+def _in_world(path: FloatArray, windows: PredictionWindows) -> FloatArray:
+    """Paths (S, K + 1, 6) from the origin, moved to the initial poses of the windows."""
+    x, y, yaw = (windows.initial_states[:, k, None] for k in range(3))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    out = path.copy()
+    out[..., 0] = x + cos * path[..., 0] - sin * path[..., 1]
+    out[..., 1] = y + sin * path[..., 0] + cos * path[..., 1]
+    out[..., 2] = yaw + path[..., 2]
+    return out
+
+
+__all__ = ["BlackBox", "BlackBoxSettings", "check_duration", "train_black_box"]

@@ -1,0 +1,213 @@
+"""Measured curves of a car with a motor controller that is not in the catalogue, and their report."""
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from carlab.cars import load_car_file
+from carlab.diagnosis.curves.curve_fit import fit_curves
+from carlab.diagnosis.curves.support import curve_findings, driving_time_s
+from carlab.diagnosis.diagnose import diagnose
+from carlab.diagnosis.evidence import Texts
+from carlab.diagnosis.findings import CurveAxis, CurveFinding
+from carlab.diagnosis.identification.fit import Fitter, Scale
+from carlab.diagnosis.report.curves import curve_sentences, readings_of_drive
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.report.write import write_report
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem
+from carlab.diagnosis.settings import DEFAULT, CurveSettings
+from carlab.prediction.windows import cut_windows, tracks_of
+from sim_backends import EFFECTS, SimulatorConfig, registered
+from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter, confusable_effects
+from tests.helpers.recorded_drives import PERIOD_S, drive
+
+CAR = SimulatorConfig(control_period_s=PERIOD_S)
+GAIN, TOP_SPEED, LIMIT = 4.0, 3.0, 4.0
+SETTINGS = replace(
+    DEFAULT,
+    curves=CurveSettings(max_windows=60, first_iterations=8, iterations=2, last_iterations=2),
+    windows=replace(DEFAULT.windows, max_fit_windows=80),
+)
+
+
+def controller_acceleration(throttle, speed):
+    """A controller that holds the speed 3 m/s times throttle, with at most 4 m/s2."""
+    return np.clip(GAIN * (TOP_SPEED * np.asarray(throttle) - np.asarray(speed)), -LIMIT, LIMIT)
+
+
+class SpeedController(DynamicsEffect):
+    """``F_x = m clip(4 /s (3 m/s u - vx), -4 m/s2, 4 m/s2)``, with the strength 1."""
+
+    id = "speed_controller"
+    catalogued = False
+    summary = "The motor controller holds a speed."
+    class_statement = "holds a speed"
+    parameters = (EffectParameter("strength", "1", 0.0, 0.0, 1.0, 1.0),)
+
+    def on_drive(self, ops, forces, values):
+        held = ops.clip(GAIN * (TOP_SPEED * forces.throttle - forces.vx), -LIMIT, LIMIT)
+        damped = forces.mass * held + 1.56 * forces.vx  # the base model subtracts its damping
+        forces.drive = forces.drive + values["strength"] * (damped - forces.drive)
+
+
+@pytest.fixture(scope="module")
+def drives():
+    with registered(SpeedController()):
+        config = replace(CAR, effects={"speed_controller": {"strength": 1.0}})
+        return drive(config, 70.0, 1), drive(config, 25.0, 2)
+
+
+@pytest.fixture(scope="module")
+def outcome(drives):
+    fit, held_out = drives
+    texts = Texts(effect_sentence, separating_drive, confusable_effects())
+    return diagnose([fit], [held_out], CAR, texts, effects=("steering_lag",), settings=SETTINGS, curves=True)
+
+
+def test_measured_curves_lower_the_held_out_error(outcome):
+    held_out = outcome.diagnosis.held_out
+    assert held_out["with_curves"].position_m < 0.35 * held_out["with_effects"].position_m
+    assert held_out["with_curves"].score < 0.35 * held_out["with_effects"].score
+    assert "drive_map" in [curve.id for curve in outcome.diagnosis.curves]
+
+
+def test_drive_map_agrees_with_the_controller_where_it_is_supported(outcome):
+    curve = next(c for c in outcome.diagnosis.curves if c.id == "drive_map")
+    throttle, speed = np.meshgrid(*(a.knots for a in curve.axes), indexing="ij")
+    expected = controller_acceleration(throttle, speed)
+    supported = curve.support_s > 2.0
+    error = np.abs(curve.measured - expected)[supported]
+    assert supported.sum() >= 12
+    assert np.median(error) < 0.35
+    assert np.median(np.abs(curve.car_file - expected)[supported]) > 3.0 * np.median(error)
+
+
+def test_curves_end_where_the_recordings_end(outcome, drives):
+    curve = next(c for c in outcome.diagnosis.curves if c.id == "drive_map")
+    never = np.array(curve.axes[0].knots) <= -0.6  # no drive brakes harder than -0.3
+    assert np.isnan(curve.measured[never]).all()
+    assert np.isnan(curve.std[never]).all()
+    seconds = len(drives[0].times_s) * PERIOD_S
+    assert curve.support_s.sum() == pytest.approx(seconds, rel=0.01)
+
+
+def test_report_and_model_file_contain_the_curves(outcome, tmp_path):
+    write_report(outcome.diagnosis, outcome.exhibits, tmp_path, outcome.model)
+    report = json.loads((tmp_path / "report.json").read_text())
+    table = next(c for c in report["curves"] if c["id"] == "drive_map")
+    assert np.shape(table["measured"]) == tuple(len(axis["knots"]) for axis in table["axes"])
+    assert None in itertools.chain(*table["measured"])
+    page = (tmp_path / "report.html").read_text()
+    assert "Measured curves" in page
+    assert "The motor holds a speed rather than a force" in page
+    model = load_car_file(tmp_path / "model.toml").simulator
+    assert model.values() == pytest.approx(outcome.model.values())
+    assert any(name.startswith("effects.drive_map.") for name in model.parameter_std)
+
+
+def test_car_without_missing_physics_has_no_measured_curves():
+    fit = drive(CAR, 40.0, 5)
+    windows = cut_windows(tracks_of([fit]), 0.8, 0.3).thinned(30)
+    problem = SearchProblem(CAR, windows, np.full(6, 2e-3), {}, (), SETTINGS)
+    from carlab.diagnosis.selection.search import search
+
+    assert fit_curves(problem, search(problem, RunControl()), RunControl()) is None
+
+
+def test_penalty_of_a_curve_is_that_of_its_roughness():
+    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    problem = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ())
+    free = problem.free_parameters(("front_tyre_curve",))
+    fitter = Fitter(windows, Scale(np.array([1]), np.ones((1, 6))))
+    z = np.zeros((1, len(free)))
+    own = [k for k, f in enumerate(free) if f.name.startswith("effects.front_tyre_curve.")]
+    z[0, own] = np.random.default_rng(0).normal(size=len(own))
+    settings = DEFAULT.identification
+    bends = EFFECTS["front_tyre_curve"].roughness() @ z[0, own]
+    expected = 0.5 * (bends**2).sum() / settings.curve_roughness_std**2
+    expected += 0.5 * (z[0, own] ** 2).sum() / settings.curve_std**2
+    assert fitter.prior(free, z)[0] == pytest.approx(expected)
+
+
+def test_driving_time_counts_rows_near_each_knot():
+    curve = next(c for c in CURVES if c.id == "steering_curve")
+    episode = drive(CAR, 10.0, 4)
+    tracks = tuple(tracks_of([episode]))
+    total = driving_time_s(curve, replace(CAR, command_delay_s=0.0), tracks)
+    angle = CAR.parameters.max_angle_rad * np.concatenate([t.commands[:, 0] for t in tracks])
+    knots = np.array(curve.axes[0].knots)
+    expected = [np.interp(angle, knots, np.eye(len(knots))[k]).sum() * PERIOD_S for k in range(len(knots))]
+    assert total == pytest.approx(np.array(expected))
+
+
+def finding(measured, std=0.05):
+    """A drive map of the given accelerations on the knots of the simulator, with a car file that only accelerates."""
+    axes = tuple(CurveAxis(a.name, a.unit, a.knots) for a in EFFECTS["drive_map"].axes)
+    throttle, speed = np.meshgrid(*(a.knots for a in axes), indexing="ij")
+    shape = measured.shape
+    return CurveFinding(
+        "drive_map", "acceleration by the motor", "m/s2", axes, 5.0 * throttle - speed, measured,
+        np.full(shape, std), np.full(shape, 5.0),
+    )  # fmt: skip
+
+
+def test_readings_of_a_controller_that_holds_a_speed():
+    axes = EFFECTS["drive_map"].axes
+    throttle, speed = np.meshgrid(*(a.knots for a in axes), indexing="ij")
+    sentences = readings_of_drive(finding(controller_acceleration(throttle, speed)), DEFAULT.report)
+    assert any("With the throttle released, the motor brakes with 2 to 4 m/s²" in s for s in sentences)
+    assert any("0.3 m/s at throttle 0.1" in s for s in sentences)
+    assert any("saturates" in s for s in sentences)
+
+
+def test_readings_of_the_car_file_itself_are_empty(outcome):
+    axes = EFFECTS["drive_map"].axes
+    throttle, speed = np.meshgrid(*(a.knots for a in axes), indexing="ij")
+    same = finding(5.0 * throttle - speed)
+    held = [s for s in readings_of_drive(same, DEFAULT.report) if "brakes" in s or "saturates" in s]
+    assert held == []
+    assert curve_sentences(replace(outcome.diagnosis, curves=())) == []
+
+
+@pytest.mark.parametrize("curve", CURVES, ids=lambda c: c.id)
+def test_curve_findings_of_the_car_file_equal_its_curve(curve):
+    """Without deviations, the measured curve is the base model's."""
+    from carlab.diagnosis.curves.curve_fit import CurveFit
+    from carlab.diagnosis.identification.fit import Fit
+
+    config = replace(CAR, effects={curve.id: {}})
+    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    free = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ()).free_parameters((curve.id,))
+    fit = Fit(config, free, np.zeros(len(free)), 0.0, np.zeros(1), np.eye(len(free)))
+    found = curve_findings(
+        CurveFit((curve.id,), (), fit, 5.0), CAR, tuple(tracks_of([drive(CAR, 30.0, 7)])), DEFAULT.curves
+    )
+    seen = np.isfinite(found[0].measured)
+    assert seen.any()
+    assert found[0].measured[seen] == pytest.approx(found[0].car_file[seen])
+
+
+def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
+    """The band of ``gain u / m + a`` with opposite errors of gain and deviation is narrower than either."""
+    from carlab.diagnosis.curves.curve_fit import CurveFit
+    from carlab.diagnosis.identification.fit import Fit
+
+    config = replace(CAR, effects={"drive_map": {}})
+    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    free = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ()).free_parameters(("drive_map",))
+    names = [f.name for f in free]
+    gain, knot = names.index("motor.drive_gain"), names.index("effects.drive_map.value_8_2")  # throttle 1
+    covariance = np.zeros((len(free), len(free)))
+    slope = 0.1 * CAR.parameters.drive_gain_n / CAR.parameters.mass_kg  # change of the curve per unit of z
+    covariance[gain, gain], covariance[knot, knot] = 1.0, slope**2
+    covariance[gain, knot] = covariance[knot, gain] = -0.9 * slope
+    fit = Fit(config, free, np.zeros(len(free)), 0.0, np.zeros(1), covariance)
+    tracks = tuple(tracks_of([drive(CAR, 60.0, 7)]))
+    settings = replace(DEFAULT.curves, min_support_s=0.0)
+    found = curve_findings(CurveFit(("drive_map",), (), fit, 5.0), CAR, tracks, settings)[0]
+    assert found.std[8, 2] == pytest.approx(slope * np.sqrt(2.0 - 1.8), rel=0.02)
+    assert found.std[8, 3] == pytest.approx(slope, rel=0.02)
+    assert found.std[4, 3] == pytest.approx(0.0, abs=1e-9)  # no throttle
