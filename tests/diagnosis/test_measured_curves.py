@@ -211,3 +211,11 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     assert found.std[8, 2] == pytest.approx(slope * np.sqrt(2.0 - 1.8), rel=0.02)
     assert found.std[8, 3] == pytest.approx(slope, rel=0.02)
     assert found.std[4, 3] == pytest.approx(0.0, abs=1e-9)  # no throttle
+
+
+def test_verdict_states_the_error_with_measured_curves(outcome):
+    from carlab.diagnosis.report.sentences import number, verdict_sentence
+
+    found = outcome.diagnosis.held_out["with_curves"]
+    assert f"the held-out error is {number(found.score)} noise floors" in verdict_sentence(outcome.diagnosis)
+    assert "measured curve" not in verdict_sentence(replace(outcome.diagnosis, curves=()))

@@ -211,13 +211,22 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "unexplained": _unexplained,
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
-    return f"{made(diagnosis)}{_worse_than_constant_velocity(diagnosis)}"
+    return f"{made(diagnosis)}{_with_curves(diagnosis)}{_worse_than_constant_velocity(diagnosis)}"
+
+
+def _with_curves(diagnosis: Diagnosis) -> str:
+    """The held-out error with measured curves; empty without curves."""
+    if not diagnosis.curves or "with_curves" not in diagnosis.held_out:
+        return ""
+    found = diagnosis.held_out["with_curves"]
+    curves = f"{len(diagnosis.curves)} measured curves" if len(diagnosis.curves) > 1 else "a measured curve"
+    return f" With {curves}, the held-out error is {number(found.score)} noise floors ({with_unit(found.position_m, 'm')})."
 
 
 def _worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
     """A warning if constant velocity predicts the held-out recordings better than every simulator; else empty."""
     held = diagnosis.held_out
-    ours = [held[name].score for name in ("nominal", "refit", "with_effects") if name in held]
+    ours = [held[name].score for name in ("nominal", "refit", "with_effects", "with_curves") if name in held]
     if not ours or "constant_velocity" not in held or held["constant_velocity"].score >= min(ours):
         return ""
     return (
