@@ -220,7 +220,8 @@ def _with_curves(diagnosis: Diagnosis) -> str:
         return ""
     found = diagnosis.held_out["with_curves"]
     curves = f"{len(diagnosis.curves)} measured curves" if len(diagnosis.curves) > 1 else "a measured curve"
-    return f" With {curves}, the held-out error is {number(found.score)} noise floors ({with_unit(found.position_m, 'm')})."
+    position = with_unit(found.position_m, "m")
+    return f" With {curves}, the held-out error is {number(found.score)} noise floors ({position})."
 
 
 def _worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
