@@ -13,7 +13,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.ceiling import ceiling_of
 from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
-from carlab.diagnosis.curves.support import curve_findings
+from carlab.diagnosis.curves.support import curve_findings, without_extrapolation
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.evidence import (
     ScoredSearch,
@@ -210,7 +210,7 @@ def _assemble_result(
         error = scored.errors["with_effects"]
         unexplained, model = describe_unexplained(scored.problem, naming, share, error, held_out)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
-    measured = _measured_curves(scored, share, request, control)
+    measured = _measured_curves(scored, share, recordings, request, control)
     models = _models(scored, measured, recordings, request, control)
     model = model if measured is None else measured.fit.config
     progress("preparing the report", 0.95)
@@ -238,12 +238,14 @@ def _assemble_result(
 
 
 def _measured_curves(
-    scored: ScoredSearch, unexplained: float, request: Request, control: RunControl
+    scored: ScoredSearch, unexplained: float, recordings: SplitRecordings, request: Request, control: RunControl
 ) -> CurveFit | None:
     """Measured curves if they are wanted, and named effects leave a residual that a curve may explain."""
-    if not request.curves or unexplained < request.settings.curves.min_unexplained_share or control.stop():
+    settings = request.settings.curves
+    if not request.curves or unexplained < settings.min_unexplained_share or control.stop():
         return None
-    return fit_curves(scored.problem, scored.found, control)
+    found = fit_curves(scored.problem, scored.found, control)
+    return None if found is None else without_extrapolation(found, recordings.fit_tracks, settings)
 
 
 def _models(

@@ -96,20 +96,20 @@ class CurveSettings:
     min_unexplained_share: float = 0.1
     """Share of the refit's squared excess that named effects must leave, so that curves are fitted."""
     max_windows: int = 200
-    """Number of windows of the first fit and of the removal of curves; the last fit uses all windows."""
+    """Windows of the first fit and of the removal of curves; the last fit uses all."""
     first_iterations: int = 10
     iterations: int = 4
-    """Iterations of the first fit, and of the last fit, which begins at the first."""
     last_iterations: int = 3
-    """Iterations with the updated error scale, and of a fit without one curve."""
-    tolerance: float = 1e-3
-    """Relative fall of the cost at which a fit ends."""
+    """Iterations of the first fit, of the last fit, and with the updated error scale or without one curve."""
+    tolerance: float = 1e-3  # relative fall of the cost at which a fit ends
     keep_z_min: float = 0.0
     """Minimum rise of the loss on unseen blocks without a curve that is kept [standard errors]; 2 is worse on ETH."""
     accept_z_min: float = 3.0
     """Minimum fall of the loss on unseen blocks with all curves [standard errors]."""
     min_support_s: float = 0.5
-    """Minimum driving time [s] near a knot; without it the curve ends there."""
+    """Minimum driving time [s] near a knot; without it the curve ends there in the report."""
+    min_fitted_s: float = 0.05
+    """The same for a knot whose fitted deviation is used; others have that of the nearest such knot."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,6 +94,19 @@ def test_curves_end_where_the_recordings_end(outcome, drives):
     assert curve.support_s.sum() == pytest.approx(seconds, rel=0.01)
 
 
+def test_model_does_not_extrapolate_beyond_the_recordings(outcome):
+    """Knots without data have the deviation of the nearest knot with data."""
+    curve = next(c for c in outcome.diagnosis.curves if c.id == "drive_map")
+    effect, values = EFFECTS["drive_map"], outcome.model.values()
+    deviations = np.array(effect.table({p.name: values[f"effects.drive_map.{p.name}"] for p in effect.parameters}))
+    driven = curve.support_s >= SETTINGS.curves.min_fitted_s
+    assert (~driven).sum() > 10
+    for place in np.argwhere(~driven):
+        distance = np.linalg.norm(np.argwhere(driven) - place, axis=1)
+        nearest = np.argwhere(driven)[distance <= distance.min() + 1e-9]
+        assert any(deviations[tuple(place)] == pytest.approx(deviations[tuple(k)]) for k in nearest)
+
+
 def test_report_and_model_file_contain_the_curves(outcome, tmp_path):
     write_report(outcome.diagnosis, outcome.exhibits, tmp_path, outcome.model)
     report = json.loads((tmp_path / "report.json").read_text())

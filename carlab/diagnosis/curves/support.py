@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_fit import CurveFit
@@ -42,6 +44,24 @@ def curve_findings(
             )
         )
     return tuple(made)
+
+
+def without_extrapolation(found: CurveFit, tracks: tuple[Track, ...], settings: CurveSettings) -> CurveFit:
+    """Give knots without any data the deviation of the nearest knot with data; the penalty alone would extrapolate."""
+    changes: dict[str, float] = {}
+    for curve_id in found.curves:
+        curve = EFFECTS[curve_id]
+        assert isinstance(curve, MeasuredCurve)
+        driven = driving_time_s(curve, found.fit.config, tracks) >= settings.min_fitted_s
+        values = found.fit.config.values()
+        table = np.array(curve.table({p.name: values[f"effects.{curve.id}.{p.name}"] for p in curve.parameters}))
+        if driven.any():
+            nearest = distance_transform_edt(~driven, return_distances=False, return_indices=True)
+            own = curve.numbers_of_table(table[tuple(nearest)].tolist()) or {}
+            changes |= {f"effects.{curve.id}.{name}": value for name, value in own.items()}
+    fit = found.fit
+    z = [f.coordinate(changes[f.name]) if f.name in changes else z for f, z in zip(fit.free, fit.z, strict=True)]
+    return replace(found, fit=replace(fit, config=fit.config.with_values(changes), z=np.array(z)))
 
 
 def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, tracks: tuple[Track, ...]) -> FloatArray:
@@ -97,4 +117,4 @@ def _std(found: CurveFit, curve: MeasuredCurve, grid: Sequence[FloatArray]) -> F
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(at_z.shape))
 
 
-__all__ = ["curve_findings", "driving_time_s", "recorded_forces"]
+__all__ = ["curve_findings", "driving_time_s", "recorded_forces", "without_extrapolation"]
