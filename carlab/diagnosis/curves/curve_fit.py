@@ -25,7 +25,7 @@ class CurveFit:
     curves            ids of the curves
     effects           effects of the catalogue in the fit
     fit               the fit, with covariance
-    standard_errors   fall of the loss on unseen blocks, against the model with named effects only, in standard errors
+    standard_errors   fall of the loss on unseen blocks, against the same model without curves, in standard errors
     """
 
     curves: tuple[str, ...]
@@ -52,7 +52,9 @@ def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl)
     effects = _effects_with(problem, found, curves)
     fit = _fit(problem, (*effects, *curves), _coordinates(fit), settings.iterations, settings.last_iterations)
     scale = _scale(problem, fit.config)
-    losses = [_unseen_loss(problem, each, scale) for each in (found.best, fit)]
+    named = _effects_with(problem, found, ())
+    reference = _fit(problem, named, _coordinates(found.best), settings.first_iterations, settings.last_iterations)
+    losses = [_unseen_loss(problem, each, scale) for each in (reference, fit)]
     gain, error = clustered_gain(losses[0], losses[1], problem.windows)
     log.info("measured curves %s: unseen gain %.1f standard errors", ", ".join(curves), gain / error)
     if gain < settings.accept_z_min * error:
