@@ -1,0 +1,51 @@
+"""Settings of the diagnosis: thresholds and search parameters of all stages, with meaning, unit and reason.
+
+"Development cases" are the concealed cases of ``carlab prove --set development``; figures of the test set were never
+used to choose a setting. ``carlab prove --set development --calibrate`` sweeps the
+thresholds that accept or reject effects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from carlab.diagnosis.settings.evidence import EvidenceSettings, UnexplainedSettings
+from carlab.diagnosis.settings.prediction import CurveSettings, IdentificationSettings, WindowSettings
+from carlab.diagnosis.settings.quick import QuickSettings
+from carlab.diagnosis.settings.report import ReportSettings
+from carlab.diagnosis.settings.selection import RivalSettings, ScreeningSettings, SelectionSettings
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisSettings:
+    """All settings of a diagnosis, by stage."""
+
+    windows: WindowSettings = field(default_factory=WindowSettings)
+    identification: IdentificationSettings = field(default_factory=IdentificationSettings)
+    curves: CurveSettings = field(default_factory=CurveSettings)
+    screening: ScreeningSettings = field(default_factory=ScreeningSettings)
+    selection: SelectionSettings = field(default_factory=SelectionSettings)
+    rivals: RivalSettings = field(default_factory=RivalSettings)
+    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
+    unexplained: UnexplainedSettings = field(default_factory=UnexplainedSettings)
+    quick: QuickSettings = field(default_factory=QuickSettings)
+    report: ReportSettings = field(default_factory=ReportSettings)
+
+
+DEFAULT = DiagnosisSettings()
+"""The settings of ``carlab diagnose`` and of the proof."""
+
+__all__ = [
+    "DEFAULT",
+    "CurveSettings",
+    "DiagnosisSettings",
+    "EvidenceSettings",
+    "IdentificationSettings",
+    "QuickSettings",
+    "ReportSettings",
+    "RivalSettings",
+    "ScreeningSettings",
+    "SelectionSettings",
+    "UnexplainedSettings",
+    "WindowSettings",
+]

@@ -1,0 +1,69 @@
+"""Settings of the evidence, the verdict and the unexplained residual."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceSettings:
+    """Intervals, confidence, the verdict."""
+
+    parameter_z_min: float = 4.0
+    """First condition of the verdict "parameters": minimum gain of the refit [standard errors]."""
+    parameter_gain_share: float = 0.05
+    """Second condition: minimum gain of the refit, as a share of the nominal loss."""
+    parameter_score_ratio: float = 0.98
+    """Third condition: maximum held-out score of the refit, as a share of the nominal score."""
+    interval_z: float = 1.6449
+    """Quantile of the normal distribution for 90 % intervals."""
+    interval_factor: float = 1.25
+    """Factor on the width of intervals of the sandwich covariance, which covered 79 % on development cases."""
+    min_relative_std: float = 0.01
+    """Minimum half width of an interval over ``interval_z``, as a share of the value: allows for model error."""
+    unexplained_score_min: float = 1.2
+    """Refit score (noise floors) above which unnamed terms count as missing physics. Chosen on development cases."""
+    unexplained_score_min_without_term: float = 1.8
+    """The same if no unnamed term is significant."""
+    confidence_half: float = 8.0
+    """Square root of chi2 at which half of the effects are correct: logistic regression on development cases."""
+    confidence_slope: float = 5.0
+    """Slope of that regression in the logarithm of the root."""
+    min_explained_excess: float = 0.05
+    """Squared excess of the refit below which the unexplained share is 0."""
+    unexplained_share_min: float = 0.1
+    """Minimum unexplained share of the squared excess that is reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnexplainedSettings:
+    """Unnamed terms, the worst regime, and vibration."""
+
+    max_terms: int = 3
+    """Maximum number of terms of the formula."""
+    term_chi2_min: float = 28.0
+    """Minimum chi2 of a term; about 400 terms are compared."""
+    next_term_share: float = 0.12
+    """Minimum gain of an additional term, as a share of the first term's gain."""
+    simplest_gain_share: float = 0.97
+    """The simplest of the terms with at least this share of the best gain is chosen."""
+    impulses: int = 8
+    """Number of impulses along a window for the response to an acceleration."""
+    impulse_sizes: tuple[float, float, float] = (0.02, 0.02, 0.1)
+    """Size of an impulse on vx, vy [m/s] and yaw rate [rad/s]: small enough for a linear response."""
+    regime_quantile: float = 2 / 3
+    """A regime is the range of a feature above this quantile."""
+    regime_ratio_min: float = 1.3
+    """Minimum ratio of the errors in a regime to those outside."""
+    regime_windows_min: int = 5
+    """Minimum number of windows in a regime and outside it."""
+    vibration_ratio_min: float = 4.5
+    """Minimum power of a line over the mean power; development recordings without vibration stay below 3.2."""
+    vibration_p_max: float = 1e-15
+    """Maximum p-value of that power; matters for short recordings."""
+    vibration_block_s: float = 4.0
+    """Length [s] of blocks whose power spectra are added."""
+    vibration_speed_min_mps: float = 0.3
+    """Minimum mean speed [m/s] of a block."""
+    vibration_max_z: float = 4.0
+    """Residuals are clipped here [robust standard deviations]."""

@@ -1,0 +1,107 @@
+"""Settings of the split into windows and of the fit of a simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSettings:
+    """How recordings are split and cut into prediction windows."""
+
+    fit_window_s: float = 0.8
+    """Length [s] of a window to fit: long enough for lags to show, short enough for errors to stay linear."""
+    fit_stride_s: float = 0.3
+    """Time [s] between the starts of windows to fit."""
+    held_out_window_s: float = 1.0
+    """Horizon [s] of held-out errors and of the score, as report.json states it."""
+    held_out_stride_s: float = 0.25
+    """Time [s] between the starts of held-out windows."""
+    max_fit_windows: int = 600
+    """Maximum number of windows to fit, thinned evenly; bounds the time of a diagnosis."""
+    max_held_out_windows: int = 1200
+    """Maximum number of held-out windows, thinned evenly."""
+    min_fit_s: float = 8.0
+    """Minimum driving time [s] to fit; shorter recordings are inconclusive. Chosen on development cases."""
+    default_held_out_share: float = 0.3
+    """Last share of each recording that is held out if no recordings are given as held out."""
+    max_held_out_share: float = 0.5
+    """Maximum held-out share."""
+    split_guard_s: float = 0.5
+    """Gap [s], in addition to one horizon, between the part to fit and the held-out part (history of commands)."""
+    unusable_share: float = 0.5
+    """The verdict is "data" if faults leave less than this share of the driving usable."""
+    min_speed_mps: float = 0.2
+    """The 90 % quantile of the speed [m/s] must reach this for a verdict."""
+    min_command_std: float = 0.01
+    """A command with a lower standard deviation counts as constant."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdentificationSettings:
+    """Fit of a simulator to windows, noise of the recordings, and the window of their velocities."""
+
+    huber_delta: float = 4.0
+    """Whitened error [standard deviations] from which Huber's loss is linear (Huber 1964)."""
+    loss_steps: int = 6
+    """Steps of a window whose errors enter the loss."""
+    max_fold_step: float = 4.0
+    """Maximum step of a coordinate when a fold is removed from a fit."""
+    fold_step_shares: tuple[float, ...] = (1.0, 0.5, 0.2)
+    """Shares of that step that are evaluated; the share with the smallest loss on the other folds is used."""
+    prior_std_share: float = 0.3
+    """Prior standard deviation of a base parameter without a range, as a share of the car file's value."""
+    latency_std_s: float = 0.01
+    """Prior standard deviation [s] of a latency of motion capture that the car file does not state. Camera systems over
+    a network have 3 to 30 ms."""
+    max_latency_s: float = 0.15
+    """Maximum latency [s] of motion capture."""
+    min_noise_std: tuple[float, ...] = (1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4)
+    """Minimum noise of x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]: keeps weights of noise-free data finite."""
+    min_power_share: float = 0.5
+    """Share of noise power that the residual of the local cubic must keep for its spectrum to be used."""
+    noise_max_z: float = 3.0
+    """Residuals are clipped here [robust standard deviations]; larger ones are motion faster than the cubic."""
+    noise_segment_rows: int = 64
+    """Rows of a segment of Welch's spectrum (Welch 1967)."""
+    slowest_share: float = 0.3
+    """Share of the slowest rows, which give the noise of a car whose wheels vibrate."""
+    max_error_quantile: float = 0.99
+    """Quantile at which errors of initial states are clipped: a window at the edge of a spin contains no noise."""
+    velocity_max_period_s: float = 0.06
+    """Maximum period [s] at which velocities can be estimated from differences of poses."""
+    velocity_max_width_s: float = 0.25
+    """Maximum width [s] of a velocity window, as a box."""
+    velocity_z_min: float = 3.0
+    """Minimum variance of the velocity window [standard errors]."""
+    curve_std: float = 10.0
+    """Prior standard deviation of a measured curve's deviations, in typical sizes: keeps knots without data at 0."""
+    curve_roughness_std: float = 1.0
+    """The same for its changes of slope. From 0.1 to 1 the error on the last part of ETH train_1 changes by 4 %."""
+    max_batch_sets: int = 24
+    """Maximum number of parameter sets that are simulated in one batch; bounds the memory of a Jacobian."""
+    velocity_min_samples: int = 50
+    """Minimum number of samples of the regression of the velocity window."""
+
+
+@dataclass(frozen=True, slots=True)
+class CurveSettings:
+    """Fit of measured curves, and what a recording supports."""
+
+    min_unexplained_share: float = 0.1
+    """Share of the refit's squared excess that named effects must leave, so that curves are fitted."""
+    max_windows: int = 200
+    """Windows of the first fit and of the removal of curves; the last fit uses all."""
+    first_iterations: int = 10
+    iterations: int = 4
+    last_iterations: int = 3
+    """Iterations of the first fit, of the last fit, and with the updated error scale or without one curve."""
+    tolerance: float = 1e-3  # relative fall of the cost at which a fit ends
+    keep_z_min: float = 0.0
+    """Minimum rise of the loss on unseen blocks without a curve that is kept [standard errors]; 2 is worse on ETH."""
+    accept_z_min: float = 3.0
+    """Minimum fall of the loss on unseen blocks with all curves [standard errors]."""
+    min_support_s: float = 0.5
+    """Minimum driving time [s] near a knot; without it the curve ends there in the report."""
+    min_fitted_s: float = 0.05
+    """The same for a knot whose fitted deviation is used; others have that of the nearest such knot."""

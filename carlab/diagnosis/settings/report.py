@@ -1,0 +1,31 @@
+"""Settings of the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ReportSettings:
+    """Contents of the report."""
+
+    reading_z_min: float = 2.0
+    """Minimum difference from the car file's curve at each knot of a reading [standard deviations]."""
+    saturation_share: float = 0.3
+    """A drive force saturates if it grows by less than this share of the car file's growth."""
+    score_above_noise: float = 1.5
+    """Score (noise floors) above which a verdict without missing physics has a warning."""
+    max_traces: int = 3
+    """Maximum number of held-out recordings in figures."""
+    max_correlations: int = 3
+    """Maximum number of effects with a figure of their cross-correlation."""
+    max_candidates: int = 12
+    """Maximum number of rows in the table of candidate effects."""
+    max_picture_names: int = 5
+    """Maximum number of effects in the title of summary.png."""
+    correlation_step_s: float = 0.2
+    """Time [s] into a window at which the residual is correlated with earlier commands."""
+    correlation_z: float = 2.58
+    """Quantile of the normal distribution for the 99 % bound of a correlation."""
+    worst_stretches: int = 3
+    """Number of stretches with the largest errors that are marked in a recording."""

@@ -1,0 +1,116 @@
+"""Settings of the search for effects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ScreeningSettings:
+    """The score test of all candidates (Rao 1948), evaluated at finite sizes."""
+
+    max_windows: int = 180
+    """Number of windows for screening; sufficient to rank the candidates."""
+    error_rms_changes: tuple[float, ...] = (0.15, 0.6, 2.4)
+    """Root mean square changes of the whitened errors at which a candidate is evaluated."""
+    typical_size_ratios: tuple[float, ...] = (0.15, 0.25, 0.4, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0)
+    """Shares of the typical size at which a candidate with an infinite identity value is evaluated."""
+    max_starts: int = 3
+    """Maximum number of initial points of a candidate's fit."""
+    min_start_score_share: float = 0.75
+    """A further initial point must have this share of the best screening score."""
+    probe_size: float = 0.03
+    """Size of the probe, in typical sizes, that relates a parameter to a change of the errors."""
+    max_whitened_change: float = 50.0
+    """Changes of whitened errors are clipped here [standard deviations]."""
+    batch_size: int = 8
+    """Number of points that are simulated in one batch; bounds the memory."""
+    step_range: tuple[float, float] = (0.3, 1.5)
+    """Bounds of the factor by which an initial point is scaled along the best direction."""
+    max_step: float = 2.0
+    """Maximum step along a candidate's secant for the score."""
+
+
+@dataclass(frozen=True, slots=True)
+class SelectionSettings:
+    """Joint refits, tests on unseen blocks, acceptance, moves, elimination and pairwise tests."""
+
+    max_refits: int = 10
+    """Maximum number of candidates, by screening score, that are refitted together with the base parameters."""
+    confusable_leaders: int = 3
+    """Number of leading candidates whose confusable effects are refitted as well."""
+    folds: int = 6
+    """Number of folds of blocks for the test on unseen blocks."""
+    min_score_share: float = 0.1
+    """A candidate is refitted if its screening score is at least this share of the best. Chosen on development
+    cases."""
+    min_score_chi2: float = 8.0
+    """A candidate is refitted if twice its score over the design effect is at least this."""
+    min_gain_share: float = 0.3
+    """A refitted candidate is tested on unseen blocks if its gain is at least this share of the best."""
+    max_unseen_error: float = 12.0
+    """Whitened errors on unseen blocks are clipped here [standard deviations], to limit the influence of one spin."""
+    accept_chi2_min: float = 25.0
+    """Minimum chi2 (twice the gain over the design effect) of an accepted effect with one parameter. Chosen on
+    development cases: about 60 candidates are compared."""
+    accept_chi2_per_number: float = 8.0
+    """Additional chi2 per additional parameter and for an infinite identity value. Chosen on development cases."""
+    accept_unseen_share: float = 0.015
+    """Minimum unseen gain of an accepted effect, as a share of the loss of a perfect simulator."""
+    accept_unseen_ratio: float = 0.3
+    """Minimum unseen gain of an accepted effect, as a share of its gain on the fitted blocks."""
+    steady_z_min: float = 3.0
+    """Alternative: minimum unseen gain [standard errors] together with ``steady_unseen_share``."""
+    steady_unseen_share: float = 0.03
+    """Alternative: minimum unseen gain, as a share of the loss of a perfect simulator."""
+    keep_chi2_min: float = 16.0
+    """Minimum chi2 of an earlier effect after others were added, and minimum chi2 of a swap."""
+    swap_score_share: float = 0.7
+    """A confusable effect may replace an effect if its screening score is at least this share of the effect's gain."""
+    max_effects: int = 10
+    """Maximum number of effects."""
+    scale_change_max: float = 0.03
+    """Relative change of the error scale at convergence."""
+    scale_iterations: int = 4
+    """Maximum number of refits until the error scale converges."""
+    start_iterations: int = 3
+    """Number of iterations by which the initial points of a candidate are compared."""
+    keep_z_min: float = 1.2
+    """One of several effects is removed if its removal costs less than this on unseen blocks [standard errors]."""
+    tie_z: float = 2.0
+    """Two effects are indistinguishable if their losses on unseen blocks differ by less [standard errors]."""
+    max_set_rivals: int = 2
+    """Maximum number of effects in ``indistinguishable_from`` of report.json."""
+
+
+@dataclass(frozen=True, slots=True)
+class RivalSettings:
+    """Uncatalogued physics as a rival of accepted effects, and spurious attributions."""
+
+    max_refits: int = 2
+    """Maximum number of rivals, by screening score, that are fitted."""
+    min_score_share: float = 0.6
+    """A rival is fitted in place of effects if its screening score is at least this share of their gain."""
+    chi2_per_number: float = 4.0
+    """Minimum chi2 per additional parameter of a rival."""
+    max_single_names: int = 2
+    """Maximum number of effects that are compared with rivals one by one; up to twice as many are compared together."""
+    additional_chi2_min: float = 20.0
+    """Minimum chi2 of uncatalogued physics that is reported in addition to effects."""
+    spurious_share: float = 0.1
+    """Effects are spurious if unnamed physics gains more than this share of the total gain. Chosen on development
+    cases."""
+    spurious_share_many: float = 0.3
+    """The same for ``many_effects`` effects or more: such a car may also have physics outside the catalogue."""
+    many_effects: int = 3
+    """Number of effects from which ``spurious_share_many`` applies."""
+    min_unnamed_share: float = 0.04
+    """Minimum gain of unnamed physics that makes effects spurious, as a share of a perfect simulator's loss."""
+    unnamed_ratio: float = 1.15
+    """One or two effects are spurious if unnamed terms gain this many times the gain of the effects."""
+    weak_term_chi2: float = 14.0
+    """Minimum chi2 of a term that describes a residual that is already significant."""
+    vibration_share: float = 0.02
+    """Vibration comes first in the description if its lower bound is this share of the squared excess."""
+    description_ratio: float = 0.85
+    """Uncatalogued physics describes the residual if it gains this share of the gain of unnamed terms."""
