@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,14 +23,19 @@ class RecordingNoise:
         measured_std: standard deviations of measured x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
         initial_state_std: the same of estimated initial states.
         velocity_window_s2: variance of the time window of the velocity columns [s2]; 0 without a window.
+        floor_std: noise floor: error of a perfect simulator after ``floor_horizon_s``; None if unknown.
+        floor_horizon_s: horizon of the noise floor [s].
     """
 
     measured_std: StateStd
     initial_state_std: StateStd
     velocity_window_s2: float
+    floor_std: StateStd | None = None
+    floor_horizon_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, std in zip(STATE_NAMES * 2, (*self.measured_std, *self.initial_state_std), strict=True):
+        every = (*self.measured_std, *self.initial_state_std, *(self.floor_std or ()))
+        for name, std in zip(itertools.cycle(STATE_NAMES), every, strict=False):
             if not 0.0 < std < math.inf:
                 raise ConfigError(f"The standard deviation of {name} in [recording_noise] is {std:g}; it must be > 0.")
         if not 0.0 <= self.velocity_window_s2 < 1.0:
@@ -42,10 +48,17 @@ class RecordingNoise:
         """Read the table. Raises ConfigError for an unknown or missing key, or a value out of range."""
         return from_table(cls, table, where)
 
+    def floor_after(self, horizon_s: float) -> StateStd | None:
+        """The noise floor after a horizon; None if it is that of another horizon."""
+        return self.floor_std if math.isclose(self.floor_horizon_s, horizon_s, rel_tol=1e-3) else None
+
     def to_table(self) -> dict[str, Any]:
         """The content of the table."""
+        floor = {} if self.floor_std is None else {"floor_std": list(self.floor_std)}
         return {
             "measured_std": list(self.measured_std),
             "initial_state_std": list(self.initial_state_std),
             "velocity_window_s2": self.velocity_window_s2,
+            **floor,
+            "floor_horizon_s": self.floor_horizon_s,
         }

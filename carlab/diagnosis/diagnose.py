@@ -34,6 +34,7 @@ from carlab.diagnosis.report.exhibits import exhibits_of
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
+from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.prediction.black_box import BlackBoxSettings, check_duration, train_black_box
@@ -187,7 +188,7 @@ def _search_effects(
     vibration = find_vibration(recordings.fit_tracks, request.settings.unexplained)
     if vibration is not None:
         noise = estimate_noise(recordings.fit_tracks, windows.curvature_bias, slowest=True, settings=identification)
-    held_out = HeldOut.of(recordings.held_out_windows, noise, found.best.config, identification)
+    held_out = HeldOut.of(recordings.held_out_windows, noise, nominal, identification)
     if request.effects is None:
         naming = accept_names(problem, found, held_out, vibration, search_control)
     else:
@@ -214,7 +215,8 @@ def _assemble_result(
     models = _models(scored, measured, recordings, request, control)
     model = model if measured is None else measured.fit.config
     progress("preparing the report", 0.95)
-    held_out_errors = {name: held_out.summary(held_out.final_error(each)) for name, each in models.items()}
+    final_errors = {name: held_out.final_error(each) for name, each in models.items()}
+    held_out_errors = {name: held_out.summary(error) for name, error in final_errors.items()}
     held_out_errors["noise_floor"] = held_out.floor_summary()
     tracks, settings = recordings.fit_tracks, request.settings.curves
     diagnosis = Diagnosis(
@@ -231,6 +233,12 @@ def _assemble_result(
         seconds=0.0,
         curves=() if measured is None else curve_findings(measured, request.nominal, tracks, settings),
         ceiling=_ceiling(held_out_errors),
+        skill=skill_of(
+            held_out.windows,
+            final_errors.get("with_curves", final_errors["with_effects"]),
+            final_errors["constant_velocity"],
+            request.settings.evidence,
+        ),
     )
     exhibits = exhibits_of(scored, recordings.held_out_tracks)
     exhibits = replace(exhibits, noise=held_out.recording_noise)

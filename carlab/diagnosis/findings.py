@@ -145,6 +145,29 @@ class Ceiling:
 
 
 @dataclass(frozen=True, slots=True)
+class Skill:
+    """Position errors of the diagnosed model and of constant velocity on one held-out recording in one regime.
+
+    Attributes:
+        recording: number of the recording, from 1.
+        regime: "all", "steady commands", "changing commands", "low speed" or "high speed" (halves of its windows).
+        windows: number of windows.
+        model_m: root mean square position error of the model after the horizon [m].
+        constant_velocity_m: that of constant body velocities and yaw rate, from the same windows [m].
+        travelled_m: mean distance that the car travels in a window [m].
+        standard_errors: mean fall of the position error by the model over its clustered standard error.
+    """
+
+    recording: int
+    regime: str
+    windows: int
+    model_m: float
+    constant_velocity_m: float
+    travelled_m: float
+    standard_errors: float
+
+
+@dataclass(frozen=True, slots=True)
 class DataFault:
     """A fault of a recording."""
 
@@ -185,6 +208,7 @@ class Diagnosis:
     advice: str = ""
     curves: tuple[CurveFinding, ...] = ()
     ceiling: Ceiling | None = None
+    skill: tuple[Skill, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
@@ -212,6 +236,7 @@ class Diagnosis:
             "unexplained": unexplained,
             "curves": [_curve_table(curve) for curve in self.curves],
             "ceiling": None if self.ceiling is None else asdict(self.ceiling),
+            "skill": [asdict(s) for s in self.skill],
             "data_faults": [asdict(f) for f in self.data_faults],
             "recordings": [asdict(r) for r in self.recordings],
             "seed": self.seed,

@@ -141,7 +141,8 @@ def _score(
         noise = estimate_noise(fit_tracks, fit_windows.curvature_bias, slowest=shakes)
     else:
         noise = Noise.of(known)
-    held_out = HeldOut.of(windows, noise, config)
+    floor = None if known is None else known.floor_after(windows.horizon_s)
+    held_out = HeldOut.of(windows, noise, config) if floor is None else HeldOut(windows, np.array(floor), noise)
     models: dict[str, PredictiveModel] = {
         MODEL: SimulatorModel(config),
         CONSTANT_VELOCITY: ConstantVelocity(),

@@ -28,6 +28,7 @@ def valid_car_files() -> list[str]:
     presets = (resources.files("sim_backends") / "presets").iterdir()
     noise = "[recording_noise]\nmeasured_std = [1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.02]\n"
     noise += "initial_state_std = [1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.02]\nvelocity_window_s2 = 1e-4\n"
+    noise += "floor_std = [0.01, 0.01, 0.02, 0.03, 0.03, 0.1]\nfloor_horizon_s = 1.0\n"
     return [block[1] + noise, *(p.read_text(encoding="utf-8") for p in presets if p.name.endswith(".toml"))]
 
 
@@ -92,10 +93,13 @@ def test_recording_noise_is_read_and_checked(tmp_path: Path) -> None:
     assert noise is not None
     assert noise.measured_std == (1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.02)
     assert noise.velocity_window_s2 == 1e-4
+    assert noise.floor_after(1.0) == (0.01, 0.01, 0.02, 0.03, 0.03, 0.1)
+    assert noise.floor_after(0.5) is None
     assert load_car_file(Path("eth_rc_car")).recording_noise is None
     changes = {
         "measured_std = [1e-3": "measured_std = [-1.0",
         "velocity_window_s2 = 1e-4": "velocity_window_s2 = 1e4",
+        "floor_std = [0.01": "floor_std = [0.0",
         "2e-3, 0.01, 0.01, 0.02]": "2e-3]",
     }
     for old, new in changes.items():

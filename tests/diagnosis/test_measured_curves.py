@@ -15,7 +15,7 @@ from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.identification.fit import Fitter, Scale
 from carlab.diagnosis.report.curves import curve_sentences, readings_of_drive
-from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, with_unit
 from carlab.diagnosis.report.write import write_report
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.settings import DEFAULT, CurveSettings
@@ -230,5 +230,8 @@ def test_verdict_states_the_error_with_measured_curves(outcome):
     from carlab.diagnosis.report.sentences import number, verdict_sentence
 
     found = outcome.diagnosis.held_out["with_curves"]
-    assert f"the held-out error is {number(found.score)} noise floors" in verdict_sentence(outcome.diagnosis)
+    assert (
+        f"the held-out error is {with_unit(found.position_m, 'm')} ({number(found.score)} noise floors)"
+        in verdict_sentence(outcome.diagnosis)
+    )
     assert "measured curve" not in verdict_sentence(replace(outcome.diagnosis, curves=()))

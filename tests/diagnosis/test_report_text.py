@@ -14,6 +14,7 @@ from carlab.diagnosis.findings import (
     Estimate,
     Evidence,
     FitErrors,
+    Skill,
     Unexplained,
     Where,
 )
@@ -145,7 +146,7 @@ def test_mismatch_names_its_effects_and_its_sets() -> None:
         "(or a delay of the throttle; these recordings do not distinguish them)" in text
     )
     assert "and a yaw damping moment" in text
-    assert "from 4 to 2.5 noise floors, which removes 50 % of the error above the noise" in text
+    assert "from 4 to 2.5 noise floors), which removes 50 % of the error above the noise" in text
     assert "distinguish" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
 
 
@@ -156,13 +157,19 @@ def test_attained_share_of_the_error_above_the_noise() -> None:
     assert "removes 100 % of the error above the noise" in text
 
 
-def test_simulator_that_is_worse_than_constant_velocity_has_a_warning() -> None:
+def test_first_sentence_states_where_constant_velocity_is_better_and_why() -> None:
     fitted = diagnosis("mismatch", finding("motor_lag"), refit=60.0, with_effects=47.8)
-    held = fitted.held_out | {"nominal": replace(fitted.held_out["refit"], score=409.0)}
-    for score, warns in ((35.8, True), (50.0, False)):
-        known = replace(fitted, held_out=held | {"constant_velocity": replace(held["refit"], score=score)})
-        assert ("constant-velocity model predicts these recordings better" in verdict_sentence(known)) == warns
-        assert ("(35.8 against 47.8 noise floors)" in verdict_sentence(known)) == warns
+    better = Skill(1, "all", 40, 0.1, 0.5, 2.0, 6.0)
+    worse = Skill(2, "low speed", 20, 0.15, 0.06, 1.0, -4.0)
+    not_significant = Skill(2, "high speed", 20, 0.15, 0.14, 1.0, -1.0)
+    assert verdict_sentence(replace(fitted, skill=(better, not_significant))) == verdict_sentence(fitted)
+    expected = (
+        "This model predicts held-out recording 2 at low speed worse than constant velocity (0.15 m against 0.06 m "
+        "after 1 s). Velocities hardly change there, so such a drive does not separate causes. The simulator leaves out"
+    )
+    assert verdict_sentence(replace(fitted, skill=(better, worse))).startswith(expected)
+    wrong = replace(worse, constant_velocity_m=0.12)
+    assert "The model is wrong there." in verdict_sentence(replace(fitted, skill=(wrong,)))
 
 
 @pytest.mark.parametrize("verdict", ["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"])

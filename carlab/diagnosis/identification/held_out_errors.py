@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
-from carlab.core.recording_noise import RecordingNoise
+from carlab.core.recording_noise import RecordingNoise, StateStd
 from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.identification.fit import clustered_gain, huber
 from carlab.diagnosis.identification.measurement_noise import Noise
@@ -43,13 +44,15 @@ class HeldOut:
         config: SimulatorConfig,
         settings: IdentificationSettings = DEFAULT.identification,
     ) -> HeldOut:
-        """Compute the noise floor; ``config`` propagates the errors of initial states."""
+        """Compute the noise floor; the car file's simulator ``config`` propagates the errors of initial states."""
         return cls(windows, noise_floor(windows, noise, config, settings)[-1], noise, settings.huber_delta)
 
     @property
     def recording_noise(self) -> RecordingNoise:
         """Noise and velocity window, as ``model.toml`` keeps them."""
-        return self.noise.as_recorded(self.windows.velocity_window_s2)
+        noise = self.noise.as_recorded(self.windows.velocity_window_s2)
+        floor = cast(StateStd, tuple(self.floor.tolist()))
+        return replace(noise, floor_std=floor, floor_horizon_s=self.windows.horizon_s)
 
     def final_error(self, model: SimulatorConfig | PredictiveModel) -> FloatArray:
         """Errors (S, 6) of a model after the horizon."""

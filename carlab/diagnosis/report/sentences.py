@@ -202,7 +202,7 @@ def set_noun(effect: EffectFinding) -> str:
 
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one to four sentences with the scores."""
+    """The verdict in a few sentences with the scores; where constant velocity is better, the first one says so."""
     made = {
         "mismatch": _mismatch,
         "parameters": _parameters,
@@ -211,7 +211,7 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "unexplained": _unexplained,
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
-    return f"{made(diagnosis)}{_with_curves(diagnosis)}{_worse_than_constant_velocity(diagnosis)}"
+    return f"{worse_than_constant_velocity(diagnosis)}{made(diagnosis)}{_with_curves(diagnosis)}"
 
 
 def _with_curves(diagnosis: Diagnosis) -> str:
@@ -221,19 +221,27 @@ def _with_curves(diagnosis: Diagnosis) -> str:
     found = diagnosis.held_out["with_curves"]
     curves = f"{len(diagnosis.curves)} measured curves" if len(diagnosis.curves) > 1 else "a measured curve"
     position = with_unit(found.position_m, "m")
-    return f" With {curves}, the held-out error is {number(found.score)} noise floors ({position})."
+    return f" With {curves}, the held-out error is {position} ({number(found.score)} noise floors)."
 
 
-def _worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
-    """A warning if constant velocity predicts the held-out recordings better than every simulator; else empty."""
-    held = diagnosis.held_out
-    ours = [held[name].score for name in ("nominal", "refit", "with_effects", "with_curves") if name in held]
-    if not ours or "constant_velocity" not in held or held["constant_velocity"].score >= min(ours):
+def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
+    """Where constant velocity predicts held-out recordings better than the model, and why; empty if nowhere."""
+    settings = DEFAULT.evidence
+    worse = [s for s in diagnosis.skill if s.standard_errors < -settings.skill_z_min]
+    if not worse:
         return ""
+    whole = [s for s in worse if s.regime == "all"]
+    worst = max(whole or worse, key=lambda s: s.model_m - s.constant_velocity_m)
+    place = f"recording {worst.recording}" + ("" if worst.regime == "all" else f" at {worst.regime}")
+    steady = worst.constant_velocity_m < settings.steady_share * worst.travelled_m
+    why = (
+        "Velocities hardly change there, so such a drive does not separate causes."
+        if steady
+        else "The model is wrong there."
+    )
     return (
-        " A constant-velocity model predicts these recordings better "
-        f"({number(held['constant_velocity'].score)} against {number(min(ours))} noise floors). "
-        "Do not rely on this simulator for such drives."
+        f"This model predicts held-out {place} worse than constant velocity ({with_unit(worst.model_m, 'm')} against "
+        f"{with_unit(worst.constant_velocity_m, 'm')} after {with_unit(diagnosis.horizon_s, 's')}). {why} "
     )
 
 
@@ -242,8 +250,9 @@ def _fall(diagnosis: Diagnosis, before: str, after: str) -> str:
     if before not in held or after not in held:
         return ""
     return (
-        f"the error on held-out recordings after {with_unit(diagnosis.horizon_s, 's')} goes from "
-        f"{number(held[before].score)} to {number(held[after].score)} noise floors"
+        f"the position error on held-out recordings after {with_unit(diagnosis.horizon_s, 's')} goes from "
+        f"{with_unit(held[before].position_m, 'm')} to {with_unit(held[after].position_m, 'm')} (all channels: from "
+        f"{number(held[before].score)} to {number(held[after].score)} noise floors)"
     )
 
 
@@ -294,8 +303,9 @@ def _none(diagnosis: Diagnosis) -> str:
     if held is None:
         return text
     return (
-        f"{text} The error after {with_unit(diagnosis.horizon_s, 's')} is {number(held.score)} noise floors "
-        f"(1 is the error that measurement noise alone causes).{_warning_above_noise(diagnosis, 'nominal')}"
+        f"{text} The position error after {with_unit(diagnosis.horizon_s, 's')} is {with_unit(held.position_m, 'm')}; "
+        f"all channels: {number(held.score)} noise floors (1 is the error that measurement noise alone causes)."
+        f"{_warning_above_noise(diagnosis, 'nominal')}"
     )
 
 

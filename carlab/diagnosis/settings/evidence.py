@@ -33,6 +33,12 @@ class EvidenceSettings:
     """Squared excess of the refit below which the unexplained share is 0."""
     unexplained_share_min: float = 0.1
     """Minimum unexplained share of the squared excess that is reported."""
+    skill_windows_min: int = 8
+    """Minimum number of held-out windows of a regime that is compared with constant velocity."""
+    skill_z_min: float = 2.0
+    """Constant velocity is better if its position error is lower by this many standard errors."""
+    steady_share: float = 0.1
+    """Velocities hardly change if constant velocity errs by less than this share of the travelled distance."""
 
 
 @dataclass(frozen=True, slots=True)
