@@ -78,13 +78,13 @@ def check_unseen(model: Path, held_out: Path) -> None:
         )
 
 
-def recordings_in(folder: Path) -> list[Path]:
-    """Recordings of a folder, sorted by name. Raises ConfigError or DataError for less than two."""
+def recordings_in(folder: Path, least: int = 2) -> list[Path]:
+    """Recordings of a folder, sorted by name. Raises ConfigError or DataError for less than ``least``."""
     if not folder.is_dir():
-        raise ConfigError(f"--data {folder} is not a folder; name a folder with at least two recordings (MCAP or CSV).")
+        raise ConfigError(f"--data {folder} is not a folder; name a folder with recordings (MCAP or CSV).")
     files = sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
-    if len(files) < 2:
-        raise DataError(f"{folder} has {len(files)} recordings; add some (two or more are needed).")
+    if len(files) < least:
+        raise DataError(f"{folder} has {len(files)} recordings; add some (at least {least}).")
     return files
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -24,6 +25,8 @@ STAGES = {
     "diagnose": "cases diagnosed",
     "oracle": "cases diagnosed with the true names",
     "baselines": "cases scored by the baselines",
+    "references": "references diagnosed",
+    "answer": "cases answered",
 }
 DAY_S = 86400.0
 
@@ -39,8 +42,18 @@ class Prove:
     out: Path = Path("proof")
     """Folder of the benchmark; an unfinished benchmark with the same options is continued."""
 
-    set: Literal["short", "full", "development"] = "short"
-    """short: five small cases; full: about 350 cases of the test set; development: 350 other cases."""
+    set: Literal["short", "full", "development", "real"] = "short"
+    """short: five small cases; full: about 350 cases of the test set; development: 350 other cases; real: about 150
+    cases with effects of commands and sensors concealed in recordings of a real car."""
+
+    data: Path | None = None
+    """Only --set real: folder with recordings of one car, at least 120 s."""
+
+    car: str = ""
+    """Only --set real: car file or preset of that car."""
+
+    tool: Literal["diagnose", "compare"] = "diagnose"
+    """Only --set real: what answers. compare gets the untouched recordings too; diagnose gets their model only."""
 
     simulator: Literal["own", "commonroad", "commonroad-drift"] = "own"
     """own: effects concealed in carlab's simulator; commonroad: no seal, recordings of an independent simulator, the
@@ -80,6 +93,8 @@ class Prove:
 
         if self.jobs < 1 or self.timeout <= 0.0:
             raise ConfigError("--jobs and --timeout: give numbers above zero.")
+        if self.set == "real":
+            return self._real()
         specs = self._specs()
         if self.simulator != "own":
             return self._study()
@@ -97,6 +112,33 @@ class Prove:
                 fail(f"Stopped with {stages.last}; run the same command to continue.")
                 return 130
         return self._score(proof)
+
+    def _real(self) -> int:
+        from carlab.benchmark.real.runner import RealProof, Tool, drawn_specs
+        from carlab.cli.prove_real import car_path, require_tool, run_stages, score, tables_in
+        from carlab.experiment.episodes.interrupts import Interrupts
+
+        self._check_limit()
+        require_tool(self.tool)
+        car, recordings = car_path(self.car, self.out), tables_in(self.data)
+        specs, refused = drawn_specs(self.seed, self.limit, recordings)
+        if refused:
+            console.print(f"Not concealed, because commands would leave [-1, 1]: {', '.join(refused)}.")
+        with Interrupts() as interrupts, progress(speed_estimate_period_s=DAY_S) as bar:
+            stages = _Bar(bar)
+            proof = RealProof(
+                self.out, specs, recordings, car, tool=Tool(self.tool, _carlab_command()), command=_carlab_command(),
+                progress=stages, timeout_s=self.timeout, jobs=self.jobs, stop_requested=interrupts.requested.is_set,
+                abandon=interrupts.urgent.is_set,
+            )  # fmt: skip
+            if not run_stages(proof):
+                fail(f"Stopped with {stages.last}; run the same command to continue.")
+                return 130
+        return score(proof, self.out, lambda runs: self._facts([spec.seed for spec in specs], runs))
+
+    def _check_limit(self) -> None:
+        if self.limit is not None and self.limit < 1:
+            raise ConfigError(f"--limit {self.limit}: give at least 1.")
 
     def _study(self) -> int:
         from carlab.benchmark.public_simulators.commonroad import require_public_simulator
@@ -146,8 +188,7 @@ class Prove:
     def _specs(self) -> list[CaseSpec]:
         from carlab.benchmark.cases.proof_set import drawn, full_set, short_set
 
-        if self.limit is not None and self.limit < 1:
-            raise ConfigError(f"--limit {self.limit}: give at least 1.")
+        self._check_limit()
         if self.set == "short":
             specs = short_set("test", self.seed)
         else:
@@ -173,19 +214,18 @@ class Prove:
             fail(f"{summary['no_report']} diagnoses have no report; results.md lists them with the reasons.")
         write_scores(proof.root / "scores.json", rows, summary, comparison)
         draw_confusion(proof.root / "confusion.png", rows.values())
-        page = results_page(self._facts(proof, runs), rows, runs, summary, comparison)
+        page = results_page(self._facts([spec.seed for spec in proof.specs], runs), rows, runs, summary, comparison)
         (proof.root / "results.md").write_text(page, encoding="utf-8")
         console.print(f"Read {self.out / 'results.md'} and {self.out / 'confusion.png'}; all figures: scores.json.")
         return 0
 
-    def _facts(self, proof: Proof, runs: dict[str, dict[str, Any]]) -> dict[str, str]:
+    def _facts(self, seeds: Sequence[int], runs: Mapping[str, Any]) -> dict[str, str]:
         import os
         from datetime import datetime
 
         from carlab.core.clock import wall_clock_ns
         from carlab.core.version import VERSION
 
-        seeds = [spec.seed for spec in proof.specs]
         memory = [run["peak_memory_mib"] for run in runs.values()]
         jobs = sorted({int(run["jobs"]) for run in runs.values()})
         return {
@@ -231,3 +271,9 @@ def _diagnose_command() -> tuple[str, ...]:
     from carlab.benchmark.proof.runner import DIAGNOSE
 
     return DIAGNOSE
+
+
+def _carlab_command() -> tuple[str, ...]:
+    from carlab.benchmark.real.runner import CARLAB
+
+    return CARLAB

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ SEED_BASE = {"development": 1_000_000, "test": 2_000_000}
 # Faults that leave the concealed effects identifiable.
 ON_TOP = ("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples")
 Purpose = Literal["development", "test"]
+Spec = TypeVar("Spec")
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def short_set(
     return [CaseSpec(s.kind, s.seed, s.effects, s.form, s.excess, s.fault, s.period_s, 40.0, 20.0) for s in specs]
 
 
-def drawn(specs: list[CaseSpec], count: int, seed: int = 0) -> list[CaseSpec]:
+def drawn(specs: list[Spec], count: int, seed: int = 0) -> list[Spec]:
     """Draw at most ``count`` cases without replacement, in their order."""
     order = np.random.default_rng((seed, 7)).permutation(len(specs))[:count]
     return [specs[k] for k in sorted(order.tolist())]

@@ -36,22 +36,22 @@ def mocap_yaw_misalignment(world: World, p: Parameters) -> None:
     world.pose_changes.append(lambda t, pose: pose + turn)
 
 
+def ramp_filter(t_s: FloatArray, values: FloatArray, time_constant_s: float) -> FloatArray:
+    """First-order low-pass filter of (N, k) values that are linear between even stamps; exact."""
+    if time_constant_s <= 0.0:
+        return values
+    out = values.copy()
+    gap = float(t_s[1] - t_s[0])
+    keep = math.exp(-gap / time_constant_s)
+    ramp = time_constant_s / gap * (1.0 - keep)
+    for k in range(1, len(values)):
+        out[k] = keep * out[k - 1] + (ramp - keep) * values[k - 1] + (1.0 - ramp) * values[k]
+    return out
+
+
 def velocity_filter_lag(world: World, p: Parameters) -> None:
     """First-order filter of the velocity columns with an input that is linear between captures."""
-    lag = p["time_constant"]
-
-    def smooth(t: FloatArray, v: FloatArray) -> FloatArray:
-        if lag <= 0.0:
-            return v
-        out = v.copy()
-        gap = float(t[1] - t[0])
-        keep = math.exp(-gap / lag)
-        ramp = lag / gap * (1.0 - keep)
-        for k in range(1, len(v)):
-            out[k] = keep * out[k - 1] + (ramp - keep) * v[k - 1] + (1.0 - ramp) * v[k]
-        return out
-
-    world.velocity_changes.append(smooth)
+    world.velocity_changes.append(lambda t, v: ramp_filter(t, v, p["time_constant"]))
 
 
 def moving_average(world: World, p: Parameters) -> None:

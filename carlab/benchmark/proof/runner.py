@@ -24,25 +24,20 @@ from typing import Any
 import numpy as np
 
 from carlab.benchmark.cases.proof_set import CaseSpec
-from carlab.benchmark.cases.seal import check, digest, file_digest, new_name, new_nonce
 from carlab.benchmark.cases.set_check import CHEAP, indistinguishable
-from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, run_child, side_by_side
+from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, run_child
+from carlab.benchmark.proof.sealed_run import Progress, SealedRun, silent
 from carlab.benchmark.proof.worker import FILES, read_json, write_json
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
 
-Progress = Callable[[str, int, int, str], None]
 DIAGNOSE = (sys.executable, "-m", "carlab", "diagnose", "--decisions")
 COMPARED = ("single", "null", "parameters", "outside")
 WORKER = (sys.executable, "-m", "carlab.benchmark.proof.worker")
 
 
-def silent(stage: str, done: int, total: int, note: str) -> None:
-    """Report nothing."""
-
-
-class Proof:
+class Proof(SealedRun):
     """One proof on disk.
 
     Args:
@@ -70,54 +65,39 @@ class Proof:
         abandon: Callable[[], bool] = lambda: False,
         jobs: int = 1,
     ) -> None:
-        self.root = root.absolute()
+        super().__init__(
+            root, [spec.as_dict() for spec in specs], progress=progress, timeout_s=timeout_s,
+            stop_requested=stop_requested, abandon=abandon, jobs=jobs,
+        )  # fmt: skip
         self.specs = list(specs)
         self.command = tuple(command)
-        self.progress = progress
-        self.timeout_s = timeout_s
-        self.stop_requested = stop_requested
-        self.abandon = abandon
-        self.jobs = jobs
-        self._answers = self.root / "answers"
 
     def make(self) -> str | None:
         """Make the missing cases, then seal. Returns the hash of the seal, or None if stopped."""
-        specs = dict(zip(self._names(), self.specs, strict=True))
+        specs = dict(zip(self.names(), self.specs, strict=True))
 
         def make_one(name: str) -> ChildEnd:
             order = {"spec": specs[name].as_dict(), "handed": str(self.root / "handed" / name)}
-            return self._work("make", {**order, "answer": str(self._answers / f"{name}.json")})
+            return self._work("make", {**order, "answer": str(self.answers_folder / f"{name}.json")})
 
-        if not self._stage("make", list(specs), lambda name: (self._answers / f"{name}.json").exists(), make_one):
+        if not self.stage("make", list(specs), lambda name: (self.answers_folder / f"{name}.json").exists(), make_one):
             return None
         return self.seal()
-
-    def seal(self) -> str:
-        """Hash the answers once; the hash is written to seal.json and passed to ``progress``."""
-        path = self.root / "seal.json"
-        if not path.exists():
-            nonce = new_nonce()
-            answers = self._load_answers()
-            write_json(self._answers / "nonce.json", {"nonce": nonce})
-            write_json(path, {"sha256": digest(answers, nonce), "cases": len(answers)})
-        sealed = str(read_json(path)["sha256"])
-        self.progress("seal", len(self.specs), len(self.specs), sealed)
-        return sealed
 
     def diagnose(self, *, oracle: bool = False) -> bool:
         """Diagnose the cases without a report; with ``oracle`` single and paired cases with the true names given.
 
         Returns whether all are done. Raises DataError before the answers are sealed.
         """
-        self._need_seal()
-        names = sorted(self._names())  # sorted: random names give a random order of kinds
+        self.need_seal()
+        names = sorted(self.names())  # sorted: random names give a random order of kinds
         true_effects: dict[str, tuple[str, ...]] = {}
         if oracle:
-            by_name = dict(zip(self._names(), self.specs, strict=True))
+            by_name = dict(zip(self.names(), self.specs, strict=True))
             true_effects = {n: by_name[n].effects for n in names if by_name[n].kind in ("single", "pair")}
             names = list(true_effects)
         folder = self.root / ("oracle" if oracle else "reports")
-        return self._stage(
+        return self.stage(
             "oracle" if oracle else "diagnose",
             names,
             lambda name: (folder / name / "run.json").exists(),
@@ -129,43 +109,20 @@ class Proof:
 
         Returns whether all are done. Raises DataError before the answers are sealed.
         """
-        self._need_seal()
+        self.need_seal()
         folder = self.root / "baselines"
 
         def run_one(name: str) -> ChildEnd:
-            floor = read_json(self._answers / f"{name}.json")["floor"]
+            floor = read_json(self.answers_folder / f"{name}.json")["floor"]
             order = {"handed": str(self.root / "handed" / name), "to": str(folder / f"{name}.json"), "floor": floor}
             return self._work("baselines", order)
 
-        names = sorted(n for n, spec in zip(self._names(), self.specs, strict=True) if spec.kind in COMPARED)
-        return self._stage("baselines", names, lambda name: (folder / f"{name}.json").exists(), run_one)
-
-    def open_seal(self) -> dict[str, Any]:
-        """Check the seal and return the answers by name. Raises DataError if an answer or file was changed."""
-        answers = self._load_answers()
-        nonce = str(read_json(self._answers / "nonce.json")["nonce"])
-        check(answers, nonce, str(read_json(self.root / "seal.json")["sha256"]))
-        for name, answer in answers.items():
-            for file, sha in answer["files"].items():
-                if file_digest(self.root / "handed" / name / file) != sha:
-                    raise DataError(
-                        f"The seal is broken: {name}/{file} differs from the sealed file; repeat the proof."
-                    )
-        return answers
+        names = sorted(n for n, spec in zip(self.names(), self.specs, strict=True) if spec.kind in COMPARED)
+        return self.stage("baselines", names, lambda name: (folder / f"{name}.json").exists(), run_one)
 
     def reports(self, *, oracle: bool = False) -> dict[str, dict[str, Any]]:
         """Results of the diagnoses by name: ``report`` (None if missing), ``exit_status``, ``seconds``."""
-        found = {}
-        folder = self.root / ("oracle" if oracle else "reports")
-        for run in sorted(folder.glob("*/run.json")):
-            report = run.with_name("report.json")
-            entry = read_json(run)
-            try:
-                entry["report"] = read_json(report) if report.exists() else None
-            except ValueError:
-                entry["report"] = None
-            found[run.parent.name] = entry
-        return found
+        return self.results("oracle" if oracle else "reports", "report.json")
 
     def decisions(self) -> dict[str, dict[str, Any]]:
         """Recorded decisions about effects with their statistics, by name of the case."""
@@ -178,7 +135,7 @@ class Proof:
 
     def same(self, name: str, one: str, other: str) -> bool | None:
         """Whether the generator's refit does not distinguish two effects on a case; None if it does not cover them."""
-        answer = read_json(self._answers / f"{name}.json")
+        answer = read_json(self.answers_folder / f"{name}.json")
         if answer["fault"] is not None or any(effect not in CHEAP for effect in (one, other)):
             return None
         kept = self.root / "checks" / f"{name}.json"
@@ -191,48 +148,6 @@ class Proof:
             known[key] = indistinguishable(one, other, BaseCar.read(folder / "car.toml"), fit, hold, floor)
             write_json(kept, known)
         return None if known[key] is None else bool(known[key])
-
-    def _need_seal(self) -> None:
-        if not (self.root / "seal.json").exists():
-            raise DataError("Seal the answers before the first diagnosis: call make() first.")
-
-    def _names(self) -> list[str]:
-        path = self._answers / "plan.json"
-        plan = json.loads(json.dumps([spec.as_dict() for spec in self.specs]))
-        if not path.exists():
-            write_json(path, {"plan": plan, "names": [new_name() for _ in plan]})
-        kept = read_json(path)
-        if kept["plan"] != plan:
-            raise DataError(f"{self.root} contains a proof of other cases; use the same cases or another folder.")
-        return list(kept["names"])
-
-    def _load_answers(self) -> dict[str, Any]:
-        return {name: read_json(self._answers / f"{name}.json") for name in self._names()}
-
-    def _stage(
-        self, stage: str, names: Sequence[str], there: Callable[[str], bool], work: Callable[[str], ChildEnd]
-    ) -> bool:
-        todo = [name for name in names if not there(name)]
-        done = len(names) - len(todo)
-        self.progress(stage, done, len(names), "")
-        stopped = False
-
-        def finished(name: str, end: ChildEnd) -> None:
-            nonlocal done, stopped
-            if end.abandoned:
-                stopped = True
-                return
-            done += 1
-            self.progress(stage, done, len(names), name)
-
-        complete = side_by_side(
-            self.jobs,
-            todo,
-            work,
-            stop_requested=lambda: self.stop_requested() or self.abandon(),
-            finished=finished,
-        )
-        return complete and not stopped
 
     def _work(self, what: str, order: dict[str, Any]) -> ChildEnd:
         end = run_child(

@@ -1,0 +1,135 @@
+"""Cases on disk whose answers are sealed before the first diagnosis; stages that can be stopped and resumed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from carlab.benchmark.cases.seal import check, digest, file_digest, new_name, new_nonce
+from carlab.benchmark.proof.child_processes import ChildEnd, side_by_side
+from carlab.benchmark.proof.worker import read_json, write_json
+from carlab.core.errors import DataError
+
+Progress = Callable[[str, int, int, str], None]
+
+
+def silent(stage: str, done: int, total: int, note: str) -> None:
+    """Report nothing."""
+
+
+class SealedRun:
+    """Folder with ``seal.json``, ``handed/NAME/`` (input of the tool) and ``answers/`` (not accessible to the tool).
+
+    Args:
+        root: Folder; created if missing.
+        plan: The cases as JSON; they must equal those of an existing folder.
+        progress: Called with stage, done, total and a note.
+        timeout_s: Time-out of a child process.
+        stop_requested: Called before each case; True ends the stage after the running cases.
+        abandon: Polled; True kills the running cases, which are repeated when the stage is resumed.
+        jobs: Number of parallel child processes; with more than one, each uses one thread.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        plan: Sequence[Mapping[str, Any]],
+        *,
+        progress: Progress = silent,
+        timeout_s: float = 1800.0,
+        stop_requested: Callable[[], bool] = lambda: False,
+        abandon: Callable[[], bool] = lambda: False,
+        jobs: int = 1,
+    ) -> None:
+        self.root = root.absolute()
+        self.progress = progress
+        self.timeout_s = timeout_s
+        self.stop_requested = stop_requested
+        self.abandon = abandon
+        self.jobs = jobs
+        self.answers_folder = self.root / "answers"
+        self._plan = json.loads(json.dumps(list(plan)))
+
+    def names(self) -> list[str]:
+        """Random names of the cases, in the order of the plan. Raises DataError if the folder has another plan."""
+        path = self.answers_folder / "plan.json"
+        if not path.exists():
+            write_json(path, {"plan": self._plan, "names": [new_name() for _ in self._plan]})
+        kept = read_json(path)
+        if kept["plan"] != self._plan:
+            raise DataError(f"{self.root} contains a proof of other cases; use the same cases or another folder.")
+        return list(kept["names"])
+
+    def seal(self) -> str:
+        """Hash the answers once; the hash is written to seal.json and passed to ``progress``."""
+        path = self.root / "seal.json"
+        if not path.exists():
+            nonce = new_nonce()
+            answers = self._load_answers()
+            write_json(self.answers_folder / "nonce.json", {"nonce": nonce})
+            write_json(path, {"sha256": digest(answers, nonce), "cases": len(answers)})
+        sealed = read_json(path)
+        self.progress("seal", sealed["cases"], sealed["cases"], sealed["sha256"])
+        return str(sealed["sha256"])
+
+    def open_seal(self) -> dict[str, Any]:
+        """Check the seal and return the answers by name. Raises DataError if an answer or file was changed."""
+        answers = self._load_answers()
+        nonce = str(read_json(self.answers_folder / "nonce.json")["nonce"])
+        check(answers, nonce, str(read_json(self.root / "seal.json")["sha256"]))
+        for name, answer in answers.items():
+            for file, sha in answer["files"].items():
+                if file_digest(self.root / "handed" / name / file) != sha:
+                    raise DataError(
+                        f"The seal is broken: {name}/{file} differs from the sealed file; repeat the proof."
+                    )
+        return answers
+
+    def need_seal(self) -> None:
+        """Raise DataError before the answers are sealed."""
+        if not (self.root / "seal.json").exists():
+            raise DataError("Seal the answers before the first diagnosis: call make() first.")
+
+    def stage(
+        self, stage: str, names: Sequence[str], there: Callable[[str], bool], work: Callable[[str], ChildEnd]
+    ) -> bool:
+        """Do the work of every name that is not there; returns whether all is done."""
+        todo = [name for name in names if not there(name)]
+        done = len(names) - len(todo)
+        self.progress(stage, done, len(names), "")
+        stopped = False
+
+        def finished(name: str, end: ChildEnd) -> None:
+            nonlocal done, stopped
+            if end.abandoned:
+                stopped = True
+                return
+            done += 1
+            self.progress(stage, done, len(names), name)
+
+        complete = side_by_side(
+            self.jobs,
+            todo,
+            work,
+            stop_requested=lambda: self.stop_requested() or self.abandon(),
+            finished=finished,
+        )
+        return complete and not stopped
+
+    def results(self, folder: str, file: str) -> dict[str, dict[str, Any]]:
+        """``run.json`` of each case with its ``report`` from another file (None if missing or not JSON)."""
+        found = {}
+        for run in sorted((self.root / folder).glob("*/run.json")):
+            report = run.with_name(file)
+            entry = read_json(run)
+            try:
+                entry["report"] = read_json(report) if report.exists() else None
+            except ValueError:
+                entry["report"] = None
+            found[run.parent.name] = entry
+        return found
+
+    def _load_answers(self) -> dict[str, Any]:
+        return {name: read_json(self.answers_folder / f"{name}.json") for name in self.names()}

@@ -1,0 +1,190 @@
+"""Kinds of effects that a real recording can appear to have, each with three sizes and its true parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from carlab.benchmark.effects.data_faults import Table
+from carlab.benchmark.effects.observation_forms import ramp_filter
+from carlab.benchmark.real import columns as c
+
+FULL_LOCK = 0.7
+"""Full steering lock in the files of a proof; room for transformations that enlarge commands."""
+MAX_INEXACT = 0.1
+"""Largest error of a transformation, as a share of the effect itself (root mean square); clipping causes it."""
+Channel = Literal["steering", "throttle", "both", "observation"]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The size of one parameter as a change against the car of the untouched recordings.
+
+    ``size`` is added to the parameter, multiplies it, or is its value. With ``per_lock`` it is a steering command,
+    which ``steering.max_angle`` of a car file converts to an angle.
+    """
+
+    parameter: str
+    size: float
+    composes: Literal["adds", "multiplies", "replaces"] = "adds"
+    per_lock: bool = False
+
+
+@dataclass(frozen=True)
+class Change:
+    """A recording with one more effect, and what is true about it.
+
+    ``inexact`` is the root mean square error of the transformation as a share of the effect.
+    """
+
+    table: Table
+    truth: tuple[Truth, ...]
+    inexact: float = 0.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of effect.
+
+    ``names`` are the ids that are correct answers; several where the transformed recordings are identical. The
+    function gets the recording, the size and a random sign or angle in [0, 1).
+    """
+
+    id: str
+    names: tuple[str, ...]
+    channel: Channel
+    sizes: tuple[float, float, float]
+    change: Callable[[Table, float, float], Change]
+
+    def apply(self, table: Table, size: float, draw: float) -> Change:
+        """Return the recording of a car with the effect."""
+        return self.change(table, size, draw)
+
+    def as_dict(self, change: Change, size: float) -> dict[str, Any]:
+        """The answer, as JSON."""
+        return {
+            "id": self.id, "names": list(self.names), "size": size, "inexact": change.inexact,
+            "truth": [vars(truth) for truth in change.truth],
+        }  # fmt: skip
+
+
+def _sign(draw: float) -> float:
+    return 1.0 if draw < 0.5 else -1.0
+
+
+def _delay(parameter: str, *channels: str) -> Callable[[Table, float, float], Change]:
+    def change(table: Table, size: float, draw: float) -> Change:
+        period_s = float(np.median(np.diff(table["t"])))
+        rows = max(1, round(size / period_s))
+        moved = {name: c.issued_earlier(table[name], rows) for name in channels}
+        return Change({**table, **moved}, (Truth(parameter, rows * period_s),))
+
+    return change
+
+
+def _lag(channel: str) -> Callable[[Table, float, float], Change]:
+    def change(table: Table, size: float, draw: float) -> Change:
+        earlier, lagged = c.before_lag(table["t"], table[channel], size)
+        mean = 0.5 * (table[channel] + np.concatenate([table[channel][:1], table[channel][:-1]]))
+        untransformed = ramp_filter(table["t"], mean[:, None], size)[:, 0]
+        inexact = float(np.std(lagged - mean) / max(np.std(untransformed - mean), 1e-9))
+        return Change({**table, channel: earlier}, (Truth("time_constant", size),), inexact)
+
+    return change
+
+
+def _gain(table: Table, size: float, draw: float) -> Change:
+    gain = (1.0 + size) ** _sign(draw)
+    moved = c.with_command(table, "steering", lambda u: u / gain)
+    return Change(moved, (Truth("value", gain, "multiplies"),))
+
+
+def _offset(table: Table, size: float, draw: float) -> Change:
+    shift = _sign(draw) * size * FULL_LOCK
+    moved = c.with_command(table, "steering", lambda u: u - shift)
+    return Change(moved, (Truth("angle", shift, per_lock=True),))
+
+
+def _asymmetry(table: Table, size: float, draw: float) -> Change:
+    gain = _sign(draw) * size
+    moved = c.with_command(table, "steering", lambda u: u / (1.0 + gain * np.sign(u)))
+    return Change(moved, (Truth("gain", gain),))
+
+
+def _steering_dead_band(table: Table, size: float, draw: float) -> Change:
+    width = size * FULL_LOCK
+    moved = c.with_command(table, "steering", lambda u: c.before_dead_band(u, 0.5 * width))
+    return Change(moved, (Truth("width", width, per_lock=True),))
+
+
+def _play(table: Table, size: float, draw: float) -> Change:
+    play = size * FULL_LOCK
+    moved = c.with_command(table, "steering", lambda u: c.before_play(u, play))
+    return Change(moved, (Truth("play", play, per_lock=True),))
+
+
+def _saturation(table: Table, size: float, draw: float) -> Change:
+    """``size``: the share by which the angle at full lock is smaller than a linear one."""
+    x = float(np.interp(size, 1.0 - np.tanh(_ARGUMENTS) / _ARGUMENTS, _ARGUMENTS))  # tanh(x) = (1 - size) x
+    saturation = FULL_LOCK / math.tanh(x)
+    moved = c.with_command(table, "steering", lambda u: c.before_saturation(u, saturation))
+    return Change(moved, (Truth("saturation", saturation, "replaces", per_lock=True),))
+
+
+_ARGUMENTS = np.linspace(0.01, 2.0, 400)
+
+
+def _throttle_dead_band(table: Table, size: float, draw: float) -> Change:
+    moved = c.with_command(table, "throttle", lambda u: c.before_dead_band(u * (1.0 - size), size))
+    return Change(moved, (Truth("width", size),))
+
+
+def _exponent(table: Table, size: float, draw: float) -> Change:
+    exponent = (1.0 + size) ** _sign(draw)
+    moved = c.with_command(table, "throttle", lambda u: np.sign(u) * np.abs(u) ** (1.0 / exponent))
+    return Change(moved, (Truth("exponent", exponent, "multiplies"),))
+
+
+def _marker(table: Table, size: float, draw: float) -> Change:
+    ahead, left = size * math.cos(2.0 * math.pi * draw), size * math.sin(2.0 * math.pi * draw)
+    return Change(c.moved_point(table, ahead, left), (Truth("ahead", ahead), Truth("left", left)))
+
+
+def _misalignment(table: Table, size: float, draw: float) -> Change:
+    angle = _sign(draw) * size
+    return Change(c.turned_frame(table, angle), (Truth("angle", angle),))
+
+
+def _latency(table: Table, size: float, draw: float) -> Change:
+    return Change(c.delayed_observation(table, size), (Truth("latency", size),))
+
+
+def _filter(table: Table, size: float, draw: float) -> Change:
+    return Change(c.filtered_velocity(table, size), (Truth("time_constant", size),))
+
+
+_LATE = ("command_delay", "mocap_latency")  # all commands later and all measurements later are the same recording
+DELAYS_S = (0.033, 0.067, 0.1)
+KINDS = (
+    Kind("command_delay", _LATE, "both", DELAYS_S, _delay("extra_delay", "steering", "throttle")),
+    Kind("mocap_latency", (_LATE[1], _LATE[0]), "both", (0.02, 0.045, 0.08), _latency),
+    Kind("steering_delay", ("steering_delay",), "steering", DELAYS_S, _delay("delay", "steering")),
+    Kind("throttle_delay", ("throttle_delay",), "throttle", (0.067, 0.1, 0.2), _delay("delay", "throttle")),
+    Kind("steering_lag", ("steering_lag",), "steering", (0.03, 0.05, 0.08), _lag("steering")),
+    Kind("motor_lag", ("motor_lag",), "throttle", (0.03, 0.05, 0.1), _lag("throttle")),
+    Kind("steering_gain", ("steering.max_angle",), "steering", (0.05, 0.1, 0.2), _gain),
+    Kind("steering_offset", ("steering_offset",), "steering", (0.03, 0.06, 0.12), _offset),
+    Kind("steering_asymmetry", ("steering_asymmetry",), "steering", (0.05, 0.1, 0.2), _asymmetry),
+    Kind("steering_deadband", ("steering_deadband",), "steering", (0.08, 0.16, 0.3), _steering_dead_band),
+    Kind("steering_backlash", ("steering_backlash",), "steering", (0.08, 0.16, 0.3), _play),
+    Kind("steering_nonlinearity", ("steering_nonlinearity",), "steering", (0.06, 0.12, 0.24), _saturation),
+    Kind("throttle_deadband", ("throttle_deadband",), "throttle", (0.03, 0.06, 0.12), _throttle_dead_band),
+    Kind("throttle_nonlinearity", ("throttle_nonlinearity",), "throttle", (0.1, 0.25, 0.5), _exponent),
+    Kind("marker_offset", ("marker_offset",), "observation", (0.01, 0.02, 0.04), _marker),
+    Kind("mocap_yaw_misalignment", ("mocap_yaw_misalignment",), "observation", (0.01, 0.02, 0.04), _misalignment),
+    Kind("velocity_filter_lag", ("velocity_filter_lag",), "observation", (0.03, 0.06, 0.12), _filter),
+)

@@ -1,0 +1,223 @@
+"""Run of a proof on real recordings. A stopped run can resume.
+
+Folder of a proof, in addition to that of ``SealedRun``:
+
+    references/K/        untouched_1.csv ..., car.toml: input of the diagnosis of reference K; out/model.toml
+    handed/NAME/         other.csv: the recording of a case
+    answered/NAME/       the tool's report, run.json (exit status, seconds, peak memory)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import sys
+import tempfile
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tomli_w
+
+from carlab.benchmark.cases.proof_set import drawn
+from carlab.benchmark.effects.data_faults import Table
+from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, run_child
+from carlab.benchmark.proof.sealed_run import SealedRun
+from carlab.benchmark.proof.worker import read_json, write_json
+from carlab.benchmark.real.cases import (
+    RealCaseSpec,
+    case_specs,
+    make_real_case,
+    parts,
+    reference,
+    with_full_lock,
+    write_tables,
+)
+from carlab.benchmark.real.kinds import FULL_LOCK, KINDS
+from carlab.core.errors import ConfigError, DataError
+
+OTHER, CAR, MODEL = "other.csv", "car.toml", "model.toml"
+CARLAB = (sys.executable, "-m", "carlab")
+REFERENCE_OPTIONS = ("--effects", "command_delay", "--curves")
+CONCEALABLE_EFFECTS = tuple(sorted({name for kind in KINDS for name in kind.names if "." not in name}))
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A command that answers, and the file of its report.
+
+    ``compare`` gets the untouched recordings, ``--with other.csv``, the reference's model and a folder. ``diagnose``
+    gets the other recording alone, and searches only the effects of commands and sensors.
+    """
+
+    verb: Literal["compare", "diagnose"]
+    command: tuple[str, ...] = CARLAB
+
+    @property
+    def report(self) -> str:
+        """Name of the report in the tool's folder."""
+        return "compare.json" if self.verb == "compare" else "report.json"
+
+    def arguments(self, untouched: Sequence[str]) -> list[str]:
+        """The command line of one case."""
+        recordings = [*untouched, "--with", OTHER] if self.verb == "compare" else [OTHER]
+        options = [] if self.verb == "compare" else ["--effects", *CONCEALABLE_EFFECTS]
+        return [*self.command, self.verb, *recordings, "--car", MODEL, "--out", "out", *options]
+
+
+class RealProof(SealedRun):
+    """One proof on real recordings on disk.
+
+    Args:
+        root: Folder of the proof.
+        specs: The cases.
+        recordings: Recordings by name, with the columns of ``measurement.COLUMNS``.
+        car: TOML file of the car.
+        tool: What answers.
+        command: The program that diagnoses the references.
+        options: As for ``SealedRun``.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        specs: Sequence[RealCaseSpec],
+        recordings: Mapping[str, Table],
+        car: Path,
+        *,
+        tool: Tool,
+        command: Sequence[str] = CARLAB,
+        **options: Any,
+    ) -> None:
+        super().__init__(root, _plan(specs, recordings, tool), **options)
+        self.specs = list(specs)
+        self.recordings = {name: with_full_lock(table) for name, table in recordings.items()}
+        self.car = car
+        self.tool = tool
+        self.command = tuple(command)
+        self.parts = parts(self.recordings)
+
+    def case_names(self) -> list[str]:
+        """Random names of the cases."""
+        return self.names()[: len(self.specs)]
+
+    def make(self) -> str:
+        """Make the missing cases and the input of the references, then seal. Returns the hash of the seal."""
+        for name, spec in zip(self.case_names(), self.specs, strict=True):
+            path = self.answers_folder / f"{name}.json"
+            if not path.exists():
+                number, table, answer = make_real_case(spec, self.recordings, self.parts)
+                files = write_tables(self.root / "handed" / name, {OTHER: table})
+                write_json(path, {**answer, "reference": number, "files": files})
+        for number, part in enumerate(self.parts):
+            folder = self.root / "references" / str(number)
+            if not (folder / CAR).exists():
+                untouched = reference(self.recordings, part)
+                write_tables(folder, {f"untouched_{k + 1}.csv": table for k, table in enumerate(untouched)})
+                write_smaller_unit(self.car, folder / CAR)
+        return self.seal()
+
+    def diagnose_references(self) -> bool:
+        """Diagnose the references that cases need; returns whether all are done."""
+        self.need_seal()
+        needed = sorted({str(self._answer(name)["reference"]) for name in self.case_names()})
+        folder = self.root / "references"
+        return self.stage(
+            "references", needed, lambda k: (folder / k / "out" / MODEL).exists(), lambda k: self._reference(folder / k)
+        )
+
+    def answer(self) -> bool:
+        """Let the tool answer the cases without an answer; returns whether all are done."""
+        self.need_seal()
+        folder = self.root / "answered"
+        names = sorted(self.case_names())  # random names give a random order of kinds
+        return self.stage("answer", names, lambda name: (folder / name / "run.json").exists(), self._answer_one)
+
+    def reports(self) -> dict[str, dict[str, Any]]:
+        """The tool's report and ``run.json`` by name of the case."""
+        return self.results("answered", self.tool.report)
+
+    def models(self) -> dict[str, dict[str, Any]]:
+        """The model of the reference of each case, parsed."""
+        return {name: tomllib.loads(self._model(name).read_text(encoding="utf-8")) for name in self.case_names()}
+
+    def _answer(self, name: str) -> dict[str, Any]:
+        return read_json(self.answers_folder / f"{name}.json")
+
+    def _load_answers(self) -> dict[str, Any]:
+        return {name: self._answer(name) for name in self.case_names()}
+
+    def _model(self, name: str) -> Path:
+        return self.root / "references" / str(self._answer(name)["reference"]) / "out" / MODEL
+
+    def _reference(self, folder: Path) -> ChildEnd:
+        files = sorted(path.name for path in folder.glob("untouched_*.csv"))
+        shutil.rmtree(folder / "out", ignore_errors=True)
+        end = run_child(
+            [*self.command, "diagnose", *files, "--car", CAR, "--out", "out", *REFERENCE_OPTIONS], folder,
+            timeout_s=self.timeout_s, environment=self._environment(), abandon=self.abandon,
+        )  # fmt: skip
+        if not end.abandoned and not (folder / "out" / MODEL).exists():
+            last = end.words.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
+            raise DataError(f"The diagnosis of a reference failed: {last[0]}")
+        return end
+
+    def _answer_one(self, name: str) -> ChildEnd:
+        to = self.root / "answered" / name
+        with tempfile.TemporaryDirectory(prefix="answer-") as fresh:
+            here = Path(fresh)
+            untouched = sorted(self._model(name).parents[1].glob("untouched_*.csv"))
+            for source in (*untouched, self._model(name), self.root / "handed" / name / OTHER):
+                shutil.copyfile(source, here / source.name)
+            end = run_child(
+                self.tool.arguments([path.name for path in untouched]), here, timeout_s=self.timeout_s,
+                environment=self._environment(), abandon=self.abandon,
+            )  # fmt: skip
+            if end.abandoned:
+                return end
+            to.mkdir(parents=True, exist_ok=True)
+            if (here / "out" / self.tool.report).exists():
+                shutil.copyfile(here / "out" / self.tool.report, to / self.tool.report)
+        run = {**dataclasses.asdict(end), "jobs": self.jobs}
+        write_json(to / "run.json", run)
+        return end
+
+    def _environment(self) -> Mapping[str, str]:
+        return ONE_THREAD if self.jobs > 1 else {}
+
+
+def write_smaller_unit(car: Path, to: Path) -> None:
+    """Write a car file for recordings whose full lock is ``FULL_LOCK``. Raises ConfigError without its max_angle."""
+    values = tomllib.loads(car.read_text(encoding="utf-8"))
+    try:
+        steering = values["steering"]
+        angle = steering["max_angle"]
+    except KeyError as error:
+        raise ConfigError(f"{car} does not state steering.max_angle; add it.") from error
+    entry = {k: v / FULL_LOCK for k, v in angle.items()} if isinstance(angle, dict) else angle / FULL_LOCK
+    values["steering"] = {**steering, "max_angle": entry}
+    to.parent.mkdir(parents=True, exist_ok=True)
+    to.write_text(tomli_w.dumps(values), encoding="utf-8")
+
+
+def drawn_specs(seed: int, limit: int | None, recordings: Mapping[str, Table]) -> tuple[list[RealCaseSpec], list[str]]:
+    """Cases of a seed, at most ``limit`` drawn without replacement, and the kinds that no recording allows."""
+    in_unit = {name: with_full_lock(table) for name, table in recordings.items()}
+    left_out = parts(in_unit)
+    usable: list[RealCaseSpec] = []
+    refused: set[str] = set()
+    for spec in case_specs(seed):
+        try:
+            make_real_case(spec, in_unit, left_out)
+        except DataError:
+            refused.update(spec.kinds)
+        else:
+            usable.append(spec)
+    allowed = {name for spec in usable for name in spec.kinds}
+    return usable if limit is None else drawn(usable, limit, seed), sorted(refused - allowed)
+
+
+def _plan(specs: Sequence[RealCaseSpec], recordings: Mapping[str, Table], tool: Tool) -> list[dict[str, Any]]:
+    return [*(spec.as_dict() for spec in specs), {"recordings": sorted(recordings), "tool": tool.verb}]

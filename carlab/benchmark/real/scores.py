@@ -1,0 +1,215 @@
+"""Scores of a proof on real recordings: names, sizes, spurious names and false alarms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from carlab.benchmark.intervals import wilson
+from carlab.benchmark.proof.results_page import markdown
+from carlab.core.errors import DataError
+
+CHANGES = {"carlab.compare/1": "changes", "carlab.diagnosis/1": "effects"}
+"""Key of the named changes by schema of the report."""
+VISIBLE_STDS = 2.0
+"""A size counts as visible from this many standard deviations of the tool's estimate on."""
+IDENTITY = {"exponent": 1.0}
+Json = Mapping[str, Any]
+Rows = Mapping[str, Json]
+
+
+def score_comparison(answer: Json, report: Json | None, model: Json, seconds: float | None = None) -> dict[str, Any]:
+    """Score one case.
+
+    Args:
+        answer: The sealed answer, from ``make_real_case``.
+        report: ``compare.json``, or ``report.json`` of a diagnosis; None if there is none.
+        model: The reference's car file, parsed.
+        seconds: Run time [s].
+
+    Returns:
+        A flat table. ``first`` and ``first_with_sets``: the first name is correct (of a pair: one of both); ``found``:
+        concealed effects that are named or in a set; ``spurious``: names that are not concealed.
+
+    Raises:
+        DataError: the report has another schema.
+    """
+    if report is not None and report.get("schema") not in CHANGES:
+        raise DataError(f"The report has schema {report.get('schema')!r}; known: {', '.join(CHANGES)}.")
+    changes = [] if report is None else list(report[CHANGES[report["schema"]]])
+    row: dict[str, Any] = {
+        "kind": answer["kind"],
+        "true": [e["id"] for e in answer["effects"]],
+        "size_index": [e["size_index"] for e in answer["effects"]],
+        "part": answer["part"],
+        "seconds": seconds,
+        "verdict": "no report" if report is None else report["verdict"],
+        "named": [change["id"] for change in changes],
+        "sets": [list(change.get("indistinguishable_from") or []) for change in changes],
+    }
+    if answer["kind"] == "null":
+        return {**row, "false_alarm": bool(changes)}
+    true = [set(e["names"]) for e in answer["effects"]]
+    in_set = [{change["id"], *(change.get("indistinguishable_from") or [])} for change in changes]
+    row["first"] = bool(changes) and any(changes[0]["id"] in names for names in true)
+    row["first_with_sets"] = bool(changes) and any(in_set[0] & names for names in true)
+    row["found"] = sum(any(members & names for members in in_set) for names in true)
+    row["spurious"] = [
+        c["id"] for c, members in zip(changes, in_set, strict=True) if not any(members & n for n in true)
+    ]
+    row["sizes"] = [
+        size
+        for effect in answer["effects"]
+        for change in changes
+        if change["id"] in effect["names"]
+        for size in _sizes(effect, change, model)
+    ]
+    return row
+
+
+def _sizes(effect: Json, change: Json, model: Json) -> list[dict[str, Any]]:
+    """True and estimated value of each parameter of a named effect."""
+    found = []
+    estimates = change["parameters"]
+    for truth in effect["truth"]:
+        estimate = estimates.get(truth["parameter"]) or (
+            next(iter(estimates.values())) if len(estimates) == 1 else None
+        )
+        if estimate is None:
+            continue
+        value = true_value(truth, change["id"], model)
+        found.append({
+            "parameter": f"{change['id']}.{truth['parameter']}", "true": value, "value": estimate["value"],
+            "std": estimate["std"], "covered": estimate["low90"] <= value <= estimate["high90"],
+            "stds": abs(value - _before(change["id"], truth["parameter"], model)) / max(estimate["std"], 1e-12),
+        })  # fmt: skip
+    return found
+
+
+def true_value(truth: Json, name: str, model: Json) -> float:
+    """Value of a parameter for the changed car: the reference's value, changed by the concealed size."""
+    size = float(truth["size"]) * (_base_value("steering.max_angle", model) if truth["per_lock"] else 1.0)
+    before = _before(name, truth["parameter"], model)
+    return {"adds": before + size, "multiplies": before * size, "replaces": size}[truth["composes"]]
+
+
+def _before(name: str, parameter: str, model: Json) -> float:
+    """The parameter in the reference's car file; its identity if the effect is absent (infinite: 0)."""
+    if "." in name:
+        return _base_value(name, model)
+    entry = model.get("effects", {}).get(name, {}).get(parameter)
+    if entry is None and parameter == "latency":
+        entry = model.get("mocap", {}).get("latency", 0.0)
+    return IDENTITY.get(parameter, 0.0) if entry is None else _number(entry)
+
+
+def _base_value(name: str, model: Json) -> float:
+    entry: Any = model
+    for key in name.split("."):
+        entry = entry[key]
+    return _number(entry)
+
+
+def _number(entry: Any) -> float:
+    return float(entry["value"] if isinstance(entry, Mapping) else entry)
+
+
+def add_visibility(rows: Rows) -> None:
+    """Set ``stds`` of each single case: its size in standard deviations of the tool.
+
+    A case without an estimate of its own takes the median ratio of size to deviation of the named cases of its kind and
+    size; without any such case it stays None.
+    """
+    singles = [row for row in rows.values() if row["kind"] == "single"]
+    for row in singles:
+        own = [size["stds"] for size in row["sizes"]]
+        row["stds"] = max(own) if own else None  # type: ignore[index]
+    for row in singles:
+        if row["stds"] is None:
+            alike = [
+                other["stds"]
+                for other in singles
+                if other["true"] == row["true"] and other["sizes"] and other["size_index"] == row["size_index"]
+            ]
+            row["stds"] = float(np.median(alike)) if alike else None  # type: ignore[index]
+
+
+def _single(row: Json) -> bool:
+    return bool(row["kind"] == "single")
+
+
+def _visible(row: Json) -> bool:
+    return _single(row) and row["stds"] is not None and row["stds"] >= VISIBLE_STDS
+
+
+RATES: tuple[tuple[str, Callable[[Json], bool], Callable[[Json], Any], str], ...] = (
+    ("named first, sets allowed, size at least 2 std", _visible, lambda r: r["first_with_sets"], ">= 0.90"),
+    ("named first, strictly, size at least 2 std", _visible, lambda r: r["first"], ""),
+    ("named first, sets allowed, all sizes", _single, lambda r: r["first_with_sets"], ""),
+    ("named first, strictly, all sizes", _single, lambda r: r["first"], ""),
+    ("cases with a spurious name", lambda r: r["kind"] != "null", lambda r: bool(r["spurious"]), ""),
+    ("pairs: both found", lambda r: r["kind"] == "pair", lambda r: r["found"] == 2, ""),
+    ("false alarms, untouched recordings", lambda r: r["kind"] == "null", lambda r: r["false_alarm"], "<= 0.05"),
+)
+
+
+def rate_rows(rows: Rows) -> list[tuple[str, str, str, str]]:
+    """Rows (figure, share with Wilson interval, cases, target)."""
+    found = [
+        _rate(title, [bool(hit(r)) for r in rows.values() if among(r)], target) for title, among, hit, target in RATES
+    ]
+    sizes = [size for r in rows.values() if r["kind"] != "null" for size in r["sizes"]]
+    found.append(_rate("size within its 90 % interval", [s["covered"] for s in sizes], "0.80 to 0.97"))
+    errors = [abs(s["value"] - s["true"]) / s["std"] for s in sizes if s["std"] > 0.0 and math.isfinite(s["value"])]
+    seconds = [r["seconds"] for r in rows.values() if r["seconds"] is not None]
+    for title, values in (("error of a size in its standard deviations, median", errors), ("seconds, median", seconds)):
+        found.append((title, f"{np.median(values):.2g}" if values else "-", str(len(values)), ""))
+    return found
+
+
+def _rate(title: str, hits: Sequence[bool], target: str) -> tuple[str, str, str, str]:
+    low, high = wilson(sum(hits), len(hits))
+    value = f"{sum(hits) / len(hits):.2f} ({low:.2f} to {high:.2f})" if hits else "-"
+    return title, value, f"{sum(hits)}/{len(hits)}", target
+
+
+def kind_rows(rows: Iterable[Json]) -> list[tuple[str, ...]]:
+    """One row per kind: correct first names (sets allowed) of cases at the small, middle and large size, and sizes."""
+    table: dict[str, list[Json]] = {}
+    for row in rows:
+        if row["kind"] == "single":
+            table.setdefault(row["true"][0], []).append(row)
+    found = []
+    for kind, cases in sorted(table.items()):
+        by_size = [[c["first_with_sets"] for c in cases if c["size_index"] == [k]] for k in range(3)]
+        sizes = [size["covered"] for c in cases for size in c["sizes"]]
+        hits = [f"{sum(group)}/{len(group)}" if group else "-" for group in by_size]
+        found.append((kind, *hits, f"{sum(sizes)}/{len(sizes)}" if sizes else "-"))
+    return found
+
+
+def real_results_page(facts: Mapping[str, str], rows: Rows, runs: Rows) -> str:
+    """Results as Markdown: command, figures, kinds, failures."""
+    parts = ["# Concealed in real recordings", "\n".join(f"* {name}: {value}" for name, value in facts.items())]
+    parts.append(markdown(("figure", "value (95 %)", "n", "target"), rate_rows(rows)))
+    parts.append("## Each kind: named first (sets allowed), by size")
+    columns = ("kind", "small", "middle", "large", "size in its interval")
+    parts += [markdown(columns, kind_rows(rows.values())), "## Failures", "\n".join(_failures(rows, runs)) or "None."]
+    return "\n\n".join(parts) + "\n"
+
+
+def _failures(rows: Rows, runs: Rows) -> list[str]:
+    lines = []
+    for name, row in sorted(rows.items(), key=lambda item: (item[1]["kind"], item[1]["true"], item[0])):
+        is_right = not row["false_alarm"] if row["kind"] == "null" else row["first_with_sets"] and not row["spurious"]
+        if row["verdict"] == "no report":
+            words = str(runs.get(name, {}).get("words", "")).strip().splitlines()
+            lines.append(f"* {name}: {row['kind']} {' + '.join(row['true'])}: no report: {words[-1] if words else ''}")
+        elif not is_right:
+            sizes = ", ".join(("small", "middle", "large")[k] for k in row["size_index"])
+            true = f"{' + '.join(row['true'])} ({sizes})" if row["true"] else "nothing"
+            lines.append(f"* {name}: {row['kind']}, {true}: answered {' + '.join(row['named']) or row['verdict']}")
+    return lines

@@ -1,0 +1,230 @@
+"""Test effects concealed in recordings against simulated cars that have them, the sealed run, and its scores."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from carlab.benchmark.real.cases import RealCaseSpec, case_specs, make_real_case, parts, reference, with_full_lock
+from carlab.benchmark.real.kinds import FULL_LOCK, KINDS, Kind, Truth
+from carlab.benchmark.real.runner import RealProof, Tool
+from carlab.benchmark.real.scores import add_visibility, kind_rows, rate_rows, real_results_page, score_comparison
+from carlab.benchmark.world.measurement import COLUMNS, read_csv
+from carlab.core.errors import DataError
+from sim_backends import SimulatorConfig, rollout
+
+PERIOD_S = 1.0 / 30.0
+FAKE = (sys.executable, str(Path(__file__).with_name("fake_comparison.py")))
+LAGS = ("steering_lag", "motor_lag")
+BY_ID = {kind.id: kind for kind in KINDS}
+CAR = SimulatorConfig(control_period_s=PERIOD_S, command_delay_s=2.0 * PERIOD_S)
+MAX_ANGLE_RAD = CAR.parameters.max_angle_rad
+OBSERVED = COLUMNS[1:7]
+# Largest distance from the car with the effect [m, m, rad, m/s, m/s, rad/s]: interpolation of poses; steps that a lag
+# rounds off over a row; commands of less than 0.002 within a dead band. All other transformations are exact.
+TOLERANCE = {
+    "mocap_latency": np.array([2e-4, 2e-4, 5e-4, 0.01, 3e-3, 0.02]),
+    "velocity_filter_lag": np.array([1e-9, 1e-9, 1e-9, 3e-3, 1e-3, 1e-3]),
+    "steering_deadband": np.full(6, 1e-4),
+}
+EXACT = np.full(6, 1e-6)
+
+
+def commands(seconds: float, seed: int = 0) -> np.ndarray:
+    """One second at rest, then smooth steering within full lock and held throttle that is often zero, (T, 2)."""
+    t = PERIOD_S * np.arange(int(seconds / PERIOD_S))
+    rng = np.random.default_rng(seed)
+    steering = FULL_LOCK * np.clip(0.6 * np.sin(1.9 * t) + 0.5 * np.sin(0.73 * t + rng.random()), -1.0, 1.0)
+    throttle = np.repeat(rng.choice([0.0, 0.1, 0.25, 0.4], len(t) // 20 + 1), 20)[: len(t)]
+    return np.where(t[:, None] < 1.0, 0.0, np.stack([steering, throttle], axis=1))
+
+
+def simulated(sent: np.ndarray, config: SimulatorConfig = CAR) -> dict[str, np.ndarray]:
+    """The noise-free recording of a car."""
+    start = torch.tensor([[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    states = rollout(config, start, torch.from_numpy(sent)[None], measured=True).measured
+    assert states is not None
+    rows = states[0].numpy()
+    columns = [PERIOD_S * np.arange(len(rows)), *rows.T, *np.vstack([sent, sent[-1:]]).T]
+    return dict(zip(COLUMNS, columns, strict=True))
+
+
+def with_effect(kind: Kind, truth: Sequence[Truth]) -> SimulatorConfig:
+    """The car with the kind's effect, of the size that the generator states."""
+    numbers = {t.parameter: t.size * (MAX_ANGLE_RAD if t.per_lock else 1.0) for t in truth}
+    if kind.id == "mocap_latency":
+        numbers["latency"] += CAR.mocap.latency_s
+    if kind.id == "steering_gain":
+        return CAR.with_values({"steering.max_angle": MAX_ANGLE_RAD * numbers["value"]})
+    return dataclasses.replace(CAR, effects={kind.names[0]: numbers})
+
+
+@pytest.mark.parametrize("kind", [k for k in KINDS if k.id not in LAGS], ids=lambda k: k.id)
+def test_recording_is_that_of_a_car_with_the_effect(kind: Kind) -> None:
+    """The effect-free car's recording with transformed columns is reproduced by a simulated car with the effect."""
+    change = kind.apply(simulated(commands(12.0)), kind.sizes[1], 0.3)
+    sent = np.stack([change.table["steering"], change.table["throttle"]], axis=1)[:-1]
+    assert np.abs(sent).max() <= 1.0
+    expected = simulated(sent, with_effect(kind, change.truth))
+    rows = slice(10, -10)  # without the start of a delayed recording, and rows whose commands a shift has lost
+    for name, tolerance in zip(OBSERVED, TOLERANCE.get(kind.id, EXACT), strict=True):
+        error = change.table[name][rows] - expected[name][rows]
+        error = np.remainder(error + np.pi, 2.0 * np.pi) - np.pi if name == "yaw" else error
+        assert np.abs(error).max() <= tolerance, name
+
+
+@pytest.mark.parametrize("name", LAGS)
+def test_lag_leaves_a_fifteenth_of_its_effect(name: str) -> None:
+    """Compare with the error of the untransformed recording against the car with the lag."""
+    plain = simulated(commands(12.0))
+    change = BY_ID[name].apply(plain, BY_ID[name].sizes[1], 0.3)
+    car = with_effect(BY_ID[name], change.truth)
+    sent = np.stack([change.table["steering"], change.table["throttle"]], axis=1)[:-1]
+    column = "yaw_rate" if name == "steering_lag" else "vx"
+    effect = simulated(commands(12.0), car)[column] - plain[column]
+    error = simulated(sent, car)[column] - plain[column]
+    assert np.std(error) < 0.07 * np.std(effect)
+
+
+def test_lag_reports_commands_that_it_clips() -> None:
+    table = simulated(commands(12.0))
+    table["steering"] = FULL_LOCK * np.sign(table["steering"])
+    change = BY_ID["steering_lag"].apply(table, 0.1, 0.3)
+    assert np.abs(change.table["steering"]).max() <= 1.0
+    assert change.inexact > 0.1
+
+
+@pytest.fixture(scope="module")
+def recordings() -> dict[str, dict[str, np.ndarray]]:
+    tables = {
+        name: simulated(commands(length_s, seed))
+        for seed, (name, length_s) in enumerate({"a": 130.0, "b": 70.0}.items())
+    }
+    for table in tables.values():
+        table["steering"] = table["steering"] / FULL_LOCK
+    return tables
+
+
+def test_reference_leaves_out_the_part_of_the_case(recordings: dict[str, dict[str, np.ndarray]]) -> None:
+    tables = {name: with_full_lock(table) for name, table in recordings.items()}
+    left_out = parts(tables)
+    assert [(p.recording, round(p.end_s - p.begin_s)) for p in left_out] == [("a", 65), ("a", 65), ("b", 70)]
+    poses = {(x, y) for table in reference(tables, left_out[0]) for x, y in zip(table["x"], table["y"], strict=True)}
+    assert sum(len(table["t"]) for table in reference(tables, left_out[0])) == pytest.approx(134.0 / PERIOD_S, abs=5)
+    for seed in range(5):
+        number, other, answer = make_real_case(RealCaseSpec("null", seed), tables, left_out)
+        assert answer["effects"] == []
+        used = set(zip(other["x"].tolist(), other["y"].tolist(), strict=True)) - {(0.0, 0.0)}
+        assert len(used) > 57.0 / PERIOD_S
+        kept = reference(tables, left_out[number])
+        assert not used & {(x, y) for table in kept for x, y in zip(table["x"], table["y"], strict=True)}
+    assert poses
+
+
+def test_set_has_each_kind_at_each_size() -> None:
+    specs = case_specs(0)
+    singles = [(spec.kinds[0], spec.sizes[0]) for spec in specs if spec.kind == "single"]
+    assert {(kind.id, size): 2 for kind in KINDS for size in range(3)} == {
+        case: singles.count(case) for case in singles
+    }
+    assert sum(spec.kind == "null" for spec in specs) >= 30
+    assert len(KINDS) >= 12
+    assert case_specs(0) == specs != case_specs(1)
+
+
+def test_too_little_driving_is_refused(recordings: dict[str, dict[str, np.ndarray]]) -> None:
+    with pytest.raises(DataError, match="a proof needs 120 s"):
+        parts({"b": recordings["b"]})
+    still = {name: {**table, "steering": 0.0 * table["steering"]} for name, table in recordings.items()}
+    with pytest.raises(DataError, match="varying commands"):
+        parts(still)
+
+
+def test_tool_sees_files_without_the_answer(recordings: dict[str, dict[str, np.ndarray]], tmp_path: Path) -> None:
+    car = tmp_path / "car.toml"
+    car.write_text("[steering]\nmax_angle = { value = 0.42, low = 0.35, high = 0.7 }\n")
+    specs = [RealCaseSpec("single", 1, ("steering_offset",), (2,)), RealCaseSpec("null", 2)]
+    log: list[str] = []
+    proof = RealProof(
+        tmp_path / "proof", specs, recordings, car, tool=Tool("compare", FAKE), command=FAKE,
+        progress=lambda stage, done, total, note: log.append(stage),
+    )  # fmt: skip
+    with pytest.raises(DataError, match="Seal the answers"):
+        proof.answer()
+    proof.make()
+    assert proof.diagnose_references()
+    assert proof.answer()
+    assert log.index("seal") < log.index("references") < log.index("answer")
+    answers, models = proof.open_seal(), proof.models()
+    rows = {
+        name: score_comparison(answers[name], run["report"], models[name], run["seconds"])
+        for name, run in proof.reports().items()
+    }
+    for name, run in proof.reports().items():
+        seen = run["report"]["seen"]
+        assert all(f.startswith("untouched_") or f in ("other.csv", "model.toml", "out") for f in seen["files"])
+        assert str(tmp_path) not in seen["folder"]
+        assert models[name]["steering"]["max_angle"]["value"] == pytest.approx(0.42 / FULL_LOCK)
+        assert np.diff(read_csv(proof.root / "handed" / name / "other.csv")["t"]).max() < 1.5 * PERIOD_S
+    add_visibility(rows)
+    by_kind = {row["kind"]: row for row in rows.values()}
+    assert by_kind["null"]["false_alarm"]
+    assert by_kind["single"]["first"]
+    size = by_kind["single"]["sizes"][0]
+    # 12 % of full lock, which is 0.42 rad, whatever the unit of the command.
+    assert abs(size["true"]) == pytest.approx(0.12 * 0.42)
+    assert size["covered"] == (0.0 <= size["true"] <= 0.04)
+    assert by_kind["single"]["stds"] == pytest.approx(5.04)
+    assert {row[0]: row[2] for row in rate_rows(rows)}["false alarms, untouched recordings"] == "1/1"
+    assert kind_rows(rows.values()) == [("steering_offset", "-", "-", "1/1", f"{int(size['covered'])}/1")]
+    assert "nothing: answered steering_offset" in real_results_page({"seed": "0"}, rows, proof.reports())
+    handed = proof.root / "handed" / next(iter(rows)) / "other.csv"
+    handed.write_text(handed.read_text().replace("0", "1", 1))
+    with pytest.raises(DataError, match="seal is broken"):
+        proof.open_seal()
+
+
+def answer(name: str, names: list[str], **truth: Any) -> dict[str, Any]:
+    change = {"parameter": "delay", "size": 0.07, "composes": "adds", "per_lock": False, **truth}
+    return {"kind": "single", "part": {}, "effects": [{"id": name, "names": names, "size_index": 1, "truth": [change]}]}
+
+
+def report(*named: tuple[str, str, float], others: tuple[str, ...] = ()) -> dict[str, Any]:
+    changes = [
+        {"id": name, "parameters": {parameter: {"value": v, "std": 0.01, "low90": v - 0.02, "high90": v + 0.02}},
+         "indistinguishable_from": list(others)}
+        for name, parameter, v in named
+    ]  # fmt: skip
+    return {"schema": "carlab.compare/1", "verdict": "changed", "changes": changes}
+
+
+def test_size_is_added_to_the_model_of_the_reference() -> None:
+    truth = answer("steering_delay", ["steering_delay"])
+    model = {"effects": {"steering_delay": {"delay": 0.03}}}
+    row = score_comparison(truth, report(("steering_delay", "delay", 0.09)), model)
+    assert row["sizes"][0]["true"] == pytest.approx(0.1)
+    assert row["sizes"][0]["covered"]
+    assert not score_comparison(truth, report(("steering_delay", "delay", 0.07)), model)["sizes"][0]["covered"]
+    gain = answer("steering_gain", ["steering.max_angle"], parameter="value", size=1.1, composes="multiplies")
+    row = score_comparison(gain, report(("steering.max_angle", "max_angle", 0.45)), {"steering": {"max_angle": 0.4}})
+    assert row["sizes"][0]["true"] == pytest.approx(0.44)
+    assert row["sizes"][0]["stds"] == pytest.approx(4.0)
+
+
+def test_sets_and_spurious_names() -> None:
+    truth = answer("steering_delay", ["steering_delay"])
+    row = score_comparison(truth, report(("steering_lag", "time_constant", 0.1), others=("steering_delay",)), {})
+    assert (row["first"], row["first_with_sets"], row["spurious"]) == (False, True, [])
+    two = score_comparison(truth, report(("motor_lag", "time_constant", 0.1), ("steering_delay", "delay", 0.07)), {})
+    assert (two["first_with_sets"], two["found"], two["spurious"]) == (False, 1, ["motor_lag"])
+    none = score_comparison(truth, None, {})
+    assert (none["first"], none["verdict"]) == (False, "no report")
+    with pytest.raises(DataError, match="schema"):
+        score_comparison(truth, {"schema": "other/1"}, {})

@@ -1,0 +1,53 @@
+"""``carlab prove --set real``: recordings of a folder, a sealed run, and refusals in one sentence."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from recorded_drives import drive
+
+from carlab.cli import prove
+from carlab.recording import write_csv
+from sim_backends import SimulatorConfig
+
+Carlab = Callable[..., tuple[int, str]]
+FAKE = Path(__file__).resolve().parents[1] / "benchmark" / "fake_comparison.py"
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    for seed in (1, 2):
+        write_csv(drive(SimulatorConfig(), 75.0, seed), folder / f"{seed}.csv")
+    return folder
+
+
+def test_recordings_of_a_folder_are_sealed_answered_and_scored(
+    data: Path, tmp_path: Path, carlab: Carlab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prove, "_carlab_command", lambda: (sys.executable, str(FAKE)))
+    options = ("prove", "--set", "real", "--data", data, "--car", "rc_car", "--out", tmp_path / "proof", "--limit", 3)
+    code, text = carlab(*options)
+    assert code == 0, text
+    assert text.index("sha256") < text.index("references diagnosed") < text.index("The seal is intact")
+    assert (tmp_path / "proof" / "scores.json").exists()
+    page = (tmp_path / "proof" / "results.md").read_text()
+    assert "false alarms, untouched recordings" in page
+    first = (tmp_path / "proof" / "seal.json").read_bytes()
+    assert carlab(*options)[0] == 0
+    assert (tmp_path / "proof" / "seal.json").read_bytes() == first
+
+
+def test_missing_data_and_car_are_refused(data: Path, tmp_path: Path, carlab: Carlab) -> None:
+    out = ("--out", tmp_path / "proof")
+    for options, words in (
+        (("--car", "rc_car"), "--data"),
+        (("--data", data), "--car"),
+        (("--data", data, "--car", "no_such_car"), "no_such_car"),
+        (("--data", tmp_path / "absent", "--car", "rc_car"), "is not a folder"),
+    ):
+        code, text = carlab("prove", "--set", "real", *out, *options)
+        assert code == 2
+        assert words in text
+    assert "Traceback" not in text
