@@ -1,4 +1,4 @@
-"""The Python interface: load, load_car, predict, diagnose, check, drive, replay, learn.
+"""The Python interface: load, load_car, predict, diagnose, compare, check, drive, replay, learn.
 
 ``carlab`` re-exports these names. The command line calls this interface: each option of a verb is an argument of the
 same name. The interface does not print. Each call imports the heavy libraries that it needs (torch, scipy, matplotlib,
@@ -7,6 +7,7 @@ rerun).
 
 from carlab.api.cars import load_car
 from carlab.api.checking import CarCheck, check
+from carlab.api.comparison import compare
 from carlab.api.diagnosis import DiagnosisReport, diagnose
 from carlab.api.driving import DriveRun, drive, replay
 from carlab.api.learning import LearnHooks, LearnRun, learn
@@ -24,6 +25,7 @@ __all__ = [
     "Recording",
     "RunHooks",
     "check",
+    "compare",
     "diagnose",
     "drive",
     "learn",

@@ -270,10 +270,28 @@ def _assigned(
         fitted, validated = _episodes_of_run(item) if isinstance(item, Path) else ([item], [])
         to_fit += fitted
         to_validate += validated
-    paths = [{p.resolve() for item in items if (p := _path_of(item))} for items in (to_fit, to_validate)]
-    if same := paths[0] & paths[1]:
+    if same := _paths_of(to_fit) & _paths_of(to_validate):
         raise ConfigError(f"{min(same).name} is both fitted and held out; remove it from one of the lists.")
     return to_fit, to_validate
+
+
+def recordings_of_runs(
+    first: list[RecordingLike], second: list[RecordingLike]
+) -> tuple[list[RecordingLike], list[RecordingLike]]:
+    """Two groups with run folders replaced by their episodes. Raises ConfigError if a recording is in both."""
+    from carlab.core.errors import ConfigError
+
+    groups: list[list[RecordingLike]] = []
+    for items in (first, second):
+        resolved = [_episodes_of_run(item) if isinstance(item, Path) else ([item], []) for item in items]
+        groups.append([recording for fitted, validated in resolved for recording in (*fitted, *validated)])
+    if same := _paths_of(groups[0]) & _paths_of(groups[1]):
+        raise ConfigError(f"{min(same).name} is in both groups; remove it from one of them.")
+    return groups[0], groups[1]
+
+
+def _paths_of(items: Iterable[RecordingLike]) -> set[Path]:
+    return {path.resolve() for item in items if (path := _path_of(item))}
 
 
 def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:

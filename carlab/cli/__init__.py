@@ -62,6 +62,7 @@ _DESCRIPTION = "Drive, learn and diagnose small race cars: real, emulated on the
 def _verbs() -> dict[str, Callable[..., Any]]:
     from carlab.cli.bench import Bench
     from carlab.cli.check import Check
+    from carlab.cli.compare import Compare
     from carlab.cli.diagnose import Diagnose
     from carlab.cli.drive import Drive
     from carlab.cli.emulate import Emulate
@@ -84,6 +85,7 @@ def _verbs() -> dict[str, Callable[..., Any]]:
         "listen": Listen,
         "learn": Learn,
         "diagnose": Diagnose,
+        "compare": Compare,
         "prove": Prove,
         "bench": Bench,
     }

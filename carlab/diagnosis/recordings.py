@@ -54,7 +54,7 @@ def split_recordings(
         Inconclusive: too little driving, speed or variation of the commands.
     """
     fit_tracks, held_out_tracks = _split(fit, held_out, held_out_share, settings)
-    _check_excitation(fit_tracks, settings)
+    check_excitation(fit_tracks, settings)
     fit_windows = _cut(fit_tracks, settings.fit_window_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
     held_out_windows = _cut(held_out_tracks, settings.held_out_window_s, settings.held_out_stride_s)
     held_out_windows = held_out_windows.thinned(settings.max_held_out_windows)
@@ -89,7 +89,7 @@ def _cut(tracks: Sequence[Track], horizon_s: float, stride_s: float) -> Predicti
         raise Inconclusive(str(error)) from error
 
 
-def _check_excitation(tracks: Sequence[Track], settings: WindowSettings) -> None:
+def check_excitation(tracks: Sequence[Track], settings: WindowSettings) -> None:
     """Raise Inconclusive if the excitation is not sufficient; the message states what to record."""
     seconds = sum(track.duration_s for track in tracks)
     if seconds < settings.min_fit_s:
@@ -110,4 +110,4 @@ def _check_excitation(tracks: Sequence[Track], settings: WindowSettings) -> None
             )
 
 
-__all__ = ["Inconclusive", "SplitRecordings", "check_held_out_share", "split_recordings"]
+__all__ = ["Inconclusive", "SplitRecordings", "check_excitation", "check_held_out_share", "split_recordings"]

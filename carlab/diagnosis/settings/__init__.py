@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from carlab.diagnosis.settings.comparison import ComparisonSettings
 from carlab.diagnosis.settings.evidence import EvidenceSettings, UnexplainedSettings
 from carlab.diagnosis.settings.prediction import CurveSettings, IdentificationSettings, WindowSettings
 from carlab.diagnosis.settings.quick import QuickSettings
@@ -29,6 +30,7 @@ class DiagnosisSettings:
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     unexplained: UnexplainedSettings = field(default_factory=UnexplainedSettings)
     quick: QuickSettings = field(default_factory=QuickSettings)
+    comparison: ComparisonSettings = field(default_factory=ComparisonSettings)
     report: ReportSettings = field(default_factory=ReportSettings)
 
 
@@ -37,6 +39,7 @@ DEFAULT = DiagnosisSettings()
 
 __all__ = [
     "DEFAULT",
+    "ComparisonSettings",
     "CurveSettings",
     "DiagnosisSettings",
     "EvidenceSettings",

@@ -1,0 +1,82 @@
+"""Comparison of two groups of recordings of one car."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from carlab.api.cars import load_car
+from carlab.api.diagnosis import RecordingLike, as_list, recordings_of_runs
+from carlab.api.diagnosis import read_material as read
+
+if TYPE_CHECKING:
+    from carlab.cars import CarFile
+    from carlab.diagnosis.comparison.result import Comparison
+
+FILE_NAME = "compare.json"
+
+
+def compare(
+    recordings: RecordingLike | Iterable[RecordingLike],
+    changed: RecordingLike | Iterable[RecordingLike],
+    car: str | Path | CarFile = "sim",
+    *,
+    candidates: Sequence[str] = (),
+    out: Path | str | None = None,
+    progress: Callable[[str, float], None] = lambda activity, share: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Comparison:
+    """Find what changed between two groups of recordings of one car.
+
+    Args:
+        recordings: first group: recordings, episodes, or paths of MCAP or CSV files or of run folders.
+        changed: second group.
+        car: the simulator, best the model of a diagnosis: a car file, its path, or a name.
+        candidates: effects and base parameters that may differ; all by default.
+        out: folder for compare.json (schema ``carlab.compare/1``); nothing is written by default.
+        progress: callback with the activity and the completed share in [0, 1].
+        stop: callback; if it returns true, the changes so far are the result.
+
+    Returns:
+        The smallest set of changes with 90 % intervals; verdict "changed" or "nothing".
+
+    Raises:
+        ConfigError: a group is empty, a recording is in both groups, or a candidate does not exist.
+        DataError: a group is too short or too uniform; the message states what to record.
+    """
+    from carlab.core.errors import ConfigError
+    from carlab.diagnosis.comparison.candidates import change_candidates
+    from carlab.diagnosis.comparison.compare import compare as search
+
+    file = load_car(car)
+    first, second = as_list(recordings), as_list(changed)
+    if not first or not second:
+        raise ConfigError("A comparison needs two groups, for example carlab compare monday.mcap --with friday.mcap.")
+    first, second = recordings_of_runs(first, second)
+    known = [c.id for c in change_candidates(file.simulator)]
+    for name in candidates:
+        if name not in known:
+            raise ConfigError(f"'{name}' cannot change in this car; choose among {', '.join(known)}.")
+    latency_s = file.simulator.mocap.latency_s
+    groups = [read(items, role, latency_s) for items, role in ((first, "first group"), (second, "second group"))]
+    found = search(
+        groups[0].episodes,
+        groups[1].episodes,
+        file.simulator,
+        candidates=tuple(candidates) or None,
+        progress=progress,
+        stop=stop,
+    )
+    if out is not None:
+        _save(found, Path(out))
+    return found
+
+
+def _save(found: Comparison, folder: Path) -> None:
+    from carlab.recording.atomic_files import write_text
+    from carlab.recording.sink import make_folder
+
+    make_folder(folder)
+    write_text(folder / FILE_NAME, json.dumps(found.to_dict(), indent=2) + "\n")

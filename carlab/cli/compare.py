@@ -1,0 +1,60 @@
+"""``carlab compare``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from carlab.cli.console import console, progress
+
+
+@dataclass
+class Compare:
+    """Find what changed between two groups of drives of one car: another day, battery, floor, tyre or set-up.
+
+    Names the smallest set of effects and parameters that differ, each with a 90 % interval, and writes compare.json.
+    Each group needs 50 s of driving. ^C ends the search and keeps the changes so far.
+    """
+
+    recordings: Positional[tuple[Path, ...]]
+    """MCAP or CSV files of the first group, or folders of runs."""
+
+    changed: Annotated[tuple[Path, ...], arg(name="with")] = ()
+    """Recordings of the second group."""
+
+    car: str = "sim"
+    """Simulator of the car, best the model.toml of a diagnosis: a car file, a preset (eth_rc_car ...), or sim."""
+
+    candidates: tuple[str, ...] = ()
+    """Restrict the changes to these effects and base parameters (motor.drive_gain ...)."""
+
+    out: Path = Path("comparison")
+    """Folder for compare.json."""
+
+    verbose: bool = False
+    """Show the whole log."""
+
+    def run(self) -> int:
+        """Compare and print the changes."""
+        from carlab.api import compare
+        from carlab.experiment.episodes.interrupts import Interrupts
+
+        with Interrupts() as interrupts, progress() as bar:
+            row = bar.add_task("comparison", total=100, note="")
+            found = compare(
+                self.recordings,
+                self.changed,
+                self.car,
+                candidates=self.candidates,
+                out=self.out,
+                progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
+                stop=interrupts.requested.is_set,
+            )
+        console.print(found.sentence)
+        for change in found.changes:
+            console.print(f"  {change.sentence}", markup=False)
+        console.print(f"Read {self.out / 'compare.json'}.")
+        return 0

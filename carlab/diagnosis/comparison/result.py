@@ -1,0 +1,94 @@
+"""Result of a comparison as data: the schema ``carlab.compare/1``, and its sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from carlab.diagnosis.findings import Estimate
+from carlab.diagnosis.report.sentences import effect_noun, listed, number, percent, unit_text
+from sim_backends.effects import EFFECTS
+
+SCHEMA = "carlab.compare/1"
+ComparisonVerdict = Literal["changed", "nothing", "inconclusive"]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """An effect or a base parameter that differs between the groups.
+
+    Attributes:
+        id: id of an effect, or dotted name of a base parameter.
+        parameters: change of each parameter, second group minus first, with its 90 % interval.
+        reference: value of each parameter in the first group.
+        p_value: of no change, multiplied by the number of candidates.
+        loss_share: fall of the loss on unseen blocks of the second group, as a share of it.
+        standard_errors: that fall in standard errors.
+        indistinguishable_from: candidates that explain the second group as well.
+    """
+
+    id: str
+    parameters: Mapping[str, Estimate]
+    reference: Mapping[str, float]
+    p_value: float
+    loss_share: float
+    standard_errors: float
+    indistinguishable_from: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The effect's name, or the name of the base parameter."""
+        return effect_noun(self.id) if self.id in EFFECTS else self.id
+
+    @property
+    def sentence(self) -> str:
+        """The change with its numbers."""
+        parts = []
+        for name, e in self.parameters.items():
+            unit = f" {unit_text(e.unit)}".rstrip()
+            interval = f"{number(e.low90)} to {number(e.high90)} at 90 %"
+            parts.append(f"{name} by {number(e.value)}{unit} ({interval}), from {number(self.reference[name])}{unit}")
+        others = listed([effect_noun(n) if n in EFFECTS else n for n in self.indistinguishable_from], "or")
+        also = f" These recordings do not distinguish it from {others}." if others else ""
+        return f"{self.name[0].upper()}{self.name[1:]} changed: {listed(parts)}.{also}"
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The smallest set of changes that explains the difference between two groups of recordings.
+
+    Attributes:
+        verdict: "changed", "nothing" or "inconclusive".
+        sentence: the verdict.
+        changes: the changes, the strongest first.
+        seconds: run time [s].
+    """
+
+    verdict: ComparisonVerdict
+    sentence: str
+    changes: tuple[Change, ...] = ()
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data in the schema, ready for JSON."""
+        return {"schema": SCHEMA, **asdict(self)}
+
+
+def verdict_sentence(changes: Sequence[Change]) -> str:
+    """The verdict of a comparison that has enough data."""
+    if not changes:
+        return "These recordings show no change of the car between the two groups."
+    falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))
+    names = listed([c.name for c in changes])
+    return f"Between the two groups changed: {names}. This lowers the loss on unseen blocks of the second by {falls}."
+
+
+def _product(factors: Sequence[float]) -> float:
+    made = 1.0
+    for factor in factors:
+        made *= factor
+    return made
+
+
+__all__ = ["SCHEMA", "Change", "Comparison", "ComparisonVerdict", "verdict_sentence"]

@@ -1,0 +1,95 @@
+"""The comparison of two groups of recordings on simulated cars whose change is known."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import carlab
+from carlab.cli import run
+from carlab.core.errors import ConfigError, DataError
+from carlab.diagnosis.comparison.compare import compare
+from carlab.diagnosis.identification.fit import with_effect
+from sim_backends import SimulatorConfig
+from tests.helpers.recorded_drives import PERIOD_S, drive
+
+CAR = SimulatorConfig(control_period_s=PERIOD_S)
+CANDIDATES = (
+    *("steering_lag", "steering_offset", "motor_lag", "command_delay", "throttle_nonlinearity"),
+    *("motor.drive_gain", "steering.max_angle", "tyre.rear.mu"),
+)
+
+
+def with_unknown_physics(config: SimulatorConfig) -> SimulatorConfig:
+    """Add physics of the real car that the simulator of the comparison does not have."""
+    return with_effect(config, "aerodynamic_drag").with_values({"effects.aerodynamic_drag.coefficient": 0.25})
+
+
+@pytest.fixture(scope="module")
+def first():
+    return drive(with_unknown_physics(CAR), 90.0, 21)
+
+
+def second(config: SimulatorConfig, seed: int = 22):
+    return drive(with_unknown_physics(config), 90.0, seed)
+
+
+def test_change_is_named_with_its_size_although_the_simulator_lacks_physics(first):
+    lag_s = 0.08
+    slow = with_effect(CAR, "steering_lag").with_values({"effects.steering_lag.time_constant": lag_s})
+    found = compare([first], [second(slow)], CAR, candidates=CANDIDATES)
+    assert found.verdict == "changed"
+    assert [change.id for change in found.changes] == ["steering_lag"]
+    estimate = found.changes[0].parameters["time_constant"]
+    assert estimate.low90 <= lag_s <= estimate.high90
+    assert estimate.value == pytest.approx(lag_s, rel=0.1)
+
+
+def test_changed_base_parameter_is_named(first):
+    gain = CAR.values()["motor.drive_gain"]
+    found = compare([first], [second(CAR.with_values({"motor.drive_gain": 0.85 * gain}))], CAR, candidates=CANDIDATES)
+    assert [change.id for change in found.changes] == ["motor.drive_gain"]
+    estimate = found.changes[0].parameters["motor.drive_gain"]
+    assert estimate.low90 <= -0.15 * gain <= estimate.high90
+    assert "motor.drive_gain changed" in found.changes[0].sentence.lower()
+
+
+@pytest.mark.parametrize("seed", [22, 23])
+def test_same_car_has_no_change(first, seed):
+    assert compare([first], [second(CAR, seed)], CAR, candidates=CANDIDATES).verdict == "nothing"
+
+
+def test_stop_ends_with_the_changes_so_far(first):
+    assert compare([first], [first], CAR, stop=lambda: True).changes == ()
+
+
+def test_unusable_groups_are_refused_with_one_sentence(first):
+    with pytest.raises(DataError, match=r"second group has 20 s of driving; a comparison needs 50 s"):
+        compare([first], [drive(CAR, 20.0, 3)], CAR)
+    still = np.zeros_like(first.sent)
+    constant = replace(first, sent=still, requested=still)
+    with pytest.raises(DataError, match="steering command is constant"):
+        compare([first], [constant], CAR)
+    with pytest.raises(ConfigError, match="needs two groups"):
+        carlab.compare([first], [], "sim")
+    with pytest.raises(ConfigError, match="cannot change in this car"):
+        carlab.compare([first], [first], "sim", candidates=["spoiler"])
+
+
+def test_verb_writes_the_result_of_the_call(first, tmp_path, capsys):
+    paths = []
+    for k, episode in enumerate((first, second(CAR))):
+        names = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
+        commands = np.vstack([episode.sent, episode.sent[-1:]])
+        rows = np.column_stack([episode.times_s, episode.states, commands])
+        paths.append(tmp_path / f"group_{k}.csv")
+        np.savetxt(paths[-1], rows, delimiter=",", header=",".join(names), comments="", fmt="%.7g")
+    arguments = ["compare", str(paths[0]), "--with", str(paths[1]), "--candidates", "motor_lag", "steering_offset"]
+    assert run([*arguments, "--out", str(tmp_path / "out")]) == 0
+    assert "These recordings show no change" in capsys.readouterr().out
+    saved = json.loads((tmp_path / "out" / "compare.json").read_text(encoding="utf-8"))
+    assert saved["schema"] == "carlab.compare/1"
+    assert saved["verdict"] == "nothing"
+    assert run(["compare", str(paths[0]), "--with", str(paths[0])]) == 2
+    assert "is in both groups" in capsys.readouterr().err
