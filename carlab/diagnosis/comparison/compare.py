@@ -1,6 +1,6 @@
 """Comparison of two groups of recordings by forward selection of the parameters that differ.
 
-The simulator is refitted to the first group. Each candidate is then fitted in each group with all other parameters
+The simulator is refitted to both groups together. Each candidate is then fitted in each group with all other parameters
 fixed. Physics that the simulator lacks biases both fits alike, so their difference, not the fitted value, is the
 change. Its covariance is the sum of both sandwich covariances, clustered by blocks of 10 s (Liang and Zeger 1986).
 """
@@ -86,7 +86,7 @@ def compare(
         DataError: the recordings are too short or too uniform, or have different periods; the message has the remedy.
     """
     began_s = MonotonicClock().now_s()
-    progress("refitting the simulator to the first group", 0.0)
+    progress("refitting the simulator to both groups", 0.0)
     base, groups = _prepare(reference, changed, nominal, settings)
     changes = _select(base, groups, change_candidates(base, candidates), settings.comparison, progress, stop)
     seconds = MonotonicClock().now_s() - began_s
@@ -99,7 +99,7 @@ def _prepare(
     nominal: SimulatorConfig,
     settings: DiagnosisSettings,
 ) -> tuple[SimulatorConfig, tuple[Group, Group]]:
-    """The simulator refitted to the first group, and both groups with one error scale."""
+    """The simulator refitted to both groups, and the groups with one error scale."""
     nominal = with_known_latency(nominal, (*reference, *changed))
     reference, changed, _ = data_faults_of.check(reference, changed, nominal)
     tracks = [_checked_tracks(group, k, settings) for k, group in enumerate((reference, changed))]
@@ -108,16 +108,17 @@ def _prepare(
         raise DataError(
             f"The groups have periods of {periods[0]:.3f} s and {periods[1]:.3f} s; compare recordings of one car."
         )
-    first, second = (_windows(t, settings) for t in tracks)
-    first, second = with_initial_states((first, second), nominal, settings.identification)
-    noise = estimate_noise(tracks[0], first.curvature_bias, settings=settings.identification)
-    per_step = noise_floor(first, noise, nominal, settings.identification)[1:]
-    floor = np.sqrt(np.mean(per_step**2, axis=0))
-    problem = SearchProblem(nominal, first, floor, confusable_effects(), (), settings)
+    everything = tracks_of((*reference, *changed), periods[0])
+    windows = _windows(everything, settings)
+    windows, _ = with_initial_states((windows, windows), nominal, settings.identification)
+    noise = estimate_noise(everything, windows.curvature_bias, settings=settings.identification)
+    per_step = noise_floor(windows, noise, nominal, settings.identification)[1:]
+    problem = SearchProblem(nominal, windows, np.sqrt(np.mean(per_step**2, axis=0)), confusable_effects(), (), settings)
     curves = tuple(f"effects.{curve.id}." for curve in CURVES)
     free = tuple(f for f in problem.free_parameters(()) if not f.name.startswith(curves))  # measured curves stay
     model = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))
-    groups = tuple(_group(windows, model.scale, settings) for windows in (first, second))
+    is_first = windows.recording < len(reference)
+    groups = [_group(windows.take(rows), model.scale, settings) for rows in (is_first, ~is_first)]
     return model.fit.config, (groups[0], groups[1])
 
 
@@ -137,7 +138,7 @@ def _checked_tracks(episodes: Sequence[EpisodeData], k: int, settings: Diagnosis
 
 def _windows(tracks: Sequence[Track], settings: DiagnosisSettings) -> PredictionWindows:
     cut = cut_windows(tracks, settings.windows.fit_window_s, settings.windows.fit_stride_s, settings.comparison.block_s)
-    return cut.thinned(settings.comparison.max_windows)
+    return cut.thinned(2 * settings.comparison.max_windows)
 
 
 def _group(windows: PredictionWindows, scale: Scale, settings: DiagnosisSettings) -> Group:
@@ -168,8 +169,7 @@ def _select(
                 progress(f"change {len(found) + 1}: {candidate.id}", k / len(candidates))
                 tested.append(_test(candidate, configs, groups, settings))
         before = groups[1].fitter.loss(configs[1], max_error=DEFAULT.selection.max_unseen_error)
-        p_max = settings.p_max / len(candidates)
-        significant = [t for t in tested if t.p_value < p_max]
+        significant = [t for t in tested if _is_significant(t, before, groups[1], len(candidates), settings)]
         if not significant:
             break
         best = min(significant, key=lambda t: float(t.loss.sum()))
@@ -205,6 +205,14 @@ def _test(
     loss = groups[1].fitter.leave_fold_out_loss(second, groups[1].folds, DEFAULT.selection.max_unseen_error)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return _Tested(candidate, (first, second), delta, std, dof, p_value, loss)
+
+
+def _is_significant(
+    tested: _Tested, before: FloatArray, group: Group, candidates: int, settings: ComparisonSettings
+) -> bool:
+    """Whether the parameters differ, and the change lowers the loss on unseen blocks of the second group."""
+    gain, error = clustered_gain(before, tested.loss, group.fitter.windows)
+    return tested.p_value < settings.p_max / candidates and gain > settings.min_unseen_z * error
 
 
 def _ties(best: _Tested, tested: Sequence[_Tested], group: Group, settings: ComparisonSettings) -> tuple[str, ...]:

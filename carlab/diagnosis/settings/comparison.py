@@ -21,6 +21,8 @@ class ComparisonSettings:
     """Maximum p-value of a change, multiplied by the number of candidates (Bonferroni)."""
     min_unseen_share: float = 0.01
     """Minimum fall of the loss on unseen blocks by a change, as a share of the loss."""
+    min_unseen_z: float = 3.0
+    """Minimum of that fall [standard errors]: the halves of a real drive differ by up to two without a change."""
     min_share_of_first: float = 0.1
     """Minimum fall of the loss by a further change, as a share of that by the first: a weak one imitates the first."""
     max_changes: int = 3
