@@ -111,4 +111,4 @@ def test_invalid_studies_are_reported(carlab: Carlab, folder: Path, model: Path,
     (folder / "2.csv").unlink()
     code, text = carlab("bench", "priors", "--data", folder)
     assert code == 1
-    assert "has 1 recordings; add some (two or more are needed)" in text
+    assert "has 1 recordings; add some (at least 2)" in text
