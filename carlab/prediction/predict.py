@@ -106,7 +106,8 @@ def simulate_windows(
     Args:
         windows: S windows.
         config: the simulator, observation effects included.
-        values: parameters by dotted name, each (P,); default: those of ``config``.
+        values: parameters by dotted name, each (P,), or (P, S) for a value of each window; default: those of
+            ``config``.
         max_step_s: maximum integration step.
 
     Returns:
@@ -116,12 +117,12 @@ def simulate_windows(
     sets = max((len(v) for v in given.values()), default=1)
     whole = with_effects_of_values(config, given)
     numbers: dict[str, float | FloatArray] = {**whole.values(), **given}
-    shaped = {name: _broadcast(value, sets)[:, None] for name, value in numbers.items()}
+    shaped = {name: _by_set(value, sets) for name, value in numbers.items()}
     measurement = MeasurementModel(ARRAYS, shaped, whole.effects)
-    inner = {n: _broadcast(v, sets) for n, v in given.items() if not is_measured(n)}
+    inner = {n: shaped[n] for n in given if not is_measured(n)}
     effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
     delay_s = delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s)
-    inner[COMMAND_DELAY] = np.asarray(delay_s)[:, 0]
+    inner[COMMAND_DELAY] = np.asarray(delay_s)
     unmeasured = replace(whole, effects=effects, control_period_s=windows.period_s, priors={}, parameter_std={})
     count = len(windows)
 
@@ -135,7 +136,7 @@ def simulate_windows(
         tensor(start.reshape(-1, 6)),
         tensor(np.tile(windows.commands, (sets, 1, 1))),
         history=tensor(np.tile(windows.past_commands, (sets, 1, 1))),
-        values={name: tensor(np.repeat(v, count)) for name, v in inner.items()},
+        values={name: tensor(np.broadcast_to(v, (sets, count)).reshape(-1)) for name, v in inner.items()},
         t0_s=tensor(np.tile(windows.t0_s, sets)),
         max_step_s=max_step_s,
     ).states
@@ -166,8 +167,10 @@ def velocity_curvature(states: FloatArray, period_s: float) -> FloatArray:
     return second
 
 
-def _broadcast(value: float | FloatArray, sets: int) -> FloatArray:
-    return np.broadcast_to(np.asarray(value, dtype=np.float64).reshape(-1), (sets,)).copy()
+def _by_set(value: float | FloatArray, sets: int) -> FloatArray:
+    """A number, (P,) or (P, S) as an array (P, 1) or (P, S)."""
+    array = np.asarray(value, dtype=np.float64)
+    return array if array.ndim == 2 else np.broadcast_to(array.reshape(-1, 1), (sets, 1)).copy()
 
 
 def _stacked(states: Sequence[State], sets: int) -> FloatArray:

@@ -25,6 +25,7 @@ from sim_backends.effects.base import (
 from sim_backends.effects.body import LateralBias, RoadSlope, TorqueSteer, YawDamping
 from sim_backends.effects.curves import CURVES, MeasuredCurve
 from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
+from sim_backends.effects.disturbances import DISTURBANCES, DRIFTING, PUSHING, Disturbance
 from sim_backends.effects.drive import BatterySag, BrakeAsymmetry, MotorSaturation, TractionLimit
 from sim_backends.effects.lags import MotorLag, SteeringLag
 from sim_backends.effects.loads import AerodynamicDownforce, LoadTransfer, RollDynamics
@@ -90,8 +91,9 @@ _ALL: tuple[Effect, ...] = (
 )
 CATALOGUE: dict[str, Effect] = {effect.id: effect for effect in _ALL}
 """The effects that a diagnosis names, by id, in the order of the catalogue."""
-EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in (*UNCATALOGUED, *CURVES)}}
-"""All effects: the catalogue, then uncatalogued physics and measured curves. ``register`` adds to both."""
+EFFECTS: dict[str, Effect] = {**CATALOGUE, **{effect.id: effect for effect in (*UNCATALOGUED, *CURVES, *DISTURBANCES)}}
+"""All effects: the catalogue, then uncatalogued physics, measured curves and disturbances. ``register`` adds to
+both."""
 
 
 def separation(one: str, other: str) -> Confusable | None:
@@ -113,10 +115,13 @@ def confusable_effects() -> dict[str, tuple[str, ...]]:
 __all__ = [
     "CATALOGUE",
     "CURVES",
+    "DRIFTING",
     "EFFECTS",
+    "PUSHING",
     "ActuatorEffect",
     "Confusable",
     "DelayEffect",
+    "Disturbance",
     "DynamicsEffect",
     "Effect",
     "EffectParameter",

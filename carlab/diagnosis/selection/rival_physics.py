@@ -13,7 +13,7 @@ from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit, refit_candidate
 from carlab.diagnosis.selection.screening import screen_candidates
-from sim_backends.effects import EFFECTS, MeasuredCurve
+from sim_backends.effects import EFFECTS, Disturbance, MeasuredCurve
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ def additional_physics(problem: SearchProblem, found: SearchResult, control: Run
 
 def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float) -> list[Candidate]:
     """Rivals added to ``model`` whose screening scores are above ``min_score``, fitted, the highest score first."""
-    rivals = [e for e in EFFECTS.values() if not e.catalogued and not isinstance(e, MeasuredCurve)]
+    rivals = [e for e in EFFECTS.values() if not e.catalogued and not isinstance(e, (MeasuredCurve, Disturbance))]
     names = [e.id for e in rivals if e.id not in problem.nominal.effects]
     screened = [result for result in screen_candidates(problem, model, names) if result.score > min_score]
     return [refit_candidate(problem, model, result) for result in screened[: problem.settings.rivals.max_refits]]
