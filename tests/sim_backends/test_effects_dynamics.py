@@ -45,6 +45,16 @@ CASES = {
     "heavy_wheels": {"longitudinal_slip": {"inertia": 2e-3, "stiffness": 25.0}},
     "ellipse_with_transfer": {"friction_ellipse": {"scale": 0.6}, "load_transfer": {"height": 0.08}},
     "relaxation_with_ellipse": {"friction_ellipse": {"scale": 0.5}, "tyre_relaxation": {"length": 0.2}},
+    "changed_saturated_map": {
+        "drive_change": {"share": 0.4},
+        "motor_saturation": {"force": 2.0},
+        "drive_map": curve_values("drive_map", 1.0)["drive_map"],
+    },
+    "changed_measured_tyres": {
+        "grip_change": {"share": -0.3},
+        "front_tyre_curve": curve_values("front_tyre_curve", 0.3)["front_tyre_curve"],
+        "rear_tyre_curve": curve_values("rear_tyre_curve", 0.3)["rear_tyre_curve"],
+    },
     "sag_with_brakes": {
         "battery_sag": {"rate": 0.3},
         "brake_asymmetry": {"gain_ratio": 1.6},
@@ -103,6 +113,8 @@ def reference_rates(t, s, d, u, p, e):
         drive += m * drive_map_at(e, u, vx)
     if has("motor_saturation"):
         drive = min(max(drive, -e["motor_saturation"]["force"]), e["motor_saturation"]["force"])
+    if has("drive_change"):
+        drive *= 1 + e["drive_change"]["share"]
     demand = drive - p.damping_nspm * vx
 
     body_x = body_y = moment = 0.0
@@ -134,6 +146,9 @@ def reference_rates(t, s, d, u, p, e):
         moment -= e["locked_axle"]["moment"] * math.tanh(r / max(abs(vx), 0.3))
     if has("braking_pull") and u < 0:
         moment -= e["braking_pull"]["coefficient"] * u
+    if has("body_force"):
+        q = e["body_force"]
+        body_x, body_y, moment = body_x + q["forward"], body_y + q["left"], moment + q["moment"]
     if has("coast_brake"):
         body_x -= e["coast_brake"]["coefficient"] * vx * math.exp(-((u / 0.05) ** 2))
 
@@ -162,6 +177,8 @@ def reference_rates(t, s, d, u, p, e):
         f_rear -= z_rear * curve_at(e, "rear_tyre_curve", SLIPS, abs(slip_rear)) * math.copysign(1.0, slip_rear)
     if has("rear_force_sharing"):
         f_rear *= max(1 + curve_at(e, "rear_force_sharing", ACCELERATIONS, force / m), 0.0)
+    if has("grip_change"):
+        f_front, f_rear = ((1 + e["grip_change"]["share"]) * f for f in (f_front, f_rear))
     rim_rate = 0.0
     if has("longitudinal_slip"):
         q = e["longitudinal_slip"]

@@ -238,6 +238,8 @@ MIRRORED = {
     "rear_side_force": ("force",),
     "braking_pull": ("coefficient",),
     "mocap_yaw_misalignment": ("angle",),
+    "steering_trim": ("angle",),
+    "body_force": ("left", "moment"),
 }
 FLIP = torch.tensor([1, -1, -1, 1, -1, -1], dtype=torch.float64)
 

@@ -87,6 +87,7 @@ def test_static_steering_effects_have_their_closed_forms():
         d = MAX_ANGLE * u
         assert angle({"steering_deadband": {"width": 0.1}}, u) == pytest.approx(d - max(min(d, 0.05), -0.05))
         assert angle({"steering_offset": {"angle": -0.03}}, u) == pytest.approx(d - 0.03)
+        assert angle({"steering_trim": {"angle": 0.02}}, u) == pytest.approx(d + 0.02)
         assert angle({"steering_asymmetry": {"gain": 0.2}}, u) == pytest.approx(d * (1 + 0.2 * np.sign(d)))
         assert angle({"steering_nonlinearity": {"saturation": 0.4}}, u) == pytest.approx(0.4 * math.tanh(d / 0.4))
 
@@ -169,7 +170,7 @@ def test_lag_weights_are_exact_from_no_lag_to_a_slow_one(dtype):
 
 @pytest.mark.parametrize("name", sorted(n for n, e in EFFECTS.items() if e.kind == "input"))
 def test_mirrored_commands_and_effects_give_mirrored_angles(name):
-    mirrored = {"steering_offset": -1.0, "steering_asymmetry": -1.0}
+    mirrored = {"steering_offset": -1.0, "steering_asymmetry": -1.0, "steering_trim": -1.0}
     typical = {p.name: p.typical for p in EFFECTS[name].parameters}
     other = {k: v * mirrored.get(name, 1.0) for k, v in typical.items()}
     if name == "steering_curve":
