@@ -16,6 +16,34 @@ StateStd = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
+class AdaptationNoise:
+    """Noise with which a simulator adapts to the recent past of a drive, chosen on the fitted recordings.
+
+    Attributes:
+        error_std: error after a short prediction in calm driving: x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
+        white_share: size of the white noise on the disturbances of the simulator, in units of the settings.
+        loss_std: robust spread of the errors after the horizon of held-out errors, in the units of ``error_std``.
+    """
+
+    error_std: StateStd
+    white_share: float
+    loss_std: StateStd
+
+    def __post_init__(self) -> None:
+        for value in (*self.error_std, self.white_share, *self.loss_std):
+            if not 0.0 < value < math.inf:
+                raise ConfigError(f"A number in [recording_noise.adaptation] is {value:g}; it must be > 0.")
+
+    def to_table(self) -> dict[str, Any]:
+        """The content of the table."""
+        return {
+            "error_std": list(self.error_std),
+            "white_share": self.white_share,
+            "loss_std": list(self.loss_std),
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class RecordingNoise:
     """Noise and velocity window of the recordings that a model was fitted to.
 
@@ -25,6 +53,7 @@ class RecordingNoise:
         velocity_window_s2: variance of the time window of the velocity columns [s2]; 0 without a window.
         floor_std: noise floor: error of a perfect simulator after ``floor_horizon_s``; None if unknown.
         floor_horizon_s: horizon of the noise floor [s].
+        adaptation: noise of the adaptation; None if the diagnosis did not adapt.
     """
 
     measured_std: StateStd
@@ -32,6 +61,7 @@ class RecordingNoise:
     velocity_window_s2: float
     floor_std: StateStd | None = None
     floor_horizon_s: float = 0.0
+    adaptation: AdaptationNoise | None = None
 
     def __post_init__(self) -> None:
         every = (*self.measured_std, *self.initial_state_std, *(self.floor_std or ()))
@@ -55,10 +85,12 @@ class RecordingNoise:
     def to_table(self) -> dict[str, Any]:
         """The content of the table."""
         floor = {} if self.floor_std is None else {"floor_std": list(self.floor_std)}
+        adaptation = {} if self.adaptation is None else {"adaptation": self.adaptation.to_table()}
         return {
             "measured_std": list(self.measured_std),
             "initial_state_std": list(self.initial_state_std),
             "velocity_window_s2": self.velocity_window_s2,
             **floor,
             "floor_horizon_s": self.floor_horizon_s,
+            **adaptation,
         }

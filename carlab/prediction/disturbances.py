@@ -1,0 +1,60 @@
+"""Predictions of a simulator with disturbances, and their Jacobian."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.prediction.adaptation_filter import MeasuredWindows
+from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import PredictionWindows
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import DRIFTING, PUSHING
+
+DISTURBANCES = (*DRIFTING, *PUSHING)
+"""Dotted names of the m disturbances; the first n of them drift."""
+
+
+def linearised(
+    windows: PredictionWindows, config: SimulatorConfig, at: FloatArray, settings: AdaptationSettings
+) -> MeasuredWindows:
+    """Errors after S windows with disturbances ``at`` (C, S, n), and their Jacobian by all m disturbances."""
+    candidates, count, size = at.shape
+    total = len(DISTURBANCES)
+    full = np.zeros((candidates, count, total))
+    full[..., :size] = np.clip(at, -np.array(settings.limits[:size]), settings.limits[:size])
+    steps = np.array(settings.steps)
+    moved = full[:, None] + np.concatenate([np.zeros((1, total)), np.diag(steps)])[None, :, None, :]
+    predicted = simulate_disturbed(windows, config, moved.reshape(-1, count, total), settings)
+    error = bounded_final_errors(windows, predicted, settings).reshape(candidates, total + 1, count, 6)
+    jacobian = (error[:, 1:] - error[:, :1]) / steps[None, :, None, None]
+    end_s = windows.t0_s + windows.horizon_s
+    return MeasuredWindows(windows.recording, end_s, error[:, 0], np.moveaxis(jacobian, 1, -1), full)
+
+
+def simulate_disturbed(
+    windows: PredictionWindows, config: SimulatorConfig, disturbances: FloatArray, settings: AdaptationSettings
+) -> FloatArray:
+    """Predict S windows with C sets of disturbances (C, S, n or m) [1, rad, 1, m/s2, m/s2, rad/s2].
+
+    Returns:
+        (C, S, K + 1, 6) as ``simulate_windows``.
+    """
+    parameters, size = config.parameters, disturbances.shape[-1]
+    mass_kg, inertia_kgm2 = parameters.mass_kg, parameters.yaw_inertia_kgm2
+    unit = np.array([1.0, 1.0, 1.0, mass_kg, mass_kg, inertia_kgm2])[:size]
+    limits = np.array(settings.limits[:size])
+    given = np.clip(disturbances, -limits, limits) * unit
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation has bounded errors
+        return simulate_windows(windows, config, {name: given[..., k] for k, name in enumerate(DISTURBANCES[:size])})
+
+
+def bounded_final_errors(windows: PredictionWindows, predicted: FloatArray, settings: AdaptationSettings) -> FloatArray:
+    """Errors (..., S, 6) after the windows, finite and bounded."""
+    bound = settings.max_error
+    error = prediction_errors(predicted[..., -1:, :], replace(windows, measured=windows.measured[:, -1:]))[..., 0, :]
+    return np.nan_to_num(error, nan=bound, posinf=bound, neginf=-bound).clip(-bound, bound)
