@@ -79,7 +79,7 @@ class DiagnosisReport:
 
     @property
     def held_out(self) -> dict[str, FitErrors]:
-        """Held-out root mean square errors of nominal, refit, with_effects, constant_velocity and noise_floor."""
+        """Held-out root mean square errors by model, as ``fit.held_out`` of report.json."""
         return dict(self.diagnosis.held_out)
 
     def save(self, folder: Path | str = "diagnosis") -> Path:
@@ -148,6 +148,7 @@ def diagnose(
     effects: Sequence[str] = (),
     curves: bool = False,
     ceiling: bool = False,
+    adapt: bool = False,
     seed: int = 0,
     out: Path | str | None = None,
     progress: Callable[[str, float], None] = lambda activity, share: None,
@@ -165,6 +166,8 @@ def diagnose(
         curves: fit measured curves (drive force, steering, tyres) where named effects leave more than a tenth of the
             error; takes minutes.
         ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
+        adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car since the
+            fitted ones; takes seconds.
         seed: seed of the black box; the rest of a diagnosis draws no random numbers.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
@@ -188,6 +191,7 @@ def diagnose(
     fit = read_material(to_fit, "fit", latency_s)
     validation = read_material(to_validate, "held out", latency_s)
     options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
+    options["adapt"] = adapt
     report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})
     if out is not None:
         report.save(out)

@@ -33,6 +33,7 @@ def run_realcars(options: BenchOptions) -> int:
             held_out=[files[name] for name in held_out],
             curves=True,
             ceiling=True,
+            adapt=True,
             out=None if options.out is None else options.out.with_suffix(""),
             progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
             stop=interrupts.requested.is_set,

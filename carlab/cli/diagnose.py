@@ -50,6 +50,9 @@ class Diagnose:
     ceiling: bool = False
     """Train a black box, to show how much of the error can be explained at all. Needs 60 s of driving."""
 
+    adapt: bool = False
+    """Adapt the simulator along the held-out recordings, and report what changed in the car since the fitted ones."""
+
     seed: int = 0
     """Seed of the black box; the rest of a diagnosis draws no random numbers."""
 
@@ -74,6 +77,7 @@ class Diagnose:
                 effects=self.effects,
                 curves=self.curves,
                 ceiling=self.ceiling,
+                adapt=self.adapt,
                 seed=self.seed,
                 out=self.out,
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
@@ -89,11 +93,12 @@ class Diagnose:
 
     def _print(self, diagnosis: Diagnosis) -> None:
         from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences
+        from carlab.diagnosis.report.drift import drift_sentences
 
         console.print(diagnosis.sentence)
         for effect in diagnosis.effects:
             console.print(f"  {effect.sentence}", markup=False)
-        for sentence in (*curve_sentences(diagnosis), ceiling_sentence(diagnosis)):
+        for sentence in (*curve_sentences(diagnosis), ceiling_sentence(diagnosis), *drift_sentences(diagnosis)):
             console.print(f"  {sentence}" if sentence else "", markup=False, end="\n" if sentence else "")
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
         console.print(f"Read {self.out / 'report.html'}; drive the diagnosed car with --car {self.out / 'model.toml'}.")

@@ -15,6 +15,7 @@ from carlab.diagnosis.ceiling import ceiling_of
 from carlab.diagnosis.curves.curve_fit import CurveFit, fit_curves
 from carlab.diagnosis.curves.support import curve_findings, without_extrapolation
 from carlab.diagnosis.decisions import Decision
+from carlab.diagnosis.drift import Adaptation, adapt_to_held_out
 from carlab.diagnosis.evidence import (
     ScoredSearch,
     Texts,
@@ -75,6 +76,7 @@ class Request:
     settings: DiagnosisSettings
     curves: bool
     ceiling: bool
+    adapt: bool
 
 
 def diagnose(
@@ -91,6 +93,7 @@ def diagnose(
     settings: DiagnosisSettings = DEFAULT,
     curves: bool = False,
     ceiling: bool = False,
+    adapt: bool = False,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Outcome:
@@ -110,6 +113,7 @@ def diagnose(
         settings: thresholds of all stages.
         curves: fit measured curves where named effects leave a residual.
         ceiling: train a black box, and compare with its error.
+        adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
 
@@ -123,7 +127,7 @@ def diagnose(
     check_held_out_share(holdout_share, settings.windows)
     began_s = MonotonicClock().now_s()
     nominal = with_known_latency(nominal, (*fit, *held_out))
-    request = Request(nominal, texts, uses, data_faults, effects, holdout_share, seed, settings, curves, ceiling)
+    request = Request(nominal, texts, uses, data_faults, effects, holdout_share, seed, settings, curves, ceiling, adapt)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append)
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
@@ -212,7 +216,8 @@ def _assemble_result(
         unexplained, model = describe_unexplained(scored.problem, naming, share, error, held_out)
     verdict = verdict_of(scored, naming.has_unnamed, request.data_faults)
     measured = _measured_curves(scored, share, recordings, request, control)
-    models = _models(scored, measured, recordings, request, control)
+    adaptation = _adaptation(scored, measured, recordings, request, control)
+    models = _models(scored, measured, adaptation, recordings, request, control)
     model = model if measured is None else measured.fit.config
     progress("preparing the report", 0.95)
     final_errors = {name: held_out.final_error(each) for name, each in models.items()}
@@ -239,9 +244,11 @@ def _assemble_result(
             final_errors["constant_velocity"],
             request.settings.evidence,
         ),
+        drift=() if adaptation is None else adaptation.drift,
     )
     exhibits = exhibits_of(scored, recordings.held_out_tracks)
-    exhibits = replace(exhibits, noise=held_out.recording_noise)
+    noise = replace(held_out.recording_noise, adaptation=None if adaptation is None else adaptation.noise)
+    exhibits = replace(exhibits, noise=noise)
     return Outcome(diagnosis, exhibits, model or scored.found.best.config, models, held_out.windows)
 
 
@@ -259,6 +266,7 @@ def _measured_curves(
 def _models(
     scored: ScoredSearch,
     measured: CurveFit | None,
+    adaptation: Adaptation | None,
     recordings: SplitRecordings,
     request: Request,
     control: RunControl,
@@ -280,7 +288,25 @@ def _models(
             progress=control.progress,
             stop=control.stop,
         )
+    if adaptation is not None:
+        models["adapted"] = adaptation.model
     return models | {"constant_velocity": ConstantVelocity()}
+
+
+def _adaptation(
+    scored: ScoredSearch,
+    measured: CurveFit | None,
+    recordings: SplitRecordings,
+    request: Request,
+    control: RunControl,
+) -> Adaptation | None:
+    """The corrected simulator adapted along the held-out recordings, if it is wanted."""
+    if not request.adapt or control.stop():
+        return None
+    control.progress("adapting along the held-out recordings", 0.93)
+    config = scored.found.best.config if measured is None else measured.fit.config
+    tracks = recordings.fit_tracks, recordings.held_out_tracks
+    return adapt_to_held_out(config, *tracks, scored.held_out, request.settings.drift)
 
 
 def _ceiling(errors: Mapping[str, FitErrors]) -> Ceiling | None:

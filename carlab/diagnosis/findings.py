@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
+
+import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise
@@ -168,6 +170,61 @@ class Skill:
 
 
 @dataclass(frozen=True, slots=True)
+class Change:
+    """A quantity of the car that changed since the fitted recordings.
+
+    Attributes:
+        quantity: "drive force", "steering trim", "grip" or "force forward".
+        unit: of the values; 1 for a share of the simulator's own force.
+        value: mean over the recording after its first quarter.
+        std: standard deviation of that: of the filter, and of the same estimate along the fitted recordings, where the
+            car has not changed.
+        first, last: mean over the first and the last quarter of the recording.
+    """
+
+    quantity: str
+    unit: str
+    value: float
+    std: float
+    first: float
+    last: float
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Adaptation to one held-out recording, and the drift of the car that it shows.
+
+    Attributes:
+        recording: number of the recording, from 1.
+        is_drift: whether a slow adaptation predicts unseen windows better than the simulator, and than the simulator
+            with the mean error of fitted windows in similar states, by the minimum number of standard errors.
+        changes: quantities that changed, largest gain first; empty without a drift, or if no single one is significant.
+        time_constant_s: likeliest time constant of the slow adaptation [s].
+        model_m, adapted_m, slow_m, similar_states_m: root mean square position errors after the horizon [m] of the
+            simulator, of the adapted prediction, of the slow adaptation, and of the simulator corrected by errors in
+            similar states.
+        standard_errors: gain of the slow adaptation over the better of model and similar states, over its clustered
+            standard error.
+        t_s: (N,) times of the series since the first row [s].
+        mean, std: (N, 4) estimated share of the drive force [1], steering trim [rad], share of the grip [1] and force
+            forward per mass [m/s2], and their standard deviations.
+    """
+
+    recording: int
+    is_drift: bool
+    changes: tuple[Change, ...]
+    time_constant_s: float
+    model_m: float
+    adapted_m: float
+    slow_m: float
+    similar_states_m: float
+    standard_errors: float
+    t_s: FloatArray
+    mean: FloatArray
+    std: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class DataFault:
     """A fault of a recording."""
 
@@ -209,6 +266,7 @@ class Diagnosis:
     curves: tuple[CurveFinding, ...] = ()
     ceiling: Ceiling | None = None
     skill: tuple[Skill, ...] = ()
+    drift: tuple[Drift, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
@@ -237,6 +295,7 @@ class Diagnosis:
             "curves": [_curve_table(curve) for curve in self.curves],
             "ceiling": None if self.ceiling is None else asdict(self.ceiling),
             "skill": [asdict(s) for s in self.skill],
+            "drift": [_drift_table(d) for d in self.drift],
             "data_faults": [asdict(f) for f in self.data_faults],
             "recordings": [asdict(r) for r in self.recordings],
             "seed": self.seed,
@@ -249,6 +308,11 @@ def _curve_table(curve: CurveFinding) -> dict[str, Any]:
     arrays = ("car_file", "measured", "std", "support_s")
     plain = {"id": curve.id, "quantity": curve.quantity, "unit": curve.unit, "axes": [asdict(a) for a in curve.axes]}
     return plain | {name: getattr(curve, name).tolist() for name in arrays}
+
+
+def _drift_table(drift: Drift) -> dict[str, Any]:
+    plain = asdict(replace(drift, t_s=np.zeros(0), mean=np.zeros(0), std=np.zeros(0)))
+    return plain | {name: getattr(drift, name).tolist() for name in ("t_s", "mean", "std")}
 
 
 def _plain(value: Any) -> Any:

@@ -22,6 +22,7 @@ MODEL_NAMES = {
     "with_effects": "diagnosed",
     "with_curves": "diagnosed, measured curves",
     "black_box": "black box",
+    "adapted": "adapted",
 }
 """Models of a diagnosis in the order of the table, with their names there."""
 

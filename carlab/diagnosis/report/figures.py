@@ -22,6 +22,7 @@ LABELS = {
     "with_effects": "with effects",
     "with_curves": "with measured curves",
     "black_box": "black box",
+    "adapted": "adapted to the recent past",
     "constant_velocity": "constant velocity",
     "noise floor": "noise floor",
     "noise_floor": "noise floor",

@@ -12,6 +12,8 @@ from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate, Exhibi
 from carlab.diagnosis.report import figures
 from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve_sentences
+from carlab.diagnosis.report.drift import drift_sentences
+from carlab.diagnosis.report.drift_charts import drift_charts
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import DEFAULT
 
@@ -58,6 +60,8 @@ def page_context(diagnosis: Diagnosis, exhibits: Exhibits) -> dict[str, Any]:
         "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
         "curve_sentences": curve_sentences(diagnosis),
         "ceiling": ceiling_sentence(diagnosis),
+        "drift": [(d, drift_charts(d)) for d in diagnosis.drift],
+        "drift_sentences": drift_sentences(diagnosis),
         "rest": rest if rest is not None and rest.share >= DEFAULT.evidence.unexplained_share_min else None,
         "rest_where": text.listed([text.CHANNEL_WORDS.get(c, c) for c in rest.channels]) if rest else "",
         "rest_regime": text.regime_words(rest.regime) if rest else "",

@@ -11,6 +11,12 @@ from collections.abc import Mapping, Sequence
 
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
+from carlab.diagnosis.report.drift import drift_of, drift_sentence
+from carlab.diagnosis.report.numbers import listed as listed
+from carlab.diagnosis.report.numbers import number as number
+from carlab.diagnosis.report.numbers import percent as percent
+from carlab.diagnosis.report.numbers import unit_text as unit_text
+from carlab.diagnosis.report.numbers import with_unit as with_unit
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends.effects import EFFECTS, Confusable, separation
 
@@ -31,44 +37,6 @@ VERDICT_TITLES = {
     "unexplained": "Physics outside the catalogue is missing",
     "inconclusive": "The recordings are not sufficient",
 }
-
-
-def number(value: float) -> str:
-    """Format three significant digits with a minus sign (U+2212); an exponent only outside [1e-6, 1e6)."""
-    if not math.isfinite(value):
-        return "no limit" if value == math.inf else "minus no limit" if value == -math.inf else "unknown"
-    if value == 0.0:
-        return "0"
-    size = abs(value)
-    if size >= 1e6 or size < 1e-6:
-        text = f"{value:.3g}"
-    else:
-        text = f"{value:.{max(2 - math.floor(math.log10(size)), 0)}f}"
-        text = text.rstrip("0").rstrip(".") if "." in text else text
-    return text.replace("-", "−")
-
-
-def percent(share: float) -> str:
-    """Format a share in per cent. A share below 1 is never rounded to 100 %, a share above 0 never to 0 %."""
-    value = 100.0 * share
-    if not math.isfinite(value):
-        return "an unknown share"
-    text = f"{value:.0f}" if abs(value) >= 9.5 or value == 0.0 else f"{value:.1f}"
-    if text in ("100", "0.0", "-0.0") and value not in (100.0, 0.0):
-        text = f"{value:.2g}" if abs(value) < 1 else "more than 99" if value < 100 else "100"
-    return text.replace("-", "−") + " %"
-
-
-def unit_text(unit: str) -> str:
-    """Format a unit with superscripts: ``N s2/m2`` -> ``N s²/m²``; empty for 1."""
-    if unit in ("", "1"):
-        return ""
-    return re.sub(r"(?<=[a-z])([23])", lambda m: "²³"[int(m[1]) - 2], unit)
-
-
-def with_unit(value: float, unit: str) -> str:
-    """A number and its unit."""
-    return f"{number(value)} {unit_text(unit)}".strip() if math.isfinite(value) else number(value)
 
 
 class _Filled:
@@ -187,11 +155,6 @@ def confidence_words(confidence: float, rivals: int = 0) -> str:
     return next((words for level, words in levels if confidence >= level), "uncertain, record another drive")
 
 
-def listed(parts: Sequence[str], last: str = "and") -> str:
-    """``a, b and c``."""
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} {last} {parts[-1]}" if parts else ""
-
-
 def set_noun(effect: EffectFinding) -> str:
     """Name of an effect, with those that are indistinguishable from it."""
     noun = effect_noun(effect.id)
@@ -211,7 +174,14 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "unexplained": _unexplained,
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
-    return f"{worse_than_constant_velocity(diagnosis)}{made(diagnosis)}{_with_curves(diagnosis)}"
+    return (
+        f"{worse_than_constant_velocity(diagnosis)}{made(diagnosis)}{_with_curves(diagnosis)}{_with_drift(diagnosis)}"
+    )
+
+
+def _with_drift(diagnosis: Diagnosis) -> str:
+    """What changed in the car since the fitted recordings; empty without a drift."""
+    return "".join(f" {drift_sentence(d, diagnosis.horizon_s)}" for d in diagnosis.drift if d.is_drift)
 
 
 def _with_curves(diagnosis: Diagnosis) -> str:
@@ -237,6 +207,8 @@ def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
     why = (
         "Velocities hardly change there, so such a drive does not separate causes."
         if steady
+        else "The car has changed since the fitted recordings."
+        if drift_of(diagnosis, worst.recording) is not None
         else "The model is wrong there."
     )
     return (

@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 from numpy.typing import ArrayLike
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.report.sentences import number
+from carlab.diagnosis.report.numbers import number
 
 MAX_LINE_POINTS = 600
 

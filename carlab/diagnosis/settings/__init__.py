@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from carlab.diagnosis.settings.comparison import ComparisonSettings
+from carlab.diagnosis.settings.drift import DriftSettings
 from carlab.diagnosis.settings.evidence import EvidenceSettings, UnexplainedSettings
 from carlab.diagnosis.settings.prediction import CurveSettings, IdentificationSettings, WindowSettings
 from carlab.diagnosis.settings.quick import QuickSettings
@@ -31,6 +32,7 @@ class DiagnosisSettings:
     unexplained: UnexplainedSettings = field(default_factory=UnexplainedSettings)
     quick: QuickSettings = field(default_factory=QuickSettings)
     comparison: ComparisonSettings = field(default_factory=ComparisonSettings)
+    drift: DriftSettings = field(default_factory=DriftSettings)
     report: ReportSettings = field(default_factory=ReportSettings)
 
 
@@ -42,6 +44,7 @@ __all__ = [
     "ComparisonSettings",
     "CurveSettings",
     "DiagnosisSettings",
+    "DriftSettings",
     "EvidenceSettings",
     "IdentificationSettings",
     "QuickSettings",

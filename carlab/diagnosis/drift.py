@@ -1,0 +1,225 @@
+"""Drift: what changed in the car since the fitted recordings, from its adaptation to held-out recordings.
+
+An adaptation also follows errors that depend on the state, as long as the state stays. So a drift must be slow, and the
+slow adaptation must predict unseen windows better than the simulator and than the simulator whose prediction is
+corrected by the mean error of fitted windows in similar states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from carlab.core.quantities import FloatArray
+from carlab.core.recording_noise import AdaptationNoise
+from carlab.diagnosis.findings import Change, Drift
+from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.settings import DriftSettings
+from carlab.prediction.adaptation import AdaptiveModel, DisturbanceSeries, adapt, choose_noise
+from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.errors import final_errors
+from carlab.prediction.predict import SimulatorModel
+from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+from sim_backends.car_parameters import SimulatorConfig
+
+QUANTITIES = (("drive force", "1"), ("steering trim", "rad"), ("grip", "1"), ("force forward", "m/s2"))
+"""Names and units of the drifting disturbances."""
+Mask = tuple[bool, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Adaptation:
+    """An adapted model of held-out recordings, the noise of its filter, and the drift of each recording."""
+
+    model: AdaptiveModel
+    noise: AdaptationNoise
+    drift: tuple[Drift, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _SlowAdaptation:
+    """A slow adaptation of some of the quantities with its errors (S, 6) on the held-out windows."""
+
+    model: AdaptiveModel
+    errors: FloatArray
+
+
+def adapt_to_held_out(
+    config: SimulatorConfig,
+    fit_tracks: Sequence[Track],
+    held_out_tracks: Sequence[Track],
+    held_out: HeldOut,
+    settings: DriftSettings,
+) -> Adaptation:
+    """Adapt a simulator along held-out recordings, and find what changed in the car since the fitted ones.
+
+    Args:
+        config: the simulator, fitted to ``fit_tracks``.
+        fit_tracks: fitted recordings; the noise of the filter is chosen on them.
+        held_out_tracks: held-out recordings.
+        held_out: windows of the held-out recordings.
+        settings: conditions of a drift.
+    """
+    whole = AdaptationSettings()
+    window_s2 = held_out.windows.velocity_window_s2
+    noise = choose_noise(config, fit_tracks, whole, velocity_window_s2=window_s2)
+    model = adapt(config, held_out_tracks, noise, whole, velocity_window_s2=window_s2)
+    times_s = tuple(t for t in whole.time_constants_s if t >= settings.min_time_constant_s)
+    slow = replace(whole, time_constants_s=times_s)
+
+    @cache
+    def slowly_adapted(mask: Mask) -> _SlowAdaptation:
+        made = adapt(config, held_out_tracks, noise, slow, drifts=(mask,), velocity_window_s2=window_s2)
+        return _SlowAdaptation(made, held_out.final_error(made))
+
+    @cache
+    def wander(mask: Mask) -> FloatArray:
+        fitted = adapt(config, fit_tracks, noise, slow, drifts=(mask,), velocity_window_s2=window_s2)
+        return np.asarray(np.sqrt(np.mean(fitted.series().mean ** 2, axis=0)))
+
+    plain = held_out.final_error(config)
+    similar = _corrected_by_similar_states(config, fit_tracks, held_out, plain, settings)
+    errors = {"model": plain, "adapted": held_out.final_error(model), "similar": similar}
+    found = [
+        _drift_of(number, held_out, errors, slowly_adapted, wander, model.series(), settings)
+        for number in np.unique(held_out.windows.recording)
+    ]
+    return Adaptation(model, noise, tuple(found))
+
+
+def _drift_of(
+    number: int,
+    held_out: HeldOut,
+    errors: dict[str, FloatArray],
+    slowly_adapted: Callable[[Mask], _SlowAdaptation],
+    wander: Callable[[Mask], FloatArray],
+    series: DisturbanceSeries,
+    settings: DriftSettings,
+) -> Drift:
+    """The drift of one recording.
+
+    Args:
+        number: index of the recording.
+        held_out: all held-out windows.
+        errors: errors (S, 6) of the simulator ("model"), of the adapted prediction ("adapted"), and of the simulator
+            corrected by errors in similar states ("similar").
+        slowly_adapted: slow adaptation of some quantities.
+        wander: root mean square (n,) of the estimates of some quantities along the fitted recordings.
+        series: estimates of the adapted prediction.
+        settings: conditions of a drift.
+    """
+    own = held_out.windows.recording == number
+    judge = replace(held_out, windows=held_out.windows.take(own))
+    everything: Mask = (True,) * len(QUANTITIES)
+    slow = slowly_adapted(everything)
+    gains = [_gain_z(judge, errors[name][own], slow.errors[own], settings) for name in ("model", "similar")]
+    is_drift = min(gains) >= settings.gain_z_min
+    mask = _changed(judge, own, errors["model"], slowly_adapted, settings) if is_drift else (False,) * len(everything)
+    changes: tuple[Change, ...] = ()
+    if any(mask):
+        changes = _changes(slowly_adapted(mask).model.series(), number, mask, wander(mask), settings)
+    shown = np.flatnonzero(series.recording == number)
+    shown = shown[:: max(1, -(-len(shown) // settings.series_points))]
+    return Drift(
+        recording=int(number) + 1,
+        is_drift=is_drift,
+        changes=changes,
+        time_constant_s=_likeliest_time_constant_s(slow.model, number),
+        model_m=_position_rms(errors["model"][own]),
+        adapted_m=_position_rms(errors["adapted"][own]),
+        slow_m=_position_rms(slow.errors[own]),
+        similar_states_m=_position_rms(errors["similar"][own]),
+        standard_errors=min(gains),
+        t_s=series.t_s[shown],
+        mean=series.mean[shown],
+        std=series.std[shown],
+    )
+
+
+def _gain_z(judge: HeldOut, before: FloatArray, after: FloatArray, settings: DriftSettings) -> float:
+    """Gain from errors ``before`` to ``after`` (S, 6) [clustered standard errors]; 0 with too few blocks."""
+    if len(np.unique(judge.windows.block)) < settings.min_blocks:
+        return 0.0
+    gain, error = judge.gain(before, after)
+    return gain / error
+
+
+def _changed(
+    judge: HeldOut,
+    own: NDArray[np.bool_],
+    plain: FloatArray,
+    slowly_adapted: Callable[[Mask], _SlowAdaptation],
+    settings: DriftSettings,
+) -> Mask:
+    """Which quantities changed: forward selection by the gain on unseen windows."""
+    mask: Mask = (False,) * len(QUANTITIES)
+    current = plain[own]
+    while not all(mask):
+        larger = [tuple(old or k == new for k, old in enumerate(mask)) for new in np.flatnonzero(~np.array(mask))]
+        gains = [judge.gain(current, slowly_adapted(each).errors[own]) for each in larger]
+        best = int(np.argmax([gain for gain, _ in gains]))
+        gain, error = gains[best]
+        if gain < settings.gain_z_min * error:
+            break
+        mask = larger[best]
+        current = slowly_adapted(mask).errors[own]
+    return mask
+
+
+def _changes(
+    series: DisturbanceSeries, number: int, mask: Mask, wander: FloatArray, settings: DriftSettings
+) -> tuple[Change, ...]:
+    """Significant changes of the quantities in ``mask``, most significant first."""
+    own = series.recording == number
+    mean, std, t_s = series.mean[own], series.std[own], series.t_s[own]
+    start_s, end_s = float(t_s[0]), float(t_s[-1])
+    first = t_s <= start_s + settings.ends_share * (end_s - start_s)
+    last = t_s >= end_s - settings.ends_share * (end_s - start_s)
+    found = []
+    for k in np.flatnonzero(mask):  # the first estimates are near 0, the prior mean
+        value, spread = float(mean[~first, k].mean()), float(np.sqrt(np.mean(std[~first, k] ** 2) + wander[k] ** 2))
+        ends = float(mean[first, k].mean()), float(mean[last, k].mean())
+        found.append(Change(*QUANTITIES[k], value, spread, *ends))
+    kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= settings.change_z_min * c.std]
+    return tuple(sorted(kept, key=lambda c: -abs(c.value) / c.std))
+
+
+def _likeliest_time_constant_s(model: AdaptiveModel, number: int) -> float:
+    series = model.series()
+    weights = series.weights[series.recording == number, 1:].mean(axis=0)
+    return float(model.processes.time_constant_s[int(np.argmax(weights))])
+
+
+def _position_rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(errors[:, 0] ** 2 + errors[:, 1] ** 2)))
+
+
+def _corrected_by_similar_states(
+    config: SimulatorConfig,
+    fit_tracks: Sequence[Track],
+    held_out: HeldOut,
+    errors: FloatArray,
+    settings: DriftSettings,
+) -> FloatArray:
+    """Errors (S, 6) on held-out windows less the mean error of fitted windows in similar states."""
+    windows = held_out.windows
+    fitted = cut_windows(fit_tracks, windows.horizon_s, windows.horizon_s).thinned(settings.max_fit_windows)
+    fitted = replace(fitted, velocity_window_s2=windows.velocity_window_s2)
+    fit_errors = final_errors(SimulatorModel(config), fitted)
+    fit_states, states = _state_features(fitted), _state_features(windows)
+    scale = np.maximum(fit_states.std(axis=0), 1e-9)
+    count = min(settings.neighbours, len(fitted))
+    _, index = cKDTree(fit_states / scale).query(states / scale, k=count)
+    return np.asarray(errors - fit_errors[index.reshape(len(windows), count)].mean(axis=1))
+
+
+def _state_features(windows: PredictionWindows) -> FloatArray:
+    """Features (S, 7) of the state of the car: body velocities, last commands, mean commands in the window."""
+    return np.concatenate(
+        [windows.initial_states[:, 3:], windows.past_commands[:, -1], windows.commands.mean(axis=1)], axis=1
+    )

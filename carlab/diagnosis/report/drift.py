@@ -1,0 +1,59 @@
+"""Sentences about the drift of a car since the fitted recordings."""
+
+from __future__ import annotations
+
+from carlab.diagnosis.findings import Change, Diagnosis, Drift
+from carlab.diagnosis.report.numbers import listed, number, percent, with_unit
+
+
+def drift_of(diagnosis: Diagnosis, recording: int) -> Drift | None:
+    """The drift in a held-out recording (number from 1); None without one."""
+    return next((d for d in diagnosis.drift if d.recording == recording and d.is_drift), None)
+
+
+def drift_sentence(drift: Drift, horizon_s: float) -> str:
+    """What changed in one recording, and what adaptation to it gains."""
+    what = " ".join(_change_sentence(c) for c in drift.changes)
+    if not what:
+        what = "No single one of drive force, steering trim, grip and force forward explains it."
+    before, after = with_unit(drift.model_m, "m"), with_unit(drift.adapted_m, "m")
+    return (
+        f"In held-out recording {drift.recording} the car differs from the fitted recordings. {what} With adaptation "
+        f"to the recent past, the position error after {with_unit(horizon_s, 's')} goes from {before} to {after}."
+    )
+
+
+def drift_sentences(diagnosis: Diagnosis) -> list[str]:
+    """Evidence and time constant of each drift, and one sentence for all recordings without one."""
+    made = [
+        f"Drift in held-out recording {d.recording}: {number(d.standard_errors)} standard errors on unseen windows, "
+        f"likeliest time constant {with_unit(d.time_constant_s, 's')}."
+        for d in diagnosis.drift
+        if d.is_drift
+    ]
+    without = [str(d.recording) for d in diagnosis.drift if not d.is_drift]
+    if without:
+        word = "recordings" if len(without) > 1 else "recording"
+        made.append(
+            f"No drift is found in held-out {word} {listed(without)}: a slow adaptation predicts unseen windows no "
+            "better than the model, or its errors depend on the state."
+        )
+    return made
+
+
+def _change_sentence(change: Change) -> str:
+    """The size of a change with its standard deviation, and the change along the recording if it is significant."""
+    value = change.value
+    if change.quantity == "steering trim":
+        side = "left" if value > 0.0 else "right"
+        text = f"The wheels point {with_unit(abs(value), 'rad')} (± {number(change.std)}) further to the {side}"
+    elif change.quantity == "force forward":
+        kind = "drives" if value > 0.0 else "brakes"
+        text = f"An additional force {kind} the car with {with_unit(abs(value), 'm/s2')} (± {number(change.std)})"
+    else:
+        kind = "higher" if value > 0.0 else "lower"
+        text = f"The {change.quantity} is {percent(abs(value))} (± {percent(change.std)}) {kind}"
+    if abs(change.last - change.first) >= 2.0 * change.std:
+        ends = [percent(v) if change.unit == "1" else with_unit(v, change.unit) for v in (change.first, change.last)]
+        text += f", from {ends[0]} in the first quarter to {ends[1]} in the last"
+    return f"{text}."

@@ -1,0 +1,28 @@
+"""Settings of the drift of a car between and along recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class DriftSettings:
+    """When a change of the car since the fitted recordings is reported."""
+
+    min_time_constant_s: float = 100.0
+    """Minimum time constant [s] of a drift; what changes within 10 s may be an error that depends on the state."""
+    gain_z_min: float = 2.0
+    """Minimum gain of the adapted prediction on unseen windows [standard errors], and of each reported quantity."""
+    change_z_min: float = 2.0
+    """Minimum change of a reported quantity [standard deviations]."""
+    min_blocks: int = 4
+    """Minimum number of blocks of a recording; fewer give no usable standard error."""
+    neighbours: int = 10
+    """Number of fitted windows in a similar state whose mean error corrects the prediction of a window: the prediction
+    of a car whose error depends on the state alone."""
+    max_fit_windows: int = 1200
+    """Maximum number of fitted windows among which neighbours are searched, thinned evenly."""
+    ends_share: float = 0.25
+    """First and last share of a recording, between which the change along it is stated."""
+    series_points: int = 300
+    """Maximum number of points of a series in report.json."""
