@@ -1,8 +1,8 @@
 """Drift: what changed in the car since the fitted recordings, from its adaptation to held-out recordings.
 
-An adaptation also follows errors that depend on the state, as long as the state stays. So a drift must be slow, and the
-slow adaptation must predict unseen windows better than the simulator and than the simulator whose prediction is
-corrected by the mean error of fitted windows in similar states.
+An adaptation also follows errors of a wrong simulator. So a drift must be slow, and the slow adaptation must predict
+unseen windows better than the simulator, than the simulator with the mean disturbance of the fitted recordings, and
+than the simulator whose prediction is corrected by the mean error of fitted windows in similar states.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.settings import DriftSettings
 from carlab.prediction.adaptation import AdaptiveModel, DisturbanceSeries, adapt, choose_noise
 from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.disturbances import DisturbedModel
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import PredictionWindows, Track, cut_windows
@@ -30,6 +31,9 @@ from sim_backends.car_parameters import SimulatorConfig
 QUANTITIES = (("drive force", "1"), ("steering trim", "rad"), ("grip", "1"), ("force forward", "m/s2"))
 """Names and units of the drifting disturbances."""
 Mask = tuple[bool, ...]
+EVERYTHING: Mask = (True,) * len(QUANTITIES)
+BASELINES = ("model", "fitted mean", "similar states")
+"""Predictions that a slow adaptation must improve on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,15 +82,20 @@ def adapt_to_held_out(
         return _SlowAdaptation(made, held_out.final_error(made))
 
     @cache
-    def wander(mask: Mask) -> FloatArray:
+    def along_fitted(mask: Mask) -> FloatArray:
         fitted = adapt(config, fit_tracks, noise, slow, drifts=(mask,), velocity_window_s2=window_s2)
-        return np.asarray(np.sqrt(np.mean(fitted.series().mean ** 2, axis=0)))
+        return fitted.series().mean
 
     plain = held_out.final_error(config)
-    similar = _corrected_by_similar_states(config, fit_tracks, held_out, plain, settings)
-    errors = {"model": plain, "adapted": held_out.final_error(model), "similar": similar}
+    constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0), slow)
+    errors = {
+        "model": plain,
+        "adapted": held_out.final_error(model),
+        "fitted mean": held_out.final_error(constant),
+        "similar states": _corrected_by_similar_states(config, fit_tracks, held_out, plain, settings),
+    }
     found = [
-        _drift_of(number, held_out, errors, slowly_adapted, wander, model.series(), settings)
+        _drift_of(number, held_out, errors, slowly_adapted, along_fitted, model.series(), settings)
         for number in np.unique(held_out.windows.recording)
     ]
     return Adaptation(model, noise, tuple(found))
@@ -97,7 +106,7 @@ def _drift_of(
     held_out: HeldOut,
     errors: dict[str, FloatArray],
     slowly_adapted: Callable[[Mask], _SlowAdaptation],
-    wander: Callable[[Mask], FloatArray],
+    along_fitted: Callable[[Mask], FloatArray],
     series: DisturbanceSeries,
     settings: DriftSettings,
 ) -> Drift:
@@ -106,23 +115,22 @@ def _drift_of(
     Args:
         number: index of the recording.
         held_out: all held-out windows.
-        errors: errors (S, 6) of the simulator ("model"), of the adapted prediction ("adapted"), and of the simulator
-            corrected by errors in similar states ("similar").
+        errors: errors (S, 6) of the simulator ("model"), of the adapted prediction ("adapted"), of the simulator with
+            the mean disturbance of the fitted recordings ("fitted mean"), and of the simulator corrected by errors in
+            similar states ("similar states").
         slowly_adapted: slow adaptation of some quantities.
-        wander: root mean square (n,) of the estimates of some quantities along the fitted recordings.
+        along_fitted: estimates (N, n) of some quantities along the fitted recordings.
         series: estimates of the adapted prediction.
         settings: conditions of a drift.
     """
     own = held_out.windows.recording == number
     judge = replace(held_out, windows=held_out.windows.take(own))
-    everything: Mask = (True,) * len(QUANTITIES)
-    slow = slowly_adapted(everything)
-    gains = [_gain_z(judge, errors[name][own], slow.errors[own], settings) for name in ("model", "similar")]
+    slow = slowly_adapted(EVERYTHING)
+    gains = [_gain_z(judge, errors[name][own], slow.errors[own], settings) for name in BASELINES]
     is_drift = min(gains) >= settings.gain_z_min
-    mask = _changed(judge, own, errors["model"], slowly_adapted, settings) if is_drift else (False,) * len(everything)
     changes: tuple[Change, ...] = ()
-    if any(mask):
-        changes = _changes(slowly_adapted(mask).model.series(), number, mask, wander(mask), settings)
+    if is_drift and any(mask := _changed(judge, own, errors["model"], slowly_adapted, settings)):
+        changes = _changes(slowly_adapted(mask).model.series(), number, mask, along_fitted(mask), settings)
     shown = np.flatnonzero(series.recording == number)
     shown = shown[:: max(1, -(-len(shown) // settings.series_points))]
     return Drift(
@@ -133,7 +141,7 @@ def _drift_of(
         model_m=_position_rms(errors["model"][own]),
         adapted_m=_position_rms(errors["adapted"][own]),
         slow_m=_position_rms(slow.errors[own]),
-        similar_states_m=_position_rms(errors["similar"][own]),
+        similar_states_m=_position_rms(errors["similar states"][own]),
         standard_errors=min(gains),
         t_s=series.t_s[shown],
         mean=series.mean[shown],
@@ -172,9 +180,9 @@ def _changed(
 
 
 def _changes(
-    series: DisturbanceSeries, number: int, mask: Mask, wander: FloatArray, settings: DriftSettings
+    series: DisturbanceSeries, number: int, mask: Mask, along_fitted: FloatArray, settings: DriftSettings
 ) -> tuple[Change, ...]:
-    """Significant changes of the quantities in ``mask``, most significant first."""
+    """Significant changes of the quantities in ``mask`` from the fitted recordings, most significant first."""
     own = series.recording == number
     mean, std, t_s = series.mean[own], series.std[own], series.t_s[own]
     start_s, end_s = float(t_s[0]), float(t_s[-1])
@@ -182,8 +190,10 @@ def _changes(
     last = t_s >= end_s - settings.ends_share * (end_s - start_s)
     found = []
     for k in np.flatnonzero(mask):  # the first estimates are near 0, the prior mean
-        value, spread = float(mean[~first, k].mean()), float(np.sqrt(np.mean(std[~first, k] ** 2) + wander[k] ** 2))
-        ends = float(mean[first, k].mean()), float(mean[last, k].mean())
+        before = float(along_fitted[:, k].mean())
+        value = float(mean[~first, k].mean()) - before
+        spread = float(np.sqrt(np.mean(std[~first, k] ** 2) + np.var(along_fitted[:, k])))
+        ends = float(mean[first, k].mean()) - before, float(mean[last, k].mean()) - before
         found.append(Change(*QUANTITIES[k], value, spread, *ends))
     kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= settings.change_z_min * c.std]
     return tuple(sorted(kept, key=lambda c: -abs(c.value) / c.std))
@@ -208,7 +218,7 @@ def _corrected_by_similar_states(
 ) -> FloatArray:
     """Errors (S, 6) on held-out windows less the mean error of fitted windows in similar states."""
     windows = held_out.windows
-    fitted = cut_windows(fit_tracks, windows.horizon_s, windows.horizon_s).thinned(settings.max_fit_windows)
+    fitted = cut_windows(fit_tracks, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
     fitted = replace(fitted, velocity_window_s2=windows.velocity_window_s2)
     fit_errors = final_errors(SimulatorModel(config), fitted)
     fit_states, states = _state_features(fitted), _state_features(windows)

@@ -176,10 +176,10 @@ class Change:
     Attributes:
         quantity: "drive force", "steering trim", "grip" or "force forward".
         unit: of the values; 1 for a share of the simulator's own force.
-        value: mean over the recording after its first quarter.
+        value: mean over the recording after its first quarter, less the mean of the fitted recordings.
         std: standard deviation of that: of the filter, and of the same estimate along the fitted recordings, where the
             car has not changed.
-        first, last: mean over the first and the last quarter of the recording.
+        first, last: the same over the first and the last quarter of the recording.
     """
 
     quantity: str
@@ -196,15 +196,15 @@ class Drift:
 
     Attributes:
         recording: number of the recording, from 1.
-        is_drift: whether a slow adaptation predicts unseen windows better than the simulator, and than the simulator
-            with the mean error of fitted windows in similar states, by the minimum number of standard errors.
+        is_drift: whether a slow adaptation predicts unseen windows better by the minimum number of standard errors than
+            the simulator, than the simulator with the mean disturbance of the fitted recordings, and than the simulator
+            corrected by the mean error of fitted windows in similar states.
         changes: quantities that changed, largest gain first; empty without a drift, or if no single one is significant.
         time_constant_s: likeliest time constant of the slow adaptation [s].
         model_m, adapted_m, slow_m, similar_states_m: root mean square position errors after the horizon [m] of the
             simulator, of the adapted prediction, of the slow adaptation, and of the simulator corrected by errors in
             similar states.
-        standard_errors: gain of the slow adaptation over the better of model and similar states, over its clustered
-            standard error.
+        standard_errors: smallest gain of the slow adaptation over these three, over its clustered standard error.
         t_s: (N,) times of the series since the first row [s].
         mean, std: (N, 4) estimated share of the drive force [1], steering trim [rad], share of the grip [1] and force
             forward per mass [m/s2], and their standard deviations.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,20 @@ from sim_backends.effects import DRIFTING, PUSHING
 
 DISTURBANCES = (*DRIFTING, *PUSHING)
 """Dotted names of the m disturbances; the first n of them drift."""
+
+
+@dataclass(frozen=True, slots=True)
+class DisturbedModel:
+    """A simulator with constant disturbances (n,) as a predictive model."""
+
+    config: SimulatorConfig
+    disturbances: FloatArray
+    settings: AdaptationSettings
+
+    def predict(self, windows: PredictionWindows) -> FloatArray:
+        """As ``PredictiveModel``."""
+        constant = np.broadcast_to(self.disturbances, (1, len(windows), len(self.disturbances)))
+        return np.asarray(simulate_disturbed(windows, self.config, constant, self.settings)[0])
 
 
 def linearised(

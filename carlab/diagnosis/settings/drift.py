@@ -20,6 +20,8 @@ class DriftSettings:
     neighbours: int = 10
     """Number of fitted windows in a similar state whose mean error corrects the prediction of a window: the prediction
     of a car whose error depends on the state alone."""
+    fit_stride_s: float = 0.25
+    """Time [s] between the starts of fitted windows."""
     max_fit_windows: int = 1200
     """Maximum number of fitted windows among which neighbours are searched, thinned evenly."""
     ends_share: float = 0.25
