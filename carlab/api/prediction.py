@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from carlab.cars import CarFile
-    from carlab.diagnosis.findings import FitErrors
+    from carlab.diagnosis.findings import Change, FitErrors
     from carlab.diagnosis.score_recording import PartScore, RecordingScore
     from carlab.prediction.errors import ChannelError
 
@@ -29,10 +29,12 @@ class PredictionErrors:
     Attributes:
         material: the recordings as they were read, with what was repaired.
         score: windows, errors (S, 6) of each model, and predicted trajectories.
+        is_adaptation_noise_known: whether the car file states the noise of the adaptation.
     """
 
     material: Material
     score: RecordingScore
+    is_adaptation_noise_known: bool = False
 
     @property
     def horizon_s(self) -> float:
@@ -53,11 +55,19 @@ class PredictionErrors:
         """Rms, median, 90th percentile and bias of each state channel in the whole recording.
 
         Args:
-            model: ``model``, ``constant velocity`` or ``no change``.
+            model: ``model``, ``adapted``, ``constant velocity`` or ``no change``.
         """
         from carlab.prediction.errors import channel_errors
 
         return channel_errors(self.score.whole.errors[model])
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """Estimated change of the car over the recording; empty without adaptation."""
+        from carlab.diagnosis.drift import changes_along
+
+        adaptation = self.score.adaptation
+        return () if adaptation is None else changes_along(adaptation.series())
 
     def table(self) -> list[dict[str, Any]]:
         """One dict for each model: position_m [m], yaw_rad [rad], vx, vy [m/s], yaw_rate [rad/s], score."""
@@ -121,6 +131,7 @@ def predict(
     horizon_s: float = 1.0,
     stride_s: float = 0.25,
     holdout_share: float = 0.3,
+    adapt: bool = False,
 ) -> PredictionErrors:
     """Predict a recording from many of its states, and compare the predictions with it.
 
@@ -130,10 +141,11 @@ def predict(
         horizon_s: prediction horizon [s].
         stride_s: time between initial states [s].
         holdout_share: share of the last part of the recording, above 0 and at most 0.5.
+        adapt: also predict with adaptation to the recent past: rows before each initial state.
 
     Returns:
-        The errors of the model, of constant velocity and of no change. For a model of a diagnosis they agree with its
-        report.
+        The errors of the model, with and without adaptation, of constant velocity and of no change. For a model of a
+        diagnosis they agree with its report.
 
     Raises:
         ConfigError: an argument is invalid.
@@ -150,8 +162,10 @@ def predict(
         horizon_s=horizon_s,
         stride_s=stride_s,
         holdout_share=holdout_share,
+        adapt=adapt,
     )
-    return PredictionErrors(material, score)
+    noise = file.recording_noise
+    return PredictionErrors(material, score, noise is not None and noise.adaptation is not None)
 
 
 def summary_of(part: PartScore) -> dict[str, FitErrors]:

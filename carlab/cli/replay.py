@@ -48,6 +48,9 @@ class Replay:
     holdout_share: float = 0.3
     """How much of the recording the last part is, above 0 and at most 0.5."""
 
+    adapt: bool = False
+    """Also predict with adaptation to the recent past: drive force, steering trim and grip from the rows before."""
+
     save: Path | None = None
     """Write FILE.rrd with the predictions beside the recording."""
 
@@ -75,6 +78,8 @@ class Replay:
             new_file(self.save, "--save", ".rrd")
         simulated = self.which_car.choose(seed=self.seed).car.reality is Reality.SIMULATED
         if not simulated or self.drive:
+            if self.adapt:
+                raise ConfigError("--adapt predicts a recording with a simulator; remove it, or drive without it.")
             return self._drive()
         self._predict()
         return 0
@@ -93,6 +98,7 @@ class Replay:
             horizon_s=self.horizon_s,
             stride_s=self.stride_s,
             holdout_share=self.holdout_share,
+            adapt=self.adapt,
         )
         for note in found.material.notes:
             console.print(note, markup=False)
@@ -104,9 +110,25 @@ class Replay:
                 continue
             print_errors(f"Error after {found.horizon_s:.2f} s, {describe_windows(part)}", "model", summary_of(part))
         self._print_channels(found)
+        if self.adapt:
+            self._print_changes(found)
         if self.save is not None:
             for path in found.save(self.save):
                 console.print(f"{path}")
+
+    def _print_changes(self, found: PredictionErrors) -> None:
+        rows = [
+            [f"{c.quantity} [{c.unit}]", *(f"{v:.3f}" for v in (c.value, c.std, c.first, c.last))]
+            for c in found.changes
+        ]
+        columns = ["quantity", "mean", "std", "first quarter", "last quarter"]
+        table("Difference of the car from its simulator, estimated from the past of each moment", columns, rows)
+        if not found.is_adaptation_noise_known:
+            console.print(
+                "The noise of the adaptation was chosen on this recording; carlab diagnose --adapt chooses it on the "
+                "fitted recordings and writes it into model.toml.",
+                markup=False,
+            )
 
     def _print_channels(self, found: PredictionErrors) -> None:
         from carlab.diagnosis.score_recording import CONSTANT_VELOCITY, MODEL, NO_CHANGE

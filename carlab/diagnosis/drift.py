@@ -19,7 +19,7 @@ from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import AdaptationNoise
 from carlab.diagnosis.findings import Change, Drift
 from carlab.diagnosis.identification.held_out_errors import HeldOut
-from carlab.diagnosis.settings import DriftSettings
+from carlab.diagnosis.settings import DEFAULT, DriftSettings
 from carlab.prediction.adaptation import AdaptiveModel, DisturbanceSeries, adapt, choose_noise
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import DisturbedModel
@@ -184,10 +184,8 @@ def _changes(
 ) -> tuple[Change, ...]:
     """Significant changes of the quantities in ``mask`` from the fitted recordings, most significant first."""
     own = series.recording == number
-    mean, std, t_s = series.mean[own], series.std[own], series.t_s[own]
-    start_s, end_s = float(t_s[0]), float(t_s[-1])
-    first = t_s <= start_s + settings.ends_share * (end_s - start_s)
-    last = t_s >= end_s - settings.ends_share * (end_s - start_s)
+    mean, std = series.mean[own], series.std[own]
+    first, last = _ends(series.t_s[own], settings)
     found = []
     for k in np.flatnonzero(mask):  # the first estimates are near 0, the prior mean
         before = float(along_fitted[:, k].mean())
@@ -197,6 +195,30 @@ def _changes(
         found.append(Change(*QUANTITIES[k], value, spread, *ends))
     kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= settings.change_z_min * c.std]
     return tuple(sorted(kept, key=lambda c: -abs(c.value) / c.std))
+
+
+def changes_along(series: DisturbanceSeries, settings: DriftSettings = DEFAULT.drift) -> tuple[Change, ...]:
+    """All quantities along one recording or several, whether significant or not."""
+    t_s = series.t_s
+    first, last = _ends(t_s, settings)
+    return tuple(
+        Change(
+            name,
+            unit,
+            float(series.mean[:, k].mean()),
+            float(np.sqrt(np.mean(series.std[:, k] ** 2))),
+            float(series.mean[first, k].mean()),
+            float(series.mean[last, k].mean()),
+        )
+        for k, (name, unit) in enumerate(QUANTITIES)
+    )
+
+
+def _ends(t_s: FloatArray, settings: DriftSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Rows in the first and in the last share of a recording."""
+    start_s, end_s = float(t_s.min()), float(t_s.max())
+    part_s = settings.ends_share * (end_s - start_s)
+    return t_s <= start_s + part_s, t_s >= end_s - part_s
 
 
 def _likeliest_time_constant_s(model: AdaptiveModel, number: int) -> float:

@@ -7,7 +7,7 @@ Faults of the recording are repaired; the initial states are estimated, and the 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,11 +23,13 @@ from carlab.diagnosis.recording_faults import find as recording_faults
 from carlab.diagnosis.recordings import check_held_out_share
 from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.unexplained.vibration import find_vibration
+from carlab.prediction.adaptation import AdaptiveModel, choose_noise
+from carlab.prediction.adaptation import adapt as adapt_along
 from carlab.prediction.predict import ConstantVelocity, NoChange, PredictiveModel, SimulatorModel, predicted_at
 from carlab.prediction.windows import Track, cut_windows, split_tracks, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
 
-MODEL, CONSTANT_VELOCITY, NO_CHANGE = "model", "constant velocity", "no change"
+MODEL, ADAPTED, CONSTANT_VELOCITY, NO_CHANGE = "model", "adapted", "constant velocity", "no change"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,7 @@ class RecordingScore:
         overlays: predictions (T + 1, 6) at the stamps of each episode, restarted every horizon; NaN without a
             prediction.
         faults: faults of the recording.
+        adaptation: the simulator adapted along the recording; None if that was not wanted.
     """
 
     horizon_s: float
@@ -65,6 +68,7 @@ class RecordingScore:
     episodes: tuple[EpisodeData, ...]
     overlays: tuple[FloatArray, ...]
     faults: tuple[DataFault, ...]
+    adaptation: AdaptiveModel | None = None
 
 
 def score_recording(
@@ -75,6 +79,7 @@ def score_recording(
     horizon_s: float = DEFAULT.windows.held_out_window_s,
     stride_s: float = DEFAULT.windows.held_out_stride_s,
     holdout_share: float = DEFAULT.windows.default_held_out_share,
+    adapt: bool = False,
 ) -> RecordingScore:
     """Predict a recording from many initial states along it.
 
@@ -85,6 +90,8 @@ def score_recording(
         horizon_s: prediction horizon.
         stride_s: time between initial states.
         holdout_share: share of the last part, which is scored separately, above 0 and at most 0.5.
+        adapt: also predict with adaptation to the recent past. ``noise`` states the noise of its filter; if absent, it
+            is chosen on this recording.
 
     Raises:
         DataError: the recording contains no window of that length in which the car moves.
@@ -105,6 +112,11 @@ def score_recording(
         last = _score(f"last {100.0 * holdout_share:g} %", early, late, config, noise, horizon_s, stride_s)
     except DataError:
         last = None
+    adaptation = None
+    if adapt:
+        adaptation = _adapted(tracks, config, noise, whole.held_out.windows.velocity_window_s2)
+        whole = _with_model(whole, adaptation)
+        last = None if last is None else _with_model(last, adaptation)
     return RecordingScore(
         whole.held_out.windows.horizon_s,
         whole,
@@ -112,7 +124,24 @@ def score_recording(
         tuple(repaired),
         _overlays(repaired, tracks, config, horizon_s),
         tuple(faults),
+        adaptation,
     )
+
+
+def _adapted(
+    tracks: list[Track], config: SimulatorConfig, known: RecordingNoise | None, window_s2: float
+) -> AdaptiveModel:
+    """The simulator adapted along the recording."""
+    noise = None if known is None else known.adaptation
+    if noise is None:
+        noise = choose_noise(config, tracks, velocity_window_s2=window_s2)
+    return adapt_along(config, tracks, noise, velocity_window_s2=window_s2)
+
+
+def _with_model(part: PartScore, adaptation: AdaptiveModel) -> PartScore:
+    """The part with the errors of the adapted simulator."""
+    adapted = part.held_out.final_error(adaptation)
+    return replace(part, errors={MODEL: part.errors[MODEL], ADAPTED: adapted, **part.errors})
 
 
 def _score(
@@ -171,6 +200,7 @@ def describe_windows(score: PartScore) -> str:
 
 
 __all__ = [
+    "ADAPTED",
     "CONSTANT_VELOCITY",
     "MODEL",
     "NO_CHANGE",

@@ -197,6 +197,8 @@ def choose_noise(
 ) -> AdaptationNoise:
     """Choose the noise of the filter by the likelihood of fitted recordings, each window given the earlier ones.
 
+    The unit of the losses is the spread of the errors of the simulator or, if that is smaller, of the adapted one.
+
     Raises:
         DataError: the car moves in no window.
     """
@@ -215,10 +217,18 @@ def choose_noise(
         settings.dof,
     )
     best = int(np.argmin(run_filter(measured, processes).nll.sum(axis=1)))
-    loss_windows = _windows(tracks, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
-    final = bounded_final_errors(loss_windows, simulate_windows(loss_windows, config), settings)[0]
-    spread = np.maximum(np.median(np.abs(final), axis=0) / ndtri(0.75), MIN_STD)
-    return AdaptationNoise(_as_std(errors[best] * calm), float(whites[best]), _as_std(spread))
+    windows = _windows(tracks, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
+    error_std, white_share = _as_std(errors[best] * calm), float(whites[best])
+    plain = _spread(simulate_windows(windows, config)[0], windows, settings)
+    noise = AdaptationNoise(error_std, white_share, _as_std(plain))
+    adapted = adapt(config, tracks, noise, settings, velocity_window_s2=velocity_window_s2).predict(windows)
+    return replace(noise, loss_std=_as_std(np.minimum(plain, _spread(adapted, windows, settings))))
+
+
+def _spread(predicted: FloatArray, windows: PredictionWindows, settings: AdaptationSettings) -> FloatArray:
+    """Robust standard deviations (6,) of the errors of predictions (S, K + 1, 6) after the windows."""
+    errors = bounded_final_errors(windows, predicted, settings)
+    return np.asarray(np.maximum(np.median(np.abs(errors), axis=0) / ndtri(0.75), MIN_STD))
 
 
 def _as_std(values: FloatArray) -> StateStd:

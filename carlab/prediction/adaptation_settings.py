@@ -25,7 +25,7 @@ class AdaptationSettings:
     yaw inertia [rad/s2]: what the simulator lacks from one window to the next, larger the harder the car drives."""
     white_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
     """Sizes of that noise, of which the likeliest is used."""
-    error_shares: tuple[float, ...] = (0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+    error_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
     """Sizes of the error after a window in addition to that noise, in units of the error in calm windows."""
     calm_quantile: float = 0.25
     """Quantile of the absolute errors that gives the error in calm windows."""

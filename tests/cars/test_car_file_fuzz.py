@@ -95,7 +95,19 @@ def test_recording_noise_is_read_and_checked(tmp_path: Path) -> None:
     assert noise.velocity_window_s2 == 1e-4
     assert noise.floor_after(1.0) == (0.01, 0.01, 0.02, 0.03, 0.03, 0.1)
     assert noise.floor_after(0.5) is None
+    assert noise.adaptation is None
     assert load_car_file(Path("eth_rc_car")).recording_noise is None
+    table = "[recording_noise.adaptation]\nerror_std = [1, 2, 3, 4, 5, 6]\nwhite_share = 0.1\n"
+    table += "loss_std = [6, 5, 4, 3, 2, 1]\n"
+    path.write_text(f"{text}\n{table}", encoding="utf-8")
+    read = load_car_file(path).recording_noise
+    assert read is not None
+    assert read.adaptation is not None
+    assert (read.adaptation.error_std[0], read.adaptation.white_share) == (1.0, 0.1)
+    assert read.to_table()["adaptation"]["loss_std"] == [6.0, 5.0, 4.0, 3.0, 2.0, 1.0]
+    path.write_text(f"{text}\n{table}".replace("0.1\nloss", "0\nloss"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"\[recording_noise.adaptation\] is 0; it must be > 0"):
+        load_car_file(path)
     changes = {
         "measured_std = [1e-3": "measured_std = [-1.0",
         "velocity_window_s2 = 1e-4": "velocity_window_s2 = 1e4",

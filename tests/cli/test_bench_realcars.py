@@ -47,9 +47,9 @@ def test_bad_input_is_refused_in_one_sentence(
 def test_figures_are_printed_and_written(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The diagnosis is replaced: two models on the windows of two held-out drives."""
+    """The diagnosis is replaced: three models on the windows of two held-out drives."""
     windows = cut_windows(tracks_of([drive(SimulatorConfig(), 12.0, k) for k in (1, 2)], PERIOD_S), 1.0, 0.25)
-    models = {"nominal": NoChange(), "constant_velocity": ConstantVelocity()}
+    models = {"nominal": NoChange(), "adapted": NoChange(), "constant_velocity": ConstantVelocity()}
     asked: dict[str, object] = {}
 
     def diagnose(fit, car, **options):
@@ -66,11 +66,15 @@ def test_figures_are_printed_and_written(
     assert asked["fit"] == ["a.csv"]
     assert asked["curves"]
     assert asked["ceiling"]
+    assert asked["adapt"]
     figures = json.loads(out.read_text())
     assert (figures["fit"], figures["held_out"]) == (["a.csv"], ["b.csv", "c.csv"])
     rows = {(e["recording"], e["model"], e["horizon_s"]): e for e in figures["errors"]}
-    assert len(rows) == 3 * 2 * 3
-    still, constant = (rows["all", name, 1.0]["position_rms_m"] for name in ("car file", "constant velocity"))
+    assert len(rows) == 3 * 3 * 3
+    still, adapted, constant = (
+        rows["all", name, 1.0]["position_rms_m"] for name in ("car file", "adapted", "constant velocity")
+    )
     assert still > 2.0 * constant
+    assert adapted == still
     assert f"{constant:.3f}" in capsys.readouterr().out
     assert JSON_NAME not in {p.name for p in folder.iterdir()}

@@ -1,6 +1,7 @@
 """``carlab replay`` on a simulated car: errors by part and channel, the overlay in rerun, and refusals."""
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -62,3 +63,24 @@ def test_invalid_options_are_refused_in_one_sentence(
     code, text = carlab("replay", circle(tmp_path / "drive.csv", 30.0), *options)
     assert code != 0
     assert message in text
+
+
+def test_adaptation_to_a_car_that_turns_more_than_its_simulator_is_printed(carlab: Carlab, tmp_path: Path) -> None:
+    """The default car does not drive this circle; an adapted one predicts it several times better."""
+    path = circle(tmp_path / "drive.csv", 30.0)
+    code, text = carlab("replay", path, "--adapt")
+    assert code == 0
+    last_part = text[text.index("last 30 %") :]
+    model, adapted = (float(re.findall(rf"{name} ([\d.]+)", last_part)[0]) for name in ("model", "adapted"))
+    assert model > 0.1
+    assert adapted < 0.3 * model
+    for quantity in ("drive force [1]", "steering trim [rad]", "grip [1]", "force forward [m/s2]"):
+        assert quantity in text
+    assert "The noise of the adaptation was chosen on this recording" in text
+    assert "adapted" not in carlab("replay", path)[1]
+
+
+def test_adaptation_and_driving_exclude_each_other(carlab: Carlab, tmp_path: Path) -> None:
+    code, text = carlab("replay", circle(tmp_path / "drive.csv", 5.0), "--adapt", "--drive")
+    assert code == 2
+    assert "--adapt predicts a recording with a simulator; remove it, or drive without it." in text
