@@ -13,6 +13,7 @@ from carlab.core.quantities import STATE_NAMES
 from carlab.core.tables import from_table
 
 StateStd = tuple[float, float, float, float, float, float]
+FeatureStd = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,14 +24,17 @@ class AdaptationNoise:
         error_std: error after a short prediction in calm driving: x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s].
         white_share: size of the white noise on the disturbances of the simulator, in units of the settings.
         loss_std: robust spread of the errors after the horizon of held-out errors, in the units of ``error_std``.
+        feature_std: standard deviations of vx, vy [m/s], yaw rate [rad/s], steering, throttle, mean steering and mean
+            throttle of a window.
     """
 
     error_std: StateStd
     white_share: float
     loss_std: StateStd
+    feature_std: FeatureStd
 
     def __post_init__(self) -> None:
-        for value in (*self.error_std, self.white_share, *self.loss_std):
+        for value in (*self.error_std, self.white_share, *self.loss_std, *self.feature_std):
             if not 0.0 < value < math.inf:
                 raise ConfigError(f"A number in [recording_noise.adaptation] is {value:g}; it must be > 0.")
 
@@ -40,6 +44,7 @@ class AdaptationNoise:
             "error_std": list(self.error_std),
             "white_share": self.white_share,
             "loss_std": list(self.loss_std),
+            "feature_std": list(self.feature_std),
         }
 
 

@@ -23,9 +23,10 @@ from carlab.diagnosis.settings import DEFAULT, DriftSettings
 from carlab.prediction.adaptation import AdaptiveModel, DisturbanceSeries, adapt, choose_noise
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import DisturbedModel
+from carlab.prediction.error_memory import state_features
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+from carlab.prediction.windows import Track, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
 QUANTITIES = (("drive force", "1"), ("steering trim", "rad"), ("grip", "1"), ("force forward", "m/s2"))
@@ -72,7 +73,7 @@ def adapt_to_held_out(
     whole = AdaptationSettings()
     window_s2 = held_out.windows.velocity_window_s2
     noise = choose_noise(config, fit_tracks, whole, velocity_window_s2=window_s2)
-    model = adapt(config, held_out_tracks, noise, whole, velocity_window_s2=window_s2)
+    model = adapt(config, held_out_tracks, noise, whole, fitted=fit_tracks, velocity_window_s2=window_s2)
     times_s = tuple(t for t in whole.time_constants_s if t >= settings.min_time_constant_s)
     slow = replace(whole, time_constants_s=times_s)
 
@@ -223,7 +224,7 @@ def _ends(t_s: FloatArray, settings: DriftSettings) -> tuple[NDArray[np.bool_], 
 
 def _likeliest_time_constant_s(model: AdaptiveModel, number: int) -> float:
     series = model.series()
-    weights = series.weights[series.recording == number, 1:].mean(axis=0)
+    weights = series.weights[series.recording == number, 1 : 1 + len(model.processes.std)].mean(axis=0)
     return float(model.processes.time_constant_s[int(np.argmax(weights))])
 
 
@@ -243,15 +244,8 @@ def _corrected_by_similar_states(
     fitted = cut_windows(fit_tracks, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
     fitted = replace(fitted, velocity_window_s2=windows.velocity_window_s2)
     fit_errors = final_errors(SimulatorModel(config), fitted)
-    fit_states, states = _state_features(fitted), _state_features(windows)
+    fit_states, states = state_features(fitted), state_features(windows)
     scale = np.maximum(fit_states.std(axis=0), 1e-9)
     count = min(settings.neighbours, len(fitted))
     _, index = cKDTree(fit_states / scale).query(states / scale, k=count)
     return np.asarray(errors - fit_errors[index.reshape(len(windows), count)].mean(axis=1))
-
-
-def _state_features(windows: PredictionWindows) -> FloatArray:
-    """Features (S, 7) of the state of the car: body velocities, last commands, mean commands in the window."""
-    return np.concatenate(
-        [windows.initial_states[:, 3:], windows.past_commands[:, -1], windows.commands.mean(axis=1)], axis=1
-    )

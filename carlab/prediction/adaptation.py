@@ -21,14 +21,17 @@ from scipy.special import ndtri
 
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
-from carlab.core.recording_noise import AdaptationNoise, StateStd
+from carlab.core.recording_noise import AdaptationNoise, FeatureStd, StateStd
 from carlab.prediction.adaptation_filter import Filtered, Processes, run_filter
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import bounded_final_errors, linearised, simulate_disturbed
+from carlab.prediction.error_memory import ErrorMemory, state_features
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import IndexArray, PredictionWindows, Track, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
+MIN_FEATURE_STD = 0.01
+"""Minimum standard deviation of a feature of the state [m/s, rad/s, 1]: a constant command has no unit."""
 MIN_STD = 1e-6
 """Minimum standard deviation of an error [m, rad, m/s, rad/s]: keeps noise-free recordings finite."""
 SINGLE_AND_ALL = ((True,) * 4, *(tuple(k == own for k in range(4)) for own in range(4)))
@@ -45,8 +48,7 @@ class DisturbanceSeries:
         mean: (S, n) share of the drive force [1], steering trim [rad], share of the grip [1], force forward per mass
             [m/s2], under the condition that the car changed.
         std: (S, n) standard deviations of the same.
-        weights: (S, C + 1) of the simulator without a change and of the C candidates, largest where errors of the last
-            seconds are smallest.
+        weights: (S, 1 + C + M) of the simulator without a change, of the candidates and of the memories of errors.
     """
 
     recording: IndexArray
@@ -83,8 +85,9 @@ class AdaptiveModel:
         processes: C candidates.
         measured: S ends of the windows that measure the disturbances.
         filtered: estimates of the candidates after each of these windows.
+        memories: M simulators without a change, corrected by their errors in similar states.
         weighed: L ends of the windows that weigh the candidates.
-        losses: (C + 1, L) of the simulator without a change and of the candidates, summed with forgetting.
+        losses: (1 + C + M, L) of the predictions of ``candidates``, summed with forgetting.
         guard_s: minimum time [s] between the end of a used window and the start of a prediction.
         settings: settings of the adaptation.
     """
@@ -93,6 +96,7 @@ class AdaptiveModel:
     processes: Processes
     measured: Moments
     filtered: Filtered
+    memories: tuple[ErrorMemory, ...]
     weighed: Moments
     losses: FloatArray
     guard_s: float
@@ -104,10 +108,12 @@ class AdaptiveModel:
         return np.asarray(np.einsum("cs,cskj->skj", weights, self.candidates(windows)))
 
     def candidates(self, windows: PredictionWindows) -> FloatArray:
-        """Predictions (C + 1, S, K + 1, 6) without a change and by each candidate."""
+        """Predictions (1 + C + M, S, K + 1, 6) without a change, by each candidate and by each memory."""
         drifting = self.disturbances(windows.recording, windows.t0_s)
         unchanged = np.zeros((1, *drifting.shape[1:]))
-        return simulate_disturbed(windows, self.config, np.concatenate([unchanged, drifting]), self.settings)
+        predicted = simulate_disturbed(windows, self.config, np.concatenate([unchanged, drifting]), self.settings)
+        corrected = [memory.corrected(windows, predicted[0]) for memory in self.memories]
+        return np.concatenate([predicted, np.stack(corrected)])
 
     def disturbances(self, recording: IndexArray, t_s: FloatArray) -> FloatArray:
         """Estimated disturbances (C, S, n) at times of recordings, 0 before the first measured window."""
@@ -119,19 +125,25 @@ class AdaptiveModel:
         return np.where(index[:, None] >= 0, self.filtered.mean[:, index] * decay[..., None], 0.0)
 
     def weights(self, recording: IndexArray, t_s: FloatArray) -> FloatArray:
-        """Weights (C + 1, S) of the simulator without a change and of the candidates at times of recordings."""
-        logarithm = np.zeros((len(self.losses), len(t_s)))
+        """Weights (1 + C + M, S) of the predictions of ``candidates`` at times of recordings."""
+        logarithm = np.repeat(np.log(self._prior_weights())[:, None], len(t_s), axis=1)
         if len(self.weighed.end_s):
             index = self.weighed.last_before(recording, t_s - self.guard_s)
-            logarithm = np.where(index >= 0, -self.losses[:, index], 0.0)
+            logarithm -= np.where(index >= 0, self.losses[:, index], 0.0)
         weights = np.exp(logarithm - logarithm.max(axis=0))
         return np.asarray(weights / weights.sum(axis=0))
+
+    def _prior_weights(self) -> FloatArray:
+        """Weights (1 + C + M,) without past errors, the same for each of the three kinds of predictions."""
+        kinds = (1, len(self.processes.std), len(self.memories))
+        return np.concatenate([np.full(count, 1.0 / (len(kinds) * count)) for count in kinds])
 
     def series(self) -> DisturbanceSeries:
         """Mean and standard deviation over the candidates after each measured window."""
         moments = self.measured
         weights = self.weights(moments.recording, moments.end_s + self.guard_s)
-        shares = weights[1:] / np.maximum(weights[1:].sum(axis=0), 1e-300)
+        drifting = weights[1 : 1 + len(self.processes.std)]
+        shares = drifting / np.maximum(drifting.sum(axis=0), 1e-300)
         mean = np.einsum("cs,csn->sn", shares, self.filtered.mean)
         variance = np.einsum("csnn->csn", self.filtered.covariance) + (self.filtered.mean - mean) ** 2
         std = np.sqrt(np.einsum("cs,csn->sn", shares, variance))
@@ -145,6 +157,7 @@ def adapt(
     settings: AdaptationSettings | None = None,
     *,
     drifts: Sequence[Sequence[bool]] = SINGLE_AND_ALL,
+    fitted: Sequence[Track] = (),
     velocity_window_s2: float = 0.0,
 ) -> AdaptiveModel:
     """Estimate the disturbances of a simulator along recordings.
@@ -156,6 +169,7 @@ def adapt(
         settings: settings of the adaptation.
         drifts: which of the n drifting disturbances may differ from 0, for each group of candidates; a group has one
             candidate for each time constant.
+        fitted: tracks of earlier recordings, whose errors are also remembered.
         velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
 
     Raises:
@@ -169,14 +183,21 @@ def adapt(
         measured = linearised(windows, config, at, settings)
         filtered = run_filter(measured, processes)
         at = filtered.predicted
+    memories = tuple(
+        ErrorMemory(
+            config, tracks, earlier, np.array(noise.feature_std), guard_s(windows), velocity_window_s2, settings
+        )
+        for earlier in ([(), fitted] if fitted else [()])
+    )
     none = Moments(np.zeros(0, dtype=np.int64), np.zeros(0))
     model = AdaptiveModel(
         config,
         processes,
         Moments(measured.recording, measured.end_s),
         filtered,
+        memories,
         none,
-        np.zeros((len(at) + 1, 0)),
+        np.zeros((1 + len(at) + len(memories), 0)),
         guard_s(windows),
         settings,
     )
@@ -220,7 +241,8 @@ def choose_noise(
     windows = _windows(tracks, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
     error_std, white_share = _as_std(errors[best] * calm), float(whites[best])
     plain = _spread(simulate_windows(windows, config)[0], windows, settings)
-    noise = AdaptationNoise(error_std, white_share, _as_std(plain))
+    feature_std = cast(FeatureStd, tuple(np.maximum(state_features(windows).std(axis=0), MIN_FEATURE_STD).tolist()))
+    noise = AdaptationNoise(error_std, white_share, _as_std(plain), feature_std)
     adapted = adapt(config, tracks, noise, settings, velocity_window_s2=velocity_window_s2).predict(windows)
     return replace(noise, loss_std=_as_std(np.minimum(plain, _spread(adapted, windows, settings))))
 
@@ -253,7 +275,7 @@ def _with_losses(
 
 def _remembered(losses: FloatArray, moments: Moments, settings: AdaptationSettings) -> FloatArray:
     """Sums of losses (C, L) of each recording up to each window, with exponential forgetting."""
-    total = losses * min(settings.weight_stride_s / settings.weight_horizon_s, 1.0)  # the windows overlap
+    total = losses * min(settings.weight_stride_s / settings.weight_dependence_s, 1.0)
     for k in range(1, len(moments.end_s)):
         if moments.recording[k] == moments.recording[k - 1]:
             elapsed_s = moments.end_s[k] - moments.end_s[k - 1]

@@ -38,8 +38,17 @@ class AdaptationSettings:
     weight_horizon_s: float = 1.0
     """Horizon [s] of these errors, that of held-out errors. Errors after ``window_s`` would favour a candidate whose
     error grows faster."""
+    weight_dependence_s: float = 3.0
+    """Time [s] within which errors count as one, because they are dependent. 1 s is 2 % worse, 10 s 1 %."""
     weight_stride_s: float = 0.25
     """Time [s] between the starts of the windows that weigh the candidates."""
+    memory_neighbours: int = 30
+    """Number of past windows that give the expected error of a prediction; bounds the time."""
+    memory_length: float = 2.0
+    """Length scale of the kernel over the state, in standard deviations of the states of the fitted recordings."""
+    memory_noise: float = 0.5
+    """Variance of an error about its expectation, over that of the expectation. From 0.3 to 1 the results differ by
+    1 %."""
     limits: tuple[float, ...] = (0.9, 0.4, 0.9, 10.0, 10.0, 100.0)
     """Maximum size of each disturbance in a simulation [1, rad, 1, m/s2, m/s2, rad/s2]."""
     steps: tuple[float, ...] = (0.05, 0.01, 0.05, 0.1, 0.1, 0.5)

@@ -1,0 +1,124 @@
+"""Memory of a simulator's errors: the expected error of a prediction from errors of the past in similar states.
+
+A Gaussian process over the state of the car (body velocities and commands) with a squared exponential kernel predicts
+the error along a window. Each prediction uses the nearest windows of the past only (local Gaussian process regression:
+Nguyen-Tuong, Seeger and Peters 2009, Model learning with local Gaussian process regression). Far from all past states
+the expected error is 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+from carlab.prediction.adaptation_settings import AdaptationSettings
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+from sim_backends.car_parameters import SimulatorConfig
+
+BATCH = 128
+"""Windows whose Gaussian processes are solved at once; bounds the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorMemory:
+    """Simulator corrected by its errors in similar states of the past.
+
+    Attributes:
+        config: the simulator.
+        tracks: tracks of the recordings that are predicted; only windows before a prediction are used.
+        fitted: tracks of earlier recordings, all of whose windows are used.
+        state_std: (7,) unit of the features of the state.
+        guard_s: minimum time [s] between the end of a used window and the start of a prediction.
+        velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
+        settings: settings of the adaptation.
+    """
+
+    config: SimulatorConfig
+    tracks: Sequence[Track]
+    fitted: Sequence[Track]
+    state_std: FloatArray
+    guard_s: float
+    velocity_window_s2: float
+    settings: AdaptationSettings
+
+    def corrected(self, windows: PredictionWindows, predicted: FloatArray) -> FloatArray:
+        """Predictions (S, K + 1, 6) of the simulator less their expected errors."""
+        past = self._windows(self.tracks, windows.horizon_s)
+        earlier = self._windows(self.fitted, windows.horizon_s)
+        if past is None and earlier is None:
+            return predicted
+        errors = np.concatenate([self._errors(w) for w in (past, earlier) if w is not None])
+        past_states = np.concatenate([state_features(w) for w in (past, earlier) if w is not None]) / self.state_std
+        states = state_features(windows) / self.state_std
+        expected = np.zeros_like(predicted)
+        for first in range(0, len(windows), BATCH):
+            rows = slice(first, first + BATCH)
+            known = np.ones((len(states[rows]), len(past_states)), dtype=bool)
+            if past is not None:
+                known[:, : len(past)] = self._is_known(windows, past, rows)
+            weights = _weights(states[rows], past_states, known, self.settings)
+            expected[rows] = np.tensordot(weights, errors, axes=1)
+        return predicted - _in_world(expected, windows)
+
+    def _windows(self, tracks: Sequence[Track], horizon_s: float) -> PredictionWindows | None:
+        """Windows of the tracks; None if the car moves in none."""
+        try:
+            windows = cut_windows(tracks, horizon_s, self.settings.weight_stride_s) if tracks else None
+        except DataError:
+            return None
+        return None if windows is None else replace(windows, velocity_window_s2=self.velocity_window_s2)
+
+    def _errors(self, windows: PredictionWindows) -> FloatArray:
+        """Errors (S, K + 1, 6) of the simulator, finite and bounded."""
+        bound = self.settings.max_error
+        errors = prediction_errors(simulate_windows(windows, self.config)[0], windows)
+        return np.nan_to_num(errors, nan=bound, posinf=bound, neginf=-bound).clip(-bound, bound)
+
+    def _is_known(self, windows: PredictionWindows, past: PredictionWindows, rows: slice) -> NDArray[np.bool_]:
+        """Which windows of the past (s, N) end before windows of a batch start."""
+        same = windows.recording[rows, None] == past.recording
+        end_s = past.t0_s + past.horizon_s + self.guard_s
+        return np.asarray(same & (end_s <= windows.t0_s[rows, None] + 1e-6))
+
+
+def state_features(windows: PredictionWindows) -> FloatArray:
+    """Features (S, 7) of the state of the car: body velocities, last commands, mean commands in the window."""
+    return np.concatenate(
+        [windows.initial_states[:, 3:], windows.past_commands[:, -1], windows.commands.mean(axis=1)], axis=1
+    )
+
+
+def _weights(
+    states: FloatArray, past_states: FloatArray, known: NDArray[np.bool_], settings: AdaptationSettings
+) -> FloatArray:
+    """Weights (s, N) of past errors in the posterior mean at ``states`` (s, 7); 0 where they are not ``known``."""
+    distance_sq = np.where(known, cdist(states, past_states, "sqeuclidean"), np.inf)
+    count = min(settings.memory_neighbours, len(past_states))
+    nearest = np.argpartition(distance_sq, count - 1, axis=1)[:, :count]
+    kernel = np.exp(-0.5 * np.take_along_axis(distance_sq, nearest, axis=1) / settings.memory_length**2)
+    chosen = past_states[nearest]
+    between = np.sum((chosen[:, :, None] - chosen[:, None]) ** 2, axis=-1)
+    covariance = np.exp(-0.5 * between / settings.memory_length**2) + settings.memory_noise * np.eye(count)
+    weights = np.zeros(distance_sq.shape)
+    used = np.isfinite(np.take_along_axis(distance_sq, nearest, axis=1))
+    covariance = np.where(used[:, :, None] & used[:, None], covariance, (1.0 + settings.memory_noise) * np.eye(count))
+    np.put_along_axis(weights, nearest, np.linalg.solve(covariance, kernel[..., None])[..., 0], axis=1)
+    return weights
+
+
+def _in_world(errors: FloatArray, windows: PredictionWindows) -> FloatArray:
+    """Errors (S, K + 1, 6) in the body frame of each window's initial state with x and y in the recording's frame."""
+    yaw = windows.initial_states[:, 2, None]
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    turned = errors.copy()
+    turned[..., 0] = cos * errors[..., 0] - sin * errors[..., 1]
+    turned[..., 1] = sin * errors[..., 0] + cos * errors[..., 1]
+    return turned
