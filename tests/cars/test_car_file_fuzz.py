@@ -98,7 +98,7 @@ def test_recording_noise_is_read_and_checked(tmp_path: Path) -> None:
     assert noise.adaptation is None
     assert load_car_file(Path("eth_rc_car")).recording_noise is None
     table = "[recording_noise.adaptation]\nerror_std = [1, 2, 3, 4, 5, 6]\nwhite_share = 0.1\n"
-    table += "loss_std = [6, 5, 4, 3, 2, 1]\n"
+    table += "loss_std = [6, 5, 4, 3, 2, 1]\nfeature_std = [1, 1, 1, 1, 1, 1, 1]\n"
     path.write_text(f"{text}\n{table}", encoding="utf-8")
     read = load_car_file(path).recording_noise
     assert read is not None
