@@ -79,12 +79,12 @@ def adapt_to_held_out(
 
     @cache
     def slowly_adapted(mask: Mask) -> _SlowAdaptation:
-        made = adapt(config, held_out_tracks, noise, slow, drifts=(mask,), velocity_window_s2=window_s2)
+        made = adapt(config, held_out_tracks, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
         return _SlowAdaptation(made, held_out.final_error(made))
 
     @cache
     def along_fitted(mask: Mask) -> FloatArray:
-        fitted = adapt(config, fit_tracks, noise, slow, drifts=(mask,), velocity_window_s2=window_s2)
+        fitted = adapt(config, fit_tracks, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
         return fitted.series().mean
 
     plain = held_out.final_error(config)

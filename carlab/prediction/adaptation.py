@@ -113,7 +113,7 @@ class AdaptiveModel:
         unchanged = np.zeros((1, *drifting.shape[1:]))
         predicted = simulate_disturbed(windows, self.config, np.concatenate([unchanged, drifting]), self.settings)
         corrected = [memory.corrected(windows, predicted[0]) for memory in self.memories]
-        return np.concatenate([predicted, np.stack(corrected)])
+        return np.concatenate([predicted, np.stack(corrected)]) if corrected else predicted
 
     def disturbances(self, recording: IndexArray, t_s: FloatArray) -> FloatArray:
         """Estimated disturbances (C, S, n) at times of recordings, 0 before the first measured window."""
@@ -136,7 +136,7 @@ class AdaptiveModel:
     def _prior_weights(self) -> FloatArray:
         """Weights (1 + C + M,) without past errors, the same for each of the three kinds of predictions."""
         kinds = (1, len(self.processes.std), len(self.memories))
-        return np.concatenate([np.full(count, 1.0 / (len(kinds) * count)) for count in kinds])
+        return np.concatenate([np.full(count, 1.0 / (len(kinds) * max(count, 1))) for count in kinds])
 
     def series(self) -> DisturbanceSeries:
         """Mean and standard deviation over the candidates after each measured window."""
@@ -158,6 +158,7 @@ def adapt(
     *,
     drifts: Sequence[Sequence[bool]] = SINGLE_AND_ALL,
     fitted: Sequence[Track] = (),
+    remember: bool = True,
     velocity_window_s2: float = 0.0,
 ) -> AdaptiveModel:
     """Estimate the disturbances of a simulator along recordings.
@@ -170,6 +171,7 @@ def adapt(
         drifts: which of the n drifting disturbances may differ from 0, for each group of candidates; a group has one
             candidate for each time constant.
         fitted: tracks of earlier recordings, whose errors are also remembered.
+        remember: whether errors in similar states are remembered at all.
         velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
 
     Raises:
@@ -188,6 +190,7 @@ def adapt(
             config, tracks, earlier, np.array(noise.feature_std), guard_s(windows), velocity_window_s2, settings
         )
         for earlier in ([(), fitted] if fitted else [()])
+        if remember
     )
     none = Moments(np.zeros(0, dtype=np.int64), np.zeros(0))
     model = AdaptiveModel(
