@@ -167,7 +167,7 @@ def diagnose(
             error; takes minutes.
         ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car since the
-            fitted ones; takes seconds.
+            fitted ones; takes up to a minute.
         seed: seed of the black box; the rest of a diagnosis draws no random numbers.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
