@@ -36,15 +36,18 @@ class Prove:
     """Benchmark the diagnosis on new recordings with concealed effects, and score it against the sealed answers.
 
     Prints a hash of the answers before the first diagnosis. Takes hours (--set short: minutes). ^C ends after the
-    running cases, a second ^C at once; the same command continues. Writes scores.json, confusion.png, results.md.
+    running cases, a second ^C at once; the same command continues. Writes scores.json, confusion.png, detection.png,
+    results.md.
     """
 
     out: Path = Path("proof")
     """Folder of the benchmark; an unfinished benchmark with the same options is continued."""
 
-    set: Literal["short", "full", "development", "real"] = "short"
-    """short: five small cases; full: about 350 cases of the test set; development: 350 other cases; real: about 150
-    cases with effects of commands and sensors concealed in recordings of a real car."""
+    set: Literal["short", "full", "development", "hard", "hard-development", "real"] = "short"
+    """short: five small cases; full: about 390 cases of the test set; development: 390 other cases; hard: about 280
+    cases with three to five effects, 30 s of recording, a wrong kind of base model, feedback driving only, or jitter in
+    the stamps; hard-development: 280 other ones; real: about 150 cases with effects of commands and sensors concealed
+    in recordings of a real car."""
 
     data: Path | None = None
     """Only --set real: folder with recordings of one car, at least 120 s."""
@@ -186,17 +189,21 @@ class Prove:
         return not interrupts.requested.is_set()
 
     def _specs(self) -> list[CaseSpec]:
+        from carlab.benchmark.cases.hard_set import hard_set
         from carlab.benchmark.cases.proof_set import drawn, full_set, short_set
 
         self._check_limit()
         if self.set == "short":
             specs = short_set("test", self.seed)
+        elif self.set in ("hard", "hard-development"):
+            specs = hard_set("test" if self.set == "hard" else "development", self.seed)
         else:
             specs = full_set("test" if self.set == "full" else "development", self.seed)
         return specs if self.limit is None else drawn(specs, self.limit, self.seed)
 
     def _score(self, proof: Proof) -> int:
         from carlab.benchmark.baselines.scores import COLUMNS, compare, comparison_rows
+        from carlab.benchmark.proof.detection import detection_curves, draw_detection
         from carlab.benchmark.proof.results_page import results_page
         from carlab.benchmark.proof.scores import draw_confusion, score_cases, summarise, table_rows, write_scores
 
@@ -214,6 +221,7 @@ class Prove:
             fail(f"{summary['no_report']} diagnoses have no report; results.md lists them with the reasons.")
         write_scores(proof.root / "scores.json", rows, summary, comparison)
         draw_confusion(proof.root / "confusion.png", rows.values())
+        draw_detection(proof.root / "detection.png", detection_curves(rows.values()))
         page = results_page(self._facts([spec.seed for spec in proof.specs], runs), rows, runs, summary, comparison)
         (proof.root / "results.md").write_text(page, encoding="utf-8")
         console.print(f"Read {self.out / 'results.md'} and {self.out / 'confusion.png'}; all figures: scores.json.")

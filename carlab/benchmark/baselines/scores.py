@@ -34,6 +34,8 @@ def compare(rows: Mapping[str, Row], answers: Mapping[str, Mapping[str, Any]]) -
 
     def rate(title: str, among: Callable[[Row], bool], hit: Callable[[Row, str | None], bool]) -> None:
         chosen = [name for name in names if among(rows[name])]
+        if not chosen:
+            return
         entry: dict[str, Any] = {"figure": title, "kind": "rate", "count": len(chosen)}
         for column in COLUMNS:
             hits = sum(hit(rows[name], first(name, column)) for name in chosen)
@@ -49,6 +51,9 @@ def compare(rows: Mapping[str, Row], answers: Mapping[str, Mapping[str, Any]]) -
         "wrong effect first, singles",
         lambda r: r["kind"] == "single",
         lambda r, name: name is not None and not right(r, name),
+    )
+    rate(
+        "one of the effects first, three to five", lambda r: r["kind"] == "multiple", lambda r, name: name in r["true"]
     )
     rate(
         "false alarms, null and parameters",

@@ -2,36 +2,27 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
-from carlab.benchmark.cases.refit import Refit, Windows, cut_windows, refit
-from carlab.benchmark.effects.catalogue import DRIFTS, LAG_PARAMETERS, Draw, Form, FormName
+from carlab.benchmark.cases.conditions import Conditions, with_stamp_delays
+from carlab.benchmark.cases.refit import Refit
+from carlab.benchmark.cases.scene import Concealed, Scene
+from carlab.benchmark.effects.catalogue import DRIFTS, LAG_PARAMETERS, Form, FormName
 from carlab.benchmark.effects.data_faults import FAULTS, Table
 from carlab.benchmark.effects.forms import all_forms
-from carlab.benchmark.world.base_car import BaseCar, draw_nominal
-from carlab.benchmark.world.driver import HumanDriver, Track
-from carlab.benchmark.world.measurement import Noise, Recording, as_table, record
-from carlab.benchmark.world.physics import World
-from carlab.benchmark.world.simulation import drive
-from carlab.core.errors import ConfigError, DataError
+from carlab.benchmark.world.base_car import BaseCar
+from carlab.benchmark.world.measurement import Recording, as_table
+from carlab.core.errors import ConfigError
 
-CaseKind = Literal["single", "pair", "null", "parameters", "outside", "fault"]
+CaseKind = Literal["single", "pair", "multiple", "null", "parameters", "outside", "fault"]
 CHANNELS = ("x", "y", "yaw", "vx", "vy", "yaw_rate")
-NEAR = 0.10  # relative tolerance of the search for a strength
-
-
-@dataclass(frozen=True)
-class Concealed:
-    """A concealed effect of the true car."""
-
-    form: Form
-    parameters: dict[str, float]
-    size: float
+EFFECT_COUNTS = {"single": (1,), "outside": (1,), "pair": (2,), "multiple": (3, 4, 5)}
+PLAIN = Conditions()
 
 
 @dataclass(frozen=True)
@@ -51,6 +42,8 @@ class Case:
     single_excesses: tuple[float, ...] = ()
     fault: dict[str, Any] | None = None
     recordings: tuple[Recording, ...] = field(default=(), repr=False)
+    conditions: Conditions = PLAIN
+    fit_s: float = 100.0
 
     @property
     def excess(self) -> float:
@@ -76,6 +69,8 @@ class Case:
             "nominal_score": self.refit.nominal_score,
             "refit_score": self.refit.score,
             "fault": self.fault,
+            "conditions": self.conditions.names(self.fit_s),
+            "implied_effects": list(self.conditions.implied_effects()),
         }
 
     def _effect(self, c: Concealed) -> dict[str, Any]:
@@ -94,75 +89,8 @@ class Case:
             "place": {k: c.parameters[k] for k in ("x", "y", "radius")} if place else None,
             "time": "drift" if c.form.id in DRIFTS else None,
             "class_words": [list(group) for group in c.form.class_words],
+            "resemblance": None if c.resemblance is None else dataclasses.asdict(c.resemblance),
         }
-
-
-class _Scene:
-    """Random draws of a case that do not depend on the strength; it can be driven with any effects."""
-
-    def __init__(
-        self,
-        seed: int,
-        kind: CaseKind,
-        model: Literal["dynamic", "linear_tyre"],
-        lengths_s: tuple[float, float],
-        period_s: float,
-        true_starts: bool,
-    ) -> None:
-        draws = np.random.default_rng((seed, 1))
-        self.nominal = draw_nominal(draws, period_s, model)
-        moved = self.nominal.perturbed(draws)
-        self.car = self.nominal if kind == "null" else moved
-        self.track = Track(draws)
-        self.noise = Noise(self.nominal.position_std, self.nominal.yaw_std, float(draws.choice((0.06, 0.075, 0.09))))
-        self.seed, self.lengths_s, self.true_starts = seed, lengths_s, true_starts
-        self.draws = draws
-
-    def drive(self, concealed: Sequence[Concealed]) -> tuple[Refit, tuple[Recording, ...], Windows]:
-        recordings: list[Recording] = []
-        windows: list[Windows] = []
-        for part, length_s in enumerate(self.lengths_s):
-            world = World(self.car)
-            for c in concealed:
-                c.form.attach(world, c.parameters)
-            human = HumanDriver(self.car, self.track, np.random.default_rng((self.seed, 2, part)))
-            what = drive(world, human, length_s, start=human.start())
-            recordings.append(record(what, world, self.noise, np.random.default_rng((self.seed, 3, part))))
-            windows.append(cut_windows(recordings[-1], self.car, true_starts=self.true_starts))
-        fitted = refit(windows[0], windows[1], self.nominal)
-        return fitted, tuple(recordings), windows[1]
-
-    def sized(self, form: Form, target: float, tries: int = 8) -> tuple[Concealed, float]:
-        """Scale the effect until its excess is ``target``, or as near as possible. Returns it and its excess."""
-        draw = Draw.from_rng(self.draws, self.car, self.track.points)
-        low, high, best, best_miss, best_excess = 0.0, math.inf, None, math.inf, 0.0
-        size, last = min(max(form.typical * target, form.smallest), form.largest), (0.0, 0.0)
-        for _ in range(tries):
-            candidate = Concealed(form, form.sized(size, draw), size)
-            try:
-                ratio = self.drive([candidate])[0].excess / target
-            except DataError:
-                ratio = math.inf
-            miss = abs(math.log(max(ratio, 1e-3))) if math.isfinite(ratio) else math.inf
-            if miss < best_miss:
-                best, best_miss, best_excess = candidate, miss, ratio * target
-            if miss < NEAR or (ratio < 1.0 and size >= form.largest) or (ratio > 1.0 and size <= form.smallest):
-                break
-            low, high = (size, high) if ratio < 1.0 else (low, min(high, size))
-            slope = 1.0
-            if math.isfinite(ratio) and ratio > 0.05 and last[1] > 0.05 and size != last[0]:
-                slope = min(max(math.log(ratio / last[1]) / math.log(size / last[0]), 0.3), 4.0)
-            last = (size, ratio if math.isfinite(ratio) else 0.0)
-            usable = min(max(ratio, 0.05), 20.0)
-            size *= min(max(usable ** (-1.0 / slope), 0.2), 5.0)
-            if size <= low or size >= high:
-                size = math.sqrt(low * high) if low > 0.0 else 0.3 * high
-            size = min(max(size, form.smallest), form.largest)
-        if best is None:
-            raise DataError(
-                f"The car cannot be driven with {form.id} of any size at seed {self.seed}; use another seed."
-            )
-        return best, best_excess
 
 
 def make_case(
@@ -177,53 +105,82 @@ def make_case(
     fit_s: float = 100.0,
     hold_s: float = 40.0,
     true_starts: bool = False,
+    conditions: Conditions = PLAIN,
 ) -> Case:
     """Draw, size and record one case. The same arguments give the same case.
 
     Args:
-        kind: ``null`` (correct car file), ``parameters`` (wrong base parameters), ``single``, ``pair``, ``outside``
-            (physics outside the catalogue) or ``fault`` (wrong base parameters and a data fault).
+        kind: ``null`` (correct car file), ``parameters`` (wrong base parameters), ``single``, ``pair``, ``multiple``
+            (three to five effects), ``outside`` (physics outside the catalogue) or ``fault`` (wrong base parameters
+            and a data fault).
         seed: Seed of all random draws.
-        effects: One or two ids; for ``outside`` the id of an uncatalogued form.
+        effects: Ids of the effects; for ``outside`` the id of an uncatalogued or random form.
         form: Form of the effects; an effect without this form has its other form.
-        excess: Target strength of each effect alone.
+        excess: Target strength of each effect alone, measured with the kind of model of the true car.
         fault: Additional data fault, of FAULTS.
         period_s: Control period: 1/30 s, or 1/100 s.
         fit_s: Length of the recording to fit [s].
         hold_s: Length of the held-out recording [s].
         true_starts: Measure the excess from noise-free initial states; the floor is then the recording's noise.
+        conditions: Conditions of driving, recording and car file.
 
     Raises:
         ConfigError: for an unknown effect or fault, or a wrong number of effects.
     """
+    forms = _checked_forms(kind, effects, form, fault)
+    linear = any(f.nominal_kind == "linear_tyre" for f in forms)
+    scene = Scene(
+        seed, kind, "linear_tyre" if linear else "dynamic", (fit_s, hold_s), period_s, true_starts,
+        conditions.feedback_only,
+    )  # fmt: skip
+    found = [scene.sized(f, excess) for f in forms]
+    concealed = tuple(c for c, _ in found)
+    fitted, recordings, windows = scene.drive(concealed)
+    tables, described = _tables(scene, recordings, fault, conditions)
+    nominal = scene.nominal
+    if conditions.base_model != "same":
+        nominal = dataclasses.replace(nominal, kind=conditions.base_model)
+    return Case(
+        kind, seed, nominal, tables[0], tables[1], scene.car, concealed, fitted, tuple(windows.floor.tolist()),
+        excess if forms else 0.0, tuple(e for _, e in found), described, recordings, conditions, fit_s,
+    )  # fmt: skip
+
+
+def _checked_forms(kind: CaseKind, effects: Sequence[str], form: FormName, fault: str | None) -> list[Form]:
     forms = [_form(name, "outside" if kind == "outside" else form) for name in effects]
-    wanted = {"single": 1, "outside": 1, "pair": 2}.get(kind, 0)
-    if len(forms) != wanted:
-        raise ConfigError(f"A case of kind '{kind}' requires {wanted} effects, not {len(forms)}.")
+    wanted = EFFECT_COUNTS.get(kind, (0,))
+    if len(forms) not in wanted:
+        numbers = " or ".join(map(str, wanted))
+        raise ConfigError(f"A case of kind '{kind}' requires {numbers} effects, not {len(forms)}.")
     if fault is not None and fault not in FAULTS:
         raise ConfigError(f"Unknown data fault '{fault}'; known: {', '.join(FAULTS)}.")
     if kind == "fault" and fault is None:
         raise ConfigError("A case of kind 'fault' needs a data fault.")
-    linear = any(f.nominal_kind == "linear_tyre" for f in forms)
-    scene = _Scene(seed, kind, "linear_tyre" if linear else "dynamic", (fit_s, hold_s), period_s, true_starts)
-    found = [scene.sized(f, excess) for f in forms]
-    concealed = tuple(c for c, _ in found)
-    fitted, recordings, windows = scene.drive(concealed)
-    tables = [as_table(r) for r in recordings]
-    described = None
+    return forms
+
+
+def _tables(
+    scene: Scene, recordings: Sequence[Recording], fault: str | None, conditions: Conditions
+) -> tuple[list[Table], dict[str, Any] | None]:
+    """Columns of the recordings with the data fault and the delayed stamps, and a description of the fault."""
+    tables, described = [as_table(r) for r in recordings], None
     if fault is not None:
-        done = [FAULTS[fault](t, np.random.default_rng((seed, 4)), scene.nominal) for t in tables]
+        done = [FAULTS[fault](t, np.random.default_rng((scene.seed, 4)), scene.nominal) for t in tables]
         tables = [t for t, _ in done]
         described = {"id": fault, "columns": list(done[0][1].columns), "rows": done[0][1].rows}
-    return Case(
-        kind, seed, scene.nominal, tables[0], tables[1], scene.car, concealed, fitted,
-        tuple(windows.floor.tolist()), excess if forms else 0.0, tuple(e for _, e in found), described, recordings,
-    )  # fmt: skip
+    if conditions.stamp_delay_periods > 0.0:
+        period_s = scene.nominal.control_period
+        mean_s = conditions.stamp_delay_periods * period_s
+        tables = [
+            with_stamp_delays(t, mean_s, period_s, np.random.default_rng((scene.seed, 5, part)))
+            for part, t in enumerate(tables)
+        ]
+    return tables, described
 
 
 def _form(name: str, form: FormName) -> Form:
     known = all_forms()
-    for wanted in (form, "catalogue", "other") if form != "outside" else ("outside",):
+    for wanted in ("outside", "random") if form == "outside" else (form, "catalogue", "other"):
         if (name, wanted) in known:
             return known[(name, wanted)]  # type: ignore[index]
     raise ConfigError(f"There is no effect '{name}' of form '{form}' to conceal.")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from carlab.benchmark.cases.case import Case, CaseKind, make_case
+from carlab.benchmark.cases.case import PLAIN, Case, CaseKind, make_case
+from carlab.benchmark.cases.conditions import Conditions
 from carlab.benchmark.effects.catalogue import EFFECT_IDS, FormName, are_confusable
 from carlab.benchmark.effects.data_faults import FAULTS
 from carlab.benchmark.effects.forms import all_forms
@@ -33,6 +35,7 @@ class CaseSpec:
     period_s: float = 1.0 / 30.0
     fit_s: float = 100.0
     hold_s: float = 40.0
+    conditions: Conditions = PLAIN
 
     def make(self) -> Case:
         """Draw, size and record the case."""
@@ -46,20 +49,42 @@ class CaseSpec:
             period_s=self.period_s,
             fit_s=self.fit_s,
             hold_s=self.hold_s,
+            conditions=self.conditions,
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        return asdict(self)
+        """As JSON, without conditions that are those of the full set."""
+        values = asdict(self)
+        if self.conditions == PLAIN:
+            del values["conditions"]
+        return values
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> CaseSpec:
+        """Read ``as_dict``."""
+        conditions = Conditions.from_dict(values.get("conditions", {}))
+        return cls(**{**values, "effects": tuple(values["effects"]), "conditions": conditions})
 
 
 def full_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
-    """Cases of the protocol: 4 per effect, 100 null, 40 pairs, 40 outside, 2 per data fault.
+    """Cases of the protocol: 4 per effect, 100 null, 40 pairs, 40 outside, 2 per data fault, 40 of random physics.
 
     Half of an effect's cases have the catalogue's form, half another form. Each strength occurs once per effect, in a
     random order of the forms. One single case in ten also has a data fault.
     """
-    return _specs(purpose, seed, per_effect=4, nulls=100, pairs=40, outside=40, per_fault=2)
+    specs = _specs(purpose, seed, per_effect=4, nulls=100, pairs=40, outside=40, per_fault=2)
+    rng = np.random.default_rng((SEED_BASE[purpose], seed, 1))
+    return specs + random_physics(rng, 40, SEED_BASE[purpose] + 100_000 * seed + len(specs))
+
+
+def random_physics(rng: np.random.Generator, count: int, first_seed: int) -> list[CaseSpec]:
+    """Cases with random smooth physics outside the catalogue: every kind and every strength equally often."""
+    kinds = [name for name, form in all_forms() if form == "random"]
+    strengths = rng.permutation(np.resize(STRENGTHS, count))
+    return [
+        CaseSpec("outside", first_seed + k, (kinds[k % len(kinds)],), "outside", float(strengths[k]))
+        for k in range(count)
+    ]
 
 
 def short_set(

@@ -12,7 +12,7 @@ from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.physics import World
 
 Parameters = Mapping[str, float]
-FormName = Literal["catalogue", "other", "outside"]
+FormName = Literal["catalogue", "other", "outside", "random"]
 
 # Confusable effects of each effect.
 CONFUSABLE: dict[str, tuple[str, ...]] = {

@@ -8,6 +8,7 @@ from carlab.benchmark.effects import (
     command_forms,
     force_forms,
     observation_forms,
+    random_physics,
     tyre_forms,
     uncatalogued_forms,
 )
@@ -21,6 +22,7 @@ _MODULES = (
     alternative_command_forms,
     alternative_force_forms,
     uncatalogued_forms,
+    random_physics,
 )
 
 

@@ -42,7 +42,8 @@ def score_case(
             does not cover them. Then only the list of confusable effects counts.
 
     Returns:
-        A flat table; figures that do not apply to the kind of case are absent.
+        A flat table; figures that do not apply to the kind of case are absent. Names that a wrong base model implies
+        do not count.
     """
     row: dict[str, Any] = {
         "kind": answer["kind"],
@@ -56,8 +57,10 @@ def score_case(
     if report is not None:
         check_report(report)
     row["verdict"] = report["verdict"] if report is not None else "no report"
-    named = [dict(e) for e in report["effects"]] if report is not None else []
+    implied = answer.get("implied_effects", ())
+    named = [dict(e) for e in report["effects"] if e["id"] not in implied] if report is not None else []
     row["named"] = [e["id"] for e in named]
+    row["conditions"] = list(answer.get("conditions", ()))
     if answer["fault"] is not None:
         faults = [f.get("id") for f in (report or {}).get("data_faults", [])]
         row["fault_found"] = answer["fault"]["id"] in faults
@@ -68,17 +71,22 @@ def score_case(
         found = [any(_found(e, true, same) for e in named) for true in row["true"]]
         strict = [true in row["named"] for true in row["true"]]
         row["both_found"], row["both_strict"] = all(found), all(strict)
+    elif kind == "multiple":
+        row["first_right"] = bool(named) and any(_found(named[0], true, same) for true in row["true"])
     elif kind == "outside":
         _outside(row, answer, report)
     else:
         row["false_alarm"] = bool(named)
-        if kind == "parameters":
+        if any(name.startswith("base model") for name in row["conditions"]):
+            row["verdict_right"] = not named  # the car file lacks physics, so every verdict without a name is correct
+        elif kind == "parameters":
             row["verdict_right"] = row["verdict"] == "parameters"
         elif kind == "null":
             row["verdict_right"] = row["verdict"] in ("none", "parameters")
         else:
             row["verdict_right"] = row["verdict"] in ("data", "parameters", "none") and row["fault_found"]
-    if kind in ("single", "pair"):
+    if kind in ("single", "pair", "multiple"):
+        _detections(row, answer, named, same)
         _ratios(row, report, oracle)
     return row
 
@@ -95,6 +103,21 @@ def _found(effect: Json, true: str, same: SeparationTest | None) -> bool:
     if effect["id"] == true:
         return True
     return true in (effect.get("indistinguishable_from") or []) and valid_set(effect, same)
+
+
+def _detections(row: dict[str, Any], answer: Json, named: list[dict[str, Any]], same: SeparationTest | None) -> None:
+    """Whether each concealed effect is named, at any rank, and whether each name is right."""
+    excesses = answer.get("single_excesses") or [answer["excess"]] * len(row["true"])
+    row["detections"] = [
+        {
+            "id": true,
+            "excess": excess,
+            "found": any(_found(e, true, same) for e in named),
+            "strict": true in row["named"],
+        }
+        for true, excess in zip(row["true"], excesses, strict=True)
+    ]
+    row["names_right"] = [any(_found(e, true, same) for true in row["true"]) for e in named]
 
 
 def _single(row: dict[str, Any], answer: Json, named: list[dict[str, Any]], same: SeparationTest | None) -> None:
@@ -142,6 +165,7 @@ def _parameters(found: Json, true: Json) -> dict[str, dict[str, Any]]:
 
 def _outside(row: dict[str, Any], answer: Json, report: Json | None) -> None:
     row["is_spurious"] = bool(row["named"])
+    row["is_random"] = answer["effects"][0]["form"] == "random"
     unexplained = (report or {}).get("unexplained") or {}
     channels = list(unexplained.get("channels") or [])
     row["main_channel_right"] = bool(channels) and channels[0] in answer["main_channels"]

@@ -6,9 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from carlab.benchmark.baselines.scores import COLUMNS, comparison_rows
+from carlab.benchmark.proof.detection import BINS, curve_rows, detection_curves, spurious_curves
 from carlab.benchmark.proof.scores import per_effect, table_rows
 
 Row = Mapping[str, Any]
+DETECTION = (
+    "Share of concealed effects that are named (at any rank, sets allowed) by the excess of each effect alone, with "
+    "95 % Wilson intervals and counts."
+)
 
 
 def results_page(
@@ -36,10 +41,17 @@ def results_page(
             "generator's model and the true noise floor; those of the tool use its own model and its own estimate.",
             markdown(("figure", *COLUMNS), comparison_rows(comparison)),
         ]
-    found = [
-        (name, str(e["strict"]), str(e["with_sets"]), str(e["cases"])) for name, e in per_effect(rows.values()).items()
+    parts += ["## Detection curves", DETECTION, "![Share of effects found over the excess](detection.png)"]
+    parts.append(markdown(("cases", *BINS), curve_rows(detection_curves(rows.values()))))
+    spurious = curve_rows(spurious_curves(rows.values()))
+    if spurious:
+        parts += ["Cases outside the catalogue with a spurious name:", markdown(("physics", *BINS), spurious)]
+    effects = [
+        (name, f"{e['strict']}/{e['alone']}", f"{e['with_sets']}/{e['alone']}", f"{e['named']}/{e['cases']}")
+        for name, e in per_effect(rows.values()).items()
     ]
-    parts += ["## Each effect", markdown(("effect", "strictly first", "with sets", "cases"), found)]
+    columns = ("effect", "alone: strictly first", "alone: first, with sets", "named, also beside others")
+    parts += ["## Each effect", markdown(columns, effects)]
     parts += ["## Failures", failures(rows, runs)]
     return "\n\n".join(parts) + "\n"
 
@@ -52,6 +64,7 @@ def failures(rows: Mapping[str, Row], runs: Mapping[str, Mapping[str, Any]]) -> 
         true = " + ".join(row["true"]) or row["kind"]
         answered = " + ".join(row["named"]) or row["verdict"]
         strength = f", excess {row['excess']:.1f}" if row["excess"] else ""
+        strength += "".join(f", {condition}" for condition in row["conditions"])
         if not row["reported"]:
             words = str(run.get("words", "")).strip().splitlines()
             why = "took too long" if run.get("exit_status") is None else f"exit status {run['exit_status']}"
@@ -67,6 +80,8 @@ def right(row: Row) -> bool:
         return bool(row["set_top1"])
     if row["kind"] == "pair":
         return bool(row["both_found"])
+    if row["kind"] == "multiple":
+        return all(d["found"] for d in row["detections"]) and all(row["names_right"])
     if row["kind"] == "outside":
         return not row["is_spurious"] and bool(row["main_channel_right"])
     return bool(row["verdict_right"])

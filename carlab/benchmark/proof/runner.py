@@ -33,7 +33,8 @@ from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
 
 DIAGNOSE = (sys.executable, "-m", "carlab", "diagnose", "--decisions")
-COMPARED = ("single", "null", "parameters", "outside")
+COMPARED = ("single", "multiple", "null", "parameters", "outside")
+WITH_EFFECTS = ("single", "pair", "multiple")
 WORKER = (sys.executable, "-m", "carlab.benchmark.proof.worker")
 
 
@@ -85,7 +86,7 @@ class Proof(SealedRun):
         return self.seal()
 
     def diagnose(self, *, oracle: bool = False) -> bool:
-        """Diagnose the cases without a report; with ``oracle`` single and paired cases with the true names given.
+        """Diagnose the cases without a report; with ``oracle`` those with effects, with the true names given.
 
         Returns whether all are done. Raises DataError before the answers are sealed.
         """
@@ -94,7 +95,7 @@ class Proof(SealedRun):
         true_effects: dict[str, tuple[str, ...]] = {}
         if oracle:
             by_name = dict(zip(self.names(), self.specs, strict=True))
-            true_effects = {n: by_name[n].effects for n in names if by_name[n].kind in ("single", "pair")}
+            true_effects = {n: by_name[n].effects for n in names if by_name[n].kind in WITH_EFFECTS}
             names = list(true_effects)
         folder = self.root / ("oracle" if oracle else "reports")
         return self.stage(
@@ -134,9 +135,16 @@ class Proof(SealedRun):
         return {path.stem: read_json(path) for path in sorted((self.root / "baselines").glob("*.json"))}
 
     def same(self, name: str, one: str, other: str) -> bool | None:
-        """Whether the generator's refit does not distinguish two effects on a case; None if it does not cover them."""
+        """Whether the generator's refit does not distinguish two effects on a case; None if it does not cover them.
+
+        It covers neither recordings with a fault or delayed stamps nor a wrong base model.
+        """
         answer = read_json(self.answers_folder / f"{name}.json")
-        if answer["fault"] is not None or any(effect not in CHEAP for effect in (one, other)):
+        changed = answer["fault"] is not None or set(answer.get("conditions", ())) - {
+            "short recording",
+            "feedback only",
+        }
+        if changed or any(effect not in CHEAP for effect in (one, other)):
             return None
         kept = self.root / "checks" / f"{name}.json"
         known = read_json(kept) if kept.exists() else {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from carlab.benchmark.effects.catalogue import EFFECT_IDS
 from carlab.benchmark.intervals import wilson
 from carlab.benchmark.proof.case_score import score_case
+from carlab.benchmark.proof.detection import detection_curves, spurious_curves
 
 Row = Mapping[str, Any]
 
@@ -36,7 +38,10 @@ RATES: tuple[tuple[str, str, Callable[[Row], bool], str], ...] = (
     ("pairs: both named strictly", "both_strict", lambda r: True, ""),
     ("false alarms, null and parameters", "false_alarm", lambda r: r["kind"] in ("null", "parameters"), "<= 0.05"),
     ("verdict correct, null and parameters", "verdict_right", lambda r: r["kind"] in ("null", "parameters"), ""),
+    ("three to five effects: one of them first", "first_right", lambda r: True, ""),
     ("outside: spurious attribution", "is_spurious", lambda r: True, "<= 0.10"),
+    ("outside: spurious attribution, excess >= 1", "is_spurious", _strong, "<= 0.05"),
+    ("outside: spurious attribution, random physics", "is_spurious", lambda r: bool(r["is_random"]), "<= 0.10"),
     ("outside: main channel correct", "main_channel_right", lambda r: True, ">= 0.80"),
     ("outside: class correct", "class_right", lambda r: True, ">= 0.60"),
     ("data faults found", "fault_found", lambda r: True, ""),
@@ -44,6 +49,13 @@ RATES: tuple[tuple[str, str, Callable[[Row], bool], str], ...] = (
     ("located: lag within 25 ms", "lag_right", lambda r: True, ""),
     ("located: patch centre within its radius", "place_right", lambda r: True, ""),
     ("located: drift separated from switch", "time_right", lambda r: True, ">= 0.80"),
+)
+
+# (title, kinds of cases, targets for effects found and for names that are right); each effect and each name counts.
+NAMED = (
+    ("one effect", ("single",), ("", "")),
+    ("two effects", ("pair",), ("", "")),
+    ("three to five effects", ("multiple",), (">= 0.60", ">= 0.90")),
 )
 
 
@@ -73,21 +85,19 @@ def score_cases(
 def summarise(rows: Iterable[Row]) -> dict[str, Any]:
     """Return rates, medians and coverage over rows of ``score_case``."""
     table = list(rows)
-    rates = []
-    for title, key, among, target in RATES:
-        values = [bool(r[key]) for r in table if r.get(key) is not None and among(r)]
-        low, high = wilson(sum(values), len(values))
-        rates.append({
-            "figure": title, "share": sum(values) / len(values) if values else None, "low95": low, "high95": high,
-            "hits": sum(values), "count": len(values), "target": target,
-        })  # fmt: skip
+    rates = [
+        _rate(title, [bool(r[key]) for r in table if r.get(key) is not None and among(r)], target)
+        for title, key, among, target in RATES
+    ]
+    for title, kinds, target in NAMED:
+        chosen = [r for r in table if r["kind"] in kinds]
+        found = [bool(d["found"]) for r in chosen for d in r.get("detections", ())]
+        right = [bool(name) for r in chosen for name in r.get("names_right", ())]
+        rates.append(_rate(f"{title}: effects found", found, target[0]))
+        rates.append(_rate(f"{title}: names that are right", right, target[1]))
     fitted = [p for r in table for p in r.get("parameters", {}).values()]
     covered = [bool(p["covered"]) for p in fitted if p["covered"] is not None]
-    low, high = wilson(sum(covered), len(covered))
-    rates.append({
-        "figure": "90 % intervals cover", "share": sum(covered) / len(covered) if covered else None, "low95": low,
-        "high95": high, "hits": sum(covered), "count": len(covered), "target": "0.80 to 0.97",
-    })  # fmt: skip
+    rates.append(_rate("90 % intervals cover", covered, "0.80 to 0.97"))
     medians = [
         _median("parameter error, relative", [p["relative_error"] for p in fitted], ""),
         _median("lag error [s]", [r.get("lag_error_s") for r in table], "<= 0.025"),
@@ -96,6 +106,14 @@ def summarise(rows: Iterable[Row]) -> dict[str, Any]:
         _median("seconds", [r.get("seconds") for r in table], "<= 60"),
     ]
     return {"cases": len(table), "no_report": sum(not r["reported"] for r in table), "rates": rates, "medians": medians}
+
+
+def _rate(title: str, values: Sequence[bool], target: str) -> dict[str, Any]:
+    low, high = wilson(sum(values), len(values))
+    return {
+        "figure": title, "share": sum(values) / len(values) if values else None, "low95": low, "high95": high,
+        "hits": sum(values), "count": len(values), "target": target,
+    }  # fmt: skip
 
 
 def _median(title: str, values: Sequence[float | None], target: str) -> dict[str, Any]:
@@ -131,14 +149,18 @@ def table_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
 
 
 def per_effect(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
-    """Return cases, strict hits and hits with sets of each effect."""
+    """Return the cases of each effect, alone or with others: first name strictly and with sets, named at any rank."""
     found: dict[str, dict[str, int]] = {}
     for r in rows:
-        if r["kind"] == "single":
-            entry = found.setdefault(r["true"][0], {"cases": 0, "strict": 0, "with_sets": 0})
+        for detection in r.get("detections", ()):
+            start = {"alone": 0, "strict": 0, "with_sets": 0, "cases": 0, "named": 0}
+            entry = found.setdefault(detection["id"], start)
             entry["cases"] += 1
-            entry["strict"] += bool(r["strict_top1"])
-            entry["with_sets"] += bool(r["set_top1"])
+            entry["named"] += bool(detection["found"])
+            if r["kind"] == "single":
+                entry["alone"] += 1
+                entry["strict"] += bool(r["strict_top1"])
+                entry["with_sets"] += bool(r["set_top1"])
     return found
 
 
@@ -146,7 +168,13 @@ def write_scores(
     path: Path, rows: Mapping[str, Row], summary: Mapping[str, Any], baselines: Sequence[Mapping[str, Any]] = ()
 ) -> None:
     """All figures as JSON; ``baselines`` as ``baseline_scores.compare`` gives them."""
-    figures = {"summary": summary, "per_effect": per_effect(rows.values()), "baselines": list(baselines)}
+    figures = {
+        "summary": summary,
+        "per_effect": per_effect(rows.values()),
+        "detection": [asdict(curve) for curve in detection_curves(rows.values())],
+        "spurious": [asdict(curve) for curve in spurious_curves(rows.values())],
+        "baselines": list(baselines),
+    }
     path.write_text(json.dumps({**figures, "cases": dict(rows)}, indent=1) + "\n", encoding="utf-8")
 
 
@@ -154,7 +182,7 @@ def confusion(rows: Iterable[Row]) -> tuple[list[str], list[str], np.ndarray[tup
     """Return concealed effects (rows), first named effects or verdicts (columns), and counts."""
     pairs = []
     for r in rows:
-        if r["kind"] == "pair":
+        if r["kind"] in ("pair", "multiple"):
             continue
         true = r["true"][0] if r["kind"] == "single" else r["kind"]
         pairs.append((true, r["named"][0] if r["named"] else r["verdict"]))

@@ -27,7 +27,7 @@ def make(order: dict[str, Any]) -> None:
 
     If the car cannot be driven with the effect at any strength, the case gets another, fixed seed.
     """
-    spec = CaseSpec(**{**order["spec"], "effects": tuple(order["spec"]["effects"])})
+    spec = CaseSpec.from_dict(order["spec"])
     begin = time.perf_counter()
     for attempt in range(ATTEMPTS):
         try:

@@ -36,11 +36,14 @@ class Track:
 class HumanDriver:
     """Closed-loop driver with human errors: pure pursuit, proportional speed control, slow noise, changing modes.
 
-    Called with time and newest state; returns commands in [-1, 1], as issued.
+    Called with time and newest state; returns commands in [-1, 1], as issued. With ``feedback_only`` it always follows
+    the track without errors: commands are a function of the state, the path and a target speed that changes every few
+    seconds.
     """
 
-    def __init__(self, car: BaseCar, track: Track, rng: np.random.Generator) -> None:
+    def __init__(self, car: BaseCar, track: Track, rng: np.random.Generator, *, feedback_only: bool = False) -> None:
         self._car, self._track, self._rng = car, track, rng
+        self._feedback_only = feedback_only
         self._grip = min(car.mu_front, car.mu_rear) * 9.81
         if car.kind == "linear_tyre":
             self._grip = min(self._grip, 6.0)
@@ -65,7 +68,8 @@ class HumanDriver:
         if t >= self._until or (off > 1.5 and self._mode in ("steps", "reverse", "coast")):
             self._intend(t, off)
         decay = math.exp(-period / 0.35)
-        self._wobble = decay * self._wobble + math.sqrt(1 - decay**2) * self._rng.normal(0.0, (0.08, 0.05))
+        if not self._feedback_only:
+            self._wobble = decay * self._wobble + math.sqrt(1 - decay**2) * self._rng.normal(0.0, (0.08, 0.05))
         steering = self._pursue(i, x, y, psi, vx)
         if self._mode == "steps":
             steering = self._turn
@@ -79,7 +83,8 @@ class HumanDriver:
 
     def _intend(self, t: float, off: float) -> None:
         rng = self._rng
-        shares = (0.46, 0.25, 0.07, 0.04, 0.08, 0.10) if off < 1.0 else (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        follow_only = self._feedback_only or off >= 1.0
+        shares = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0) if follow_only else (0.46, 0.25, 0.07, 0.04, 0.08, 0.10)
         self._mode = str(rng.choice(MODES, p=shares))
         length = {"follow": (1.5, 5.0), "steps": (0.25, 0.9), "coast": (0.6, 1.5), "stand": (0.5, 1.2)}
         self._until = t + float(rng.uniform(*length.get(self._mode, (1.5, 3.0))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import deque
 from collections.abc import Callable
@@ -18,6 +19,8 @@ FloatArray = NDArray[np.float64]
 Driver = Callable[[float, FloatArray], tuple[float, float]]
 RTOL = 1e-8
 ATOL = 1e-9
+HIDDEN_STEP_S = 1e-3
+"""Step for hidden states along given states; a wheel with longitudinal slip has the shortest time constant, 1.4 ms."""
 
 
 @dataclass(frozen=True)
@@ -158,3 +161,33 @@ def _before(state: FloatArray, t: float) -> FloatArray:
     early[1] += t * (early[3] * sin + early[4] * cos)
     early[2] += t * early[5]
     return early
+
+
+def rates_along(world: World, driven: Drive) -> FloatArray:
+    """Rates of vx, vy, yaw rate (K, 3) of a car that is forced through the captured states of a drive of another car.
+
+    The car gets the commands of the drive as issued. Hidden states of its effects are integrated by Euler's method with
+    steps of at most ``HIDDEN_STEP_S``.
+
+    Args:
+        world: The car.
+        driven: K captures and the commands.
+    """
+    acting = _Acting(world)
+    hidden = np.array(world.hidden(float(driven.captures[0, 3])))
+    found = np.empty((len(driven.captures), 3))
+    gap_s = float(driven.capture_s[1] - driven.capture_s[0])
+    substeps = max(1, math.ceil(gap_s / HIDDEN_STEP_S)) if len(hidden) else 1
+    tick = 0
+    for k, t in enumerate(driven.capture_s.tolist()):
+        while tick < len(driven.row_s) and driven.row_s[tick] <= t:
+            acting.issue(float(driven.row_s[tick]), (float(driven.commands[tick, 0]), float(driven.commands[tick, 1])))
+            tick += 1
+        while acting.next_s() <= t:
+            acting.switch(acting.next_s())
+        for j in range(substeps):
+            rates = acting.rates(t, np.concatenate([driven.captures[k], hidden]))
+            if j == 0:
+                found[k] = rates[3:6]
+            hidden = hidden + gap_s / substeps * np.array(rates[6:])
+    return found
