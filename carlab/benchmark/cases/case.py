@@ -130,8 +130,8 @@ def make_case(
     forms = _checked_forms(kind, effects, form, fault)
     linear = any(f.nominal_kind == "linear_tyre" for f in forms)
     scene = Scene(
-        seed, kind, "linear_tyre" if linear else "dynamic", (fit_s, hold_s), period_s, true_starts,
-        conditions.feedback_only,
+        seed, "linear_tyre" if linear else "dynamic", (fit_s, hold_s), period_s, true_starts=true_starts,
+        feedback_only=conditions.feedback_only, is_null=kind == "null",
     )  # fmt: skip
     found = [scene.sized(f, excess) for f in forms]
     concealed = tuple(c for c, _ in found)
@@ -182,5 +182,5 @@ def _form(name: str, form: FormName) -> Form:
     known = all_forms()
     for wanted in ("outside", "random") if form == "outside" else (form, "catalogue", "other"):
         if (name, wanted) in known:
-            return known[(name, wanted)]  # type: ignore[index]
+            return known[(name, wanted)]
     raise ConfigError(f"There is no effect '{name}' of form '{form}' to conceal.")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from carlab.benchmark.cases.conditions import SHORT_FIT_S, Conditions
+from carlab.benchmark.cases.conditions import SHORT_FIT_S
 from carlab.benchmark.cases.proof_set import STRENGTHS, CaseSpec, Purpose, random_physics
 from carlab.benchmark.effects.catalogue import EFFECT_IDS, FormName, are_confusable
 from carlab.benchmark.effects.forms import all_forms
@@ -61,10 +61,7 @@ def _singles(rng: np.random.Generator) -> list[CaseSpec]:
 
 
 def _multiples(rng: np.random.Generator) -> list[CaseSpec]:
-    specs = []
-    for count in (3, 4, 5):
-        for k in range(PER_COUNT):
-            specs.append(_multiple(rng, count, k))
+    specs = [_multiple(rng, count, k) for count in (3, 4, 5) for k in range(PER_COUNT)]
     for k in range(ALL_CONDITIONS):
         spec = _multiple(rng, 3, k)
         for condition in ("short", "feedback", "stamps"):

@@ -86,7 +86,7 @@ class CatalogueInfluence:
                 drawn += [] if parameters in drawn else [parameters]
         columns = np.stack([self.of(form, parameters) for parameters in drawn], axis=1)
         lengths = np.linalg.norm(columns, axis=0)
-        return columns[:, lengths > 0.0] / lengths[lengths > 0.0]
+        return np.asarray(columns[:, lengths > 0.0] / lengths[lengths > 0.0], dtype=np.float64)
 
     def _of_parameter(self, name: str) -> FloatArray:
         values = self._car.free()

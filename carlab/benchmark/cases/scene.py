@@ -39,22 +39,25 @@ class Concealed:
 
 
 class Scene:
-    """Random draws of a case that do not depend on the strength; it can be driven with any effects."""
+    """Random draws of a case that do not depend on the strength; it can be driven with any effects.
+
+    With ``is_null`` the true car is the nominal car; otherwise its base parameters differ.
+    """
 
     def __init__(
         self,
         seed: int,
-        kind: CaseKind,
         model: Literal["dynamic", "linear_tyre"],
         lengths_s: tuple[float, float],
         period_s: float,
         true_starts: bool = False,
         feedback_only: bool = False,
+        is_null: bool = False,
     ) -> None:
         draws = np.random.default_rng((seed, 1))
         self.nominal = draw_nominal(draws, period_s, model)
         moved = self.nominal.perturbed(draws)
-        self.car = self.nominal if kind == "null" else moved
+        self.car = self.nominal if is_null else moved
         self.track = Track(draws)
         self.noise = Noise(self.nominal.position_std, self.nominal.yaw_std, float(draws.choice((0.06, 0.075, 0.09))))
         self.seed, self.lengths_s, self.true_starts = seed, lengths_s, true_starts
