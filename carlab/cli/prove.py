@@ -67,7 +67,7 @@ class Prove:
     """Seed of the cases."""
 
     limit: int | None = None
-    """Number of cases drawn from the set; for a public simulator, number of drives (1 by default)."""
+    """Number of cases drawn from the set, of a hard set equally many of each kind; for a public simulator, number of drives (1 by default)."""
 
     jobs: int = 1
     """Number of parallel cases; with more than one, each case has one thread."""
@@ -189,7 +189,7 @@ class Prove:
         return not interrupts.requested.is_set()
 
     def _specs(self) -> list[CaseSpec]:
-        from carlab.benchmark.cases.hard_set import hard_set
+        from carlab.benchmark.cases.hard_set import drawn_evenly, hard_set
         from carlab.benchmark.cases.proof_set import drawn, full_set, short_set
 
         self._check_limit()
@@ -197,6 +197,7 @@ class Prove:
             specs = short_set("test", self.seed)
         elif self.set in ("hard", "hard-development"):
             specs = hard_set("test" if self.set == "hard" else "development", self.seed)
+            return specs if self.limit is None else drawn_evenly(specs, self.limit, self.seed)
         else:
             specs = full_set("test" if self.set == "full" else "development", self.seed)
         return specs if self.limit is None else drawn(specs, self.limit, self.seed)

@@ -35,6 +35,18 @@ def hard_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
     return specs + random_physics(rng, RANDOM, first + len(specs))
 
 
+def drawn_evenly(specs: list[CaseSpec], count: int, seed: int = 0) -> list[CaseSpec]:
+    """Draw at most ``count`` cases without replacement, equally many of each kind (without an effect: one kind)."""
+    order = np.random.default_rng((seed, 7)).permutation(len(specs)).tolist()
+    seen: dict[str, int] = {}
+    turns = []
+    for k in order:
+        kind = "null" if specs[k].kind == "parameters" else specs[k].kind
+        turns.append((seen.setdefault(kind, 0), len(turns), k))
+        seen[kind] += 1
+    return [specs[k] for k in sorted(k for _, _, k in sorted(turns)[:count])]
+
+
 def under(spec: CaseSpec, condition: str, k: int = 0) -> CaseSpec:
     """The case under one more of the CONDITIONS; ``k`` alternates the kind of wrong base model."""
     conditions = spec.conditions

@@ -140,11 +140,8 @@ class Proof(SealedRun):
         It covers neither recordings with a fault or delayed stamps nor a wrong base model.
         """
         answer = read_json(self.answers_folder / f"{name}.json")
-        changed = answer["fault"] is not None or set(answer.get("conditions", ())) - {
-            "short recording",
-            "feedback only",
-        }
-        if changed or any(effect not in CHEAP for effect in (one, other)):
+        unlike = set(answer.get("conditions", ())) - {"short recording", "feedback only"}
+        if answer["fault"] is not None or unlike or any(effect not in CHEAP for effect in (one, other)):
             return None
         kept = self.root / "checks" / f"{name}.json"
         known = read_json(kept) if kept.exists() else {}
