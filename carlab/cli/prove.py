@@ -67,7 +67,8 @@ class Prove:
     """Seed of the cases."""
 
     limit: int | None = None
-    """Number of cases drawn from the set, of a hard set equally many of each kind; for a public simulator, number of drives (1 by default)."""
+    """Number of cases drawn from the set, of a hard set equally many of each kind; for a public simulator, number of
+    drives (1 by default)."""
 
     jobs: int = 1
     """Number of parallel cases; with more than one, each case has one thread."""
