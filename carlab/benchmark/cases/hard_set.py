@@ -39,7 +39,7 @@ def drawn_evenly(specs: list[CaseSpec], count: int, seed: int = 0) -> list[CaseS
     """Draw at most ``count`` cases without replacement, equally many of each kind (without an effect: one kind)."""
     order = np.random.default_rng((seed, 7)).permutation(len(specs)).tolist()
     seen: dict[str, int] = {}
-    turns = []
+    turns: list[tuple[int, int, int]] = []
     for k in order:
         kind = "null" if specs[k].kind == "parameters" else specs[k].kind
         turns.append((seen.setdefault(kind, 0), len(turns), k))
