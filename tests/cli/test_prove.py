@@ -66,8 +66,10 @@ def test_proof_is_sealed_scored_and_not_repeated(proof_dir: Path, carlab: Carlab
     assert shares["false alarms, null and parameters"] == 1.0  # the fake diagnosis always answers steering_lag
     assert (proof_dir / "confusion.png").read_bytes()[:4] == b"\x89PNG"
     page = (proof_dir / "results.md").read_text()
-    assert "| steering_lag | 1 | 1 | 1 |" in page
-    assert "null null: answered steering_lag" in page
+    assert "| steering_lag | 1/1 | 1/1 | 1/1 |" in page
+    assert "| one effect, short recording | - | - | - | 1.00 (0.21 to 1.00) 1/1 | - |" in page
+    assert (proof_dir / "detection.png").read_bytes()[:4] == b"\x89PNG"
+    assert "null null, short recording: answered steering_lag" in page
     assert "seeds: 1 to 2" in page
     runs = [json.loads(path.read_text()) for path in proof_dir.glob("reports/*/run.json")]
     assert all(run["exit_status"] == 0 and run["peak_memory_mib"] > 1.0 and run["jobs"] == 2 for run in runs)
