@@ -64,6 +64,16 @@ def score_case(
     if answer["fault"] is not None:
         faults = [f.get("id") for f in (report or {}).get("data_faults", [])]
         row["fault_found"] = answer["fault"]["id"] in faults
+    _criteria_of_kind(row, answer, named, report, same)
+    if answer["kind"] in ("single", "pair", "multiple"):
+        _detections(row, answer, named, same)
+        _ratios(row, report, oracle)
+    return row
+
+
+def _criteria_of_kind(
+    row: dict[str, Any], answer: Json, named: list[dict[str, Any]], report: Json | None, same: SeparationTest | None
+) -> None:
     kind = answer["kind"]
     if kind == "single":
         _single(row, answer, named, same)
@@ -85,10 +95,6 @@ def score_case(
             row["verdict_right"] = row["verdict"] in ("none", "parameters")
         else:
             row["verdict_right"] = row["verdict"] in ("data", "parameters", "none") and row["fault_found"]
-    if kind in ("single", "pair", "multiple"):
-        _detections(row, answer, named, same)
-        _ratios(row, report, oracle)
-    return row
 
 
 def valid_set(effect: Json, same: SeparationTest | None = None) -> bool:
