@@ -69,7 +69,8 @@ def test_curves_count_by_excess_and_group() -> None:
         score_case(answer("multiple", *THREE, excesses=(0.69, 0.7, 9.0)), report("steering_lag")),
         score_case(answer("single", "yaw_damping", excesses=(0.2,), conditions=["feedback only"]), report()),
     ]
-    several, single = sorted(detection_curves(rows), key=lambda curve: curve.group)[::-1]
+    every, single, several = detection_curves(rows)
+    assert every == Curve("all", (0, 1, 1, 0, 0), (1, 2, 2, 0, 2))
     assert several == Curve("three to five effects", (0, 1, 1, 0, 0), (0, 2, 2, 0, 2))
     assert single == Curve("one effect, feedback only", (0, 0, 0, 0, 0), (1, 0, 0, 0, 0))
     low, high = wilson(1, 2)

@@ -38,7 +38,7 @@ class Curve:
 
 
 def detection_curves(rows: Iterable[Row]) -> list[Curve]:
-    """Return a curve for each number of effects under each combination of conditions.
+    """Return a curve for each number of effects under each combination of conditions, and before them one for all.
 
     Args:
         rows: Rows of ``score_case``; each concealed effect counts, with the excess of the effect alone.
@@ -48,7 +48,8 @@ def detection_curves(rows: Iterable[Row]) -> list[Curve]:
         for detection in row.get("detections", ()):
             group = ", ".join((KINDS[row["kind"]], *row["conditions"]))
             groups.setdefault(group, []).append((float(detection["excess"]), bool(detection["found"])))
-    return [Curve.of(group, groups[group]) for group in sorted(groups)]
+    every = [value for values in groups.values() for value in values]
+    return [Curve.of("all", every), *(Curve.of(group, groups[group]) for group in sorted(groups))]
 
 
 def spurious_curves(rows: Iterable[Row]) -> list[Curve]:
@@ -75,7 +76,7 @@ def _cell(hits: int, count: int) -> str:
 
 def draw_detection(path: Path, curves: Sequence[Curve]) -> None:
     """Draw the curves with their intervals; the format follows from the name of the file."""
-    figure = Figure(figsize=(8.0, 4.2), layout="constrained")
+    figure = Figure(figsize=(7.0, 4.0 + 0.2 * len(curves)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for number, curve in enumerate(curves):
@@ -89,7 +90,7 @@ def draw_detection(path: Path, curves: Sequence[Curve]) -> None:
         axes.errorbar([shift * _AT[k] for k in known], shares, [below, above], marker="o", capsize=3, label=label)
     axes.set_xscale("log", base=2)
     axes.set_xticks(_AT, BINS, fontsize=8)
-    axes.set(xlabel="excess of the effect alone", ylabel="share of effects found", ylim=(-0.03, 1.03))
+    axes.set(xlabel="excess of the effect alone", ylabel="share of effects found", ylim=(-0.03, 1.03), xlim=(0.2, 5.0))
     if curves:
-        figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+        figure.legend(loc="outside lower center", frameon=False, fontsize=8)
     figure.savefig(path, dpi=130)
