@@ -69,10 +69,10 @@ class Moments:
         """Index (N,) of the last window of each recording (N,) that ends up to a time (N,); -1 if there is none."""
         found = np.full(len(t_s), -1)
         for name in np.unique(recording):
-            own, asked = np.flatnonzero(self.recording == name), recording == name
+            own, rows = np.flatnonzero(self.recording == name), recording == name
             if len(own):
-                index = np.searchsorted(self.end_s[own], t_s[asked] + 1e-6, side="right") - 1
-                found[asked] = np.where(index >= 0, own[np.maximum(index, 0)], -1)
+                index = np.searchsorted(self.end_s[own], t_s[rows] + 1e-6, side="right") - 1
+                found[rows] = np.where(index >= 0, own[np.maximum(index, 0)], -1)
         return found
 
 
