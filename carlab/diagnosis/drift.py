@@ -14,13 +14,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import AdaptationNoise
 from carlab.diagnosis.findings import Change, Drift
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.settings import DEFAULT, DriftSettings
-from carlab.prediction.adaptation import AdaptiveModel, DisturbanceSeries, adapt, choose_noise
+from carlab.prediction.adaptation import MIN_FEATURE_STD, AdaptiveModel, DisturbanceSeries, adapt, choose_noise
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import DisturbedModel
 from carlab.prediction.error_memory import state_features
@@ -88,15 +89,19 @@ def adapt_to_held_out(
         return fitted.series().mean
 
     plain = held_out.final_error(config)
+    similar = _similar_states(config, fit_tracks, held_out, plain, settings)
     constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0), slow)
     errors = {
         "model": plain,
         "adapted": held_out.final_error(model),
         "fitted mean": held_out.final_error(constant),
-        "similar states": _corrected_by_similar_states(config, fit_tracks, held_out, plain, settings),
+        "similar states": similar.errors,
     }
     found = [
-        _drift_of(number, held_out, errors, slowly_adapted, along_fitted, model.series(), settings)
+        replace(
+            _drift_of(number, held_out, errors, slowly_adapted, along_fitted, model.series(), settings),
+            similar_share=float(np.mean(similar.is_similar[held_out.windows.recording == number])),
+        )
         for number in np.unique(held_out.windows.recording)
     ]
     return Adaptation(model, noise, tuple(found))
@@ -111,7 +116,7 @@ def _drift_of(
     series: DisturbanceSeries,
     settings: DriftSettings,
 ) -> Drift:
-    """The drift of one recording.
+    """The drift of one recording, without its share of similar states.
 
     Args:
         number: index of the recording.
@@ -144,6 +149,7 @@ def _drift_of(
         slow_m=_position_rms(slow.errors[own]),
         similar_states_m=_position_rms(errors["similar states"][own]),
         standard_errors=min(gains),
+        similar_share=1.0,
         t_s=series.t_s[shown],
         mean=series.mean[shown],
         std=series.std[shown],
@@ -232,20 +238,35 @@ def _position_rms(errors: FloatArray) -> float:
     return float(np.sqrt(np.mean(errors[:, 0] ** 2 + errors[:, 1] ** 2)))
 
 
-def _corrected_by_similar_states(
+@dataclass(frozen=True, slots=True)
+class _SimilarStates:
+    """What fitted windows in similar states say about the held-out windows.
+
+    errors     (S, 6) errors of the simulator less the mean error of fitted windows in similar states
+    is_similar (S,) whether there are fitted windows in a similar state
+    """
+
+    errors: FloatArray
+    is_similar: NDArray[np.bool_]
+
+
+def _similar_states(
     config: SimulatorConfig,
     fit_tracks: Sequence[Track],
     held_out: HeldOut,
     errors: FloatArray,
     settings: DriftSettings,
-) -> FloatArray:
-    """Errors (S, 6) on held-out windows less the mean error of fitted windows in similar states."""
+) -> _SimilarStates:
     windows = held_out.windows
     fitted = cut_windows(fit_tracks, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
     fitted = replace(fitted, velocity_window_s2=windows.velocity_window_s2)
     fit_errors = final_errors(SimulatorModel(config), fitted)
     fit_states, states = state_features(fitted), state_features(windows)
-    scale = np.maximum(fit_states.std(axis=0), 1e-9)
+    scale = np.maximum(fit_states.std(axis=0), MIN_FEATURE_STD)
     count = min(settings.neighbours, len(fitted))
-    _, index = cKDTree(fit_states / scale).query(states / scale, k=count)
-    return np.asarray(errors - fit_errors[index.reshape(len(windows), count)].mean(axis=1))
+    distance, index = cKDTree(fit_states / scale).query(states / scale, k=count)
+    mean = fit_errors[index.reshape(len(windows), count)].mean(axis=1)
+    other_block = fitted.block[:, None] != fitted.block
+    between = np.where(other_block, cdist(fit_states / scale, fit_states / scale), np.inf).min(axis=1)
+    limit = np.quantile(between, settings.similar_quantile)
+    return _SimilarStates(errors - mean, distance.reshape(len(windows), count)[:, 0] <= limit)

@@ -205,6 +205,8 @@ class Drift:
             simulator, of the adapted prediction, of the slow adaptation, and of the simulator corrected by errors in
             similar states.
         standard_errors: smallest gain of the slow adaptation over these three, over its clustered standard error.
+        similar_share: share of the windows with fitted windows in a similar state. If it is small, an error of the
+            simulator that depends on the state explains a drift as well as a change of the car.
         t_s: (N,) times of the series since the first row [s].
         mean, std: (N, 4) estimated share of the drive force [1], steering trim [rad], share of the grip [1] and force
             forward per mass [m/s2], and their standard deviations.
@@ -219,6 +221,7 @@ class Drift:
     slow_m: float
     similar_states_m: float
     standard_errors: float
+    similar_share: float
     t_s: FloatArray
     mean: FloatArray
     std: FloatArray

@@ -9,6 +9,7 @@ from carlab.diagnosis.diagnose import Texts, diagnose
 from carlab.diagnosis.drift import adapt_to_held_out
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.report.drift import drift_sentence
 from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.report.write import completed
@@ -45,6 +46,7 @@ def test_changed_drive_force_and_trim_are_found_with_their_sizes_and_an_unchange
     assert found["steering trim"].value == pytest.approx(0.04, abs=0.006)
     assert first.time_constant_s >= 100.0
     assert first.adapted_m < 0.3 * first.model_m
+    assert min(first.similar_share, second.similar_share) > 0.5
     assert not second.is_drift
     assert second.changes == ()
 
@@ -63,6 +65,18 @@ def test_physics_that_the_simulator_lacks_in_all_recordings_is_no_drift():
     car = replace(CONFIG, effects={"motor_saturation": {"force": 3.0}, "aerodynamic_drag": {"coefficient": 0.3}})
     found = drift_of([drive(car, SECONDS, 5)], [drive(car, SECONDS, 6), drive(car, SECONDS, 7)])
     assert [d.is_drift for d in found] == [False, False]
+
+
+def test_drift_in_states_that_were_not_fitted_may_be_an_error_of_the_model(fitted):
+    """A car with three times the drive gain is faster than it ever was in the fitted recording."""
+    fast = CONFIG.with_values({"motor.drive_gain": 3.0 * CONFIG.parameters.drive_gain_n})
+    (found,) = drift_of([fitted], [drive(fast, 30.0, 9)])
+    assert found.is_drift
+    assert found.similar_share < 0.5
+    sentence = drift_sentence(found, 1.0)
+    assert "the car differs from the model" in sentence
+    assert "so this is a change of the car or an error of the model in these states" in sentence
+    assert "the car differs from the fitted recordings" in drift_sentence(replace(found, similar_share=0.9), 1.0)
 
 
 def test_diagnosis_states_the_drift_in_its_report(fitted):

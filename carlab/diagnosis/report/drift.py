@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from carlab.diagnosis.findings import Change, Diagnosis, Drift
 from carlab.diagnosis.report.numbers import listed, number, percent, with_unit
+from carlab.diagnosis.settings import DEFAULT
 
 
-def drift_of(diagnosis: Diagnosis, recording: int) -> Drift | None:
-    """The drift in a held-out recording (number from 1); None without one."""
-    return next((d for d in diagnosis.drift if d.recording == recording and d.is_drift), None)
+def has_changed(diagnosis: Diagnosis, recording: int) -> bool:
+    """Whether a held-out recording (number from 1) shows a change of the car, in states that were fitted."""
+    return any(d.recording == recording and d.is_drift and _is_in_similar_states(d) for d in diagnosis.drift)
+
+
+def _is_in_similar_states(drift: Drift) -> bool:
+    return drift.similar_share >= DEFAULT.drift.min_similar_share
 
 
 def drift_sentence(drift: Drift, horizon_s: float) -> str:
@@ -16,11 +21,16 @@ def drift_sentence(drift: Drift, horizon_s: float) -> str:
     what = " ".join(_change_sentence(c) for c in drift.changes)
     if not what:
         what = "No single one of drive force, steering trim, grip and force forward explains it."
+    head = f"In held-out recording {drift.recording} the car differs from the fitted recordings."
+    if not _is_in_similar_states(drift):
+        head = f"In held-out recording {drift.recording} the car differs from the model."
+        what += (
+            f" Only {percent(drift.similar_share)} of its states are similar to fitted ones, so this is a change of "
+            "the car or an error of the model in these states."
+        )
     before, after = with_unit(drift.model_m, "m"), with_unit(drift.adapted_m, "m")
-    return (
-        f"In held-out recording {drift.recording} the car differs from the fitted recordings. {what} With adaptation "
-        f"to the recent past, the position error after {with_unit(horizon_s, 's')} goes from {before} to {after}."
-    )
+    gain = f"With adaptation to the recent past, the position error after {with_unit(horizon_s, 's')} goes from"
+    return f"{head} {what} {gain} {before} to {after}."
 
 
 def drift_sentences(diagnosis: Diagnosis) -> list[str]:

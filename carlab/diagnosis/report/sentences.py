@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from carlab.core.manoeuvres import MANOEUVRES
 from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate
-from carlab.diagnosis.report.drift import drift_of, drift_sentence
+from carlab.diagnosis.report.drift import drift_sentence, has_changed
 from carlab.diagnosis.report.numbers import listed as listed
 from carlab.diagnosis.report.numbers import number as number
 from carlab.diagnosis.report.numbers import percent as percent
@@ -208,7 +208,7 @@ def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
         "Velocities hardly change there, so such a drive does not separate causes."
         if steady
         else "The car has changed since the fitted recordings."
-        if drift_of(diagnosis, worst.recording) is not None
+        if has_changed(diagnosis, worst.recording)
         else "The model is wrong there."
     )
     return (

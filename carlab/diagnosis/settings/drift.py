@@ -20,6 +20,11 @@ class DriftSettings:
     neighbours: int = 10
     """Number of fitted windows in a similar state whose mean error corrects the prediction of a window: the prediction
     of a car whose error depends on the state alone."""
+    similar_quantile: float = 0.9
+    """A state is similar to fitted ones if the nearest fitted window is nearer than this quantile of the distances from
+    each fitted window to the nearest one of another block."""
+    min_similar_share: float = 0.5
+    """Minimum share of windows in similar states for a drift to be stated as a change of the car."""
     fit_stride_s: float = 0.25
     """Time [s] between the starts of fitted windows."""
     max_fit_windows: int = 1200
