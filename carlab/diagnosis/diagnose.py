@@ -38,7 +38,7 @@ from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, Identification
 from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.diagnosis.unexplained.vibration import find_vibration
-from carlab.prediction.black_box import BlackBoxSettings, check_duration, train_black_box
+from carlab.prediction.network_ensemble import EnsembleSettings, check_duration, train_ensemble
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
 from carlab.prediction.windows import PredictionWindows, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
@@ -132,7 +132,7 @@ def diagnose(
     control = RunControl(progress, stop, decisions.append)
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
     if ceiling:
-        check_duration(recordings.fit_tracks, BlackBoxSettings())
+        check_duration(recordings.fit_tracks, EnsembleSettings())
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
     scored, naming = _search_effects(recordings, noise, request, control)
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
@@ -281,7 +281,7 @@ def _models(
     if measured is not None:
         models["with_curves"] = SimulatorModel(measured.fit.config)
     if request.ceiling:
-        models["black_box"] = train_black_box(
+        models["black_box"] = train_ensemble(
             recordings.fit_tracks,
             seed=request.seed,
             velocity_window_s2=recordings.fit_windows.velocity_window_s2,

@@ -8,14 +8,14 @@ import torch
 
 from carlab.core.errors import DataError
 from carlab.diagnosis.ceiling import ceiling_of
-from carlab.prediction.black_box import BlackBoxSettings, train_black_box
+from carlab.prediction.network_ensemble import EnsembleSettings, train_ensemble
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import ConstantVelocity
 from carlab.prediction.windows import cut_windows, tracks_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
-SMALL = BlackBoxSettings(updates=250, check_every=50, n_networks=2, hidden_units=32, batch_windows=64)
+SMALL = EnsembleSettings(updates=250, check_every=50, n_networks=2, hidden_units=32, batch_windows=64)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def tracks():
 
 @pytest.fixture(scope="module")
 def model(tracks):
-    return train_black_box(tracks, SMALL)
+    return train_ensemble(tracks, SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -68,20 +68,20 @@ def test_prediction_moves_with_the_frame_of_the_recording(model, held_out):
 
 def test_training_repeats_with_the_same_seed(tracks, held_out):
     short = replace(SMALL, updates=20)
-    first, again, other = (train_black_box(tracks, short, seed=k).predict(held_out) for k in (3, 3, 4))
+    first, again, other = (train_ensemble(tracks, short, seed=k).predict(held_out) for k in (3, 3, 4))
     assert (first == again).all()
     assert not (first == other).all()
 
 
 def test_stop_ends_the_training_with_a_usable_model(tracks, held_out):
-    model = train_black_box(tracks, SMALL, stop=lambda: True)
+    model = train_ensemble(tracks, SMALL, stop=lambda: True)
     assert np.isfinite(model.predict(held_out)).all()
 
 
 def test_short_recordings_are_refused_in_one_sentence():
     tracks = tracks_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 10.0, 1)])
     with pytest.raises(DataError, match="contain 10 s of driving; a black box needs at least 60 s"):
-        train_black_box(tracks)
+        train_ensemble(tracks)
 
 
 def test_windows_with_another_rate_are_refused(model, held_out):

@@ -1,9 +1,13 @@
-"""Black-box predictor: an ensemble of small networks, trained on prediction windows with a multi-step loss.
+"""Ensembles of small networks, trained on prediction windows with a multi-step loss: a black box, or a discrepancy.
 
-It has no physics, so its error shows how much of a recording can be predicted from past commands and velocities at all.
-Each network maps past commands and the body velocities of the last rows to accelerations; the loss is the error of a
-whole window (simulation error training; Forgione and Piga 2021, "Continuous-time system identification with neural
-networks: Model structures and fitting criteria").
+A black box has no physics, so its error shows how much of a recording can be predicted from past commands and
+velocities at all. Each network maps past commands and the body velocities of the last rows to accelerations; the loss
+is the error of a whole window (simulation error training; Forgione and Piga 2021, "Continuous-time system
+identification with neural networks: Model structures and fitting criteria").
+
+A learned discrepancy is the same ensemble beside a simulator: its networks also see the simulated velocities, and their
+output is added to the simulated accelerations (an additive model discrepancy; Kennedy and O'Hagan 2001, "Bayesian
+calibration of computer models").
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ import torch
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.prediction.errors import prediction_errors
-from carlab.prediction.predict import ConstantVelocity
+from carlab.prediction.predict import ConstantVelocity, PredictiveModel
 from carlab.prediction.windows import PredictionWindows, Track, cut_windows
 
 Progress = Callable[[str, float], None]
@@ -27,7 +31,7 @@ Weights = tuple[torch.Tensor, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class BlackBoxSettings:
+class EnsembleSettings:
     """Size and training of the networks. Chosen on the first two thirds of one real recording (ETH train_1)."""
 
     n_networks: int = 3
@@ -61,7 +65,7 @@ class BlackBoxSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class BlackBox:
+class NetworkEnsemble:
     """A trained ensemble; a ``PredictiveModel``.
 
     Attributes:
@@ -71,6 +75,7 @@ class BlackBox:
         velocity_rows: rows of body velocities that the networks use.
         input_mean, input_std: (inputs,) standardisation.
         output_std: (3,) unit of the accelerations [m/s2, m/s2, rad/s2].
+        simulator: the model whose accelerations the networks correct; None for a black box.
     """
 
     weights: Weights
@@ -80,53 +85,57 @@ class BlackBox:
     input_mean: torch.Tensor
     input_std: torch.Tensor
     output_std: torch.Tensor
+    simulator: PredictiveModel | None = None
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
         """Mean path (S, K + 1, 6) of the networks. Raises DataError for windows with another period."""
         if not math.isclose(windows.period_s, self.period_s, rel_tol=0.02):
             raise DataError(
-                f"The black box was trained at {1 / self.period_s:.1f} Hz and the windows have "
+                f"The network was trained at {1 / self.period_s:.1f} Hz and the windows have "
                 f"{1 / windows.period_s:.1f} Hz; train it on recordings with the same rate."
             )
         with torch.no_grad():
-            paths = _paths(self, _inputs(windows, self, self.input_mean.device))
+            paths = _paths(self, _inputs(windows, self, self.input_mean.device, _simulated(self.simulator, windows)))
         mean = paths.mean(dim=0).double().cpu().numpy()
         return _in_world(mean, windows)
 
 
 @dataclass(frozen=True, slots=True)
 class _Inputs:
-    """Commands (S, P + K, 2) with P past rows, velocities (S, V, 3) up to the start."""
+    """Commands (S, P + K, 2) with P past rows, velocities (S, V, 3) up to the start, simulated ones (S, K + 1, 3)."""
 
     commands: torch.Tensor
     velocities: torch.Tensor
+    simulated: torch.Tensor | None
 
 
-def check_duration(tracks: Sequence[Track], settings: BlackBoxSettings) -> None:
+def check_duration(tracks: Sequence[Track], settings: EnsembleSettings) -> None:
     """Raise DataError if the recordings are too short to train on."""
     seconds = sum(track.duration_s for track in tracks)
     if seconds < settings.min_duration_s:
         raise DataError(
-            f"The recordings to fit contain {seconds:.0f} s of driving; a black box needs at least "
-            f"{settings.min_duration_s:.0f} s. Record more, or omit --ceiling."
+            f"The recordings to fit contain {seconds:.0f} s of driving; a network needs at least "
+            f"{settings.min_duration_s:.0f} s. Record more, or omit --ceiling and --discrepancy."
         )
 
 
-def train_black_box(
+def train_ensemble(
     tracks: Sequence[Track],
-    settings: BlackBoxSettings | None = None,
+    settings: EnsembleSettings | None = None,
     *,
+    simulator: PredictiveModel | None = None,
     seed: int = 0,
     device: str = "cpu",
     velocity_window_s2: float = 0.0,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
-) -> BlackBox:
+) -> NetworkEnsemble:
     """Train an ensemble on the windows of tracks.
 
     Args:
         tracks: recordings to fit, at least ``settings.min_duration_s`` in all.
         settings: sizes and training.
+        simulator: model whose discrepancy the networks learn; without it they are a black box.
         seed: seed of initial weights, batches and validation blocks.
         device: torch device.
         velocity_window_s2: variance of the velocity window, for the initial states.
@@ -136,11 +145,11 @@ def train_black_box(
     Raises:
         DataError: too little driving.
     """
-    settings = settings or BlackBoxSettings()
+    settings = settings or EnsembleSettings()
     check_duration(tracks, settings)
     windows = cut_windows(tracks, settings.horizon_s, settings.stride_s)
     windows = replace(windows, velocity_window_s2=velocity_window_s2)
-    return _Training(windows, settings, seed, torch.device(device)).run(progress, stop)
+    return _Training(windows, settings, simulator, seed, torch.device(device)).run(progress, stop)
 
 
 @dataclass(slots=True)
@@ -148,19 +157,21 @@ class _Training:
     """Training of one ensemble."""
 
     windows: PredictionWindows
-    settings: BlackBoxSettings
+    settings: EnsembleSettings
+    simulator: PredictiveModel | None
     seed: int
     device: torch.device
     _best: tuple[float, Weights] = field(init=False, default=(math.inf, ()))
 
-    def run(self, progress: Progress, stop: Callable[[], bool]) -> BlackBox:
+    def run(self, progress: Progress, stop: Callable[[], bool]) -> NetworkEnsemble:
         settings, windows = self.settings, self.windows
         generator = torch.Generator().manual_seed(self.seed)
-        model = self._initial(generator)
+        simulated = _simulated(self.simulator, windows)
+        model = self._initial(generator, simulated)
         validates = _validation(windows, settings.validation_share, self.seed)
         target = _target(windows, self.device)
         scale = _scale(windows.take(~validates), self.device)
-        inputs = _inputs(windows, model, self.device)
+        inputs = _inputs(windows, model, self.device, simulated)
         rows = torch.from_numpy(np.flatnonzero(~validates))
         held_rows = torch.from_numpy(np.flatnonzero(validates)).to(self.device)
         optimiser = torch.optim.AdamW(model.weights, settings.learning_rate, weight_decay=settings.weight_decay)
@@ -170,7 +181,7 @@ class _Training:
                 break
             if update % settings.check_every == 0:
                 self._check(model, inputs, target, scale, held_rows)
-                progress("training the black box", update / settings.updates)
+                progress(f"training {self._name}", update / settings.updates)
             batch = rows[torch.randint(len(rows), (settings.batch_windows,), generator=generator)].to(self.device)
             steps = _curriculum(update / settings.updates, windows.steps)
             loss = self._loss(model, inputs, target, scale, batch, steps).mean()
@@ -182,10 +193,14 @@ class _Training:
         self._check(model, inputs, target, scale, held_rows)
         return replace(model, weights=self._best[1])
 
-    def _initial(self, generator: torch.Generator) -> BlackBox:
+    @property
+    def _name(self) -> str:
+        return "the black box" if self.simulator is None else "the discrepancy"
+
+    def _initial(self, generator: torch.Generator, simulated: FloatArray | None) -> NetworkEnsemble:
         settings, windows = self.settings, self.windows
         past = min(max(round(settings.past_s / windows.period_s), 1), windows.past_commands.shape[1])
-        n_inputs = 3 * settings.velocity_rows + 2 * (past + 1)
+        n_inputs = 3 * settings.velocity_rows + 2 * (past + 1) + (0 if simulated is None else 6)
         sizes = (n_inputs, settings.hidden_units, settings.hidden_units, 3)
         weights: list[torch.Tensor] = []
         for layer, (before, after) in enumerate(itertools.pairwise(sizes)):
@@ -199,13 +214,18 @@ class _Training:
         input_mean = np.concatenate([np.tile(a.mean(axis=0), n) for a, n in repeats])
         input_std = np.concatenate([np.tile(np.maximum(a.std(axis=0), 1e-3), n) for a, n in repeats])
         rate = np.diff(windows.measured[..., 3:], axis=1) / windows.period_s
+        if simulated is not None:
+            error_std, rate_std = _simulated_std(windows, simulated)
+            input_mean = np.concatenate([input_mean, np.zeros(6)])
+            input_std = np.concatenate([input_std, error_std, rate_std])
         unit = np.maximum(1.4826 * np.median(np.abs(rate), axis=(0, 1)), 1e-2)
         mean, std, output = (torch.from_numpy(v).float().to(self.device) for v in (input_mean, input_std, unit))
-        return BlackBox(tuple(weights), windows.period_s, past, settings.velocity_rows, mean, std, output)
+        rows = settings.velocity_rows
+        return NetworkEnsemble(tuple(weights), windows.period_s, past, rows, mean, std, output, self.simulator)
 
     def _loss(
         self,
-        model: BlackBox,
+        model: NetworkEnsemble,
         inputs: _Inputs,
         target: torch.Tensor,
         scale: torch.Tensor,
@@ -214,7 +234,8 @@ class _Training:
     ) -> torch.Tensor:
         """Huber loss (E,) over the first ``steps`` steps of windows."""
         count = inputs.commands.shape[1] - target.shape[1] + 1 + steps
-        chosen = _Inputs(inputs.commands[rows, :count], inputs.velocities[rows])
+        simulated = None if inputs.simulated is None else inputs.simulated[rows, : steps + 1]
+        chosen = _Inputs(inputs.commands[rows, :count], inputs.velocities[rows], simulated)
         white = (_paths(model, chosen)[:, :, 1:] - target[rows, 1 : steps + 1]) / scale[1 : steps + 1]
         delta = self.settings.huber_delta
         size = white.abs()
@@ -222,7 +243,7 @@ class _Training:
         return loss.mean(dim=(1, 2, 3))
 
     def _check(
-        self, model: BlackBox, inputs: _Inputs, target: torch.Tensor, scale: torch.Tensor, rows: torch.Tensor
+        self, model: NetworkEnsemble, inputs: _Inputs, target: torch.Tensor, scale: torch.Tensor, rows: torch.Tensor
     ) -> None:
         """Keep the weights with the smallest loss on the validation blocks."""
         with torch.no_grad():
@@ -236,7 +257,7 @@ def _curriculum(share: float, steps: int) -> int:
     return min(steps, max(2, round(steps * (1.0 / 3.0 + 4.0 / 3.0 * share))))
 
 
-def _paths(model: BlackBox, inputs: _Inputs) -> torch.Tensor:
+def _paths(model: NetworkEnsemble, inputs: _Inputs) -> torch.Tensor:
     """Paths (E, S, K + 1, 6) of each network from the origin; K is the number of commands after the past ones."""
     networks = model.weights[0].shape[0]
     velocities = inputs.velocities.expand(networks, -1, -1, -1)
@@ -248,8 +269,13 @@ def _paths(model: BlackBox, inputs: _Inputs) -> torch.Tensor:
     step_s = model.period_s
     for k in range(commands.shape[2] - model.past_rows):
         past = commands[:, :, k : k + model.past_rows + 1].flatten(2)
-        features = (torch.cat([*recent, past], dim=-1) - model.input_mean) / model.input_std
-        after = now + step_s * model.output_std * _network(model.weights, features)
+        change = torch.zeros_like(now)
+        known = [*recent, past]
+        if inputs.simulated is not None:
+            change = (inputs.simulated[:, k + 1] - inputs.simulated[:, k]).expand_as(now)
+            known += [now - inputs.simulated[:, k], change / step_s]
+        features = (torch.cat(known, dim=-1) - model.input_mean) / model.input_std
+        after = now + change + step_s * model.output_std * _network(model.weights, features)
         mean = 0.5 * (now + after)
         yaw = pose[..., 2] + 0.5 * step_s * mean[..., 2]
         cos, sin = torch.cos(yaw), torch.sin(yaw)
@@ -267,12 +293,29 @@ def _network(weights: Weights, features: torch.Tensor) -> torch.Tensor:
     return torch.baddbmm(weights[-1], features, weights[-2])
 
 
-def _inputs(windows: PredictionWindows, model: BlackBox, device: torch.device) -> _Inputs:
+def _simulated(simulator: PredictiveModel | None, windows: PredictionWindows) -> FloatArray | None:
+    """Simulated velocities (S, K + 1, 3); None without a simulator."""
+    return None if simulator is None else simulator.predict(windows)[..., 3:]
+
+
+def _simulated_std(windows: PredictionWindows, simulated: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Scale (3,) of the simulator's velocity errors, and of its accelerations."""
+    error, rate = windows.measured[..., 3:] - simulated, np.diff(simulated, axis=1) / windows.period_s
+    return np.maximum(error.std(axis=(0, 1)), 1e-3), np.maximum(rate.std(axis=(0, 1)), 1e-2)
+
+
+def _inputs(
+    windows: PredictionWindows, model: NetworkEnsemble, device: torch.device, simulated: FloatArray | None
+) -> _Inputs:
     past = windows.past_commands[:, windows.past_commands.shape[1] - model.past_rows :]
     commands = np.concatenate([past, windows.commands], axis=1)
     before = windows.past_states[:, windows.past_states.shape[1] - model.velocity_rows + 1 :, 3:]
     velocities = np.concatenate([before, windows.initial_states[:, None, 3:]], axis=1)
-    return _Inputs(*(torch.from_numpy(v).float().to(device) for v in (commands, velocities)))
+
+    def tensor(array: FloatArray) -> torch.Tensor:
+        return torch.from_numpy(array).float().to(device)
+
+    return _Inputs(tensor(commands), tensor(velocities), None if simulated is None else tensor(simulated))
 
 
 def _target(windows: PredictionWindows, device: torch.device) -> torch.Tensor:
@@ -309,4 +352,4 @@ def _in_world(path: FloatArray, windows: PredictionWindows) -> FloatArray:
     return out
 
 
-__all__ = ["BlackBox", "BlackBoxSettings", "check_duration", "train_black_box"]
+__all__ = ["EnsembleSettings", "NetworkEnsemble", "check_duration", "train_ensemble"]
