@@ -148,6 +148,7 @@ def diagnose(
     effects: Sequence[str] = (),
     curves: bool = False,
     ceiling: bool = False,
+    discrepancy: bool = False,
     adapt: bool = False,
     seed: int = 0,
     out: Path | str | None = None,
@@ -166,9 +167,10 @@ def diagnose(
         curves: fit measured curves (drive force, steering, tyres) where named effects leave more than a tenth of the
             error; takes minutes.
         ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
+        discrepancy: train networks that correct the diagnosed simulator, and report their error; takes minutes.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car since the
             fitted ones; takes up to a minute.
-        seed: seed of the black box; the rest of a diagnosis draws no random numbers.
+        seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
         stop: once it returns true, the search ends and the report covers the findings so far.
@@ -191,7 +193,7 @@ def diagnose(
     fit = read_material(to_fit, "fit", latency_s)
     validation = read_material(to_validate, "held out", latency_s)
     options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
-    options["adapt"] = adapt
+    options |= {"discrepancy": discrepancy, "adapt": adapt}
     report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})
     if out is not None:
         report.save(out)

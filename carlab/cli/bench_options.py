@@ -22,7 +22,7 @@ class BenchOptions:
     kinematic, the nominal and the diagnosed prior, on a simulated car with two concealed effects or on the recordings
     in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are continued.
     realcars: prediction errors on held-out drives of a real car in --data, for constant velocity, the car file, refit,
-    diagnosis, measured curves and a black box."""
+    diagnosis, measured curves, a learned discrepancy, a black box and adaptation."""
 
     out: Path | None = None
     """Write the figures to FILE.json (regression and priors after each fit). All but speed also draw FILE.png; priors
@@ -60,6 +60,9 @@ class BenchOptions:
 
     fit: tuple[str, ...] = ()
     """realcars: parts of the names of the recordings to fit; by default all that are not held out."""
+
+    effects: tuple[str, ...] = ()
+    """realcars: restrict the search to these effects of the catalogue."""
 
     car: Path = Path("eth_rc_car")
     """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. priors with
@@ -129,6 +132,7 @@ PLACES = {
     "way": (REGRESSION,),
     "data": (REGRESSION, PRIORS, REALCARS),
     "held_out": (REALCARS,),
+    "effects": (REALCARS,),
     "fit": (REALCARS,),
     "car": (REALCAR, READ, REALCARS),
     "history": (REALCAR, PRIORS),

@@ -53,8 +53,11 @@ class Diagnose:
     adapt: bool = False
     """Adapt the simulator along the held-out recordings, and report what changed in the car since the fitted ones."""
 
+    discrepancy: bool = False
+    """Train networks that correct the diagnosed simulator, and report their error. Needs 60 s of driving."""
+
     seed: int = 0
-    """Seed of the black box; the rest of a diagnosis draws no random numbers."""
+    """Seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers."""
 
     decisions: bool = False
     """Also write decisions.json: the statistics and thresholds of each decision about an effect."""
@@ -77,6 +80,7 @@ class Diagnose:
                 effects=self.effects,
                 curves=self.curves,
                 ceiling=self.ceiling,
+                discrepancy=self.discrepancy,
                 adapt=self.adapt,
                 seed=self.seed,
                 out=self.out,

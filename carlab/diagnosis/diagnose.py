@@ -76,6 +76,7 @@ class Request:
     settings: DiagnosisSettings
     curves: bool
     ceiling: bool
+    discrepancy: bool
     adapt: bool
 
 
@@ -93,6 +94,7 @@ def diagnose(
     settings: DiagnosisSettings = DEFAULT,
     curves: bool = False,
     ceiling: bool = False,
+    discrepancy: bool = False,
     adapt: bool = False,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
@@ -109,10 +111,11 @@ def diagnose(
         effects: candidate effects, the whole catalogue by default. Given effects are not withdrawn.
         holdout_share: last share of each recording that is held out if ``held_out`` is empty, above 0 and at most
             0.5; by default that of the settings.
-        seed: seed of the black box; the rest of a diagnosis uses no random numbers.
+        seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
         curves: fit measured curves where named effects leave a residual.
         ceiling: train a black box, and compare with its error.
+        discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
@@ -120,18 +123,19 @@ def diagnose(
     Raises:
         Inconclusive: the recordings do not allow a verdict; the message states why and what to record.
         ConfigError: the simulator cannot integrate, or the held-out share is out of range.
-        DataError: a ceiling of recordings that are too short for a black box.
+        DataError: a ceiling or a discrepancy of recordings that are too short for a network.
     """
     if holdout_share is None:
         holdout_share = settings.windows.default_held_out_share
     check_held_out_share(holdout_share, settings.windows)
     began_s = MonotonicClock().now_s()
     nominal = with_known_latency(nominal, (*fit, *held_out))
-    request = Request(nominal, texts, uses, data_faults, effects, holdout_share, seed, settings, curves, ceiling, adapt)
+    stages = curves, ceiling, discrepancy, adapt
+    request = Request(nominal, texts, uses, data_faults, effects, holdout_share, seed, settings, *stages)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append)
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
-    if ceiling:
+    if ceiling or discrepancy:
         check_duration(recordings.fit_tracks, EnsembleSettings())
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
     scored, naming = _search_effects(recordings, noise, request, control)
@@ -271,7 +275,7 @@ def _models(
     request: Request,
     control: RunControl,
 ) -> dict[str, PredictiveModel]:
-    """All models whose held-out errors are reported; a black box is trained on the recordings to fit."""
+    """All models whose held-out errors are reported; networks are trained on the recordings to fit."""
     found = scored.found
     models: dict[str, PredictiveModel] = {
         "nominal": SimulatorModel(scored.problem.nominal),
@@ -280,14 +284,21 @@ def _models(
     }
     if measured is not None:
         models["with_curves"] = SimulatorModel(measured.fit.config)
-    if request.ceiling:
-        models["black_box"] = train_ensemble(
+
+    def trained(simulator: PredictiveModel | None) -> PredictiveModel:
+        return train_ensemble(
             recordings.fit_tracks,
+            simulator=simulator,
             seed=request.seed,
             velocity_window_s2=recordings.fit_windows.velocity_window_s2,
             progress=control.progress,
             stop=control.stop,
         )
+
+    if request.discrepancy:
+        models["with_discrepancy"] = trained(models.get("with_curves", models["with_effects"]))
+    if request.ceiling:
+        models["black_box"] = trained(None)
     if adaptation is not None:
         models["adapted"] = adaptation.model
     return models | {"constant_velocity": ConstantVelocity()}

@@ -251,7 +251,8 @@ class Diagnosis:
     """Result of a diagnosis.
 
     ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; with measured curves also
-    with_curves, with a ceiling also black_box.
+    with_curves, with a ceiling also black_box, with a discrepancy also
+    with_discrepancy.
     """
 
     verdict: Verdict

@@ -21,6 +21,7 @@ MODEL_NAMES = {
     "refit": "refit",
     "with_effects": "diagnosed",
     "with_curves": "diagnosed, measured curves",
+    "with_discrepancy": "diagnosed, learned discrepancy",
     "black_box": "black box",
     "adapted": "adapted",
 }

@@ -62,11 +62,14 @@ def test_figures_are_printed_and_written(
     monkeypatch.setattr(carlab.api, "diagnose", diagnose)
     out = folder.parent / "figures.json"
     command = ["bench", "realcars", "--data", str(folder), "--held-out", "b.csv", "c.csv", "--out", str(out)]
+    command += ["--effects", "command_delay"]
     assert run(command) == 0
     assert asked["fit"] == ["a.csv"]
     assert asked["curves"]
     assert asked["ceiling"]
     assert asked["adapt"]
+    assert asked["discrepancy"]
+    assert asked["effects"] == ("command_delay",)
     figures = json.loads(out.read_text())
     assert (figures["fit"], figures["held_out"]) == (["a.csv"], ["b.csv", "c.csv"])
     rows = {(e["recording"], e["model"], e["horizon_s"]): e for e in figures["errors"]}

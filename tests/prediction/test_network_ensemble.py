@@ -1,4 +1,4 @@
-"""The black-box predictor against closed forms and the constant-velocity baseline."""
+"""The black box and the learned discrepancy against closed forms, the constant-velocity baseline and a known car."""
 
 from dataclasses import replace
 
@@ -8,9 +8,9 @@ import torch
 
 from carlab.core.errors import DataError
 from carlab.diagnosis.ceiling import ceiling_of
-from carlab.prediction.network_ensemble import EnsembleSettings, train_ensemble
 from carlab.prediction.errors import final_errors
-from carlab.prediction.predict import ConstantVelocity
+from carlab.prediction.network_ensemble import EnsembleSettings, train_ensemble
+from carlab.prediction.predict import ConstantVelocity, SimulatorModel
 from carlab.prediction.windows import cut_windows, tracks_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -80,13 +80,44 @@ def test_stop_ends_the_training_with_a_usable_model(tracks, held_out):
 
 def test_short_recordings_are_refused_in_one_sentence():
     tracks = tracks_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 10.0, 1)])
-    with pytest.raises(DataError, match="contain 10 s of driving; a black box needs at least 60 s"):
+    with pytest.raises(DataError, match="contain 10 s of driving; a network needs at least 60 s"):
         train_ensemble(tracks)
 
 
 def test_windows_with_another_rate_are_refused(model, held_out):
     with pytest.raises(DataError, match=r"was trained at 30\.0 Hz and the windows have 60\.0 Hz"):
         model.predict(replace(held_out, period_s=PERIOD_S / 2))
+
+
+@pytest.fixture(scope="module")
+def weak_motor():
+    """A simulator with two thirds of the drive force of the recorded car."""
+    car = SimulatorConfig(control_period_s=PERIOD_S)
+    return SimulatorModel(car.with_values({"motor.drive_gain": car.values()["motor.drive_gain"] * 2 / 3}))
+
+
+@pytest.fixture(scope="module")
+def corrected(tracks, weak_motor):
+    return train_ensemble(tracks, SMALL, simulator=weak_motor)
+
+
+def test_discrepancy_without_output_is_the_simulator(corrected, weak_motor, held_out):
+    silent = replace(corrected, weights=tuple(torch.zeros_like(w) for w in corrected.weights))
+    expected = weak_motor.predict(held_out)
+    assert silent.predict(held_out)[..., 3:] == pytest.approx(expected[..., 3:], abs=1e-4)
+    assert silent.predict(held_out)[..., :3] == pytest.approx(expected[..., :3], abs=0.01)  # trapezoidal rule
+
+
+def test_discrepancy_corrects_a_wrong_drive_force(corrected, weak_motor, held_out):
+    before, after = rms(weak_motor, held_out), rms(corrected, held_out)
+    assert after[0] < 0.3 * before[0]
+    assert after[3] < 0.3 * before[3]
+
+
+def test_discrepancy_of_the_true_simulator_adds_little_error(tracks, held_out):
+    truth = SimulatorModel(SimulatorConfig(control_period_s=PERIOD_S))
+    corrected = train_ensemble(tracks, SMALL, simulator=truth)
+    assert (rms(corrected, held_out)[:2] < rms(truth, held_out)[:2] + 0.01).all()
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ LABELS = {
     "refit": "parameters refitted",
     "with_effects": "with effects",
     "with_curves": "with measured curves",
+    "with_discrepancy": "with a learned discrepancy",
     "black_box": "black box",
     "adapted": "adapted to the recent past",
     "constant_velocity": "constant velocity",
