@@ -30,7 +30,7 @@ from carlab.diagnosis.identification.measurement_noise import Noise, estimate_no
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.naming import NamingResult, accept_names, describe_unexplained, residual_of
 from carlab.diagnosis.recording_faults import find as data_faults_of
-from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, check_held_out_share, split_recordings
+from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
 from carlab.diagnosis.report.exhibits import exhibits_of
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
@@ -125,13 +125,11 @@ def diagnose(
         ConfigError: the simulator cannot integrate, or the held-out share is out of range.
         DataError: a ceiling or a discrepancy of recordings that are too short for a network.
     """
-    if holdout_share is None:
-        holdout_share = settings.windows.default_held_out_share
-    check_held_out_share(holdout_share, settings.windows)
+    share = checked_held_out_share(holdout_share, settings.windows)
     began_s = MonotonicClock().now_s()
     nominal = with_known_latency(nominal, (*fit, *held_out))
     stages = curves, ceiling, discrepancy, adapt
-    request = Request(nominal, texts, uses, data_faults, effects, holdout_share, seed, settings, *stages)
+    request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append)
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)

@@ -36,13 +36,15 @@ class SplitRecordings:
     held_out_windows: PredictionWindows
 
 
-def check_held_out_share(share: float, settings: WindowSettings) -> None:
-    """Raise ConfigError if the held-out share is out of range."""
+def checked_held_out_share(given: float | None, settings: WindowSettings) -> float:
+    """The given held-out share, or the default one; raises ConfigError if it is out of range."""
+    share = settings.default_held_out_share if given is None else given
     if not 0.0 < share <= settings.max_held_out_share:
         raise ConfigError(
             f"--holdout-share {share:g} is out of range; give a share above 0 and at most "
             f"{settings.max_held_out_share:g}."
         )
+    return share
 
 
 def split_recordings(
@@ -110,4 +112,4 @@ def check_excitation(tracks: Sequence[Track], settings: WindowSettings) -> None:
             )
 
 
-__all__ = ["Inconclusive", "SplitRecordings", "check_excitation", "check_held_out_share", "split_recordings"]
+__all__ = ["Inconclusive", "SplitRecordings", "check_excitation", "checked_held_out_share", "split_recordings"]

@@ -20,7 +20,7 @@ from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.recording_faults import find as recording_faults
-from carlab.diagnosis.recordings import check_held_out_share
+from carlab.diagnosis.recordings import checked_held_out_share
 from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.prediction.adaptation import AdaptiveModel, choose_noise
@@ -97,7 +97,7 @@ def score_recording(
         DataError: the recording contains no window of that length in which the car moves.
         ConfigError: the share is out of range.
     """
-    check_held_out_share(holdout_share, DEFAULT.windows)
+    checked_held_out_share(holdout_share, DEFAULT.windows)
     if not (horizon_s > 0 and stride_s > 0):
         raise DataError(f"Horizon {horizon_s:g} s and stride {stride_s:g} s must be positive.")
     if not any(episode.ticks for episode in episodes):

@@ -34,6 +34,8 @@ BASE = (
     "steering.max_angle",
 )
 TYRES = tuple(name for name in BASE if name.startswith("tyre."))
+MIN_POSITIVE_SHARE = 1e-3
+"""Smallest value of a parameter that must be positive, over its typical size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +115,7 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
             found.append(FitParameter(name, p.typical, 0.3, max(p.low, 0.02 * p.typical), 50.0 * p.typical, True))
         else:
             origin = float(values.get(p.same_as, 0.0)) if p.identity is None else p.identity
-            low = max(p.low, origin - 20.0 * size)
+            low = max(p.low + MIN_POSITIVE_SHARE * size * p.positive, origin - 20.0 * size)
             if p.reduces:
                 low = max(low, -values[p.reduces])
             found.append(FitParameter(name, origin, size, low, min(p.high, origin + 20.0 * size)))
