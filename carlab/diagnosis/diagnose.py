@@ -133,8 +133,6 @@ def diagnose(
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append)
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
-    if ceiling or discrepancy:
-        check_duration(recordings.fit_tracks, EnsembleSettings())
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
     scored, naming = _search_effects(recordings, noise, request, control)
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
@@ -154,13 +152,16 @@ def _prepare_recordings(
     faults = (*request.data_faults, *own_faults)
     progress("reading", 0.03)
     try:
-        return split_recordings(fit, held_out, request.held_out_share, settings), faults
+        recordings = split_recordings(fit, held_out, request.held_out_share, settings)
     except Inconclusive as error:
         error.data_faults = faults
         usable_s = sum(track.duration_s for track in tracks_of(fit))
         if faults and usable_s < settings.min_fit_s and usable_s < settings.unusable_share * recorded_s:
             error.verdict = "data"
         raise
+    if request.ceiling or request.discrepancy:
+        check_duration(recordings.fit_tracks, EnsembleSettings())
+    return recordings, faults
 
 
 def _estimate_noise(
