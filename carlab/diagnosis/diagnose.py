@@ -320,10 +320,12 @@ def _adaptation(
 
 
 def _ceiling(errors: Mapping[str, FitErrors]) -> Ceiling | None:
-    if "black_box" not in errors:
+    """The ceiling by the better of black box and learned discrepancy; None without both."""
+    networks = [errors[name].score for name in ("black_box", "with_discrepancy") if name in errors]
+    if not networks:
         return None
     model = errors.get("with_curves", errors["with_effects"])
-    return ceiling_of(errors["refit"].score, model.score, errors["black_box"].score)
+    return ceiling_of(errors["refit"].score, model.score, min(networks))
 
 
 __all__ = ["Inconclusive", "Outcome", "Texts", "diagnose"]

@@ -131,8 +131,8 @@ class CurveFinding:
 class Ceiling:
     """How much of the refit's squared excess can be explained from past commands and velocities.
 
-    Shares add up to 1: ``by_model`` is what the diagnosed model explains, ``predictable`` what a black box predicts in
-    addition, ``unpredictable`` what neither predicts.
+    Shares add up to 1: ``by_model`` is what the diagnosed model explains, ``predictable`` what the better of black
+    box and learned discrepancy predicts in addition, ``unpredictable`` what neither predicts.
     """
 
     by_model: float

@@ -27,12 +27,12 @@ def curve_sentences(diagnosis: Diagnosis) -> list[str]:
 
 
 def ceiling_sentence(diagnosis: Diagnosis) -> str:
-    """How much of the excess is explained, can be explained and cannot; empty without a black box."""
+    """How much of the excess is explained, can be explained and cannot; empty without networks."""
     ceiling = diagnosis.ceiling
     if ceiling is None:
         return ""
     return (
-        f"Of the refit's squared excess the model explains {percent(ceiling.by_model)}; a black box predicts another "
+        f"Of the refit's squared excess the model explains {percent(ceiling.by_model)}; networks predict another "
         f"{percent(ceiling.predictable)} from past commands and velocities; {percent(ceiling.unpredictable)} is "
         f"predicted by neither. The model explains {percent(ceiling.explained_of_predictable)} of the predictable "
         "part."
