@@ -1,4 +1,4 @@
-"""Predictions by learned dynamics: sampled paths of one-step models."""
+"""Predictions by learned cars: sampled paths."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from carlab.core.errors import DataError
 from carlab.core.observation import decode_state, encode
 from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import PredictionWindows
-from learning.world.car_dynamics import OneStep
+from learning.world.disturbance import RolloutModel, start_rollouts
+from learning.world.disturbance_fit import DriveWindows
 
 N_SAMPLES = 64
 
 
 def sample_paths(
-    dynamics: OneStep,
+    dynamics: RolloutModel,
     initial_states: FloatArray,
     past_commands: FloatArray,
     commands: FloatArray,
@@ -25,10 +26,13 @@ def sample_paths(
     n_samples: int = N_SAMPLES,
     seed: int = 0,
 ) -> FloatArray:
-    """Sample paths of a learned car; each step samples particle and noise.
+    """Sample paths of a learned car.
+
+    A one-step model samples particle and noise in each step. With a disturbance, each path has one particle and one
+    path of the disturbance, and the noise of the measurement is added after each step without moving the car.
 
     Args:
-        dynamics: the learned one-step model with a history of H commands.
+        dynamics: the learned car with a history of H commands.
         initial_states: (S, 6).
         past_commands: (S, H, 2) before the first step.
         commands: (S, K, 2), one per step.
@@ -41,11 +45,14 @@ def sample_paths(
     generator = torch.Generator().manual_seed(seed)
     first = encode(initial_states, past_commands)
     features = torch.from_numpy(first).float().repeat_interleave(n_samples, dim=0)
+    rollouts = start_rollouts(dynamics, len(features), generator)
     states = [decode_state(features).view(len(initial_states), n_samples, 6)]
     for command in np.moveaxis(commands, 1, 0):
         action = torch.from_numpy(np.ascontiguousarray(command)).float().repeat_interleave(n_samples, dim=0)
-        features = dynamics.step(features, action, generator)
-        states.append(decode_state(features).view(len(initial_states), n_samples, 6))
+        features = rollouts.step(features, action, generator)
+        state, noise = decode_state(features), rollouts.measurement_noise(generator)
+        state = state if noise is None else state + noise
+        states.append(state.view(len(initial_states), n_samples, 6))
     paths = torch.stack(states, dim=1).double().numpy()
     paths[..., 2] = np.unwrap(paths[..., 2], axis=1)
     return np.asarray(paths)
@@ -56,31 +63,60 @@ class LearnedModel:
     """A learned car as a predictive model: the mean of its sampled paths.
 
     Attributes:
-        dynamics: one-step model with the step of the windows.
+        dynamics: learned car with the step of the windows.
         n_samples: paths from each initial state.
         seed: seed of the samples.
     """
 
-    dynamics: OneStep
+    dynamics: RolloutModel
     n_samples: int = N_SAMPLES
     seed: int = 0
 
     def predict(self, windows: PredictionWindows) -> FloatArray:
         """As ``PredictiveModel``. Raises DataError if the model's history is longer than that of the windows."""
-        history = self.dynamics.history
-        if history > windows.past_commands.shape[1]:
-            raise DataError(
-                f"The learned car requires {history} past commands, but the windows have "
-                f"{windows.past_commands.shape[1]}; learn with a shorter history."
-            )
-        past = windows.past_commands[:, windows.past_commands.shape[1] - history :]
+        return np.asarray(self.sample(windows).mean(axis=2))
+
+    def sample(self, windows: PredictionWindows) -> FloatArray:
+        """Paths (S, K + 1, n_samples, 6), yaw continuous with that of the windows. Raises DataError as ``predict``."""
+        past = past_commands(windows, self.dynamics.history)
         paths = sample_paths(
             self.dynamics, windows.initial_states, past, windows.commands, n_samples=self.n_samples, seed=self.seed
         )
-        mean = np.asarray(paths.mean(axis=2))
         # Angles are encoded by sine and cosine; the recording's yaw is unwrapped.
-        mean[..., 2] += np.round((windows.initial_states[:, 2] - mean[:, 0, 2]) / (2 * np.pi))[:, None] * 2 * np.pi
-        return mean
+        turns = np.round((windows.initial_states[:, 2, None] - paths[:, 0, :, 2]) / (2 * np.pi))
+        paths[..., 2] += 2 * np.pi * turns[:, None]
+        return paths
 
 
-__all__ = ["N_SAMPLES", "LearnedModel", "sample_paths"]
+def past_commands(windows: PredictionWindows, history: int) -> FloatArray:
+    """The last ``history`` commands (S, H, 2) before windows. Raises DataError if the windows have fewer."""
+    length = windows.past_commands.shape[1]
+    if history > length:
+        raise DataError(
+            f"The learned car requires {history} past commands, but the windows have {length}; learn with a shorter "
+            "history."
+        )
+    return windows.past_commands[:, length - history :]
+
+
+def drive_windows(windows: PredictionWindows, history: int) -> DriveWindows:
+    """The same windows in the frames of their initial poses, for the fit of a disturbance.
+
+    Args:
+        windows: windows with initial states as they are measured, since a one-step model is fitted to these.
+        history: number of past commands of the learned car.
+
+    Raises:
+        DataError: the windows have fewer past commands.
+    """
+    start = windows.initial_states[:, None]
+    sin, cos = np.sin(start[..., 2]), np.cos(start[..., 2])
+    motion = windows.measured[:, 1:].copy()
+    dx, dy = motion[..., 0] - start[..., 0], motion[..., 1] - start[..., 1]
+    motion[..., 0], motion[..., 1] = cos * dx + sin * dy, cos * dy - sin * dx
+    motion[..., 2] -= start[..., 2]
+    arrays = (windows.initial_states[:, 3:], past_commands(windows, history), windows.commands, motion)
+    return DriveWindows(*(torch.from_numpy(np.ascontiguousarray(a)).float() for a in arrays), period_s=windows.period_s)
+
+
+__all__ = ["N_SAMPLES", "LearnedModel", "drive_windows", "past_commands", "sample_paths"]

@@ -11,6 +11,45 @@ from learning.posterior.particle_posterior import ParticlePosterior
 
 
 @dataclass(frozen=True, slots=True)
+class Assignment:
+    """Assignment of N rows to L particles, which are evaluated in one batch.
+
+    Attributes:
+        slot: of each row (N,), from 0 to ``L * share - 1``; all different. Row k has particle ``slot[k] // share``.
+        share: slots of each particle.
+    """
+
+    slot: Tensor
+    share: int
+
+    @classmethod
+    def random(cls, count: int, particles: int, generator: torch.Generator, spare: int = 0) -> Assignment:
+        """Random and even assignment of ``count`` rows, with at least ``spare`` free slots."""
+        share = -(-(count + spare) // particles)
+        return cls(torch.randperm(share * particles, generator=generator)[:count], share)
+
+    @classmethod
+    def of_particles(cls, particle: Tensor, particles: int) -> Assignment:
+        """Assignment of each row to a given particle (N,)."""
+        order = torch.argsort(particle, stable=True)
+        counts = torch.bincount(particle, minlength=particles)
+        rank = torch.empty_like(order)
+        rank[order] = torch.arange(len(order)) - (counts.cumsum(0) - counts)[particle[order]]
+        share = int(counts.max())
+        return cls(particle * share + rank, share)
+
+    def reassigned(self, rows: Tensor, particles: int, generator: torch.Generator) -> Assignment:
+        """Copy with new random slots for some rows (indices), drawn among their slots and the free ones."""
+        taken = torch.zeros(self.share * particles, dtype=torch.bool)
+        taken[self.slot] = True
+        taken[self.slot[rows]] = False
+        free = torch.nonzero(~taken)[:, 0]
+        slot = self.slot.clone()
+        slot[rows] = free[torch.randperm(len(free), generator=generator)[: len(rows)]]
+        return Assignment(slot, self.share)
+
+
+@dataclass(frozen=True, slots=True)
 class Draws:
     """Sampler of a posterior; units, decorrelation and correlation are precomputed in its matrices.
 
@@ -51,17 +90,34 @@ class Draws:
 
         Rows are assigned to particles at random and evenly; each particle is evaluated only at its rows.
         """
-        count, particles = len(inputs), len(self.parameters)
-        share = -(-count // particles)
+        assignment = Assignment.random(len(inputs), len(self.parameters), generator)
         with torch.no_grad():
-            slot = torch.randperm(share * particles, generator=generator)[:count].to(inputs.device)
-            assigned = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
-            assigned[slot] = self.posterior.clipped_inputs(inputs)
-            by_particle = assigned.view(particles, share, inputs.shape[1])
-            values = self.posterior.network(self.parameters, by_particle)
+            values = self._values(inputs, assignment)
             noise = torch.randn(values.shape, generator=generator).to(values)
-            values += by_particle @ self.slopes + self.scales * (noise @ self.noise)
-            return values.flatten(0, 1)[slot]
+            values += self.scales * (noise @ self.noise)
+            return values.flatten(0, 1)[assignment.slot.to(inputs.device)]
+
+    def without_noise(self, inputs: Tensor, assignment: Assignment) -> Tensor:
+        """Raw outputs (N, O) of the assigned particles at raw inputs (N, D)."""
+        with torch.no_grad():
+            return self._values(inputs, assignment).flatten(0, 1)[assignment.slot.to(inputs.device)]
+
+    def noise_samples(self, count: int, generator: torch.Generator) -> Tensor:
+        """Samples (N, O) of the noise of the likelihood, raw."""
+        which = torch.randint(len(self.scales), (count,), generator=generator).to(self.scales.device)
+        noise = torch.randn((count, len(self.noise)), generator=generator).to(self.noise)
+        samples: Tensor = self.scales[which, 0] * (noise @ self.noise)
+        return samples
+
+    def _values(self, inputs: Tensor, assignment: Assignment) -> Tensor:
+        """Raw outputs (L, share, O) of each particle at its rows."""
+        particles, share = len(self.parameters), assignment.share
+        assigned = torch.zeros((share * particles, inputs.shape[1]), dtype=inputs.dtype, device=inputs.device)
+        assigned[assignment.slot.to(inputs.device)] = self.posterior.clipped_inputs(inputs)
+        by_particle = assigned.view(particles, share, inputs.shape[1])
+        values = self.posterior.network(self.parameters, by_particle)
+        values += by_particle @ self.slopes
+        return values
 
 
-__all__ = ["Draws"]
+__all__ = ["Assignment", "Draws"]

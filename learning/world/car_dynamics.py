@@ -66,6 +66,11 @@ class CarDynamics(StepInBody):
     def __post_init__(self) -> None:
         object.__setattr__(self, "_draws", Draws.of(self.posterior))
 
+    @property
+    def draws(self) -> Draws:
+        """Sampler of the particles."""
+        return self._draws
+
     def predict(self, inputs: Tensor) -> Mixture:
         """Predictive distribution of changes at inputs (N, 3 + 2 (H + 1))."""
         return self.posterior.predict(inputs)

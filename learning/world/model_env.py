@@ -21,7 +21,7 @@ from carlab.core.geofence import can_stop_inside_batch, stopping_distance_m
 from carlab.core.observation import ACTION_SIZE, decode_state, encode, feature_size
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import Task
-from learning.world.car_dynamics import OneStep
+from learning.world.disturbance import RolloutModel, start_rollouts
 
 FEATURE_UNITS = (2.0, 2.0, 1.0, 1.0, 2.0, 1.0, 4.0)
 """Units of x, y [m], sine, cosine, vx, vy [m/s] and yaw rate [rad/s] in a policy's inputs."""
@@ -47,7 +47,7 @@ class ModelEnv(VecEnv):
     """Parallel copies of a learned car.
 
     Args:
-        model: one-step dynamics of the car.
+        model: the learned car; with a disturbance, each episode has one particle and one path of the disturbance.
         task: reward, termination and start states, with the history of the model.
         cars: number of copies.
         recorded: features (R, 7 + 2 H) of recorded states; may be empty.
@@ -56,7 +56,7 @@ class ModelEnv(VecEnv):
         period_s: control period, for the slew limits [s].
         bonus: additional reward (cars,) for features (cars, 7 + 2 H) after a step; not part of the returns of
             ``roll_out``.
-        seed: of start states, particles and noise.
+        seed: of start states, particles, noise and disturbances.
         device: of the model's tensors.
 
     Raises:
@@ -66,7 +66,7 @@ class ModelEnv(VecEnv):
 
     def __init__(
         self,
-        model: OneStep,
+        model: RolloutModel,
         task: Task,
         cars: int,
         *,
@@ -99,6 +99,7 @@ class ModelEnv(VecEnv):
         self._own_seed = seed
         self._rng = np.random.default_rng(seed)
         self._generator = torch.Generator().manual_seed(seed)
+        self._rollouts = start_rollouts(model, cars, self._generator)
         self._features = torch.zeros((cars, width), device=self._device)
         self._ticks = np.zeros(cars, dtype=np.int64)
         self._actions = torch.zeros((cars, ACTION_SIZE), device=self._device)
@@ -119,7 +120,7 @@ class ModelEnv(VecEnv):
         before = self._features
         with torch.no_grad():
             action = self._gate(before, self._actions)
-            after = self._model.step(before, action, self._generator)
+            after = self._rollouts.step(before, action, self._generator)
             reward = self._task.reward(before, action, after)
             if self._bonus is not None:
                 reward = reward + self._bonus(after)
@@ -157,7 +158,7 @@ class ModelEnv(VecEnv):
             for _ in range(self._task.max_ticks):
                 before = self._features
                 action = self._gate(before, torch.as_tensor(act(seen)).to(self._device))
-                after = self._model.step(before, action, self._generator)
+                after = self._rollouts.step(before, action, self._generator)
                 here = after.cpu()
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
                 last = torch.where(ended[:, None], last, here)
@@ -203,6 +204,7 @@ class ModelEnv(VecEnv):
         features = self._features.clone()
         features[torch.from_numpy(cars).to(self._device)] = start_features.to(self._device)
         self._features = features
+        self._rollouts.restart(torch.from_numpy(cars), self._generator)
         self._ticks[cars] = 0
         array: NDArray[np.float32] = start_features.numpy()
         return array

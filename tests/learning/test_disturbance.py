@@ -1,0 +1,208 @@
+"""Rollouts with a disturbance, on a linear car whose errors have a closed form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+from torch import Tensor
+
+from carlab.core.errors import DataError
+from carlab.core.observation import decode_state, encode
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.posterior.draws import Assignment
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.world.car_dynamics import CarDynamics
+from learning.world.disturbance import DisturbanceProcess, DisturbedCar, start_rollouts
+from learning.world.disturbance_fit import (
+    MAX_SCALE,
+    DriveWindows,
+    fit_disturbance,
+    pooled,
+    rollout_errors,
+)
+
+PERIOD_S, DECAY, STEPS = 1.0 / 30.0, 0.05, 30
+INPUTS = 3 + 2
+
+
+def decaying_car(offsets: Tensor, noise: float = 1e-4) -> CarDynamics:
+    """Return a car whose velocities decay by ``DECAY`` in a step; particles differ in the change of vx by offsets (L,).
+
+    The pose follows from the velocities at the start of a step.
+    """
+    network = Network(INPUTS, 6, (2,))
+    parameters = torch.zeros(len(offsets), network.parameters)
+    parameters[:, -3] = offsets
+    trend = torch.zeros(1 + INPUTS, 6)
+    for channel in range(3):
+        trend[1 + channel, channel] = PERIOD_S
+        trend[1 + channel, 3 + channel] = -DECAY
+    units = Normaliser(torch.zeros(INPUTS), torch.ones(INPUTS), torch.zeros(6), torch.ones(6))
+    clip = torch.full((INPUTS,), 100.0)
+    noise_std = torch.full((6,), noise)
+    return CarDynamics(ParticlePosterior(network, parameters, noise_std, units, math.inf, trend, None, clip), 0)
+
+
+def vx_std(scale: float, correlation_s: float, steps: int) -> float:
+    """Standard deviation of vx after a number of steps by an AR(1) acceleration."""
+    rho = math.exp(-PERIOD_S / correlation_s)
+    gain = (1.0 - DECAY) ** np.arange(steps - 1, -1, -1) * PERIOD_S
+    lag = np.abs(np.subtract.outer(np.arange(steps), np.arange(steps)))
+    return scale * math.sqrt(gain @ rho**lag @ gain)
+
+
+def driven_windows(process: DisturbanceProcess, count: int, seed: int = 1, offset: float = 0.0) -> DriveWindows:
+    """Return windows of the decaying car with a disturbance, computed by NumPy in double precision."""
+    rng = np.random.default_rng(seed)
+    rho = np.exp(-PERIOD_S / np.array(process.correlation_s))
+    scale = np.array(process.scale)
+    if not math.isinf(process.dof):
+        scale = scale * np.sqrt(process.dof / rng.chisquare(process.dof, (count, 1)))
+    velocity = rng.normal(size=(count, 3)) * [1.0, 0.2, 0.5]
+    start, unit = velocity.copy(), rng.normal(size=(count, 3))
+    pose, motion = np.zeros((count, 3)), []
+    for _ in range(STEPS):
+        moved = velocity * PERIOD_S + 0.5 * PERIOD_S**2 * scale * unit
+        sin, cos = np.sin(pose[:, 2]), np.cos(pose[:, 2])
+        pose = pose + np.column_stack([cos * moved[:, 0] - sin * moved[:, 1],
+                                       sin * moved[:, 0] + cos * moved[:, 1], moved[:, 2]])  # fmt: skip
+        velocity = (1.0 - DECAY) * velocity + PERIOD_S * scale * unit + [offset, 0.0, 0.0]
+        unit = rho * unit + np.sqrt(1.0 - rho**2) * rng.normal(size=(count, 3))
+        motion.append(np.hstack([pose, velocity]))
+    none = torch.zeros((count, 0, 2))
+    motions = torch.from_numpy(np.stack(motion, axis=1)).float()
+    return DriveWindows(torch.from_numpy(start).float(), none, torch.zeros((count, STEPS, 2)), motions, PERIOD_S)
+
+
+def sampled(model: DisturbedCar | CarDynamics, count: int, steps: int = STEPS) -> Tensor:
+    """Return states (count, 6) after rollouts from rest."""
+    generator = torch.Generator().manual_seed(0)
+    features = encode(torch.zeros(count, 6), torch.zeros(count, 0, 2))
+    rollouts = start_rollouts(model, count, generator)
+    for _ in range(steps):
+        features = rollouts.step(features, torch.zeros(count, 2), generator)
+    states: Tensor = decode_state(features)
+    return states
+
+
+@pytest.mark.parametrize("correlation_s", [0.05, 0.4, 100.0])
+def test_sampled_velocity_has_the_closed_form_variance(correlation_s: float) -> None:
+    process = DisturbanceProcess((1.0, 0.5, 2.0), (correlation_s,) * 3, PERIOD_S)
+    states = sampled(DisturbedCar(decaying_car(torch.zeros(4)), process), 8000)
+    for channel, scale in enumerate(process.scale):
+        expected = vx_std(scale, correlation_s, STEPS)
+        if channel < 2:  # The yaw turns the body axes, but a car at rest has small velocities.
+            assert float(states[:, 3 + channel].std()) == pytest.approx(expected, rel=0.05)
+    assert float(states[:, 5].std()) == pytest.approx(vx_std(2.0, correlation_s, STEPS), rel=0.05)
+
+
+def test_independent_steps_are_overconfident_by_the_closed_form_factor() -> None:
+    """The same variance in one step, redrawn in each step, has less variance after a second."""
+    correlated, redrawn = (
+        float(
+            sampled(
+                DisturbedCar(decaying_car(torch.zeros(4)), DisturbanceProcess((1.0,) * 3, (t,) * 3, PERIOD_S)), 8000
+            )[:, 3].std()
+        )
+        for t in (0.8, 1e-3)
+    )
+    expected = vx_std(1.0, 0.8, STEPS) / vx_std(1.0, 1e-3, STEPS)
+    assert expected > 2.5
+    assert correlated / redrawn == pytest.approx(expected, rel=0.06)
+
+
+def test_each_rollout_keeps_its_particle() -> None:
+    """vx drifts by the offset of one particle: after 30 steps, rollouts have as many values as particles."""
+    offsets = torch.tensor([-0.1, 0.0, 0.1])
+    quiet = DisturbanceProcess((1e-9,) * 3, (1.0,) * 3, PERIOD_S)
+    vx = sampled(DisturbedCar(decaying_car(offsets, 1e-9), quiet), 300)[:, 3]
+    total = (1.0 - (1.0 - DECAY) ** STEPS) / DECAY
+    nearest = (vx[:, None] - offsets * total).abs()
+    assert float(nearest.min(dim=1).values.max()) < 1e-4
+    assert torch.bincount(nearest.argmin(dim=1)).min() >= 99
+    stepwise = sampled(decaying_car(offsets, 1e-9), 300)[:, 3]
+    assert float(stepwise.std()) < 0.4 * float(vx.std()), "with steps of random particles the offsets average out"
+
+
+def test_fit_recovers_scale_and_correlation_time() -> None:
+    truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.4,) * 3, PERIOD_S)
+    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 400)))
+    assert found.dof >= 10.0, "the planted disturbance is Gaussian"
+    np.testing.assert_allclose(found.scale, truth.scale, rtol=0.25)
+    assert set(found.correlation_s) <= {0.2, 0.4, 0.8}
+
+
+def test_fitted_bands_cover_new_windows_at_their_nominal_level() -> None:
+    """Sampled bands of 90 % cover 90 % after 0.5 and 1 s; the closed form gives the level of step noise alone."""
+    truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.8,) * 3, PERIOD_S)
+    car = decaying_car(torch.zeros(2))
+    process = fit_disturbance(rollout_errors(car, driven_windows(truth, 300)))
+    new = driven_windows(truth, 2000, seed=2)
+    for steps in (15, 30):
+        undisturbed = (1.0 - DECAY) ** steps * new.velocities[:, 0]
+        error = (new.motion[:, steps - 1, 3] - undisturbed).abs()
+        band = float(sampled(DisturbedCar(car, process), 8000, steps)[:, 3].abs().quantile(0.9))
+        assert float((error < band).float().mean()) == pytest.approx(0.9, abs=0.03)
+        # A model that redraws the same variance in each step has the coverage of a smaller standard deviation.
+        ratio = vx_std(0.8, 1e-3, steps) / vx_std(0.8, 0.8, steps)
+        redrawn_band = norm.ppf(0.95) * vx_std(0.8, 1e-3, steps)
+        expected = 2.0 * norm.cdf(norm.ppf(0.95) * ratio) - 1.0
+        assert float((error < redrawn_band).float().mean()) == pytest.approx(expected, abs=0.04)
+        assert expected < 0.65
+
+
+def test_fit_finds_heavy_tails() -> None:
+    truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.4,) * 3, PERIOD_S, dof=3.0)
+    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 400)))
+    assert found.dof <= 6.0
+    np.testing.assert_allclose(found.scale, truth.scale, rtol=0.35)
+
+
+def test_spread_of_the_particles_is_not_counted_as_disturbance() -> None:
+    """Errors as large as the particles' spread need no disturbance; the same errors of equal particles do."""
+    quiet = DisturbanceProcess((1e-6,) * 3, (1.0,) * 3, PERIOD_S)
+    parts = [driven_windows(quiet, 40, seed=k, offset=o) for k, o in enumerate((-0.02, -0.005, 0.005, 0.02))]
+    spread, equal = (
+        fit_disturbance(pooled([rollout_errors(decaying_car(offsets), part) for part in parts]))
+        for offsets in (torch.tensor([-0.02, -0.007, 0.007, 0.02]), torch.zeros(4))
+    )
+    assert equal.scale[0] > 0.2
+    assert spread.scale[0] < 0.25 * equal.scale[0]
+
+
+def test_few_or_infinite_errors_are_refused() -> None:
+    windows = driven_windows(DisturbanceProcess((1.0,) * 3, (1.0,) * 3, PERIOD_S), 10)
+    errors = rollout_errors(decaying_car(torch.zeros(2)), windows.take(torch.arange(1)))
+    with pytest.raises(DataError, match="record a longer drive"):
+        fit_disturbance(errors)
+
+
+def test_error_far_beyond_the_bounds_gives_the_largest_scale() -> None:
+    windows = driven_windows(DisturbanceProcess((1e4,) * 3, (1.0,) * 3, PERIOD_S), 20)
+    assert max(fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), windows)).scale) <= MAX_SCALE
+
+
+@pytest.mark.parametrize("count", [1, 6, 7])
+def test_restarted_rollouts_have_free_slots_and_others_keep_theirs(count: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    assignment = Assignment.random(count, 3, generator, spare=1)
+    found = set()
+    for _ in range(60):
+        after = assignment.reassigned(torch.tensor([0]), 3, generator)
+        assert torch.equal(after.slot[1:], assignment.slot[1:])
+        assert len(set(after.slot.tolist())) == count
+        found.add(int(after.slot[0]))
+        assignment = after
+    assert len(found) > 1
+
+
+def test_rows_are_assigned_to_the_given_particles() -> None:
+    particle = torch.tensor([2, 0, 2, 1, 2, 0])
+    assignment = Assignment.of_particles(particle, 4)
+    assert torch.equal(assignment.slot // assignment.share, particle)
+    assert len(set(assignment.slot.tolist())) == len(particle)
