@@ -33,6 +33,10 @@ class Bench(BenchOptions):
             from carlab.cli.bench_realcars import run_realcars
 
             return run_realcars(self)
+        if self.what == "rollouts":
+            from carlab.cli.bench_rollouts import run_rollouts
+
+            return run_rollouts(self)
         if self.what == "priors":
             from carlab.cli.bench_priors import run_priors
 

@@ -16,17 +16,18 @@ from carlab.core.errors import ConfigError
 class BenchOptions:
     """Options of all uses of ``carlab bench``."""
 
-    what: Positional[Literal["speed", "regression", "priors", "parking", "realcars"]] = "speed"
+    what: Positional[Literal["speed", "regression", "priors", "parking", "realcars", "rollouts"]] = "speed"
     """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios within one run.
     regression: Sim-FSVGD and its baselines on the cases of the paper. priors: Sim-FSVGD without a prior and with the
     kinematic, the nominal and the diagnosed prior, on a simulated car with two concealed effects or on the recordings
     in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are continued.
     realcars: prediction errors on held-out drives of a real car in --data, for constant velocity, the car file, refit,
-    diagnosis, measured curves, a learned discrepancy, a black box and adaptation."""
+    diagnosis, measured curves, a learned discrepancy, a black box and adaptation. rollouts: coverage and error of the
+    rollouts of a learned car on the last recording in --data, with and without a disturbance."""
 
     out: Path | None = None
-    """Write the figures to FILE.json (regression and priors after each fit). All but speed also draw FILE.png; priors
-    stores its recordings and the diagnosis in the folder FILE."""
+    """Write the figures to FILE.json (regression, priors and rollouts after each fit). regression, priors and parking
+    also draw FILE.png; priors stores its recordings and the diagnosis in the folder FILE."""
 
     seconds: float = 10.0
     """speed: length of each condition of the sender's measurement [s]."""
@@ -38,7 +39,8 @@ class BenchOptions:
     recordings in the folder --data, the last one held out."""
 
     rows: tuple[int, ...] = ()
-    """regression and priors: numbers of training rows; by default those of the paper's figure."""
+    """regression, priors and rollouts: numbers of training rows; by default those of the paper's figure, or 200 and
+    800 (rollouts)."""
 
     seeds: int = 3
     """Repetitions of each fit: with other true systems, other rows of a recording, or (parking) other runs."""
@@ -53,7 +55,7 @@ class BenchOptions:
 
     data: Path | None = None
     """regression: folder with the authors' arrays (pendulum_seed0_n5.npz and so on); by default rows are generated.
-    realcar and priors: folder with recordings, the last one held out. realcars: folder with recordings."""
+    realcar, priors and rollouts: folder with recordings, the last one held out. realcars: folder with recordings."""
 
     held_out: tuple[str, ...] = ()
     """realcars: parts of the names of the held-out recordings; by default the last recording."""
@@ -65,11 +67,12 @@ class BenchOptions:
     """realcars: restrict the search to these effects of the catalogue."""
 
     car: Path = Path("eth_rc_car")
-    """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. priors with
-    --data, and realcars: car file of the nominal simulator, which is diagnosed."""
+    """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. rollouts: the
+    same. priors with --data, and realcars: car file of the nominal simulator, which is diagnosed."""
 
     history: int | None = None
-    """realcar and priors: number of past commands; by default estimated from the recordings (the paper has 3)."""
+    """realcar, priors and rollouts: number of past commands; by default estimated from the recordings (the paper has
+    3)."""
 
     diagnosed: Path | None = None
     """priors: model.toml of a diagnosis without the last recording; by default the study runs the diagnosis."""
@@ -90,8 +93,8 @@ class BenchOptions:
     """parking: gradient steps of SAC before an episode, as for carlab learn."""
 
     steps: int | None = None
-    """Steps of the model's optimiser. By default 12 000 for regression and priors, 2500 for parking, or those of the
-    authors' code."""
+    """Steps of the model's optimiser. By default 12 000 for regression, priors and rollouts, 2500 for parking, or those
+    of the authors' code."""
 
     device: Literal["cpu", "cuda"] = "cpu"
     """Device of the models. speed: of the learning benchmarks only; the others run on the CPU."""
@@ -120,29 +123,30 @@ PRIORS = Place("'bench priors'", lambda given: given.what == "priors")
 READ = Place("'bench priors --data FOLDER'", lambda given: PRIORS.holds(given) and given.data is not None)
 CONCEALED = Place("'bench priors' without --data", lambda given: PRIORS.holds(given) and given.data is None)
 PARKING = Place("'bench parking'", lambda given: given.what == "parking")
+ROLLOUTS = Place("'bench rollouts'", lambda given: given.what == "rollouts")
 REALCARS = Place("'bench realcars'", lambda given: given.what == "realcars")
 
 EVERYWHERE = frozenset({"what", "out", "device", "verbose"})
 PLACES = {
     "seconds": (SPEED,),
     "case": (REGRESSION,),
-    "rows": (REGRESSION, PRIORS),
-    "seeds": (REGRESSION, PRIORS, PARKING),
+    "rows": (REGRESSION, PRIORS, ROLLOUTS),
+    "seeds": (REGRESSION, PRIORS, PARKING, ROLLOUTS),
     "methods": (REGRESSION, PARKING),
     "way": (REGRESSION,),
-    "data": (REGRESSION, PRIORS, REALCARS),
+    "data": (REGRESSION, PRIORS, REALCARS, ROLLOUTS),
     "held_out": (REALCARS,),
     "effects": (REALCARS,),
     "fit": (REALCARS,),
-    "car": (REALCAR, READ, REALCARS),
-    "history": (REALCAR, PRIORS),
+    "car": (REALCAR, READ, REALCARS, ROLLOUTS),
+    "history": (REALCAR, PRIORS, ROLLOUTS),
     "diagnosed": (PRIORS,),
     "pair": (CONCEALED,),
     "recorded_s": (CONCEALED,),
     "runs": (PARKING,),
     "episodes": (PARKING,),
     "updates": (PARKING,),
-    "steps": (REGRESSION, PRIORS, PARKING),
+    "steps": (REGRESSION, PRIORS, PARKING, ROLLOUTS),
 }
 """Uses in which an option has an effect, for options without an effect in all uses."""
 

@@ -116,7 +116,8 @@ def drive_windows(windows: PredictionWindows, history: int) -> DriveWindows:
     motion[..., 0], motion[..., 1] = cos * dx + sin * dy, cos * dy - sin * dx
     motion[..., 2] -= start[..., 2]
     arrays = (windows.initial_states[:, 3:], past_commands(windows, history), windows.commands, motion)
-    return DriveWindows(*(torch.from_numpy(np.ascontiguousarray(a)).float() for a in arrays), period_s=windows.period_s)
+    velocities, past, commands, motions = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in arrays)
+    return DriveWindows(velocities, past, commands, motions, windows.period_s)
 
 
 __all__ = ["N_SAMPLES", "LearnedModel", "drive_windows", "past_commands", "sample_paths"]

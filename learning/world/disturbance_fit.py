@@ -70,8 +70,10 @@ class DriveWindows:
 
     def take(self, rows: Tensor) -> DriveWindows:
         """Some of the windows, by index."""
-        parts = (v[rows] for v in (self.velocities, self.past_commands, self.commands, self.motion))
-        return DriveWindows(*parts, period_s=self.period_s)
+        velocities, past, commands, motion = (
+            v[rows] for v in (self.velocities, self.past_commands, self.commands, self.motion)
+        )
+        return DriveWindows(velocities, past, commands, motion, self.period_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +113,16 @@ def rollout_errors(car: CarDynamics, windows: DriveWindows) -> RolloutErrors:
     error = paths.mean(dim=0) - windows.motion[:, at].to(paths)
     variance = paths.var(dim=0) + noise_variance
     pulses = _pulse_responses(car, windows)[:, at]
-    return RolloutErrors(*(v.flatten(0, 1).double() for v in (error, variance, pulses)), period_s=windows.period_s)
+    error, variance, pulses = (v.flatten(0, 1).double() for v in (error, variance, pulses))
+    return RolloutErrors(error, variance, pulses, windows.period_s)
 
 
 def pooled(parts: Sequence[RolloutErrors]) -> RolloutErrors:
     """Errors of several cars or folds with equal periods and windows of equal length."""
-    columns = (torch.cat([getattr(part, name) for part in parts]) for name in ("error", "variance", "pulses"))
-    return RolloutErrors(*columns, period_s=parts[0].period_s)
+    error, variance, pulses = (
+        torch.cat([getattr(part, name) for part in parts]) for name in ("error", "variance", "pulses")
+    )
+    return RolloutErrors(error, variance, pulses, parts[0].period_s)
 
 
 def _pulse_responses(car: CarDynamics, windows: DriveWindows) -> Tensor:
@@ -172,7 +177,7 @@ def fit_disturbance(errors: RolloutErrors) -> DisturbanceProcess:
     Raises:
         DataError: fewer than ``MIN_WINDOWS`` windows, or errors that are not finite.
     """
-    if len(errors.error) < MIN_WINDOWS or not torch.isfinite(errors.error).all():
+    if len(errors.error) < MIN_WINDOWS * len(HORIZON_SHARES) or not torch.isfinite(errors.error).all():
         raise DataError(
             f"The disturbance needs {MIN_WINDOWS} windows with finite errors; record a longer drive, or predict "
             "without it."

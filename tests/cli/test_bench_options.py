@@ -65,7 +65,7 @@ def test_option_is_accepted_or_refused_as_listed(
         (
             "regression --car mine.toml",
             "--car has no effect in 'bench regression --case 1d'; use it with 'bench regression --case realcar' and "
-            "'bench priors --data FOLDER' and 'bench realcars'.",
+            "'bench priors --data FOLDER' and 'bench realcars' and 'bench rollouts'.",
         ),
         ("speed --held-out b", "--held-out has no effect in 'bench speed'; use it with 'bench realcars'."),
         (

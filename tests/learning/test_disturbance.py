@@ -103,14 +103,9 @@ def test_sampled_velocity_has_the_closed_form_variance(correlation_s: float) -> 
 
 def test_independent_steps_are_overconfident_by_the_closed_form_factor() -> None:
     """The same variance in one step, redrawn in each step, has less variance after a second."""
-    correlated, redrawn = (
-        float(
-            sampled(
-                DisturbedCar(decaying_car(torch.zeros(4)), DisturbanceProcess((1.0,) * 3, (t,) * 3, PERIOD_S)), 8000
-            )[:, 3].std()
-        )
-        for t in (0.8, 1e-3)
-    )
+    car = decaying_car(torch.zeros(4))
+    processes = [DisturbanceProcess((1.0,) * 3, (t,) * 3, PERIOD_S) for t in (0.8, 1e-3)]
+    correlated, redrawn = (float(sampled(DisturbedCar(car, p), 8000)[:, 3].std()) for p in processes)
     expected = vx_std(1.0, 0.8, STEPS) / vx_std(1.0, 1e-3, STEPS)
     assert expected > 2.5
     assert correlated / redrawn == pytest.approx(expected, rel=0.06)
@@ -131,7 +126,7 @@ def test_each_rollout_keeps_its_particle() -> None:
 
 def test_fit_recovers_scale_and_correlation_time() -> None:
     truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.4,) * 3, PERIOD_S)
-    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 400)))
+    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 250)))
     assert found.dof >= 10.0, "the planted disturbance is Gaussian"
     np.testing.assert_allclose(found.scale, truth.scale, rtol=0.25)
     assert set(found.correlation_s) <= {0.2, 0.4, 0.8}
@@ -141,7 +136,7 @@ def test_fitted_bands_cover_new_windows_at_their_nominal_level() -> None:
     """Sampled bands of 90 % cover 90 % after 0.5 and 1 s; the closed form gives the level of step noise alone."""
     truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.8,) * 3, PERIOD_S)
     car = decaying_car(torch.zeros(2))
-    process = fit_disturbance(rollout_errors(car, driven_windows(truth, 300)))
+    process = fit_disturbance(rollout_errors(car, driven_windows(truth, 250)))
     new = driven_windows(truth, 2000, seed=2)
     for steps in (15, 30):
         undisturbed = (1.0 - DECAY) ** steps * new.velocities[:, 0]
@@ -158,7 +153,7 @@ def test_fitted_bands_cover_new_windows_at_their_nominal_level() -> None:
 
 def test_fit_finds_heavy_tails() -> None:
     truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.4,) * 3, PERIOD_S, dof=3.0)
-    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 400)))
+    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 250)))
     assert found.dof <= 6.0
     np.testing.assert_allclose(found.scale, truth.scale, rtol=0.35)
 
@@ -166,7 +161,7 @@ def test_fit_finds_heavy_tails() -> None:
 def test_spread_of_the_particles_is_not_counted_as_disturbance() -> None:
     """Errors as large as the particles' spread need no disturbance; the same errors of equal particles do."""
     quiet = DisturbanceProcess((1e-6,) * 3, (1.0,) * 3, PERIOD_S)
-    parts = [driven_windows(quiet, 40, seed=k, offset=o) for k, o in enumerate((-0.02, -0.005, 0.005, 0.02))]
+    parts = [driven_windows(quiet, 20, seed=k, offset=o) for k, o in enumerate((-0.02, -0.005, 0.005, 0.02))]
     spread, equal = (
         fit_disturbance(pooled([rollout_errors(decaying_car(offsets), part) for part in parts]))
         for offsets in (torch.tensor([-0.02, -0.007, 0.007, 0.02]), torch.zeros(4))
@@ -177,14 +172,14 @@ def test_spread_of_the_particles_is_not_counted_as_disturbance() -> None:
 
 def test_few_or_infinite_errors_are_refused() -> None:
     windows = driven_windows(DisturbanceProcess((1.0,) * 3, (1.0,) * 3, PERIOD_S), 10)
-    errors = rollout_errors(decaying_car(torch.zeros(2)), windows.take(torch.arange(1)))
+    errors = rollout_errors(decaying_car(torch.zeros(2)), windows.take(torch.arange(7)))
     with pytest.raises(DataError, match="record a longer drive"):
         fit_disturbance(errors)
 
 
 def test_error_far_beyond_the_bounds_gives_the_largest_scale() -> None:
-    windows = driven_windows(DisturbanceProcess((1e4,) * 3, (1.0,) * 3, PERIOD_S), 20)
-    assert max(fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), windows)).scale) <= MAX_SCALE
+    windows = driven_windows(DisturbanceProcess((1e4,) * 3, (1.0,) * 3, PERIOD_S), 10)
+    assert max(fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), windows)).scale) <= 1.001 * MAX_SCALE
 
 
 @pytest.mark.parametrize("count", [1, 6, 7])

@@ -1,0 +1,214 @@
+"""Calibration of predicted rollouts of a learned car on a held-out recording.
+
+Each car is fitted to a number of random rows of the recordings to fit. Its disturbance is estimated from the errors
+over windows of blocks that the car was not fitted to (cross-validation). Two kinds of rollouts are compared: steps with
+independent particles and noise, and one particle with a disturbance for each rollout.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.initial_states import as_recorded
+from carlab.prediction.learned import LearnedModel, drive_windows
+from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.studies.regression.cases import Data
+from carlab.studies.regression.methods import FitTask
+from carlab.studies.regression.recordings import RecordedCase
+from learning.evaluation import negative_log_likelihood
+from learning.transitions import Transitions
+from learning.world.car_dynamics import CarDynamics
+from learning.world.disturbance import DisturbedCar, RolloutModel
+from learning.world.disturbance_fit import MAX_WINDOWS, RolloutErrors, fit_disturbance, pooled, rollout_errors
+
+COUNTS = (200, 800)
+HORIZONS_S = (0.3, 0.5, 1.0)
+STRIDE_S = 0.2
+N_FOLDS, BLOCK_S = 3, 20.0
+"""Folds of the cross-validation, and length of the blocks that are assigned to them in turn [s]."""
+N_SAMPLES = 200
+LEVEL = 0.9
+"""Nominal coverage of the bands."""
+INDEPENDENT, DISTURBED = "independent steps", "one particle, disturbance"
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutScore:
+    """Errors and coverage of one model after one horizon.
+
+    Attributes:
+        model: kind of rollouts.
+        rows, seed: rows of the fit, and the seed of rows, fit and samples.
+        horizon_s: horizon [s].
+        coverage: share of windows within the nominal 90 % band, for x ahead, y left, yaw, vx, vy and yaw rate.
+        band: mean width of the bands in the same order [m, m, rad, m/s, m/s, rad/s].
+        position_rms_m: root mean square distance of the mean of the paths [m].
+        yaw_rms_rad: root mean square error of its yaw [rad].
+        energy_m: mean energy score of the position (Gneiting and Raftery 2007, section 4.3) [m]; less is better.
+        nll: negative log-likelihood of the one-step predictions [nat per step].
+        windows: number of windows.
+    """
+
+    model: str
+    rows: int
+    seed: int
+    horizon_s: float
+    coverage: tuple[float, ...]
+    band: tuple[float, ...]
+    position_rms_m: float
+    yaw_rms_rad: float
+    energy_m: float
+    nll: float
+    windows: int
+
+
+def run_rollout_study(
+    case: RecordedCase,
+    recordings: Sequence[Sequence[EpisodeData]],
+    *,
+    rows: Sequence[int] = (),
+    seeds: int = 3,
+    steps: int | None = None,
+    device: str = "cpu",
+    progress: Progress = lambda what, done, total: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[RolloutScore]:
+    """Fit cars and their disturbances, and yield the scores of the held-out recording.
+
+    Args:
+        case: rows of the recordings, the last one held out.
+        recordings: the recordings of the case.
+        rows: numbers of rows of a fit; by default ``COUNTS``.
+        seeds: number of repetitions.
+        steps: of the particles' optimiser; by default those of the regression study.
+        device: of the fits; rollouts are sampled on the CPU.
+        progress: called before each fit.
+        stop: if it returns true before a fit, the study ends.
+
+    Raises:
+        DataError: too few rows, or a recording without a window in which the car moves.
+    """
+    assert case.rows is not None
+    assert case.held_out is not None
+    counts = tuple(rows) or COUNTS
+    fold_of_row = folds(case.rows.episode, case.rows.tick * _period_s(recordings))
+    smallest = min(int((fold_of_row != fold).sum()) for fold in range(N_FOLDS))
+    if max(counts) > smallest:
+        raise DataError(f"The folds have {smallest} rows, not {max(counts)}; give fewer with --rows.")
+    fitted = [episode for recording in recordings[:-1] for episode in recording]
+    fit_windows, held_out = recorded_windows(fitted), recorded_windows(recordings[-1])
+    total = len(counts) * seeds * (N_FOLDS + 1)
+    for done, (count, seed) in enumerate(itertools.product(counts, range(seeds))):
+        errors: list[RolloutErrors] = []
+        for fold in range(N_FOLDS):
+            if stop():
+                return
+            progress(f"{count} rows, seed {seed}, fold {fold + 1}", done * (N_FOLDS + 1) + fold, total)
+            car = fit_rows(case, case.rows.take(fold_of_row != fold), count, seed, steps, device)
+            errors.append(fold_errors(car, fit_windows, fold))
+        progress(f"{count} rows, seed {seed}", done * (N_FOLDS + 1) + N_FOLDS, total)
+        car = fit_rows(case, case.rows, count, seed, steps, device)
+        process = fit_disturbance(pooled(errors))
+        nll = _one_step_nll(car, case.held_out)
+        models: dict[str, RolloutModel] = {INDEPENDENT: car, DISTURBED: DisturbedCar(car, process)}
+        for name, model in models.items():
+            yield from scores_of(name, model, held_out, count, seed, nll)
+    progress("", total, total)
+
+
+def fit_rows(
+    case: RecordedCase, rows: Transitions, count: int, seed: int, steps: int | None = None, device: str = "cpu"
+) -> CarDynamics:
+    """Fit Sim-FSVGD of the regression study to ``count`` random rows; the car is on the CPU."""
+    chosen = rows.take(np.random.default_rng(seed).choice(len(rows), count, replace=False))
+    inputs, outputs = (torch.from_numpy(v).float().to(device) for v in (chosen.inputs, chosen.targets))
+    task = FitTask(case, Data(inputs, outputs, inputs, outputs), seed, "ours", steps)
+    size = case.prior_discrepancy_for(count)
+    return CarDynamics(task.distilled(case.prior, outputs, size).posterior.to("cpu"), rows.history)
+
+
+def folds(recording: np.ndarray, t_s: FloatArray) -> np.ndarray:
+    """Fold (n,) of moments (n,) in recordings (n,): blocks of ``BLOCK_S`` in turn."""
+    return np.asarray((t_s // BLOCK_S).astype(np.int64) + recording) % N_FOLDS
+
+
+def fold_errors(car: CarDynamics, windows: PredictionWindows, fold: int) -> RolloutErrors:
+    """Errors of a car over the windows that lie within the blocks of one fold."""
+    first, last = (folds(windows.recording, windows.t0_s + dt) for dt in (0.0, windows.horizon_s))
+    chosen = windows.take((first == fold) & (last == fold)).thinned(MAX_WINDOWS)
+    return rollout_errors(car, drive_windows(chosen, car.history))
+
+
+def recorded_windows(recording: Sequence[EpisodeData]) -> PredictionWindows:
+    """Windows of the longest horizon with initial states as recorded: a one-step model is fitted to these."""
+    return as_recorded(cut_windows(tracks_of(recording), max(HORIZONS_S), STRIDE_S))
+
+
+def scores_of(
+    name: str, model: RolloutModel, windows: PredictionWindows, count: int, seed: int, nll: float
+) -> Iterator[RolloutScore]:
+    """Scores of a model on windows, by horizon."""
+    paths = LearnedModel(model, N_SAMPLES, seed).sample(windows)
+    errors = prediction_errors(np.moveaxis(paths, 2, 0), windows)
+    for horizon_s in HORIZONS_S:
+        at = errors[:, :, round(horizon_s / windows.period_s)]
+        low, high = np.quantile(at, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], axis=0)
+        mean = at.mean(axis=0)
+        yield RolloutScore(
+            name, count, seed, horizon_s,
+            tuple(((low <= 0) & (high >= 0)).mean(axis=0).tolist()),
+            tuple((high - low).mean(axis=0).tolist()),
+            float(np.sqrt(np.mean(mean[:, 0] ** 2 + mean[:, 1] ** 2))),
+            float(np.sqrt(np.mean(mean[:, 2] ** 2))),
+            energy_score(at[..., :2]),
+            nll,
+            len(windows),
+        )  # fmt: skip
+
+
+def energy_score(errors: FloatArray) -> float:
+    """Mean energy score of samples (M, S, d) of predicted minus measured values (Gneiting and Raftery 2007)."""
+    half = len(errors) // 2
+    distance = np.linalg.norm(errors, axis=-1).mean()
+    spread = np.linalg.norm(errors[:half] - errors[half : 2 * half], axis=-1).mean()
+    return float(distance - 0.5 * spread)
+
+
+def as_json(scores: Sequence[RolloutScore], command: str) -> dict[str, Any]:
+    """The scores with the command, for a file."""
+    return {"schema": "carlab.rollouts/1", "command": command, "level": LEVEL, "scores": [asdict(s) for s in scores]}
+
+
+def _one_step_nll(car: CarDynamics, rows: Transitions) -> float:
+    inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
+    return negative_log_likelihood(car.predict(inputs).smoothed(), outputs)
+
+
+def _period_s(recordings: Sequence[Sequence[EpisodeData]]) -> float:
+    return recordings[0][0].period_s
+
+
+__all__ = [
+    "DISTURBED",
+    "INDEPENDENT",
+    "RolloutScore",
+    "as_json",
+    "energy_score",
+    "fit_rows",
+    "fold_errors",
+    "folds",
+    "recorded_windows",
+    "run_rollout_study",
+    "scores_of",
+]

@@ -1,0 +1,116 @@
+"""Rollout study: scores against closed forms, and the command on drives of a simulated car with a linear model."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import carlab.studies.rollouts as study
+from carlab.cli import run
+from carlab.core.episode_data import EpisodeData
+from carlab.studies.rollouts import DISTURBED, INDEPENDENT, energy_score, folds
+from learning.networks.normaliser import Normaliser
+from learning.networks.particles import Network
+from learning.posterior.particle_posterior import ParticlePosterior
+from learning.transitions import Transitions
+from learning.world.car_dynamics import CarDynamics
+from sim_backends import SimulatorConfig
+from tests.helpers.recorded_drives import drive
+
+
+def linear_car(case: object, rows: Transitions, count: int, seed: int, *others: object) -> CarDynamics:
+    """Fit two equal particles, linear in the inputs, by least squares; it cannot describe a car with tyres."""
+    design = np.hstack([np.ones((len(rows), 1)), rows.inputs])
+    weights = np.linalg.lstsq(design, rows.targets, rcond=None)[0]
+    noise = (rows.targets - design @ weights).std(axis=0)
+    width = rows.inputs.shape[1]
+    network = Network(width, 6, (2,))
+    units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(6), torch.ones(6))
+    trend, noise_std = (torch.from_numpy(v).float() for v in (weights, noise))
+    zeros = torch.zeros(2, network.parameters)
+    clip = torch.full((width,), 100.0)
+    return CarDynamics(ParticlePosterior(network, zeros, noise_std, units, math.inf, trend, None, clip), rows.history)
+
+
+def write_drive(path: Path, episode: EpisodeData) -> None:
+    """Write a recording as CSV."""
+    states, commands = episode.states[:-1], episode.sent
+    table = np.column_stack([episode.times_s[:-1], states, commands])
+    np.savetxt(path, table, "%.6f", ",", header="t,x,y,yaw,vx,vy,yaw_rate,steering,throttle", comments="")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a drive to fit and a held-out drive."""
+    data = tmp_path_factory.mktemp("study") / "data"
+    data.mkdir()
+    for name, seconds, seed in (("a.csv", 120.0, 1), ("b.csv", 60.0, 2)):
+        write_drive(data / name, drive(SimulatorConfig(), seconds, seed))
+    return data
+
+
+def test_study_prints_calibrated_bands_of_a_wrong_model(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Errors of a wrong model last. With redrawn noise its bands are too narrow, with the disturbance they are not."""
+    fitted_rows = []
+
+    def fit(case: object, rows: Transitions, *others: object) -> CarDynamics:
+        fitted_rows.append(len(rows))
+        return linear_car(case, rows, *others)
+
+    monkeypatch.setattr(study, "fit_rows", fit)
+    out = folder.parent / "figures.json"
+    command = ["bench", "rollouts", "--data", str(folder), "--rows", "200", "--seeds", "1", "--history", "3"]
+    assert run([*command, "--car", "rc_car", "--out", str(out)]) == 0
+    assert max(fitted_rows[:3]) < 0.75 * fitted_rows[3], "each fold is held out"
+    scores = json.loads(out.read_text())["scores"]
+    coverage = {(s["model"], s["horizon_s"]): s["coverage"] for s in scores}
+    for horizon_s in (0.5, 1.0):
+        ahead, left = coverage[INDEPENDENT, horizon_s][:2]
+        assert min(ahead, left) < 0.8
+        for covered in coverage[DISTURBED, horizon_s][:2]:
+            assert 0.82 <= covered <= 0.98
+    rms = {s["model"]: s["position_rms_m"] for s in scores if s["horizon_s"] == 1.0}
+    assert rms[DISTURBED] == pytest.approx(rms[INDEPENDENT], rel=0.1)
+    assert f"{rms[DISTURBED]:.3f}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "bench rollouts needs --data FOLDER"),
+        (["--data", "nowhere"], "--data nowhere is not a folder"),
+        (
+            ["--data", "data", "--rows", "100000", "--history", "3", "--car", "rc_car"],
+            "rows, not 100000; give fewer with --rows.",
+        ),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    assert run(["bench", "rollouts", *options]) != 0
+    error = " ".join(capsys.readouterr().err.split())
+    assert message in error
+    assert "Traceback" not in error
+
+
+def test_energy_score_of_a_gaussian_is_the_closed_form() -> None:
+    """In one dimension it is the CRPS (Gneiting and Raftery 2007, equation 21)."""
+    errors = 2.0 * np.random.default_rng(0).normal(size=(4000, 1, 1)) - 1.0  # a forecast of std 2, half a std too low
+    z = 0.5
+    density, below = math.exp(-0.5 * z**2) / math.sqrt(2 * math.pi), 0.5 * (1 + math.erf(z / math.sqrt(2)))
+    crps = 2.0 * (z * (2 * below - 1) + 2 * density - 1 / math.sqrt(math.pi))
+    assert energy_score(errors) == pytest.approx(crps, rel=0.05)
+
+
+def test_folds_are_blocks_of_time_in_turn() -> None:
+    found = folds(np.array([0, 0, 0, 0, 1]), np.array([0.0, 19.9, 20.1, 60.5, 0.0]))
+    assert found.tolist() == [0, 0, 1, 0, 1]
