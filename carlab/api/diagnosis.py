@@ -151,6 +151,7 @@ def diagnose(
     discrepancy: bool = False,
     adapt: bool = False,
     seed: int = 0,
+    budget_s: float = 300.0,
     out: Path | str | None = None,
     progress: Callable[[str, float], None] = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
@@ -171,6 +172,8 @@ def diagnose(
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car since the
             fitted ones; takes up to a minute.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
+        budget_s: time limit without measured curves, networks and adaptation [s]; ``math.inf`` for none. When it ends,
+            the report covers the effects found so far (``report.diagnosis.search``).
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
         stop: once it returns true, the search ends and the report covers the findings so far.
@@ -193,7 +196,7 @@ def diagnose(
     fit = read_material(to_fit, "fit", latency_s)
     validation = read_material(to_validate, "held out", latency_s)
     options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
-    options |= {"discrepancy": discrepancy, "adapt": adapt}
+    options |= {"discrepancy": discrepancy, "adapt": adapt, "budget_s": budget_s}
     report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})
     if out is not None:
         report.save(out)

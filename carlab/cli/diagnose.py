@@ -41,6 +41,10 @@ class Diagnose:
     out: Path = Path("diagnosis")
     """Folder for the report."""
 
+    budget: float = 300.0
+    """Time limit of the diagnosis without measured curves, networks and adaptation [s]; inf for none. When it ends, the
+    report covers the effects found so far, and says so."""
+
     effects: tuple[str, ...] = ()
     """Restrict the search to these effects of the catalogue."""
 
@@ -82,6 +86,7 @@ class Diagnose:
                 ceiling=self.ceiling,
                 discrepancy=self.discrepancy,
                 adapt=self.adapt,
+                budget_s=self.budget,
                 seed=self.seed,
                 out=self.out,
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),

@@ -32,6 +32,7 @@ from carlab.diagnosis.naming import NamingResult, accept_names, describe_unexpla
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
 from carlab.diagnosis.report.exhibits import exhibits_of
+from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, IdentificationSettings
@@ -96,6 +97,7 @@ def diagnose(
     ceiling: bool = False,
     discrepancy: bool = False,
     adapt: bool = False,
+    budget_s: float | None = None,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Outcome:
@@ -117,28 +119,32 @@ def diagnose(
         ceiling: train a black box, and compare with its error.
         discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
+        budget_s: time limit [s]; the search for effects ends in time and its result is reported. Curves, ceiling,
+            discrepancy and adaptation take additional time. Without a limit results are reproducible to the last digit.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
 
     Raises:
         Inconclusive: the recordings do not allow a verdict; the message states why and what to record.
-        ConfigError: the simulator cannot integrate, or the held-out share is out of range.
+        ConfigError: the simulator cannot integrate, or the held-out share or the time limit is out of range.
         DataError: a ceiling or a discrepancy of recordings that are too short for a network.
     """
     share = checked_held_out_share(holdout_share, settings.windows)
     began_s = MonotonicClock().now_s()
+    timer = SearchTimer(budget_s, stop, settings.selection.search_time_share)
     nominal = with_known_latency(nominal, (*fit, *held_out))
     stages = curves, ceiling, discrepancy, adapt
     request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
-    control = RunControl(progress, stop, decisions.append)
+    control = RunControl(progress, stop, decisions.append, timer.ends_search)
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
-    scored, naming = _search_effects(recordings, noise, request, control)
+    scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
     seconds = MonotonicClock().now_s() - began_s
     exhibits = replace(outcome.exhibits, decisions=tuple(decisions))
-    return replace(outcome, diagnosis=replace(outcome.diagnosis, seconds=seconds), exhibits=exhibits)
+    diagnosis = replace(outcome.diagnosis, seconds=seconds, search=timer.extent())
+    return replace(outcome, diagnosis=diagnosis, exhibits=exhibits)
 
 
 def _prepare_recordings(

@@ -247,6 +247,21 @@ class RecordingUse:
 
 
 @dataclass(frozen=True, slots=True)
+class SearchExtent:
+    """How far the search for effects went.
+
+    Attributes:
+        is_complete: whether it ended by itself.
+        stopped_by: "budget" or "user" if it was cut short; else empty.
+        budget_s: time limit [s]; None without one.
+    """
+
+    is_complete: bool = True
+    stopped_by: str = ""
+    budget_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Diagnosis:
     """Result of a diagnosis.
 
@@ -271,6 +286,7 @@ class Diagnosis:
     ceiling: Ceiling | None = None
     skill: tuple[Skill, ...] = ()
     drift: tuple[Drift, ...] = ()
+    search: SearchExtent = field(default_factory=SearchExtent)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
@@ -300,6 +316,7 @@ class Diagnosis:
             "ceiling": None if self.ceiling is None else asdict(self.ceiling),
             "skill": [asdict(s) for s in self.skill],
             "drift": [_drift_table(d) for d in self.drift],
+            "search": asdict(self.search),
             "data_faults": [asdict(f) for f in self.data_faults],
             "recordings": [asdict(r) for r in self.recordings],
             "seed": self.seed,

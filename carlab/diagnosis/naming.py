@@ -21,6 +21,7 @@ from carlab.diagnosis.selection.rival_physics import RivalPhysics, additional_ph
 from carlab.diagnosis.selection.search import restrict
 from carlab.diagnosis.unexplained.description import ResidualModel, describe, fit_residual_terms, start_features
 from carlab.diagnosis.unexplained.vibration import Vibration
+from carlab.diagnosis.weak_effects import without_weak_effects
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -51,6 +52,7 @@ def accept_names(
     problem: SearchProblem, found: SearchResult, held_out: HeldOut, vibration: Vibration | None, control: RunControl
 ) -> NamingResult:
     """Withdraw spurious effects, and model the residual."""
+    found = without_weak_effects(problem, found, held_out, control)
     names = found.effects
     rival = replacing_physics(problem, found, control)
     if rival is not None:

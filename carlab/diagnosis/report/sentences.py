@@ -174,9 +174,20 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "unexplained": _unexplained,
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
-    return (
-        f"{worse_than_constant_velocity(diagnosis)}{made(diagnosis)}{_with_curves(diagnosis)}{_with_drift(diagnosis)}"
-    )
+    tails = _with_curves(diagnosis), _with_drift(diagnosis), _with_search(diagnosis)
+    return f"{worse_than_constant_velocity(diagnosis)}{made(diagnosis)}{''.join(tails)}"
+
+
+def _with_search(diagnosis: Diagnosis) -> str:
+    """That the search was cut short, and the remedy; empty after a complete search."""
+    if diagnosis.search.is_complete:
+        return ""
+    limit_s = diagnosis.search.budget_s
+    if diagnosis.search.stopped_by == "budget" and limit_s is not None:
+        why = f"was cut short by the time limit of {with_unit(limit_s, 's')}"
+    else:
+        why = "was stopped by the user"
+    return f" The search for effects {why}, so it may have missed some. With --budget inf it runs to its end."
 
 
 def _with_drift(diagnosis: Diagnosis) -> str:

@@ -28,7 +28,7 @@ def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -
     done, steps = len(model.effects), problem.settings.selection.max_effects
     for k, result in enumerate(chosen):
         control.progress(f"refitting with {result.effect}", (done + 0.5 * k / len(chosen)) / steps)
-        if control.stop():
+        if control.ends_search():
             break
         refitted.append(refit_candidate(problem, model, result))
     refitted.sort(key=lambda c: -c.gain)
@@ -61,7 +61,7 @@ def _tested(
     reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_unseen_error)
     found = []
     for k, candidate in enumerate(refitted):
-        if control.stop() or (candidate.gain < settings.min_gain_share * refitted[0].gain and k >= 2):
+        if control.ends_search() or (candidate.gain < settings.min_gain_share * refitted[0].gain and k >= 2):
             found.append(candidate)
             continue
         share = (len(model.effects) + 0.7) / settings.max_effects

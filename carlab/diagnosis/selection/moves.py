@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Model:
     """Remove earlier effects that are no longer significant, and swap those with a better confusable effect."""
-    if len(model.effects) < 2 or control.stop():
+    if len(model.effects) < 2 or control.ends_search():
         return model
     fitter = problem.fitter(model.scale)
     for name in model.effects[:-1]:
@@ -43,7 +43,7 @@ def _swap(problem: SearchProblem, model: Model, reduced: Model, name: str, contr
     screen = Screen(fitter, problem.config_with(reduced.effects), reduced.fit, screening.max_windows, screening)
     gain = reduced.fit.cost - model.fit.cost
     for other in problem.confusable.get(name, ()):
-        if control.stop() or other in model.effects or not problem.is_candidate(other):
+        if control.ends_search() or other in model.effects or not problem.is_candidate(other):
             continue
         screened = screen.score(other, effect_parameters(other, problem.nominal))
         if screened.score < settings.swap_score_share * gain:

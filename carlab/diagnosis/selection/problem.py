@@ -167,11 +167,14 @@ class RunControl:
     progress    called with the activity and the completed share in [0, 1]
     stop        called between fits; if it returns true, a stage ends with its present result
     record      called with each decision about an effect
+    ends_search called between fits of the search; if it returns true, no further effect is added, but all checks of the
+                accepted effects follow
     """
 
     progress: Callable[[str, float], None] = lambda activity, share: None
     stop: Callable[[], bool] = lambda: False
     record: Callable[[Decision], None] = lambda decision: None
+    ends_search: Callable[[], bool] = lambda: False
 
 
 def is_applicable(config: SimulatorConfig, effect: str) -> bool:

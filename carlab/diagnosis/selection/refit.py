@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, FitParameter, Scale
+from carlab.diagnosis.identification.fit import Fit, FitParameter, Fitter, Scale
 from carlab.diagnosis.selection.problem import Candidate, Model, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult
 from carlab.prediction.errors import prediction_errors
@@ -24,14 +24,18 @@ def refit(problem: SearchProblem, effects: tuple[str, ...], initial: Fit, scale:
 
 
 def refit_candidate(problem: SearchProblem, model: Model, screened: ScreeningResult) -> Candidate:
-    """Fit the candidate together with ``model``, from the initial points of its screening."""
+    """Fit the candidate together with ``model``, from the initial points of its screening.
+
+    The initial points are compared after a few iterations on part of the windows.
+    """
     fitter = problem.fitter(model.scale)
     effects = (*model.effects, screened.effect)
     config, free = problem.config_with(effects), problem.free_parameters(effects)
     starts = [np.concatenate([model.fit.z, s]) for s in screened.starts]
     if len(starts) > 1:
-        iterations = problem.settings.selection.start_iterations
-        tries = [fitter.fit(config, free, s, iterations=iterations) for s in starts]
+        settings = problem.settings.selection
+        few = Fitter(problem.windows.thinned(settings.max_start_windows), model.scale, problem.settings.identification)
+        tries = [few.fit(config, free, s, iterations=settings.start_iterations) for s in starts]
         starts = [min(tries, key=lambda f: f.cost).z]
     fit = fitter.fit(config, free, starts[0])
     return Candidate(screened.effect, fit, model.fit.cost - fit.cost)

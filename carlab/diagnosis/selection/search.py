@@ -25,13 +25,13 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
     max_effects = problem.settings.selection.max_effects
     history: list[tuple[str, Fit]] = []
     tried: tuple[Candidate, ...] = ()
-    while len(model.effects) < max_effects and not control.stop():
+    while len(model.effects) < max_effects and not control.ends_search():
         control.progress(f"searching for effect {len(model.effects) + 1}", len(model.effects) / max_effects)
         candidates = next_candidates(problem, model, control)
         if not model.effects:
             tried = candidates
         leader = accept(problem, model, candidates, control)
-        if control.stop() or leader is None:
+        if control.ends_search() or leader is None:
             break
         before, fit = set(model.effects), leader.fit
         added = fit_with_scale(problem, (*model.effects, leader.effect), fit.config, fit.free, fit.z)

@@ -67,6 +67,9 @@ class SelectionSettings:
     """Minimum chi2 of an earlier effect after others were added, and minimum chi2 of a swap."""
     swap_score_share: float = 0.7
     """A confusable effect may replace an effect if its screening score is at least this share of the effect's gain."""
+    search_time_share: float = 0.85
+    """Share of ``--budget`` after which the search ends. The rest is for pairwise tests, rival physics and the report,
+    which took 20 s of 124 s on the ETH car."""
     max_effects: int = 10
     """Maximum number of effects."""
     scale_change_max: float = 0.03
@@ -75,8 +78,21 @@ class SelectionSettings:
     """Maximum number of refits until the error scale converges."""
     start_iterations: int = 3
     """Number of iterations by which the initial points of a candidate are compared."""
+    max_start_windows: int = 180
+    """Number of windows on which initial points are compared, as many as for screening. Full fits from the best point
+    use all windows. With all windows these comparisons took 40 % of a search on the ETH car."""
     keep_z_min: float = 1.2
     """One of several effects is removed if its removal costs less than this on unseen blocks [standard errors]."""
+    min_practical_size: float = 0.2
+    """Minimum size of an effect: the change of a channel at the end of the fitted windows by its removal and a refit,
+    over the error that remains [noise floors, or robust errors of the simulator where these are larger]. A smaller
+    effect lowers the root mean square error of no channel by more than 2 %. A concealed effect of the proof changes
+    the score by at least 0.5 noise floors."""
+    min_held_out_rise: float = 0.0
+    """Minimum relative rise of the held-out score without an effect."""
+    min_held_out_z: float = 2.0
+    """Alternative: minimum fall of the held-out log-likelihood without the effect [standard errors]. The score gives
+    much weight to single windows, for example after a collision; the robust likelihood does not."""
     tie_z: float = 2.0
     """Two effects are indistinguishable if their losses on unseen blocks differ by less [standard errors]."""
     max_set_rivals: int = 2
