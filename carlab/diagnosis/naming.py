@@ -2,7 +2,8 @@
 
 A spurious attribution gives a catalogue name to physics outside the catalogue. Effects are withdrawn if uncatalogued
 physics explains as much in their place, if unnamed terms explain much in addition to them or more than them, or if they
-increase the error on held-out recordings.
+increase the error on held-out recordings. Single effects are also withdrawn if they are negligible, or if they increase
+that error when they are added last (``weak_effects``).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from carlab.diagnosis.selection.rival_physics import RivalPhysics, additional_ph
 from carlab.diagnosis.selection.search import restrict
 from carlab.diagnosis.unexplained.description import ResidualModel, describe, fit_residual_terms, start_features
 from carlab.diagnosis.unexplained.vibration import Vibration
-from carlab.diagnosis.weak_effects import without_weak_effects
+from carlab.diagnosis.weak_effects import without_harmful_effects, without_negligible_effects
 from sim_backends.car_parameters import SimulatorConfig
 
 log = logging.getLogger(__name__)
@@ -51,8 +52,12 @@ class NamingResult:
 def accept_names(
     problem: SearchProblem, found: SearchResult, held_out: HeldOut, vibration: Vibration | None, control: RunControl
 ) -> NamingResult:
-    """Withdraw spurious effects, and model the residual."""
-    found = without_weak_effects(problem, found, held_out, control)
+    """Withdraw negligible, spurious and harmful effects, and model the residual.
+
+    After a search that was cut short, the residual may be an effect that was not tried, so it does not make the
+    accepted effects spurious.
+    """
+    found = without_negligible_effects(problem, found, control)
     names = found.effects
     rival = replacing_physics(problem, found, control)
     if rival is not None:
@@ -60,11 +65,16 @@ def accept_names(
     residual = residual_of(problem, found)
     if rival is None:
         rival = additional_physics(problem, found, control)
-    if found.effects and _are_spurious(problem, found, residual, rival, control):
+    if found.is_complete and found.effects and _are_spurious(problem, found, residual, rival, control):
         found = found.without_effects()
     elif found.effects and _increases_held_out_error(found, held_out):
         log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
         found = found.without_effects()
+    elif found.effects:
+        standing = without_harmful_effects(problem, found, held_out, control)
+        if standing.effects != found.effects:
+            found, residual = standing, residual_of(problem, standing)
+            rival = additional_physics(problem, found, control)
     if names and not found.effects:
         log.info("%s: withdrawn as a spurious attribution", ", ".join(names))
         residual = residual_of(problem, found)

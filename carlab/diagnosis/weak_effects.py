@@ -7,10 +7,11 @@ it, after a refit of the other parameters, differ by less than a share of the er
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 
+from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut
@@ -22,48 +23,41 @@ from carlab.prediction.predict import simulate_windows
 
 log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True, slots=True)
-class _Removal:
-    """A model refitted without one effect.
-
-    without           the fit
-    size              practical size of the effect
-    score_rise        relative rise of the held-out score
-    standard_errors   fall of the held-out log-likelihood, in standard errors
-    """
-
-    without: Fit
-    size: float
-    score_rise: float
-    standard_errors: float
+Alternatives = tuple[tuple[Condition, ...], ...]
+"""Alternative sets of conditions; an effect stands if all conditions of one set hold."""
 
 
-def without_weak_effects(
+def without_negligible_effects(problem: SearchProblem, found: SearchResult, control: RunControl) -> SearchResult:
+    """Remove negligible effects one by one, the smallest first, and refit the others."""
+    min_size = problem.settings.selection.min_practical_size
+
+    def conditions(name: str, model: Model, without: Fit) -> Alternatives:
+        return ((Condition("selection.min_practical_size", practical_size(problem, model, without), min_size),),)
+
+    return _with_standing_effects(problem, found, conditions, control)
+
+
+def without_harmful_effects(
     problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl
 ) -> SearchResult:
-    """Remove effects one by one, smaller ones first, that are negligible or raise the held-out error.
+    """Remove effects one by one that raise the held-out error when they are added last, the most harmful first.
 
-    An effect that unseen blocks do not distinguish from others is not removed for its held-out error: another member of
-    the set may be the right one.
+    An effect that unseen blocks do not distinguish from others stays: another member of its set may be the right one.
     """
-    model = found.model
-    while model.effects:
-        removals = {name: _removal(problem, model, name, held_out) for name in model.effects}
-        conditions = {name: _conditions(problem, found, name, removal) for name, removal in removals.items()}
-        by_size = sorted(model.effects, key=lambda name: removals[name].size)
-        dropped = next((name for name in by_size if not _stands(conditions[name])), None)
-        for name in model.effects if dropped is None else (dropped,):
-            control.record(Decision("stand", name, conditions[name], name != dropped, len(model.effects)))
-        if dropped is None:
-            break
-        gone = removals[dropped]
-        log.info(
-            "%s: withdrawn, its size is %.3f, the held-out score rises by %.2f %% without it (%.1f standard errors)",
-            dropped, gone.size, 100.0 * gone.score_rise, gone.standard_errors,
-        )  # fmt: skip
-        model = Model(tuple(e for e in model.effects if e != dropped), gone.without, model.scale)
-    return found if model.effects == found.effects else restrict(problem, found, model.effects, control)
+    settings = problem.settings.selection
+
+    def conditions(name: str, model: Model, without: Fit) -> Alternatives:
+        if found.rivals.get(name):
+            return ()
+        before, after = held_out.final_error(without.config), held_out.final_error(model.fit.config)
+        gain, error = held_out.gain(before, after)
+        rise = held_out.score(before) / max(held_out.score(after), 1e-12) - 1.0
+        return (
+            (Condition("selection.min_held_out_rise", rise, settings.min_held_out_rise),),
+            (Condition("selection.min_held_out_z", gain / error, settings.min_held_out_z),),
+        )
+
+    return _with_standing_effects(problem, found, conditions, control)
 
 
 def practical_size(problem: SearchProblem, model: Model, without: Fit) -> float:
@@ -79,37 +73,47 @@ def practical_size(problem: SearchProblem, model: Model, without: Fit) -> float:
         both predictions, and the error scale of ``model``, which is at least the noise floor.
     """
     windows = problem.windows
-    errors = [
-        prediction_errors(simulate_windows(windows, fit.config), windows)[0, :, -1] for fit in (model.fit, without)
-    ]
-    difference = np.sqrt(np.mean((errors[1] - errors[0]) ** 2, axis=0))
+
+    def final_error(fit: Fit) -> FloatArray:
+        return np.asarray(prediction_errors(simulate_windows(windows, fit.config), windows)[0, :, -1])
+
+    difference = np.sqrt(np.mean((final_error(without) - final_error(model.fit)) ** 2, axis=0))
     return float((difference / model.scale.sigma[-1]).max())
 
 
-def _removal(problem: SearchProblem, model: Model, name: str, held_out: HeldOut) -> _Removal:
-    without = refit(problem, tuple(e for e in model.effects if e != name), model.fit, model.scale).fit
-    before, after = held_out.final_error(without.config), held_out.final_error(model.fit.config)
-    gain, error = held_out.gain(before, after)
-    rise = held_out.score(before) / max(held_out.score(after), 1e-12) - 1.0
-    return _Removal(without, practical_size(problem, model, without), rise, gain / error)
+def _with_standing_effects(
+    problem: SearchProblem,
+    found: SearchResult,
+    conditions_of: Callable[[str, Model, Fit], Alternatives],
+    control: RunControl,
+) -> SearchResult:
+    """The result with the effects whose conditions hold; the conditions get name, model and the fit without it."""
+    model = found.model
+    while model.effects:
+        removed = {}
+        for name in model.effects:
+            others = tuple(e for e in model.effects if e != name)
+            without = refit(problem, others, model.fit, model.scale)
+            conditions = conditions_of(name, model, without.fit)
+            if conditions:
+                removed[name] = (without, conditions, _margin(conditions))
+        weakest = min(removed, key=lambda name: removed[name][2], default=None)
+        if weakest is None:
+            break
+        stands = removed[weakest][2] > 0.0
+        for name in removed if stands else (weakest,):
+            control.record(Decision("stand", name, removed[name][1], stands, len(model.effects)))
+        if stands:
+            break
+        numbers = ", ".join(f"{c.setting} {c.statistic:.3g}" for (c, *_) in removed[weakest][1])
+        log.info("%s: withdrawn (%s)", weakest, numbers)
+        model = removed[weakest][0]
+    return found if model.effects == found.effects else restrict(problem, found, model.effects, control)
 
 
-def _conditions(
-    problem: SearchProblem, found: SearchResult, name: str, removal: _Removal
-) -> tuple[tuple[Condition, ...], ...]:
-    """Alternative sets of conditions; an effect stands if all conditions of one set hold."""
-    settings = problem.settings.selection
-    size = Condition("selection.min_practical_size", removal.size, settings.min_practical_size)
-    if found.rivals.get(name):
-        return ((size,),)
-    return (
-        (size, Condition("selection.min_held_out_rise", removal.score_rise, settings.min_held_out_rise)),
-        (size, Condition("selection.min_held_out_z", removal.standard_errors, settings.min_held_out_z)),
-    )
+def _margin(alternatives: Alternatives) -> float:
+    """The best alternative's smallest excess of a statistic over its threshold; above 0 if the effect stands."""
+    return max(min(c.statistic - c.threshold for c in conditions) for conditions in alternatives)
 
 
-def _stands(alternatives: tuple[tuple[Condition, ...], ...]) -> bool:
-    return any(all(c.statistic > c.threshold for c in conditions) for conditions in alternatives)
-
-
-__all__ = ["practical_size", "without_weak_effects"]
+__all__ = ["practical_size", "without_harmful_effects", "without_negligible_effects"]

@@ -139,6 +139,7 @@ class SearchResult:
     history   (effect, fit) in the order of acceptance
     tried     candidates for the first effect
     scale     error scale of ``best``
+    is_complete  whether the search ended by itself and was not cut short
     """
 
     base: Fit
@@ -149,6 +150,7 @@ class SearchResult:
     history: tuple[tuple[str, Fit], ...]
     tried: tuple[Candidate, ...]
     scale: Scale
+    is_complete: bool = True
 
     @property
     def model(self) -> Model:

@@ -39,11 +39,14 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
         history.append((leader.effect, model.fit))
         if set(model.effects) == before:
             break
+    is_complete = not control.ends_search()
     eliminated = eliminate(problem, model, control)
     pairs = compare_pairs(problem, eliminated, control)
     model = eliminated.model
     ordered = tuple(sorted(model.effects, key=lambda e: -pairs.chi2[e]))
-    return SearchResult(base.fit, model.fit, ordered, pairs.chi2, pairs.rivals, tuple(history), tried, model.scale)
+    return SearchResult(
+        base.fit, model.fit, ordered, pairs.chi2, pairs.rivals, tuple(history), tried, model.scale, is_complete
+    )
 
 
 def restrict(problem: SearchProblem, found: SearchResult, names: tuple[str, ...], control: RunControl) -> SearchResult:

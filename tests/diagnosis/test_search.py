@@ -1,0 +1,137 @@
+"""Test the time limit of the search, and the withdrawal of effects that do not matter."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import Case
+from carlab.benchmark.world.measurement import write_csv
+from carlab.cars import load_car_file
+from carlab.core.clock import SimulatedClock
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import ConfigError
+from carlab.diagnosis.diagnose import Outcome, diagnose
+from carlab.diagnosis.evidence import Texts
+from carlab.diagnosis.findings import SearchExtent
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.report.write import completed
+from carlab.diagnosis.search_timer import SearchTimer
+from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
+from carlab.recording.csv.foreign import import_csv
+from sim_backends.effects import CATALOGUE, confusable_effects
+
+Table = dict[str, np.ndarray]
+TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
+DRAG, MISALIGNMENT = "aerodynamic_drag", "mocap_yaw_misalignment"
+
+
+@pytest.fixture(scope="module")
+def drag() -> Case:
+    """Aerodynamic drag concealed in 60 s of driving with wrong base parameters."""
+    return make_case("single", 21, effects=(DRAG,), excess=2.0, fit_s=60, hold_s=30)
+
+
+def turned(table: Table, angle: float) -> Table:
+    """Return the same drive measured by a camera system that sees the car turned by ``angle`` [rad]."""
+    sin, cos = np.sin(angle), np.cos(angle)
+    vx, vy = table["vx"], table["vy"]
+    return table | {"yaw": table["yaw"] + angle, "vx": cos * vx + sin * vy, "vy": cos * vy - sin * vx}
+
+
+@pytest.fixture(autouse=True)
+def _two_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search two effects only, because the whole catalogue takes long."""
+    monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", {name: CATALOGUE[name] for name in (DRAG, MISALIGNMENT)})
+
+
+def found(
+    case: Case,
+    folder: Path,
+    angles: tuple[float, float] = (0.0, 0.0),
+    settings: DiagnosisSettings = DEFAULT,
+    **options: Any,
+) -> Outcome:
+    """Diagnose a case, measured with misalignments [rad] of the fitted and the held-out recording."""
+    read: list[list[EpisodeData]] = []
+    for table, angle in zip((case.fit, case.hold), angles, strict=True):
+        write_csv(folder / "drive.csv", turned(table, angle))
+        read.append(list(import_csv(folder / "drive.csv").episodes))
+    case.nominal.write(folder / "car.toml")
+    return diagnose(*read, load_car_file(folder / "car.toml").simulator, TEXTS, settings=settings, **options)
+
+
+def names(outcome: Outcome) -> list[str]:
+    return [effect.id for effect in outcome.diagnosis.effects]
+
+
+@pytest.mark.parametrize(("min_size", "expected"), [(0.2, [DRAG]), (0.0, [DRAG, MISALIGNMENT])])
+def test_negligible_effect_is_not_named(drag: Case, tmp_path: Path, min_size: float, expected: list[str]) -> None:
+    """A misalignment of 0.5 mrad changes the lateral velocity by 1 mm/s. Thresholds of significance are lowered."""
+    lenient = replace(
+        DEFAULT.selection,
+        accept_chi2_min=1.0,
+        accept_unseen_share=-1.0,
+        accept_unseen_ratio=-1.0,
+        keep_z_min=-5.0,
+        min_score_chi2=0.0,
+        min_practical_size=min_size,
+    )
+    assert names(found(drag, tmp_path, (5e-4, 5e-4), replace(DEFAULT, selection=lenient))) == expected
+
+
+def test_effect_that_raises_the_held_out_error_is_withdrawn(drag: Case, tmp_path: Path) -> None:
+    """The cameras see the car turned in the fitted recording only."""
+    outcome = found(drag, tmp_path, (0.02, 0.0))
+    assert names(outcome) == [DRAG]
+    refused = [d for d in outcome.exhibits.decisions if not d.passed and d.stage == "stand"]
+    assert [(d.effect, d.alternatives[0][0].setting) for d in refused] == [
+        (MISALIGNMENT, "selection.min_held_out_rise")
+    ]
+
+
+def test_time_limit_ends_the_search_with_a_valid_report(drag: Case, tmp_path: Path) -> None:
+    outcome = found(drag, tmp_path, budget_s=1e-3)
+    assert outcome.diagnosis.search == SearchExtent(False, "budget", 1e-3)
+    assert outcome.diagnosis.effects == ()
+    held_out = outcome.diagnosis.held_out
+    assert held_out["refit"].score < held_out["nominal"].score
+    assert "cut short by the time limit of 0.001 s" in completed(outcome.diagnosis).sentence
+    assert outcome.diagnosis.to_dict()["search"] == {"is_complete": False, "stopped_by": "budget", "budget_s": 1e-3}
+
+
+def test_stopped_search_keeps_the_effects_found_so_far(drag: Case, tmp_path: Path) -> None:
+    activities = []
+    outcome = found(
+        drag,
+        tmp_path,
+        (0.01, 0.01),
+        progress=lambda activity, share: activities.append(activity),
+        stop=lambda: "searching for effect 2" in activities,
+    )
+    assert len(names(outcome)) == 1
+    assert outcome.diagnosis.held_out["with_effects"].score < outcome.diagnosis.held_out["refit"].score
+    assert outcome.diagnosis.search == SearchExtent(False, "user", None)
+
+
+def test_progress_states_the_remaining_time() -> None:
+    clock = SimulatedClock()
+    timer = SearchTimer(100.0, search_share=0.8, clock=clock)
+    shown: list[str] = []
+    progress = timer.progress(lambda activity, share: shown.append(activity))
+    for t_s in (0.0, 30.0, 79.0, 81.0):
+        clock.sleep_until(t_s)
+        progress("refitting", 0.5)
+    assert shown == [f"refitting (at most {left_s} s left)" for left_s in (80, 50, 1)] + ["refitting"]
+    assert timer.ends_search()
+    assert SearchTimer(math.inf, clock=clock).extent() == SearchExtent()
+
+
+@pytest.mark.parametrize("budget_s", [0.0, -3.0, math.nan])
+def test_time_limit_out_of_range_is_refused_with_the_remedy(budget_s: float) -> None:
+    with pytest.raises(ConfigError, match=r"--budget .*: give a time above 0 s"):
+        SearchTimer(budget_s)
