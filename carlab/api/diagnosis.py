@@ -169,11 +169,9 @@ def diagnose(
             error; takes minutes.
         ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
         discrepancy: train networks that correct the diagnosed simulator, and report their error; takes minutes.
-        adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car since the
-            fitted ones; takes up to a minute.
+        adapt: adapt the corrected simulator along the held-out recordings, and report what changed; takes a minute.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
-        budget_s: time limit without measured curves, networks and adaptation [s]; ``math.inf`` for none. When it ends,
-            the report covers the effects found so far (``report.diagnosis.search``).
+        budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search. ``inf`` for none.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
         stop: once it returns true, the search ends and the report covers the findings so far.

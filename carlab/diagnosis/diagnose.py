@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.ceiling import ceiling_of
@@ -111,16 +110,14 @@ def diagnose(
         uses: role of each recording, for the report.
         data_faults: faults that were found when the files were read; faults found here are added.
         effects: candidate effects, the whole catalogue by default. Given effects are not withdrawn.
-        holdout_share: last share of each recording that is held out if ``held_out`` is empty, above 0 and at most
-            0.5; by default that of the settings.
+        holdout_share: last share of each recording that is held out without ``held_out``; default: of the settings.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
         curves: fit measured curves where named effects leave a residual.
         ceiling: train a black box, and compare with its error.
         discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
-        budget_s: time limit [s]; the search for effects ends in time and its result is reported. Curves, ceiling,
-            discrepancy and adaptation take additional time. Without a limit results are reproducible to the last digit.
+        budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search (``SearchTimer``).
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
 
@@ -130,21 +127,19 @@ def diagnose(
         DataError: a ceiling or a discrepancy of recordings that are too short for a network.
     """
     share = checked_held_out_share(holdout_share, settings.windows)
-    began_s = MonotonicClock().now_s()
     timer = SearchTimer(budget_s, stop, settings.selection.search_time_share)
     nominal = with_known_latency(nominal, (*fit, *held_out))
     stages = curves, ceiling, discrepancy, adapt
     request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append, timer.ends_search)
+    search_control = replace(control, progress=timer.progress(progress))
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
-    scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))
+    scored, naming = _search_effects(recordings, noise, request, search_control)
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
-    seconds = MonotonicClock().now_s() - began_s
-    exhibits = replace(outcome.exhibits, decisions=tuple(decisions))
-    diagnosis = replace(outcome.diagnosis, seconds=seconds, search=timer.extent())
-    return replace(outcome, diagnosis=diagnosis, exhibits=exhibits)
+    diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=timer.extent())
+    return replace(outcome, diagnosis=diagnosis, exhibits=replace(outcome.exhibits, decisions=tuple(decisions)))
 
 
 def _prepare_recordings(

@@ -36,7 +36,8 @@ class SearchTimer:
         self.budget_s = budget_s
         self._stop = stop
         self._clock = clock or MonotonicClock()
-        self._end_s = None if budget_s is None else self._clock.now_s() + search_share * budget_s
+        self._began_s = self._clock.now_s()
+        self._end_s = None if budget_s is None else self._began_s + search_share * budget_s
         self._stopped_by = ""
 
     def ends_search(self) -> bool:
@@ -56,6 +57,10 @@ class SearchTimer:
             shown(f"{activity} (at most {left_s:.0f} s left)" if 0.0 < left_s < math.inf else activity, share)
 
         return with_time
+
+    def elapsed_s(self) -> float:
+        """Time since the beginning [s]."""
+        return self._clock.now_s() - self._began_s
 
     def extent(self) -> SearchExtent:
         """Whether the search was complete, and what ended it."""
