@@ -41,7 +41,7 @@ class Diagnose:
     out: Path = Path("diagnosis")
     """Folder for the report."""
 
-    budget: float = 300.0
+    budget_s: Annotated[float, arg(name="budget")] = 300.0
     """Time limit of the diagnosis without measured curves, networks and adaptation [s]; inf for none. When it ends, the
     report covers the effects found so far, and says so."""
 
@@ -86,7 +86,7 @@ class Diagnose:
                 ceiling=self.ceiling,
                 discrepancy=self.discrepancy,
                 adapt=self.adapt,
-                budget_s=self.budget,
+                budget_s=self.budget_s,
                 seed=self.seed,
                 out=self.out,
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
