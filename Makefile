@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint docs pictures clean
+.PHONY: demo test lint ruff types layers computing driving docs pictures clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "carlab needs Python 3.11 or newer; run: make PYTHON=python3.12 ...")'
@@ -19,19 +19,34 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 demo: $(VENV)/.installed
 	$(BIN)/python -u examples/demo.py
 
+# The parts run side by side, and each prints its output when it ends.
 lint: $(VENV)/.installed
+	$(MAKE) --jobs --output-sync ruff types layers
+
+test: $(VENV)/.installed
+	@echo "Linters, types, layers and all tests run side by side. Each part prints its output when it ends."
+	$(MAKE) --jobs --output-sync ruff types layers computing driving
+
+ruff:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
 
-# Tests that only compute run side by side, one to a core; the others drive against the clock, two at once.
-COMPUTING := tests/benchmark tests/studies tests/prediction tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/api tests/examples tests/test_architecture.py tests/docs \
+types:
+	$(YIELD) $(BIN)/mypy
+
+layers:
+	$(YIELD) $(BIN)/lint-imports
+
+# Tests that drive against the clock mostly wait; tests that only compute take the processors whenever those wait.
+COMPUTING := tests/benchmark tests/studies tests/prediction tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/api tests/examples tests/test_architecture.py \
 	$(addprefix tests/experiment/,test_quick_check.py test_priors_and_predictions.py test_training.py test_learning_on_a_device.py)
-test: export OMP_NUM_THREADS := 1
+YIELD := nice -n 19
+computing driving: export OMP_NUM_THREADS := 1
 
-test: lint
-	$(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
+computing:
+	$(YIELD) $(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
+
+driving:
 	$(BIN)/pytest --numprocesses 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))
 
 docs: $(VENV)/.installed

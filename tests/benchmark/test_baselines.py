@@ -41,8 +41,13 @@ def null_case() -> Case:
 
 
 @pytest.fixture(scope="module")
-def steering_delay_case() -> Case:
-    return case("single", 12, "steering_delay", excess=4.0)
+def null_data(null_case: Case) -> Prepared:
+    return prepared(null_case)
+
+
+@pytest.fixture(scope="module")
+def steering_delay_data() -> Prepared:
+    return prepared(case("single", 12, "steering_delay", excess=4.0))
 
 
 @pytest.fixture(scope="module")
@@ -77,29 +82,27 @@ def test_regression_on_one_term_estimates_the_concealed_angle(steering_offset_ca
     assert angle == pytest.approx(steering_offset_case.concealed[0].parameters["angle"], rel=0.25)
 
 
-def test_steering_delay_has_the_largest_cross_correlation(steering_delay_case: Case) -> None:
-    assert largest_correlation(prepared(steering_delay_case)) == "steering_delay"
+def test_steering_delay_has_the_largest_cross_correlation(steering_delay_data: Prepared) -> None:
+    assert largest_correlation(steering_delay_data) == "steering_delay"
 
 
-def test_zero_correction_has_the_score_of_the_refit(steering_delay_case: Case) -> None:
-    data = prepared(steering_delay_case)
+def test_zero_correction_has_the_score_of_the_refit(steering_delay_data: Prepared) -> None:
+    data = steering_delay_data
     assert held_out_score(data, zero_correction) == pytest.approx(score(data.windows, data.car.free()), rel=1e-9)
     system = System.of(data)
     assert corrected_score(data, system, np.zeros(len(system.terms))) == pytest.approx(data.refit_score, rel=1e-9)
 
 
-def test_terms_belong_to_effects_and_cover_all_but_four(null_case: Case) -> None:
-    data = prepared(null_case)
-    named = {effect_of(term) for term in library(data)}
+def test_terms_belong_to_effects_and_cover_all_but_four(null_data: Prepared) -> None:
+    named = {effect_of(term) for term in library(null_data)}
     assert named <= set(EFFECT_IDS)
     uncovered = {"mocap_latency", "traction_limit", "roll_dynamics", "tyre_saturation"}  # the last: linear tyres only
     assert set(EFFECT_IDS) - named == uncovered
 
 
-def test_terms_equal_closed_forms(null_case: Case) -> None:
+def test_terms_equal_closed_forms(null_data: Prepared) -> None:
     """A force term is F / m; a command term is the lost acceleration."""
-    data = prepared(null_case)
-    terms, steps = library(data), data.steps
+    terms, steps = library(null_data), null_data.steps
     drag = terms["aerodynamic_drag"](steps)
     assert drag[:, 0] == pytest.approx(-steps.middle[:, 3] * np.abs(steps.middle[:, 3]) / steps.car.mass)
     assert not drag[:, 1:].any()

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from carlab.cars import load_car_file
-from carlab.cli import _verbs
+from carlab.cli import _verbs, run
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -117,12 +117,19 @@ def test_commands_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", list(_verbs()))
-def test_help_of_each_verb_has_its_summary(verb: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "carlab", verb, "--help"], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+def test_help_of_each_verb_has_its_summary(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="^0$"):
+        run([verb, "--help"])
+    printed = capsys.readouterr().out
     summary = (_verbs()[verb].__doc__ or "").split("\n")[0].rstrip(".")
-    assert summary.split()[0] in done.stdout
-    assert "--verbose" in done.stdout
+    assert summary.split()[0] in printed
+    assert "--verbose" in printed
+
+
+def test_carlab_starts_as_a_module() -> None:
+    done = subprocess.run([sys.executable, "-m", "carlab", "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [verb for verb in _verbs() if verb not in done.stdout] == []
 
 
 def test_readme_lists_exactly_the_verbs() -> None:
