@@ -18,8 +18,6 @@ from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from drivers.sender.status import SenderStatus
 
-MAX_LOADED_RATIO = 1.5
-
 
 @contextmanager
 def firmware_process() -> Iterator[str]:

@@ -20,7 +20,6 @@ CHANNELS = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle"
 POSE_CHANNELS = ("x", "y", "yaw")
 VELOCITY_CHANNELS = ("vx", "vy", "yaw_rate")
 COMMAND_CHANNELS = ("steering", "throttle")
-REQUIRED_CHANNELS = ("t", *POSE_CHANNELS, *COMMAND_CHANNELS)
 
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -214,7 +213,6 @@ DART_ONBOARD = ColumnMapping(
     throttle_gate="safety_value",
     dead_reckoning=True,
 )
-PRESETS: Mapping[str, ColumnMapping] = {m.layout: m for m in (CANONICAL, ETH, DART, DART_ONBOARD)}
 _ORDER = (ETH, CANONICAL, DART, DART_ONBOARD)  # an export of DART data is canonical and keeps its sensors beside
 
 

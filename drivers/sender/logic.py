@@ -97,7 +97,6 @@ class SenderLogic:
         self._is_link_up = False
         self._order: Order | None = None
         self._decided: Order | None = None
-        self._t_armed_s = 0.0
         self._is_watchdog_tripped = False
         self._t_first_neutral_s: float | None = None
         self._neutral_run = 0

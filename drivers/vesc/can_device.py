@@ -21,7 +21,6 @@ class VescCanDevice:
         self.link = link
         self.controller_id = controller_id
         self.host_id = host_id
-        self.status_frames = 0
         self._reassembler = CanReassembler(host_id)
         self._replies = ReplyReader()
 
@@ -74,7 +73,6 @@ class VescCanDevice:
     def _decode(self, frame: CanFrame) -> FirmwareVersion | MotorValues | None:
         is_ours = vesc_can_codec.controller_of(frame) == self.controller_id
         if is_ours and (values := vesc_can_codec.decode_status(frame)) is not None:
-            self.status_frames += 1
             return values
         packet = self._reassembler.feed(frame)
         if packet is None or packet.send != ReplyMode.IS_REPLY or packet.sender_id != self.controller_id:

@@ -118,7 +118,7 @@ def test_commands_of_a_page_run_in_order(page: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("verb", list(_verbs()))
 def test_help_of_each_verb_has_its_summary(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         run([verb, "--help"])
     printed = capsys.readouterr().out
     summary = (_verbs()[verb].__doc__ or "").split("\n")[0].rstrip(".")

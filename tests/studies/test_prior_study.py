@@ -128,7 +128,8 @@ def test_expected_discrepancy_is_smaller_with_few_rows_and_for_pose_outputs(
         raise DataError("Enough.")
 
     monkeypatch.setattr(regression_methods, "infer", recorded_call)
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 10)  # faster GreyBox; its result is not used
+    for name in ("STEPS", "REFINEMENT_STEPS"):  # faster GreyBox; its result is not used
+        monkeypatch.setattr(f"learning.baselines.system_identification.{name}", 10)
     few, many = 100, 450
     list(run_study(case, rows=(few, many), seeds=1, methods=("Sim-FSVGD", "GreyBox"), data=Path()))
     assert [a.tolist() for a in received] == [pytest.approx([0.03] * 3 + [0.1] * 3)] * 2 + [

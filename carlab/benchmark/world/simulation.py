@@ -18,7 +18,6 @@ from carlab.core.errors import DataError
 FloatArray = NDArray[np.float64]
 Driver = Callable[[float, FloatArray], tuple[float, float]]
 RTOL = 1e-8
-ATOL = 1e-9
 HIDDEN_STEP_S = 1e-3
 """Step for hidden states along given states; a wheel with longitudinal slip has the shortest time constant, 1.4 ms."""
 
