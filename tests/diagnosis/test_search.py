@@ -21,6 +21,9 @@ from carlab.diagnosis.findings import SearchExtent
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.search_timer import SearchTimer
+from carlab.diagnosis.selection.forward import Path as SelectionPath
+from carlab.diagnosis.selection.forward import extend
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.effects import CATALOGUE, confusable_effects
@@ -116,6 +119,30 @@ def test_stopped_search_keeps_the_effects_found_so_far(drag: Case, tmp_path: Pat
     assert len(names(outcome)) == 1
     assert outcome.diagnosis.held_out["with_effects"].score < outcome.diagnosis.held_out["refit"].score
     assert outcome.diagnosis.search == SearchExtent(False, "user", None)
+
+
+@pytest.mark.parametrize(
+    ("max_alternatives", "min_remaining", "expected"),
+    [(3, 0.1, {DRAG, MISALIGNMENT}), (0, 0.1, {MISALIGNMENT}), (3, 0.99, {MISALIGNMENT})],
+)
+def test_other_choice_repairs_a_wrong_turn(
+    drag: Case,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    max_alternatives: int,
+    min_remaining: float,
+    expected: set[str],
+) -> None:
+    """A greedy path that ends after its first effect leaves the drag, unless other choices are followed."""
+
+    def one_step(problem: SearchProblem, start: SelectionPath, control: RunControl) -> SelectionPath:
+        one = replace(problem.settings, selection=replace(problem.settings.selection, max_effects=1))
+        return extend(replace(problem, settings=one), start, control)
+
+    monkeypatch.setattr("carlab.diagnosis.selection.search.extend", one_step)
+    selection = replace(DEFAULT.selection, max_alternatives=max_alternatives, min_remaining_excess=min_remaining)
+    outcome = found(drag, tmp_path, (0.02, 0.02), replace(DEFAULT, selection=selection))
+    assert set(names(outcome)) == expected
 
 
 def test_progress_states_the_remaining_time() -> None:

@@ -115,18 +115,15 @@ def is_accepted(problem: SearchProblem, candidate: Candidate) -> bool:
     return strong or steady
 
 
-def accept(
+def accepted(
     problem: SearchProblem, model: Model, candidates: tuple[Candidate, ...], control: RunControl
-) -> Candidate | None:
-    """The first candidate that is accepted, or None."""
-    for c in candidates:
-        if c.is_tested:
-            conditions = acceptance(problem, c)
-            control.record(Decision("accept", c.effect, conditions, is_accepted(problem, c), len(model.effects)))
-    leader = next((c for c in candidates if is_accepted(problem, c)), None)
-    if leader is not None:
-        log.info("accepted %s", leader.effect)
-    return leader
+) -> tuple[Candidate, ...]:
+    """The candidates that are accepted, the best first; records the decision about each tested one."""
+    tested = [c for c in candidates if c.is_tested]
+    for c in tested:
+        conditions = acceptance(problem, c)
+        control.record(Decision("accept", c.effect, conditions, is_accepted(problem, c), len(model.effects)))
+    return tuple(c for c in tested if is_accepted(problem, c))
 
 
 def _log(problem: SearchProblem, model: Model, c: Candidate) -> None:
@@ -138,4 +135,4 @@ def _log(problem: SearchProblem, model: Model, c: Candidate) -> None:
     )  # fmt: skip
 
 
-__all__ = ["accept", "is_accepted", "next_candidates"]
+__all__ = ["accepted", "is_accepted", "next_candidates"]

@@ -72,6 +72,10 @@ class SelectionSettings:
     which took 20 s of 124 s on the ETH car."""
     max_effects: int = 10
     """Maximum number of effects."""
+    min_remaining_excess: float = 0.1
+    """Other choices are followed if the effects of the greedy path leave this share of the refit's squared excess."""
+    max_alternatives: int = 3
+    """Maximum number of other choices that are followed to their end."""
     scale_change_max: float = 0.03
     """Relative change of the error scale at convergence."""
     scale_iterations: int = 4

@@ -1,0 +1,130 @@
+"""Forward selection along several paths.
+
+A greedy search can take a wrong turn: its first effect may be a proxy of two others. Where the greedy path leaves a
+part of the excess, other choices are followed to their end, and unseen blocks choose between the paths (limited
+discrepancy search, Harvey and Ginsberg 1995, with one deviation from the greedy choices).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carlab.diagnosis.identification.fit import Fit, clustered_gain
+from carlab.diagnosis.selection.candidates import accepted, next_candidates
+from carlab.diagnosis.selection.moves import apply_moves
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.refit import fit_with_scale
+
+log = logging.getLogger(__name__)
+
+ALTERNATIVES_PROGRESS = 0.9
+"""Progress of the search while other choices are followed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A candidate that was accepted as the next effect of a path, but not added."""
+
+    path: Path
+    candidate: Candidate
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Effects added to the base model one after the other.
+
+    model         fit with all effects
+    history       (effect, fit) in the order of acceptance
+    tried         candidates for the first effect of this path
+    alternatives  further accepted candidates of each step, not confusable with the one that was added
+    """
+
+    model: Model
+    history: tuple[tuple[str, Fit], ...] = ()
+    tried: tuple[Candidate, ...] = ()
+    alternatives: tuple[Choice, ...] = ()
+
+
+def extend(
+    problem: SearchProblem, path: Path, control: RunControl, visited: AbstractSet[frozenset[str]] = frozenset()
+) -> Path:
+    """Add effects to a path until none is accepted, or until its effects are one of the ``visited`` sets."""
+    max_effects = problem.settings.selection.max_effects
+    while len(path.model.effects) < max_effects and not control.ends_search():
+        count = len(path.model.effects)
+        control.progress(f"searching for effect {count + 1}", count / max_effects)
+        candidates = next_candidates(problem, path.model, control)
+        path = path if path.history else replace(path, tried=candidates)
+        chosen = accepted(problem, path.model, candidates, control)
+        if control.ends_search() or not chosen:
+            break
+        before = frozenset(path.model.effects)
+        path = _add(problem, path, chosen, control)
+        effects = frozenset(path.model.effects)
+        if effects == before or effects in visited:
+            break
+    return path
+
+
+def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunControl) -> Path:
+    """The greedy path, or the path with one other choice that predicts unseen blocks significantly better."""
+    settings = problem.settings.selection
+    best, visited = greedy, {frozenset(greedy.model.effects)}
+    choices = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.unseen_gain)[: settings.max_alternatives]
+    for k, choice in enumerate(choices):
+        if control.ends_search() or remaining_excess(problem, base, best.model) < settings.min_remaining_excess:
+            break
+        names = (*choice.path.model.effects, choice.candidate.effect)
+        log.info("alternative %d of %d: %s", k + 1, len(choices), ", ".join(names))
+        labelled = _labelled(control, f"alternative {k + 1} of {len(choices)}")
+        path = extend(problem, _add(problem, choice.path, (choice.candidate,), labelled), labelled, visited)
+        visited.add(frozenset(path.model.effects))
+        if _is_better(problem, path.model, best.model):
+            log.info("the alternative predicts unseen blocks better: %s", ", ".join(path.model.effects))
+            best = path
+    return best
+
+
+def remaining_excess(problem: SearchProblem, base: Model, model: Model) -> float:
+    """Share of the squared excess of the refitted base model that a model leaves, from the scales of their errors."""
+    excess, excess_base = (max(float(np.mean((m.scale.sigma / problem.floor) ** 2)) - 1.0, 0.0) for m in (model, base))
+    return excess / excess_base if excess_base > 0.0 else 0.0
+
+
+def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], control: RunControl) -> Path:
+    """The path with the first of the accepted candidates added."""
+    leader, before = chosen[0], path.model
+    log.info("accepted %s", leader.effect)
+    added = fit_with_scale(problem, (*before.effects, leader.effect), leader.fit.config, leader.fit.free, leader.fit.z)
+    model = apply_moves(problem, added, control)
+    confusable = problem.confusable.get(leader.effect, ())
+    others = tuple(Choice(path, c) for c in chosen[1:] if c.effect not in confusable)
+    return Path(model, (*path.history, (leader.effect, model.fit)), path.tried, (*path.alternatives, *others))
+
+
+def _labelled(control: RunControl, label: str) -> RunControl:
+    """The control with a label before each activity, at a constant share of the progress."""
+
+    def progress(activity: str, share: float) -> None:
+        control.progress(f"{label}: {activity}", ALTERNATIVES_PROGRESS)
+
+    return replace(control, progress=progress)
+
+
+def _is_better(problem: SearchProblem, model: Model, reference: Model) -> bool:
+    """Whether a model predicts unseen blocks significantly better than the reference, with the reference's scale."""
+    settings = problem.settings.selection
+    fitter = problem.fitter(reference.scale)
+    loss, reference_loss = (
+        fitter.leave_fold_out_loss(m.fit, problem.folds(), settings.max_unseen_error) for m in (model, reference)
+    )
+    gain, error = clustered_gain(reference_loss, loss, problem.windows)
+    log.info("unseen gain of the alternative: %.1f (%.1f standard errors)", gain, gain / error)
+    return gain > settings.tie_z * error
+
+
+__all__ = ["Choice", "Path", "best_path", "extend", "remaining_excess"]
