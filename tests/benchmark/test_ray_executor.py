@@ -26,7 +26,7 @@ def cluster() -> Iterator[RayExecutor]:
         yield executor
 
 
-@pytest.fixture(params=["local", "ray"])
+@pytest.fixture(scope="module", params=["local", "ray"])
 def executor(request: pytest.FixtureRequest) -> Executor:
     return LocalExecutor() if request.param == "local" else request.getfixturevalue("cluster")
 
