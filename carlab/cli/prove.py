@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from carlab.benchmark.cases.proof_set import CaseSpec
+    from carlab.benchmark.proof.child_jobs import Executor
     from carlab.benchmark.proof.runner import Proof
     from carlab.experiment.episodes.interrupts import Interrupts
 
@@ -73,6 +75,10 @@ class Prove:
     jobs: int = 1
     """Number of parallel cases; with more than one, each case has one thread."""
 
+    ray: str = ""
+    """Run the cases on Ray in place of --jobs: local for the cores of this machine, or the address of a cluster with
+    the same version of carlab. A case whose worker dies runs again. Needs pip install 'carlab[ray]'."""
+
     timeout: float = 1800.0
     """Time limit of a diagnosis [s]; a longer diagnosis counts as failed."""
 
@@ -97,6 +103,8 @@ class Prove:
 
         if self.jobs < 1 or self.timeout <= 0.0:
             raise ConfigError("--jobs and --timeout: give numbers above zero.")
+        if self.ray and (self.jobs > 1 or self.simulator != "own"):
+            raise ConfigError("--ray replaces --jobs, and needs --simulator own; leave one of them out.")
         if self.set == "real":
             return self._real()
         specs = self._specs()
@@ -106,11 +114,11 @@ class Prove:
             return self._calibrate(Proof(self.out, specs))
         if self.baselines:
             require_studies()
-        with Interrupts() as interrupts, progress(speed_estimate_period_s=DAY_S) as bar:
+        with Interrupts() as interrupts, self._executor() as executor, _bar() as bar:
             stages = _Bar(bar)
             proof = Proof(
-                self.out, specs, command=_diagnose_command(), progress=stages, timeout_s=self.timeout, jobs=self.jobs,
-                stop_requested=interrupts.requested.is_set, abandon=interrupts.urgent.is_set,
+                self.out, specs, command=_diagnose_command(), progress=stages, timeout_s=self.timeout,
+                executor=executor, stop_requested=interrupts.requested.is_set, abandon=interrupts.urgent.is_set,
             )  # fmt: skip
             if not self._stages(proof, interrupts):
                 fail(f"Stopped with {stages.last}; run the same command to continue.")
@@ -128,17 +136,26 @@ class Prove:
         specs, refused = drawn_specs(self.seed, self.limit, recordings)
         if refused:
             console.print(f"Not concealed, because commands would leave [-1, 1]: {', '.join(refused)}.")
-        with Interrupts() as interrupts, progress(speed_estimate_period_s=DAY_S) as bar:
+        with Interrupts() as interrupts, self._executor() as executor, _bar() as bar:
             stages = _Bar(bar)
             proof = RealProof(
                 self.out, specs, recordings, car, tool=Tool(self.tool, _carlab_command()), command=_carlab_command(),
-                progress=stages, timeout_s=self.timeout, jobs=self.jobs, stop_requested=interrupts.requested.is_set,
+                progress=stages, timeout_s=self.timeout, executor=executor, stop_requested=interrupts.requested.is_set,
                 abandon=interrupts.urgent.is_set,
             )  # fmt: skip
             if not run_stages(proof):
                 fail(f"Stopped with {stages.last}; run the same command to continue.")
                 return 130
         return score(proof, self.out, lambda runs: self._facts([spec.seed for spec in specs], runs))
+
+    def _executor(self) -> AbstractContextManager[Executor]:
+        from carlab.benchmark.proof.child_jobs import LocalExecutor
+
+        if not self.ray:
+            return nullcontext(LocalExecutor(self.jobs))
+        from carlab.benchmark.proof.ray_executor import RayExecutor
+
+        return RayExecutor(self.ray)
 
     def _check_limit(self) -> None:
         if self.limit is not None and self.limit < 1:
@@ -245,6 +262,10 @@ class Prove:
             "carlab": f"{VERSION}, {os.cpu_count()} cores, {' and '.join(map(str, jobs))} cases at a time",
             "peak memory of a diagnosis": f"{max(memory, default=0.0):.0f} MiB",
         }
+
+
+def _bar() -> AbstractContextManager[Progress]:
+    return progress(speed_estimate_period_s=DAY_S)
 
 
 class _Bar:

@@ -14,10 +14,7 @@ Folder of a proof:
 from __future__ import annotations
 
 import json
-import shutil
-import sys
-import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +22,19 @@ import numpy as np
 
 from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.cases.set_check import CHEAP, indistinguishable
-from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, run_child
-from carlab.benchmark.proof.sealed_run import Progress, SealedRun, silent
+from carlab.benchmark.proof.child_jobs import PYTHON, ChildJob, Executor, JobEnd
+from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd
+from carlab.benchmark.proof.sealed_run import LOCAL, Progress, SealedRun, silent
 from carlab.benchmark.proof.worker import FILES, read_json, write_json
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
 
-DIAGNOSE = (sys.executable, "-m", "carlab", "diagnose", "--decisions")
+DIAGNOSE = (PYTHON, "-m", "carlab", "diagnose", "--decisions")
 COMPARED = ("single", "multiple", "null", "parameters", "outside")
 WITH_EFFECTS = ("single", "pair", "multiple")
-WORKER = (sys.executable, "-m", "carlab.benchmark.proof.worker")
+WORKER = (PYTHON, "-m", "carlab.benchmark.proof.worker")
+CASE_OUTPUTS = tuple(f"handed/{file}" for file in FILES)
 
 
 class Proof(SealedRun):
@@ -51,7 +50,7 @@ class Proof(SealedRun):
         timeout_s: Time-out of a diagnosis, which then counts as failed.
         stop_requested: Called before each case; True ends the stage after the running cases.
         abandon: Polled; True kills the running cases, which are repeated when the stage is resumed.
-        jobs: Number of parallel child processes; with more than one, each uses one thread.
+        executor: Runs the child processes; with more than one job in parallel, each uses one thread.
     """
 
     def __init__(
@@ -64,11 +63,11 @@ class Proof(SealedRun):
         timeout_s: float = 1800.0,
         stop_requested: Callable[[], bool] = lambda: False,
         abandon: Callable[[], bool] = lambda: False,
-        jobs: int = 1,
+        executor: Executor = LOCAL,
     ) -> None:
         super().__init__(
             root, [spec.as_dict() for spec in specs], progress=progress, timeout_s=timeout_s,
-            stop_requested=stop_requested, abandon=abandon, jobs=jobs,
+            stop_requested=stop_requested, abandon=abandon, executor=executor,
         )  # fmt: skip
         self.specs = list(specs)
         self.command = tuple(command)
@@ -78,8 +77,14 @@ class Proof(SealedRun):
         specs = dict(zip(self.names(), self.specs, strict=True))
 
         def make_one(name: str) -> ChildEnd:
-            order = {"spec": specs[name].as_dict(), "handed": str(self.root / "handed" / name)}
-            return self._work("make", {**order, "answer": str(self.answers_folder / f"{name}.json")})
+            order = {"spec": specs[name].as_dict(), "handed": "handed", "answer": "answer.json"}
+            made = self._work("make", order, {}, (*CASE_OUTPUTS, "answer.json"))
+            if not made.end.abandoned:
+                answer = made.outputs["answer.json"]
+                files = {k: v for k, v in made.outputs.items() if k in CASE_OUTPUTS}
+                JobEnd(made.end, files).write_outputs(self.root / "handed" / name)
+                write_json(self.answers_folder / f"{name}.json", json.loads(answer))
+            return made.end
 
         if not self.stage("make", list(specs), lambda name: (self.answers_folder / f"{name}.json").exists(), make_one):
             return None
@@ -115,8 +120,12 @@ class Proof(SealedRun):
 
         def run_one(name: str) -> ChildEnd:
             floor = read_json(self.answers_folder / f"{name}.json")["floor"]
-            order = {"handed": str(self.root / "handed" / name), "to": str(folder / f"{name}.json"), "floor": floor}
-            return self._work("baselines", order)
+            scored = self._work(
+                "baselines", {"to": "scores.json", "floor": floor}, self._handed(name), ("scores.json",)
+            )
+            if not scored.end.abandoned:
+                write_json(folder / f"{name}.json", json.loads(scored.outputs["scores.json"]))
+            return scored.end
 
         names = sorted(n for n, spec in zip(self.names(), self.specs, strict=True) if spec.kind in COMPARED)
         return self.stage("baselines", names, lambda name: (folder / f"{name}.json").exists(), run_one)
@@ -154,32 +163,30 @@ class Proof(SealedRun):
             write_json(kept, known)
         return None if known[key] is None else bool(known[key])
 
-    def _work(self, what: str, order: dict[str, Any]) -> ChildEnd:
-        end = run_child(
-            (*WORKER, what), self.root, timeout_s=self.timeout_s, words_in=json.dumps(order), environment=ONE_THREAD,
-            abandon=self.abandon,
-        )  # fmt: skip
+    def _handed(self, name: str) -> dict[str, bytes]:
+        """Contents of the input files of a case."""
+        return {file: (self.root / "handed" / name / file).read_bytes() for file in FILES}
+
+    def _work(self, what: str, order: dict[str, Any], inputs: Mapping[str, bytes], outputs: tuple[str, ...]) -> JobEnd:
+        job = ChildJob((*WORKER, what), self.timeout_s, inputs, outputs, json.dumps(order), ONE_THREAD)
+        done = self.executor.run(job, self.abandon)
+        end = done.end
         if end.exit_status != 0 and not end.abandoned:
             last = end.words.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
             raise DataError(f"A case of the proof failed ({what}): {last[0]}")
-        return end
+        return done
 
     def _diagnose_one(self, name: str, to: Path, true_effects: tuple[str, ...]) -> ChildEnd:
-        with tempfile.TemporaryDirectory(prefix="diagnosis-") as fresh:
-            here = Path(fresh)
-            for file in FILES:
-                shutil.copyfile(self.root / "handed" / name / file, here / file)
-            command = [*self.command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out"]
-            if true_effects:
-                command += ["--effects", *true_effects]
-            environment = ONE_THREAD if self.jobs > 1 else {}
-            end = run_child(command, here, timeout_s=self.timeout_s, environment=environment, abandon=self.abandon)
-            if end.abandoned:
-                return end
-            to.mkdir(parents=True, exist_ok=True)
-            for file in ("report.json", "decisions.json", "model.toml"):
-                if (here / "out" / file).exists():
-                    shutil.copyfile(here / "out" / file, to / file)
-        run = {"exit_status": end.exit_status, "seconds": round(end.seconds, 3), "jobs": self.jobs}
+        command = (*self.command, "fit.csv", "--car", "car.toml", "--holdout", "hold.csv", "--out", "out")
+        if true_effects:
+            command += ("--effects", *true_effects)
+        outputs = ("out/report.json", "out/decisions.json", "out/model.toml")
+        job = ChildJob(command, self.timeout_s, self._handed(name), outputs, environment=self.environment)
+        done = self.executor.run(job, self.abandon)
+        end = done.end
+        if end.abandoned:
+            return end
+        done.write_outputs(to)
+        run = {"exit_status": end.exit_status, "seconds": round(end.seconds, 3), "jobs": self.executor.jobs}
         write_json(to / "run.json", {**run, "peak_memory_mib": round(end.peak_memory_mib, 1), "words": end.words})
         return end

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from carlab.benchmark.cases.seal import check, digest, file_digest, new_name, new_nonce
-from carlab.benchmark.proof.child_processes import ChildEnd, side_by_side
+from carlab.benchmark.proof.child_jobs import Executor, LocalExecutor
+from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, side_by_side
 from carlab.benchmark.proof.worker import read_json, write_json
 from carlab.core.errors import DataError
 
 Progress = Callable[[str, int, int, str], None]
+LOCAL = LocalExecutor()
 
 
 def silent(stage: str, done: int, total: int, note: str) -> None:
@@ -29,7 +31,7 @@ class SealedRun:
         timeout_s: Time-out of a child process.
         stop_requested: Called before each case; True ends the stage after the running cases.
         abandon: Polled; True kills the running cases, which are repeated when the stage is resumed.
-        jobs: Number of parallel child processes; with more than one, each uses one thread.
+        executor: Runs the child processes; with more than one job in parallel, each uses one thread.
     """
 
     def __init__(
@@ -41,16 +43,21 @@ class SealedRun:
         timeout_s: float = 1800.0,
         stop_requested: Callable[[], bool] = lambda: False,
         abandon: Callable[[], bool] = lambda: False,
-        jobs: int = 1,
+        executor: Executor = LOCAL,
     ) -> None:
         self.root = root.absolute()
         self.progress = progress
         self.timeout_s = timeout_s
         self.stop_requested = stop_requested
         self.abandon = abandon
-        self.jobs = jobs
+        self.executor = executor
         self.answers_folder = self.root / "answers"
         self._plan = json.loads(json.dumps(list(plan)))
+
+    @property
+    def environment(self) -> Mapping[str, str]:
+        """Changes to the environment of a diagnosis: one thread if several run in parallel."""
+        return ONE_THREAD if self.executor.jobs > 1 else {}
 
     def names(self) -> list[str]:
         """Random names of the cases, in the order of the plan. Raises DataError if the folder has another plan."""
@@ -110,7 +117,7 @@ class SealedRun:
             self.progress(stage, done, len(names), name)
 
         complete = side_by_side(
-            self.jobs,
+            self.executor.jobs,
             todo,
             work,
             stop_requested=lambda: self.stop_requested() or self.abandon(),

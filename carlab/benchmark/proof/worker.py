@@ -48,13 +48,12 @@ def make(order: dict[str, Any]) -> None:
 
 
 def baselines(order: dict[str, Any]) -> None:
-    """Run every baseline on one case and write the results to ``to``."""
+    """Run every baseline on the case in the working directory and write the results to ``to``."""
     from carlab.benchmark.baselines.run import run_baselines
     from carlab.benchmark.world.base_car import BaseCar
 
-    folder = Path(order["handed"])
-    fit, hold = (read_csv(folder / file) for file in FILES[:2])
-    write_json(Path(order["to"]), run_baselines(fit, hold, BaseCar.read(folder / "car.toml"), order["floor"]))
+    fit, hold = (read_csv(Path(file)) for file in FILES[:2])
+    write_json(Path(order["to"]), run_baselines(fit, hold, BaseCar.read(Path("car.toml")), order["floor"]))
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -10,9 +10,6 @@ Folder of a proof, in addition to that of ``SealedRun``:
 from __future__ import annotations
 
 import dataclasses
-import shutil
-import sys
-import tempfile
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +20,8 @@ import tomli_w
 
 from carlab.benchmark.cases.proof_set import drawn
 from carlab.benchmark.effects.data_faults import Table
-from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, run_child
+from carlab.benchmark.proof.child_jobs import PYTHON, ChildJob
+from carlab.benchmark.proof.child_processes import ChildEnd
 from carlab.benchmark.proof.sealed_run import SealedRun
 from carlab.benchmark.proof.worker import read_json, write_json
 from carlab.benchmark.real.cases import (
@@ -39,7 +37,7 @@ from carlab.benchmark.real.kinds import FULL_LOCK, KINDS
 from carlab.core.errors import ConfigError, DataError
 
 OTHER, CAR, MODEL = "other.csv", "car.toml", "model.toml"
-CARLAB = (sys.executable, "-m", "carlab")
+CARLAB = (PYTHON, "-m", "carlab")
 REFERENCE_OPTIONS = ("--effects", "command_delay", "--curves")
 CONCEALABLE_EFFECTS = tuple(sorted({name for kind in KINDS for name in kind.names if "." not in name}))
 
@@ -153,39 +151,32 @@ class RealProof(SealedRun):
         return self.root / "references" / str(self._answer(name)["reference"]) / "out" / MODEL
 
     def _reference(self, folder: Path) -> ChildEnd:
-        files = sorted(path.name for path in folder.glob("untouched_*.csv"))
-        shutil.rmtree(folder / "out", ignore_errors=True)
-        end = run_child(
-            [*self.command, "diagnose", *files, "--car", CAR, "--out", "out", *REFERENCE_OPTIONS], folder,
-            timeout_s=self.timeout_s, environment=self._environment(), abandon=self.abandon,
-        )  # fmt: skip
-        if not end.abandoned and not (folder / "out" / MODEL).exists():
-            last = end.words.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
-            raise DataError(f"The diagnosis of a reference failed: {last[0]}")
-        return end
+        inputs = {path.name: path.read_bytes() for path in (*sorted(folder.glob("untouched_*.csv")), folder / CAR)}
+        recordings = [name for name in inputs if name != CAR]
+        command = (*self.command, "diagnose", *recordings, "--car", CAR, "--out", "out", *REFERENCE_OPTIONS)
+        job = ChildJob(command, self.timeout_s, inputs, (f"out/{MODEL}",), environment=self.environment)
+        done = self.executor.run(job, self.abandon)
+        if not done.end.abandoned:
+            if not done.outputs:
+                last = done.end.words.strip().splitlines()[-1:] or [f"exit status {done.end.exit_status}"]
+                raise DataError(f"The diagnosis of a reference failed: {last[0]}")
+            done.write_outputs(folder / "out")
+        return done.end
 
     def _answer_one(self, name: str) -> ChildEnd:
-        to = self.root / "answered" / name
-        with tempfile.TemporaryDirectory(prefix="answer-") as fresh:
-            here = Path(fresh)
-            untouched = sorted(self._model(name).parents[1].glob("untouched_*.csv"))
-            for source in (*untouched, self._model(name), self.root / "handed" / name / OTHER):
-                shutil.copyfile(source, here / source.name)
-            end = run_child(
-                self.tool.arguments([path.name for path in untouched]), here, timeout_s=self.timeout_s,
-                environment=self._environment(), abandon=self.abandon,
-            )  # fmt: skip
-            if end.abandoned:
-                return end
-            to.mkdir(parents=True, exist_ok=True)
-            if (here / "out" / self.tool.report).exists():
-                shutil.copyfile(here / "out" / self.tool.report, to / self.tool.report)
-        run = {**dataclasses.asdict(end), "jobs": self.jobs}
-        write_json(to / "run.json", run)
-        return end
-
-    def _environment(self) -> Mapping[str, str]:
-        return ONE_THREAD if self.jobs > 1 else {}
+        untouched = sorted(self._model(name).parents[1].glob("untouched_*.csv"))
+        sources = (*untouched, self._model(name), self.root / "handed" / name / OTHER)
+        job = ChildJob(
+            tuple(self.tool.arguments([path.name for path in untouched])), self.timeout_s,
+            {path.name: path.read_bytes() for path in sources}, (f"out/{self.tool.report}",),
+            environment=self.environment,
+        )  # fmt: skip
+        done = self.executor.run(job, self.abandon)
+        if not done.end.abandoned:
+            to = self.root / "answered" / name
+            done.write_outputs(to)
+            write_json(to / "run.json", {**dataclasses.asdict(done.end), "jobs": self.executor.jobs})
+        return done.end
 
 
 def write_smaller_unit(car: Path, to: Path) -> None:

@@ -1,0 +1,102 @@
+"""Test jobs on a local Ray cluster: files travel, a lost worker costs nothing, a proof equals that of this machine."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.proof.child_jobs import PYTHON, ChildJob, Executor, LocalExecutor
+from carlab.benchmark.proof.ray_executor import RayExecutor
+from carlab.benchmark.proof.runner import Proof
+from carlab.core.errors import ConfigError
+
+FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).with_name("fake_diagnosis.py")))
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[RayExecutor]:
+    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    with RayExecutor("local") as executor:
+        yield executor
+
+
+@pytest.fixture(scope="module", params=["local", "ray"])
+def executor(request: pytest.FixtureRequest) -> Executor:
+    return LocalExecutor() if request.param == "local" else request.getfixturevalue("cluster")
+
+
+def never() -> bool:
+    return False
+
+
+def test_job_reads_its_input_files_and_returns_its_output_files(executor: Executor) -> None:
+    program = (
+        "import pathlib, sys, os; p = pathlib.Path; (p('out')).mkdir(); "
+        "p('out/sum.txt').write_text(p('a.txt').read_text() + sys.stdin.read() + os.environ['C']); print('printed')"
+    )
+    job = ChildJob((PYTHON, "-c", program), 60.0, {"a.txt": b"a"}, ("out/sum.txt", "absent"), "b", {"C": "c"})
+    done = executor.run(job, never)
+    assert (done.end.exit_status, done.end.words.strip()) == (0, "printed")
+    assert done.outputs == {"out/sum.txt": b"abc"}
+
+
+def test_job_that_takes_too_long_has_no_exit_status(executor: Executor) -> None:
+    done = executor.run(ChildJob((PYTHON, "-c", "import time; time.sleep(60)"), 0.5), never)
+    assert done.end.exit_status is None
+    assert not done.end.abandoned
+
+
+def test_abandoned_job_ends_at_once(executor: Executor) -> None:
+    started = threading.Event()
+    threading.Timer(0.5, started.set).start()
+    done = executor.run(ChildJob((PYTHON, "-c", "import time; time.sleep(600)"), 600.0), started.is_set)
+    assert done.end.abandoned
+
+
+def test_job_of_a_killed_worker_runs_again(cluster: RayExecutor, tmp_path: Path) -> None:
+    """The first attempt kills the worker process, which is the parent of the job."""
+    mark = tmp_path / "attempted"
+    program = (
+        "import os, pathlib, signal, sys, time; mark = pathlib.Path(sys.argv[1])\n"
+        "if not mark.exists(): mark.touch(); os.kill(os.getppid(), signal.SIGKILL); time.sleep(60)\n"
+        "print('second attempt')"
+    )
+    done = cluster.run(ChildJob((PYTHON, "-c", program, str(mark)), 60.0), never)
+    assert (done.end.exit_status, done.end.words.strip()) == (0, "second attempt")
+
+
+def test_proof_on_ray_has_the_reports_and_the_seal_of_a_proof_on_this_machine(
+    cluster: RayExecutor, tmp_path: Path
+) -> None:
+    spec = CaseSpec("null", 2, fit_s=8.0, hold_s=5.0)
+    handed, reports = [], []
+    for name, executor in (("here", LocalExecutor()), ("ray", cluster)):
+        proof = Proof(tmp_path / name, [spec], command=FAKE_DIAGNOSIS, executor=executor)
+        assert proof.make() is not None
+        assert proof.diagnose()
+        (case,) = proof.open_seal()
+        handed.append({p.name: p.read_bytes() for p in (proof.root / "handed" / case).iterdir()})
+        report = json.loads((proof.root / "reports" / case / "report.json").read_text())
+        assert report["seen"]["files"] == ["car.toml", "fit.csv", "hold.csv", "out"]
+        del report["seen"]["folder"]
+        reports.append(report)
+    assert handed[0] == handed[1]
+    assert reports[0] == reports[1]
+
+
+def test_unreachable_cluster_is_refused_with_the_remedy() -> None:
+    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    with pytest.raises(ConfigError, match=r"no Ray cluster answers .* use --ray local"), RayExecutor("localhost:1"):
+        pass
+
+
+def test_missing_ray_is_refused_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'carlab\[ray\]'"):
+        RayExecutor("local")
