@@ -164,13 +164,13 @@ def stack(
 
 
 def series(
-    name: str, paths: Sequence[str], logged: Logged = None, overlays: Sequence[str] = ()
+    name: str, paths: Sequence[str], logged: Logged = None, overlays: Sequence[str] = (), **options: Any
 ) -> rrb.TimeSeriesView | None:
-    """View of some series and the same series of overlays; None without data."""
+    """View of some series and the same series of overlays, with options of the view; None without data."""
     beside = [twin for overlay in overlays for path, twin in overlay_series(overlay).items() if path in paths]
     if not has(logged, *paths, *beside):
         return None
-    return rrb.TimeSeriesView(origin="/", contents=[f"/{path}" for path in (*paths, *beside)], name=name)
+    return rrb.TimeSeriesView(origin="/", contents=[f"/{path}" for path in (*paths, *beside)], name=name, **options)
 
 
 def extent_m(started: EpisodeStarted) -> FloatArray:
@@ -227,24 +227,35 @@ def _texts(name: str, logged: Logged) -> rrb.TextLogView | None:
     )
 
 
-def log_styles(stream: rr.RecordingStream, overlays: Sequence[str] = ()) -> None:
-    """Log the static data: axes, names and colours of the series, the car's body and the style of the trails."""
+def log_styles(
+    stream: rr.RecordingStream, overlays: Sequence[str] = (), trail_color: tuple[int, int, int] | None = SKY
+) -> None:
+    """Log the static data: axes, names and colours of the series, the car's body and the style of the trails.
+
+    With ``trail_color=None`` each row of the trail has its own colour, since static data hide those of rows.
+    """
     stream.log(MAP, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for path, (name, color) in SERIES.items():
         stream.log(path, rr.SeriesLines(names=name, colors=color, widths=1.5), static=True)
     stream.log(SAFETY_STATE, rr.StateConfiguration(values=list(STATES), colors=list(STATES.values())), static=True)
-    _log_body(stream, CAR, TRAIL, SKY)
+    _log_body(stream, CAR, TRAIL, SKY, trail_color)
     stream.log(POSES, rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5), colors=GREY), static=True)
     for k, overlay in enumerate(overlays):
         color = OVERLAY_COLORS[k % len(OVERLAY_COLORS)]
-        _log_body(stream, overlay_car(overlay), overlay_trail(overlay), color)
+        _log_body(stream, overlay_car(overlay), overlay_trail(overlay), color, color)
         for path, twin in overlay_series(overlay).items():
             stream.log(
                 twin, rr.SeriesLines(names=f"{SERIES[path][0]} {overlay}", colors=color, widths=1.5), static=True
             )
 
 
-def _log_body(stream: rr.RecordingStream, car: str, trail: str, color: tuple[int, int, int]) -> None:
+def _log_body(
+    stream: rr.RecordingStream,
+    car: str,
+    trail: str,
+    color: tuple[int, int, int],
+    trail_color: tuple[int, int, int] | None,
+) -> None:
     length_m, width_m, height_m = CAR_SIZE_M
     half = [0.5 * length_m, 0.5 * width_m, 0.5 * height_m]
     body = rr.Boxes3D(half_sizes=[half], centers=[[0, 0, half[2]]], colors=color, fill_mode="solid")
@@ -256,4 +267,4 @@ def _log_body(stream: rr.RecordingStream, car: str, trail: str, color: tuple[int
         colors=(255, 255, 255),
     )
     stream.log(f"{car}/heading", arrow, static=True)
-    stream.log(trail, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5), colors=color), static=True)
+    stream.log(trail, rr.LineStrips3D.from_fields(radii=rr.Radius.ui_points(1.5), colors=trail_color), static=True)
