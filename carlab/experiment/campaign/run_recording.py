@@ -114,6 +114,17 @@ def write_run_recording(
     return newest
 
 
+def readable_episodes(run: RunDirectory) -> list[EpisodeData]:
+    """The recordings of a run with a complete tick, also incomplete files."""
+    episodes = []
+    for file in run.recordings(partial=True):
+        try:
+            episodes.append(read_episode(file))
+        except DataError as error:
+            log.warning("%s", error)
+    return episodes
+
+
 def add_windows(recording: RunRecording, dynamics: LearnedCar, number: int, file: Path) -> PredictedEpisode | None:
     """Write the predictions of the newest episode's windows; None if it has no complete tick."""
     try:
@@ -125,4 +136,4 @@ def add_windows(recording: RunRecording, dynamics: LearnedCar, number: int, file
     return PredictedEpisode(number, data, windows)
 
 
-__all__ = ["TICKS_BETWEEN_PATHS", "LearnedDriver", "PredictedEpisode", "add_windows", "write_run_recording"]
+__all__ = ["LearnedDriver", "PredictedEpisode", "add_windows", "readable_episodes", "write_run_recording"]
