@@ -70,11 +70,11 @@ def draw(
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure = pyplot.figure(figsize=(16, 9))
+    figure: Any = pyplot.figure(figsize=(16, 9))
     figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.06)
     if rows[-1].verdict:
         figure.suptitle(textwrap.fill(rows[-1].diagnosis, CHARACTERS_PER_LINE), fontsize=9, x=0.01, ha="left")
-    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=(3, 2)))
+    upper, lower = figure.subfigures(2, 1, height_ratios=(3, 2))
     curves = [curve for curve in CURVES if _has_data(rows, curve)]
     axes = upper.subplots(1, len(curves) + 1, width_ratios=[*([2] * len(curves)), 3], squeeze=False)[0]
     for axis, curve in zip(axes, curves, strict=False):
