@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         load_car,
         predict,
         replay,
+        save_run,
     )
     from carlab.core.car import Car
     from carlab.core.errors import CarlabError
@@ -43,7 +44,7 @@ _MODULES = {
     "api": (
         *("CarCheck", "DiagnosisReport", "DriveRun", "LearnHooks", "LearnRun", "PredictionErrors"),
         *("Recording", "RunHooks"),
-        *("check", "compare", "diagnose", "drive", "learn", "load", "load_car", "predict", "replay"),
+        *("check", "compare", "diagnose", "drive", "learn", "load", "load_car", "predict", "replay", "save_run"),
     ),
     "core.car": ("Car",),
     "core.errors": ("CarlabError",),
@@ -79,6 +80,7 @@ __all__ = [
     "load_car",
     "predict",
     "replay",
+    "save_run",
 ]
 
 if not TYPE_CHECKING:

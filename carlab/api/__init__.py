@@ -1,4 +1,4 @@
-"""The Python interface: load, load_car, predict, diagnose, compare, check, drive, replay, learn.
+"""The Python interface: load, load_car, predict, diagnose, compare, check, drive, replay, learn, save_run.
 
 ``carlab`` re-exports these names. The command line calls this interface: each option of a verb is an argument of the
 same name. The interface does not print. Each call imports the heavy libraries that it needs (torch, scipy, matplotlib,
@@ -12,7 +12,7 @@ from carlab.api.diagnosis import DiagnosisReport, diagnose
 from carlab.api.driving import DriveRun, drive, replay
 from carlab.api.learning import LearnHooks, LearnRun, learn
 from carlab.api.prediction import PredictionErrors, predict
-from carlab.api.recordings import Recording, load
+from carlab.api.recordings import Recording, load, save_run
 from carlab.api.runs import RunHooks
 
 __all__ = [
@@ -33,4 +33,5 @@ __all__ = [
     "load_car",
     "predict",
     "replay",
+    "save_run",
 ]

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from carlab.api.arguments import above_zero, at_least
-from carlab.api.runs import RunHooks, html_picture, html_table, new_run, write_result
+from carlab.api.runs import (
+    RunHooks,
+    followed_by,
+    has_screen,
+    html_picture,
+    html_table,
+    new_run,
+    viewer_connection,
+    write_result,
+)
 from carlab.core.errors import ConfigError, NotReadyError
 
 if TYPE_CHECKING:
@@ -103,6 +110,8 @@ def drive(
     name: str = "drive",
     rerun: bool = True,
     picture: bool = True,
+    live: bool = False,
+    viewer: str | None = None,
     vehicle: Path | CarFile | None = None,
     reality: Path | CarFile | None = None,
     dry_run: bool = False,
@@ -125,6 +134,8 @@ def drive(
         name: last part of the run folder's name.
         rerun: also record .rrd files.
         picture: draw summary.png.
+        live: open the rerun viewer, which follows the run.
+        viewer: address of an open viewer that follows the run, ``rerun+http://HOST:9876/proxy``.
         vehicle: car file that replaces the default car of ``sim`` and ``emulated``.
         reality: car file with the true physics of a simulated or emulated car, which only its recordings reveal.
         dry_run: real inputs, but no command is sent.
@@ -143,9 +154,16 @@ def drive(
     at_least(1, episodes=episodes, ticks=ticks)
     at_least(0, seed=seed)
     _check(policy, task, max_throttle)
+    connect = viewer_connection(live, viewer)
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
     options = {"seed": seed, "max_ticks": ticks, "place": place, "record_rerun": rerun}
-    with new_run(out, name, choice, hooks) as run:
+    with contextlib.ExitStack() as stack:
+        run = stack.enter_context(new_run(out, name, choice, hooks))
+        if connect is not None:
+            from carlab.experiment.campaign.live_view import LiveSettings, LiveView
+
+            view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
+            hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
         results = _drive(choice, policy, task, max_throttle, run, episodes, hooks, options)
     _write_results(run, results, picture)
     return DriveRun(run.path, tuple(results))
@@ -258,11 +276,6 @@ def _write_results(run: RunDirectory, results: Sequence[EpisodeResult], picture:
         write_result(run, results)
     if results and picture:
         save_summary([read_episode(r.path) for r in results if r.path.exists()], run.path / PICTURE_FILE)
-
-
-def has_screen() -> bool:
-    """Whether a window can be opened."""
-    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _check(policy: PolicyName | Policy, task: TaskName | Task, max_throttle: float | None) -> None:

@@ -5,13 +5,22 @@ from __future__ import annotations
 import contextlib
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from carlab.api.arguments import above_zero, at_least
 from carlab.api.cars import car_options_text
-from carlab.api.runs import RunHooks, existing_run, html_picture, html_table, new_run, write_result
+from carlab.api.runs import (
+    RunHooks,
+    existing_run,
+    followed_by,
+    html_picture,
+    html_table,
+    new_run,
+    viewer_connection,
+    write_result,
+)
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -19,6 +28,7 @@ if TYPE_CHECKING:
     from carlab.core.outcome import EndReason
     from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
     from carlab.experiment.campaign.figures import EpisodeFigures
+    from carlab.experiment.campaign.live_view import LiveView
     from carlab.experiment.campaign.quick_check import QuickCheck
     from carlab.experiment.campaign.training import TrainingPlan
     from carlab.experiment.episodes.interrupts import Interrupts
@@ -122,6 +132,8 @@ class _Request:
     out: Path
     name: str
     rerun: bool
+    live: bool
+    viewer: str | None
     vehicle: Path | CarFile | None
     reality: Path | CarFile | None
     dry_run: bool
@@ -149,6 +161,8 @@ def learn(
     out: Path | str = "runs",
     name: str = "learn",
     rerun: bool = True,
+    live: bool = False,
+    viewer: str | None = None,
     vehicle: Path | CarFile | None = None,
     reality: Path | CarFile | None = None,
     dry_run: bool = False,
@@ -172,6 +186,8 @@ def learn(
         out: parent of the run's folder.
         name: last part of the run folder's name.
         rerun: also record .rrd files.
+        live: as for ``carlab.drive``.
+        viewer: as for ``carlab.drive``.
         vehicle: as for ``carlab.drive``.
         reality: as for ``carlab.drive``.
         dry_run: real inputs, but no command is sent.
@@ -187,7 +203,7 @@ def learn(
     """
     request = _Request(
         car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
-        None if resume is None else Path(resume), Path(out), name, rerun, vehicle, reality, dry_run,
+        None if resume is None else Path(resume), Path(out), name, rerun, live, viewer, vehicle, reality, dry_run,
     )  # fmt: skip
     return _learn(request, hooks or LearnHooks())
 
@@ -233,10 +249,12 @@ class _Progress:
 def _learn(request: _Request, hooks: LearnHooks) -> LearnRun:
     from carlab.cars import choose_car
     from carlab.experiment.campaign.campaign import saved_seed
+    from carlab.experiment.campaign.live_view import LiveSettings, LiveView
     from carlab.experiment.campaign.report import write_report
     from carlab.experiment.episodes.interrupts import Interrupts
 
     _check(request)
+    connect = viewer_connection(request.live, request.viewer)
     started = None if request.resume is None else saved_seed(request.resume)
     choice = choose_car(
         request.car,
@@ -248,6 +266,9 @@ def _learn(request: _Request, hooks: LearnHooks) -> LearnRun:
     results: list[EpisodeResult] = []
     with contextlib.ExitStack() as stack:
         campaign = (_begun if request.resume is None else _resumed)(request, choice, hooks, stack)
+        if connect is not None:
+            settings = LiveSettings(campaign.run.path, request.episodes or campaign.episodes, True, connect)
+            hooks = _with_view(hooks, stack.enter_context(LiveView(settings)))
         progress = _Progress(campaign.run, hooks)
         stack.enter_context(choice.car)
         campaign.hooks = progress.campaign_hooks(stack.enter_context(Interrupts()))
@@ -263,6 +284,17 @@ def _learn(request: _Request, hooks: LearnHooks) -> LearnRun:
     if results and campaign.run.path.is_dir():
         write_result(campaign.run, results)
     return LearnRun(campaign.run.path, campaign.episodes, tuple(progress.rows), tuple(results))
+
+
+def _with_view(hooks: LearnHooks, view: LiveView) -> LearnHooks:
+    """Hooks that also pass everything to a live view."""
+    return replace(
+        hooks,
+        on_document=followed_by(hooks.on_document, view.emit),
+        on_training=followed_by(hooks.on_training, view.report_activity),
+        on_figures=followed_by(hooks.on_figures, view.emit),
+        on_check=followed_by(hooks.on_check, view.emit),
+    )
 
 
 def _check(request: _Request) -> None:

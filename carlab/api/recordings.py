@@ -149,6 +149,46 @@ def required_file(path: Path, what: str = "The recording") -> Path:
     return path
 
 
+def is_run_folder(path: Path) -> bool:
+    """Whether a path is the folder of a run of ``carlab drive`` or ``carlab learn``."""
+    return (path / "environment.json").is_file() and (path / "episodes").is_dir()
+
+
+def save_run(run: Path | str, path: Path | str) -> Path:
+    """Write all episodes of a run as one file: .rrd (rerun, with a layout of tabs) or .png (picture).
+
+    Args:
+        run: folder of a run of ``carlab drive`` or ``carlab learn``.
+        path: the file to write; its ending chooses the format. An existing file is replaced.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: the folder is not a run's, or the ending is not one of these.
+        DataError: no recording can be read, or the file cannot be written.
+    """
+    from carlab.core.errors import ConfigError
+    from carlab.experiment.campaign.report import PICTURE_FILE, learning_curve
+    from carlab.experiment.campaign.run_recording import readable_episodes, write_run_recording
+    from carlab.recording import RunDirectory, save_summary
+
+    run, path = Path(run), Path(path)
+    if not is_run_folder(run):
+        raise ConfigError(f"{run} is not the folder of a run; name one such as runs/2026-.., or a recording in it.")
+    if path.suffix not in (".rrd", ".png"):
+        raise ConfigError(f"{path}: name a file that ends in .rrd or .png.")
+    directory = RunDirectory(run)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".rrd":
+        write_run_recording(directory, {row.episode: row for row in learning_curve(directory)}, path)
+    elif (run / PICTURE_FILE).is_file():
+        path.write_bytes((run / PICTURE_FILE).read_bytes())
+    else:
+        save_summary(readable_episodes(directory), path, run.name)
+    return path
+
+
 CHANNEL_OPTIONS = ("unit", "sign", "scale")
 RENAMED_OPTIONS = {
     "velocity_lag": "velocity_lag_s",

@@ -3,26 +3,34 @@
 from __future__ import annotations
 
 import base64
+import functools
 import html
 import json
 import logging
+import os
+import re
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec
 
-from carlab.core.errors import ConfigError
+from carlab.core.errors import ConfigError, NotReadyError
 
 if TYPE_CHECKING:
+    from rerun import RecordingStream
+
     from carlab.cars import CarChoice
     from carlab.core.car import Car
-    from carlab.core.documents import Tick
+    from carlab.core.documents import Document, Tick
     from carlab.core.outcome import EndReason
     from carlab.core.quantities import CarState
     from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
     from carlab.recording.run_folder import RunDirectory
+
+P = ParamSpec("P")
 
 
 def _refuse_to_place(start: CarState) -> None:
@@ -41,6 +49,7 @@ class RunHooks:
         place_by_hand: receives a start pose that the car cannot reach by itself; returns when the car is there.
         on_episode: receives the number of a starting episode and its maximum number of ticks.
         on_tick: receives each tick.
+        on_document: receives each document of the control loop; it must return at once.
         on_result: receives each finished episode.
         on_abandon: receives reason and detail after the control loop hung and the car was stopped; it must end the
             process.
@@ -50,6 +59,7 @@ class RunHooks:
     place_by_hand: Callable[[CarState], None] = _refuse_to_place
     on_episode: Callable[[int, int], None] = lambda episode, ticks: None
     on_tick: Callable[[Tick], None] = lambda tick: None
+    on_document: Callable[[Document], None] = lambda document: None
     on_result: Callable[[EpisodeResult], None] = lambda result: None
     on_abandon: Callable[[EndReason, str], None] = lambda reason, detail: None
 
@@ -61,6 +71,7 @@ class RunHooks:
             place_by_hand=self.place_by_hand,
             on_episode=self.on_episode,
             on_tick=self.on_tick,
+            on_document=self.on_document,
             on_result=self.on_result,
             on_abandon=self.on_abandon,
         )
@@ -103,6 +114,65 @@ def _logged(run: RunDirectory, choice: CarChoice, hooks: RunHooks) -> Iterator[N
     finally:
         logging.getLogger().removeHandler(handler)
         handler.close()
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def viewer_program(instead: str) -> Path:
+    """The program of the rerun viewer.
+
+    Args:
+        instead: what a person can do on a computer without a screen.
+
+    Raises:
+        NotReadyError: the program is not installed, or the computer has no screen.
+    """
+    from carlab.recording.rerun.viewer import rerun_program
+
+    program = rerun_program()
+    if program is None:
+        raise NotReadyError("The viewer", ["the program 'rerun' is not installed; install rerun-sdk with pip."])
+    if not has_screen():
+        raise NotReadyError("The viewer", [f"this computer has no screen; {instead}."])
+    return program
+
+
+def viewer_connection(live: bool, viewer: str | None) -> Callable[[RecordingStream], None] | None:
+    """How a run reaches the viewer that shows it; None without a live view.
+
+    Args:
+        live: open a viewer on this computer.
+        viewer: address of an open viewer, which is used instead.
+
+    Raises:
+        ConfigError: the address is invalid.
+        NotReadyError: no viewer can be opened here.
+    """
+    if viewer is not None:
+        from carlab.recording.rerun.viewer import connect_to_viewer
+
+        if not re.fullmatch(r"rerun(\+https?)?://[^/]+/proxy", viewer):
+            raise ConfigError(f"--viewer {viewer}: give the address of a viewer, rerun+http://HOST:9876/proxy.")
+        return functools.partial(connect_to_viewer, address=viewer)
+    if not live:
+        return None
+    from carlab.recording.rerun.viewer import open_viewer
+
+    program = viewer_program("name a viewer on another one with --viewer, or use carlab view RUN after the run")
+    return functools.partial(open_viewer, program=program)
+
+
+def followed_by(first: Callable[P, None], second: Callable[P, None]) -> Callable[P, None]:
+    """A callback that calls two."""
+
+    def both(*args: P.args, **kwargs: P.kwargs) -> None:
+        first(*args, **kwargs)
+        second(*args, **kwargs)
+
+    return both
 
 
 def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:

@@ -65,6 +65,12 @@ class Drive:
     rerun: bool = True
     """Also record .rrd files."""
 
+    live: bool = False
+    """Open the rerun viewer, which follows the run. A slow viewer loses data; the car never waits for it."""
+
+    viewer: str | None = None
+    """Address of an open rerun viewer, also on another computer, that follows the run: rerun+http://HOST:9876/proxy."""
+
     picture: bool = True
     """Draw summary.png."""
 
@@ -88,6 +94,8 @@ class Drive:
                 out=self.out,
                 name=self.name,
                 rerun=self.rerun,
+                live=self.live,
+                viewer=self.viewer,
                 picture=self.picture,
                 hooks=self._hooks(bar),
             )

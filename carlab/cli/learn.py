@@ -93,6 +93,12 @@ class Learn:
     rerun: bool = True
     """Also record .rrd files."""
 
+    live: bool = False
+    """Open the rerun viewer, which follows the run. A slow viewer loses data; the car never waits for it."""
+
+    viewer: str | None = None
+    """Address of an open rerun viewer, also on another computer, that follows the run: rerun+http://HOST:9876/proxy."""
+
     verbose: bool = False
     """Show the whole log."""
 
@@ -117,6 +123,8 @@ class Learn:
                 out=self.out,
                 name=self.name,
                 rerun=self.rerun,
+                live=self.live,
+                viewer=self.viewer,
                 hooks=self._hooks(bar),
             )
         return self._report(run)

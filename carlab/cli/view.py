@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from tyro.conf import Positional
 
-from carlab.api.driving import has_screen
-from carlab.api.recordings import required_file
+from carlab.api.recordings import is_run_folder, required_file, save_run
+from carlab.api.runs import viewer_program
 from carlab.cli.console import console
 from carlab.cli.options import new_file
 from carlab.cli.recordings import load_episodes
-from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, NotReadyError
+
+REPORT_FILE = "report.rrd"
 
 
 @dataclass
 class View:
-    """Open a recording in rerun, save it as .rrd, or save a picture of it."""
+    """Open a recording or a whole run in rerun, save it as .rrd, or save a picture of it.
+
+    A run has tabs: drive by episode, predicted against driven, learning curve, quick check, link. Tabs and panels
+    without data are left out.
+    """
 
     recording: Positional[Path]
-    """An MCAP (finished or .partial), a CSV, or an .rrd."""
+    """An MCAP (finished or .partial), a CSV, an .rrd, or a folder: of a run, or of a diagnosis."""
 
     save: Path | None = None
     """Write FILE.rrd instead of opening the viewer."""
@@ -36,62 +42,84 @@ class View:
 
     def run(self) -> int:
         """View or save."""
-        required_file(self.recording)
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
         if self.screenshot is not None and self.screenshot.suffix != ".png":
             raise ConfigError(f"--screenshot {self.screenshot}: name a file that ends in .png.")
-        ready = self.recording if self.recording.suffix == ".rrd" else None
-        episode = None if ready is not None else self._episode()
-        if self.save is not None:
-            ready = self._rrd(ready, episode, self.save)
-            console.print(f"{ready}")
-        if self.screenshot is not None:
-            self._picture(ready, episode, self.screenshot)
+        source = self._source()
         if self.save is None and self.screenshot is None:
-            return self._open(ready, episode)
+            return self._open(source)
+        with tempfile.TemporaryDirectory(prefix="carlab-view-") as folder:
+            rrd = source.rrd(self.save or Path(folder) / "view.rrd")
+            if self.save is not None:
+                if rrd != self.save:
+                    self.save.write_bytes(rrd.read_bytes())
+                console.print(f"{self.save}", soft_wrap=True)
+            if self.screenshot is not None:
+                self._picture(source, rrd, self.screenshot)
         return 0
 
-    def _episode(self) -> EpisodeData:
-        episodes = load_episodes(self.recording)
+    def _source(self) -> _Source:
+        path = self.recording
+        if path.is_dir():
+            if is_run_folder(path):
+                return _Source(path.name, lambda rrd: save_run(path, rrd), lambda png: save_run(path, png))
+            if not (path / REPORT_FILE).is_file():
+                raise ConfigError(
+                    f"{path} is not the folder of a run or of a diagnosis; name such a folder, or a recording."
+                )
+            path /= REPORT_FILE
+        if required_file(path).suffix == ".rrd":
+            return _Source(path.stem, lambda rrd: path, None)
+        episodes = load_episodes(path)
         if len(episodes) > 1:
             console.print(f"Showing the longest of {len(episodes)} episodes.")
-        return max(episodes, key=lambda e: e.ticks)
+        episode = max(episodes, key=lambda e: e.ticks)
 
-    def _rrd(self, ready: Path | None, episode: EpisodeData | None, path: Path) -> Path:
-        from carlab.recording.rerun.sink import episode_to_rrd
+        def write_rrd(rrd: Path) -> Path:
+            from carlab.recording.rerun.sink import episode_to_rrd
 
-        if episode is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            episode_to_rrd(episode, path, self.recording.name)
-        elif ready is not None:
-            path.write_bytes(ready.read_bytes())
-        return path
+            rrd.parent.mkdir(parents=True, exist_ok=True)
+            episode_to_rrd(episode, rrd, path.name)
+            return rrd
 
-    def _picture(self, ready: Path | None, episode: EpisodeData | None, path: Path) -> None:
-        from carlab.recording.picture import save_summary
+        def draw(png: Path) -> Path:
+            from carlab.recording.picture import save_summary
+
+            save_summary([episode], png)
+            return png
+
+        return _Source(path.stem, write_rrd, draw)
+
+    def _picture(self, source: _Source, rrd: Path, path: Path) -> None:
         from carlab.recording.rerun.screenshot import save_screenshot
 
-        with tempfile.TemporaryDirectory(prefix="carlab-view-") as folder:
-            try:
-                save_screenshot(ready or self._rrd(ready, episode, Path(folder) / "view.rrd"), path)
-            except NotReadyError as error:
-                if episode is None:
-                    raise
-                console.print(f"{error}\nDrawing a plot instead.")
-                save_summary([episode], path)
-        console.print(f"{path}")
+        try:
+            save_screenshot(rrd, path)
+        except NotReadyError as error:
+            if source.draw is None:
+                raise
+            console.print(f"{error}\nDrawing a plot instead.")
+            source.draw(path)
+        console.print(f"{path}", soft_wrap=True)
 
-    def _open(self, ready: Path | None, episode: EpisodeData | None) -> int:
-        from carlab.recording.rerun.screenshot import rerun_program
-
-        program = rerun_program()
-        if program is None:
-            raise NotReadyError("The viewer", ["the program 'rerun' is not installed; install rerun-sdk with pip."])
-        if not has_screen():
-            raise NotReadyError(
-                "The viewer", ["this computer has no screen; use --save FILE.rrd or --screenshot FILE.png."]
-            )
+    def _open(self, source: _Source) -> int:
+        program = viewer_program("use --save FILE.rrd or --screenshot FILE.png")
         with tempfile.TemporaryDirectory(prefix="carlab-view-") as folder:
-            path = ready or self._rrd(ready, episode, Path(folder) / f"{self.recording.stem}.rrd")
-            return subprocess.run([str(program), str(path), "--bind", "127.0.0.1"], check=False).returncode
+            rrd = source.rrd(Path(folder) / f"{source.name}.rrd")
+            return subprocess.run([str(program), str(rrd), "--bind", "127.0.0.1"], check=False).returncode
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What is shown.
+
+    Attributes:
+        name: of the file that the viewer opens, without suffix.
+        rrd: writes the recording to a path, or returns the path of an existing .rrd.
+        draw: draws a picture without the viewer; None: impossible.
+    """
+
+    name: str
+    rrd: Callable[[Path], Path]
+    draw: Callable[[Path], Path] | None

@@ -17,6 +17,7 @@ import pytest
 import torch
 from learning_runs import HISTORY, TICKS, InterruptedRun, drive, log_sent_actions, names, tiny_plan
 
+import carlab
 from carlab.cars import choose_car
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import EpisodeEnded, Tick
@@ -27,15 +28,16 @@ from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action, CarState, Reality
 from carlab.experiment.campaign import training
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
-from carlab.experiment.campaign.figures import EpisodeFigures
+from carlab.experiment.campaign.figures import EpisodeFigures, predict_windows
+from carlab.experiment.campaign.picture import draw
 from carlab.experiment.campaign.report import learning_curve, restore_missing_rows, save_row, write_report
+from carlab.experiment.campaign.run_recording import write_run_recording
 from carlab.experiment.campaign.training import recorded_features
 from carlab.experiment.episodes.session import SessionHooks
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.mcap.source import read_documents, read_episode
 from carlab.recording.pipe_file import PipeFile
 from carlab.recording.recorder import Recorder
-from carlab.recording.rerun.learning_curve import write_learning_curve
 from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import read_log
 from learning.evaluation import negative_log_likelihood
@@ -43,6 +45,7 @@ from learning.policy.sac_agent import SacAgent, SacPolicy, SacSettings
 from learning.transitions import transitions_of
 from learning.world import car_fit
 from learning.world.car_fit import load_car
+from tests.helpers.rerun_files import cells, tabs
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +149,44 @@ def test_learning_curve_has_the_figures_of_the_recordings(interrupted: Interrupt
     assert rows[0]["updates"] > rows[1]["updates"] == 32, "the first training makes more updates"
     assert [str(r) for r in learning_curve(interrupted.run)] == [str(f) for f in interrupted.figures]
     assert (interrupted.run.path / "learn.png").read_bytes().startswith(b"\x89PNG")
-    assert (interrupted.run.path / "learn.rrd").stat().st_size > 1000
+
+
+def test_recording_of_a_run_has_predictions_and_figures(interrupted: InterruptedRun, tmp_path: Path) -> None:
+    run, file = interrupted.run, tmp_path / "view.rrd"
+    carlab.save_run(run.path, file)
+    for path in (file, run.path / "learn.rrd"):
+        assert {"Drive by episode", "Learning curve"} <= set(tabs(path))
+        figures = cells(path, "Scalars:scalars", "episode")["learning/total_reward"]
+        assert figures == [(f.episode, [f.total_reward]) for f in interrupted.figures]
+        starts = [cell[0][0][:2] for _, cell in cells(path, "LineStrips3D:strips", "car_time")["map/predicted"]]
+        driven = [read_episode(recording).states[:TICKS:3, :2] for recording in run.recordings()]
+        np.testing.assert_allclose(starts, np.concatenate(driven), atol=1e-5, err_msg="paths start at the car")
+    shutil.copytree(run.path, tmp_path / "run")
+    shutil.rmtree(tmp_path / "run" / "models")
+    carlab.save_run(tmp_path / "run", file)
+    assert "map/predicted" not in cells(file, "LineStrips3D:strips", "car_time"), "without models no predictions"
+    assert "Predicted against driven" not in tabs(file)
+
+
+def test_picture_has_one_axis_a_panel_and_no_cut_text(
+    interrupted: InterruptedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures: list[Any] = []
+    monkeypatch.setattr("matplotlib.pyplot.close", figures.append)
+    episode = read_episode(interrupted.run.recordings()[0])
+    windows = predict_windows(load_car(interrupted.run.models / "0001" / "dynamics.pt"), episode)
+    row = replace(interrupted.figures[0], verdict="left", diagnosis="The simulator leaves an error. " * 20)
+    draw([row], 1, episode, windows, interrupted.plan.task, tmp_path / "picture.png")
+    (figure,) = figures
+    boxes = [axis.get_position().bounds for axis in figure.axes]
+    assert len(set(boxes)) == len(boxes) == 3 + 6, "return, distance, plan and six states; no likelihood yet"
+    renderer = figure.canvas.get_renderer()
+    texts = [figure._suptitle, *(axis.title for axis in figure.axes)]
+    for text in texts:
+        box = text.get_window_extent(renderer)
+        assert box.x0 >= 0, text.get_text()
+        assert box.x1 <= figure.bbox.width, text.get_text()
+    assert figure._suptitle.get_text().replace("\n", " ").strip() == row.diagnosis.strip()
 
 
 def test_likelihood_uses_the_model_trained_before_the_episode(interrupted: InterruptedRun) -> None:
@@ -358,9 +398,7 @@ def test_full_disk_is_reported_for_each_file_of_a_run(
     curve.write_bytes(b"previous content")
     monkeypatch.setattr(PipeFile, "open", open_full_disk)
     with pytest.raises(DataError, match="the disk is full; free some space"):
-        write_learning_curve(
-            curve, [{"episode": 1.0}], [np.zeros((3, 6))], [(np.zeros((0, 2)), *[np.zeros((0, 2, 6))] * 2)]
-        )
+        write_run_recording(interrupted.run, {}, curve)
     assert curve.read_bytes() == b"previous content"
     (interrupted.run.path / "learn.json.partial").symlink_to("/dev/full")
     with pytest.raises(DataError, match="the disk is full; free some space"):

@@ -1,5 +1,6 @@
 """Rerun recordings: entities, values, properties, incomplete files and screenshots."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from carlab.recording.recorder import Recorder
 from carlab.recording.rerun import blueprint
 from carlab.recording.rerun.screenshot import has_vulkan_driver, save_screenshot
 from carlab.recording.rerun.sink import RerunSink, episode_to_rrd
+from tests.helpers.rerun_files import BlueprintView, entities, tabs, views
 
 RERUN = Path(sys.executable).with_name("rerun")
 needs_rerun = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed beside this Python")
@@ -31,11 +33,6 @@ def record(path, documents):
             recorder.emit(document)
     assert recorder.failed is None
     return path
-
-
-def entities(path):
-    columns = RrdReader(str(path)).store().schema().component_columns()
-    return {column.entity_path.strip("/") for column in columns}
 
 
 def rows_of(path):
@@ -71,7 +68,28 @@ def test_live_recording_is_valid_and_has_the_entities_of_the_layout(tmp_path, ma
     assert entities(path) >= LIVE | STILL
     reader = RrdReader(str(path))
     assert len(reader.recordings()) == 1
-    assert len(reader.blueprints()) == 1
+    assert sorted(tabs(path)) == ["Drive", "Link"]
+    assert {"Safety gate", "Health"} <= {view.name for view in views(path)}
+
+
+def has_data(view: BlueprintView, logged: set[str]) -> bool:
+    """Whether an entity of a view is among ``logged``."""
+    queried = [line.replace("$origin", view.origin).strip("/").removesuffix("/**") for line in view.query]
+    return any(path == q or path.startswith(f"{q}/") for path in logged for q in queried or [view.origin.strip("/")])
+
+
+def test_layout_of_a_complete_file_has_no_panel_without_data(tmp_path, make_documents):
+    episode = dataclasses.replace(episode_from_documents(make_documents(20)), rewards=np.full(20, np.nan), extra={})
+    path = tmp_path / "arrays.rrd"
+    episode_to_rrd(episode, path)
+    names = [view.name for view in views(path)]
+    series = ("Steering [-1, 1], left positive", "Throttle [-1, 1]", "Velocity of the body [m/s]", "Yaw rate [rad/s]")
+    assert sorted(names) == ["Events and log", "Plan view [m]", *series], "no safety gate, latency, health or reward"
+    assert tabs(path) == ["Drive"]
+    with_data = set(rows_of(path)) | {"episode/end"}
+    assert all(has_data(view, with_data) for view in views(path))
+    full = record(tmp_path / "full.rrd", make_documents(20))
+    assert all(has_data(view, LIVE) for view in views(full))
 
 
 def test_values_and_times_equal_the_emitted_ones(tmp_path, make_documents):

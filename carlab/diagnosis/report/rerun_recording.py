@@ -206,28 +206,7 @@ def _tab(part: str, trace: Trace) -> rrb.Horizontal:
 
 def _plan(part: str, trace: Trace) -> rrb.Spatial3DView:
     places = trace.recorded[np.isfinite(trace.recorded[:, :2]).all(axis=1), :2]
-    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.full(2, -2.0), np.full(2, 2.0))
-    x_m, y_m = (float(v) for v in 0.5 * (low + high))
-    height_m = 1.15 * max(float(high[0] - low[0]), float(high[1] - low[1]), 1.0)
-    so_far = rrb.VisibleTimeRanges(
-        [
-            rrb.VisibleTimeRange(
-                blueprint.CAR_TIME,
-                start=rrb.TimeRangeBoundary.infinite(),
-                end=rrb.TimeRangeBoundary.cursor_relative(),
-            )
-        ]
-    )
     trails = [f"{part}/map/{name}/trail" for name in ("recorded", *MODELS)]
-    return rrb.Spatial3DView(
-        origin=f"/{part}/map",
-        name="Plan view [m]",
-        line_grid=rrb.LineGrid3D(visible=True, spacing=0.5, stroke_width=1.0, color=[128, 128, 128, 50]),
-        eye_controls=rrb.EyeControls3D(
-            kind="orbital",
-            position=[x_m, y_m - 1e-4 * height_m, height_m],
-            look_target=[x_m, y_m, 0.0],
-            eye_up=[0.0, 1.0, 0.0],
-        ),
-        overrides=dict.fromkeys(trails, so_far),
+    return blueprint.plan_view(
+        f"/{part}/map", places, overrides=dict.fromkeys(trails, blueprint.so_far(blueprint.CAR_TIME))
     )

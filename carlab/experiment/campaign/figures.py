@@ -7,13 +7,18 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 
 from carlab.core.episode_data import EpisodeData
+from carlab.core.observation import decode_state
 from carlab.core.quantities import FloatArray
 from carlab.experiment.campaign.quick_check import QuickCheck
 from carlab.experiment.episodes.session import EpisodeResult
 from carlab.prediction.learned import sample_paths
 from learning.world.car_dynamics import OneStep
+from learning.world.disturbance import RolloutModel, start_rollouts
+from learning.world.model_env import policy_inputs
 
 HORIZON_S = 1.0
 STRICT_POSITION_M, STRICT_YAW_RAD = 0.05, 0.2
@@ -137,4 +142,52 @@ def predict_windows(dynamics: OneStep, episode: EpisodeData, seed: int = 0) -> W
     return WindowPredictions(starts[:, None] + np.arange(length + 1), paths.mean(axis=2), paths.std(axis=2))
 
 
-__all__ = ["EpisodeFigures", "WindowPredictions", "figures_of", "predict_windows"]
+@dataclass(frozen=True, slots=True)
+class PathsAhead:
+    """Predicted paths of the policy in the learned car.
+
+    Attributes:
+        mean: mean states (S, K + 1, 6), yaw continuous along a path.
+        across_std: standard deviation of the position across the mean heading (S, K + 1) [m].
+    """
+
+    mean: FloatArray
+    across_std: FloatArray
+
+
+def predict_ahead(
+    dynamics: RolloutModel,
+    act: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+    features: FloatArray,
+    period_s: float,
+    *,
+    n_samples: int = 16,
+    seed: int = 0,
+) -> PathsAhead:
+    """Predict the paths of the next second by a policy in a learned car, without the slew limits of the safety gate.
+
+    Args:
+        dynamics: the learned car with a history of H commands.
+        act: commands (N, 2) of the policy for its inputs (N, 7 + 2 H).
+        features: encoded states and past commands at the starts (S, 7 + 2 H).
+        period_s: control period [s].
+        n_samples: sampled paths from each start.
+        seed: of the samples.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.from_numpy(features).float().repeat_interleave(n_samples, dim=0)
+    rollouts = start_rollouts(dynamics, len(rows), generator)
+    states = [decode_state(rows)]
+    for _ in range(max(round(HORIZON_S / period_s), 1)):
+        action = torch.from_numpy(np.clip(act(policy_inputs(rows.numpy())), -1.0, 1.0))
+        rows = rollouts.step(rows, action, generator)
+        states.append(decode_state(rows))
+    paths = torch.stack(states, dim=1).double().numpy().reshape(len(features), n_samples, len(states), 6)
+    paths[..., 2] = np.unwrap(paths[..., 2], axis=2)
+    mean = paths.mean(axis=1)
+    left = np.stack([-np.sin(mean[..., 2]), np.cos(mean[..., 2])], axis=-1)
+    across = ((paths[..., :2] - mean[:, None, :, :2]) * left[:, None]).sum(axis=-1)
+    return PathsAhead(mean, across.std(axis=1))
+
+
+__all__ = ["EpisodeFigures", "PathsAhead", "WindowPredictions", "figures_of", "predict_ahead", "predict_windows"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,33 @@ from carlab.experiment.campaign.figures import EpisodeFigures, WindowPredictions
 
 CAR_M = (0.3, 0.16)
 UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+CHARACTERS_PER_LINE = 210
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A panel of the learning curve: names of figures with label and colour."""
+
+    title: str
+    series: Mapping[str, str]
+    colors: Mapping[str, str]
+    marks_parked: bool = False
+
+
+CURVES = (
+    Curve(
+        "Return",
+        {"total_reward": "on the car", "predicted_return": "in the learned car"},
+        {"total_reward": "tab:blue", "predicted_return": "tab:orange"},
+        marks_parked=True,
+    ),
+    Curve("Distance from the goal at the end [m]", {"distance_m": "distance"}, {"distance_m": "tab:gray"}),
+    Curve(
+        "Negative log-likelihood of the\nprevious episode [nat per step]",
+        {"last_episode_nll": "nll"},
+        {"last_episode_nll": "tab:purple"},
+    ),
+)
 
 
 def draw(
@@ -41,34 +69,53 @@ def draw(
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
-    from matplotlib.ticker import MaxNLocator
 
-    figure = pyplot.figure(figsize=(15, 7.6), layout="constrained")
-    grid = figure.add_gridspec(2, 6, height_ratios=(3, 2))
-    curve, likelihood, plan = (figure.add_subplot(grid[0, k : k + 2]) for k in (0, 2, 4))
-    numbers = [r.episode for r in rows]
-    curve.plot(numbers, [r.total_reward for r in rows], marker="o", label="on the car")
-    curve.plot(numbers, [r.predicted_return for r in rows], marker=".", linestyle="--", label="in the learned car")
-    parked = [r for r in rows if r.parked]
-    curve.plot([r.episode for r in parked], [r.total_reward for r in parked], "*", markersize=14, label="parked")
-    curve.set(xlabel="episode", ylabel="return")
-    curve.legend(fontsize=8)
-    likelihood.plot(numbers, [r.last_episode_nll for r in rows], marker="o", color="tab:purple")
-    likelihood.set(xlabel="episode", ylabel="negative log-likelihood of the previous episode [nat per step]")
-    distance = likelihood.twinx()
-    distance.plot(numbers, [r.distance_m for r in rows], marker=".", linestyle=":", color="tab:gray")
-    distance.set_ylabel("final distance from the goal [m]", color="tab:gray")
-    for axis in (curve, likelihood):
-        axis.grid(alpha=0.3)
-        axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    figure: Any = pyplot.figure(figsize=(16, 9))
+    figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.06)
     if rows[-1].verdict:
-        figure.suptitle(textwrap.fill(textwrap.shorten(rows[-1].diagnosis, 400, placeholder=" …"), 200), fontsize=8)
-    _plan(plan, episode, predictions, task)
-    plan.set_title(f"episode {number}: driven, and predicted one second ahead", fontsize=9)
-    for k in range(len(STATE_NAMES)):
-        _state(figure.add_subplot(grid[1, k]), k, episode, predictions)
+        figure.suptitle(textwrap.fill(rows[-1].diagnosis, CHARACTERS_PER_LINE), fontsize=9, x=0.01, ha="left")
+    upper, lower = figure.subfigures(2, 1, height_ratios=(3, 2))
+    curves = [curve for curve in CURVES if _has_data(rows, curve)]
+    axes = upper.subplots(1, len(curves) + 1, width_ratios=[*([2] * len(curves)), 3], squeeze=False)[0]
+    for axis, curve in zip(axes, curves, strict=False):
+        _curve(axis, rows, curve)
+    _plan(axes[-1], episode, predictions, task)
+    axes[-1].set_title(f"Episode {number}: driven, and predicted one second ahead", fontsize=10)
+    states = [k for k in range(len(STATE_NAMES)) if np.isfinite(episode.states[:, k]).any()]
+    for axis, k in zip(lower.subplots(1, len(states), squeeze=False)[0], states, strict=True):
+        _state(axis, k, episode, predictions)
     figure.savefig(path, dpi=120)
     pyplot.close(figure)
+
+
+def _has_data(rows: Sequence[EpisodeFigures], curve: Curve) -> bool:
+    return any(np.isfinite(getattr(row, name)) for row in rows for name in curve.series)
+
+
+def _curve(axis: Any, rows: Sequence[EpisodeFigures], curve: Curve) -> None:
+    """Plot figures over the episodes; stars mark parked ones."""
+    from matplotlib.ticker import MaxNLocator
+
+    numbers = [row.episode for row in rows]
+    first = next(iter(curve.series))
+    for name, label in curve.series.items():
+        style = {"marker": "o"} if name == first else {"marker": ".", "linestyle": "--"}
+        axis.plot(numbers, [getattr(row, name) for row in rows], color=curve.colors[name], label=label, **style)
+    parked = [row for row in rows if row.parked]
+    if parked and curve.marks_parked:
+        values = [getattr(row, first) for row in parked]
+        axis.plot([row.episode for row in parked], values, "*", color="tab:green", markersize=14, label="parked")
+    axis.set_title(curve.title, fontsize=10)
+    axis.set(xlabel="episode", xlim=(numbers[0] - 0.5, numbers[-1] + 0.5))
+    axis.grid(alpha=0.3)
+    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axis.ticklabel_format(axis="y", useOffset=False)
+    if len(axis.get_lines()) > 1:
+        _legend_below(axis)
+
+
+def _legend_below(axis: Any) -> None:
+    axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, fontsize=8, frameon=False)
 
 
 def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task: ParkingTask) -> None:
@@ -86,7 +133,7 @@ def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task:
     corners = np.array([*task.arena_m, task.arena_m[0]])
     axis.plot(*corners.T, color="tab:red", linewidth=0.8, alpha=0.5)
     axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axis.legend(fontsize=8)
+    _legend_below(axis)
 
 
 def _state(axis: Any, which: int, episode: EpisodeData, predictions: WindowPredictions) -> None:

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import fields
-
-import numpy as np
 
 from carlab.core.errors import DataError
 from carlab.core.task import ParkingTask
-from carlab.experiment.campaign.figures import EpisodeFigures, figures_of, predict_windows
+from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.picture import draw
 from carlab.experiment.campaign.quick_check import QuickCheck
-from carlab.experiment.campaign.training import DYNAMICS_FILE, FIGURES_FILE, TrainingPlan, has_ticks, model_folder
+from carlab.experiment.campaign.run_recording import write_run_recording
+from carlab.experiment.campaign.training import FIGURES_FILE, TrainingPlan, has_ticks, model_folder
 from carlab.experiment.episodes.session import result_of
 from carlab.recording.mcap.source import read_episode
-from carlab.recording.rerun.learning_curve import write_learning_curve
 from carlab.recording.run_folder import RunDirectory
-from learning.world.car_fit import LearnedCar, load_car
 
 log = logging.getLogger(__name__)
 
 CURVE_FILE = "learn.json"
+PICTURE_FILE = "learn.png"
 
 
 def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
@@ -66,33 +63,20 @@ def save_check(run: RunDirectory, check: QuickCheck) -> None:
 def write_report(run: RunDirectory, plan: TrainingPlan, row: EpisodeFigures) -> None:
     """Add an episode to learn.json, learn.png and learn.rrd of a run.
 
-    learn.rrd omits an earlier episode if its learned car was removed or has another file version.
+    An episode has no predictions if its learned car was removed or has another file version.
     """
     rows = save_row(run, row)
-    recordings = run.recordings()
-    driven, predictions = [], []
-    shown = [r for r in rows if r.episode <= len(recordings) and has_ticks(recordings[r.episode - 1])]
-    models = {r.episode: _learned(run, r.episode) for r in shown}
-    shown = [r for r in shown if models[r.episode] is not None]
-    for r in shown:
-        episode, model = read_episode(recordings[r.episode - 1]), models[r.episode]
-        assert model is not None
-        predicted = predict_windows(model, episode)
-        driven.append(episode.states)
-        predictions.append((predicted.ticks, predicted.mean, predicted.std))
-        if r is shown[-1]:
-            draw(rows, r.episode, episode, predicted, plan.task, run.path / "learn.png")
-    numbers = [f.name for f in fields(EpisodeFigures) if f.type != "str"]
-    figures = [{n: float(np.float64(getattr(r, n))) for n in numbers} for r in shown]
-    write_learning_curve(run.path / "learn.rrd", figures, driven, predictions, [r.diagnosis for r in shown])
+    newest = write_run_recording(run, {r.episode: r for r in rows}, run.path / "learn.rrd")
+    if newest is not None:
+        draw(rows, newest.number, newest.data, newest.windows, plan.task, run.path / PICTURE_FILE)
 
 
-def _learned(run: RunDirectory, episode: int) -> LearnedCar | None:
-    """The learned car before an episode; None if it was removed or has another file version."""
-    try:
-        return load_car(model_folder(run.models, episode) / DYNAMICS_FILE)
-    except DataError:
-        return None
-
-
-__all__ = ["CURVE_FILE", "learning_curve", "restore_missing_rows", "save_check", "save_row", "write_report"]
+__all__ = [
+    "CURVE_FILE",
+    "PICTURE_FILE",
+    "learning_curve",
+    "restore_missing_rows",
+    "save_check",
+    "save_row",
+    "write_report",
+]

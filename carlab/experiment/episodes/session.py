@@ -64,13 +64,15 @@ class SessionHooks:
     """Callbacks of a session.
 
     ``place_by_hand`` is called if the car cannot move to its start pose by itself; it returns when the car is there.
-    ``on_tick`` receives each tick, for a progress bar. ``stop_reason`` may end an episode (dead-man control).
+    ``on_tick`` receives each tick, for a progress bar. ``on_document`` receives each document in the control loop, and
+    returns at once. ``stop_reason`` may end an episode (dead-man control).
     ``on_abandon`` is called last if the loop hung, with reason and detail; it must end the process.
     """
 
     place_by_hand: Callable[[CarState], None] = lambda start: None
     on_episode: Callable[[int, int], None] = lambda episode, ticks: None
     on_tick: Callable[[Tick], None] = lambda tick: None
+    on_document: Callable[[Document], None] = lambda document: None
     on_result: Callable[[EpisodeResult], None] = lambda result: None
     stop_reason: Callable[[], EndReason | None] = lambda: None
     on_abandon: Callable[[EndReason, str], None] = lambda reason, detail: None
@@ -122,7 +124,7 @@ class Session:
         if self.record_rerun:
             sinks.append(RerunSink(self.run.episode_path(number, ".rrd")))
         recorder = Recorder(sinks)
-        emitter = _Emitter(recorder, self.hooks.on_tick)
+        emitter = _Emitter(recorder, self.hooks)
         abandon = functools.partial(self._abandon, recorder, emitter, interrupts)
         watch = LoopWatch(abandon, timeout_s=self.hang_timeout_s, urgent=interrupts.urgent)
         hooks = EpisodeHooks(
@@ -175,8 +177,8 @@ class _Emitter:
     Either the loop or the watchdog thread ends the episode; later documents of the loop are discarded.
     """
 
-    def __init__(self, recorder: Recorder, on_tick: Callable[[Tick], None]) -> None:
-        self._recorder, self._on_tick = recorder, on_tick
+    def __init__(self, recorder: Recorder, hooks: SessionHooks) -> None:
+        self._recorder, self._hooks = recorder, hooks
         self._lock = threading.Lock()
         self._ended = False
         self.last_tick: Tick | None = None
@@ -191,9 +193,10 @@ class _Emitter:
         """Record a document of the loop."""
         if self.claim_end() if isinstance(document, EpisodeEnded) else not self._ended:
             self._recorder.emit(document)
+            self._hooks.on_document(document)
         if isinstance(document, Tick):
             self.last_tick = document
-            self._on_tick(document)
+            self._hooks.on_tick(document)
 
 
 def _with_recorder_error(data: EpisodeData, failed: str | None) -> EpisodeData:

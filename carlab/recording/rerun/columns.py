@@ -15,6 +15,7 @@ from carlab.recording.rerun import blueprint as look
 
 Row = tuple[int, float, Observation]
 """Step, time on the car's clock [s] and observation."""
+Color = tuple[int, int, int]
 
 
 def entity_part(name: str) -> str:
@@ -23,19 +24,47 @@ def entity_part(name: str) -> str:
 
 
 class Columns:
-    """Sends columns to ``stream``; ``origin_s`` is the car's clock at the start of the episode."""
+    """Sends columns to a stream.
 
-    def __init__(self, stream: rr.RecordingStream, origin_s: float) -> None:
+    Args:
+        stream: receives the columns.
+        origin_s: the car's clock [s] at the zero of the timeline ``car_time``.
+        episode: position on the timeline ``episode``; None: without that timeline.
+        trail: colour of the driven path; None: that of the car.
+        logged: receives the paths of the series with data.
+    """
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        origin_s: float,
+        episode: int | None = None,
+        trail: Color | None = None,
+        logged: set[str] | None = None,
+    ) -> None:
         self._stream = stream
-        self._origin_s = origin_s
+        self.origin_s = origin_s
+        self._episode = episode
+        self._trail = trail
+        self._logged = set() if logged is None else logged
         self._previous: FloatArray | None = None
 
     def indexes(self, times_s: Sequence[float] | FloatArray, steps: Sequence[int]) -> list[rr.TimeColumn]:
-        """Both timelines of some rows."""
-        return [
-            rr.TimeColumn(look.CAR_TIME, duration=np.asarray(times_s, dtype=np.float64) - self._origin_s),
+        """All timelines of some rows."""
+        times = [
+            rr.TimeColumn(look.CAR_TIME, duration=np.asarray(times_s, dtype=np.float64) - self.origin_s),
             rr.TimeColumn(look.STEP, sequence=np.asarray(steps, dtype=np.int64)),
         ]
+        if self._episode is not None:
+            times.append(rr.TimeColumn(look.EPISODE, sequence=np.full(len(times_s), self._episode)))
+        return times
+
+    def set_time(self, car_time_s: float, step: int) -> None:
+        """Set the time of the next logged entities on all timelines."""
+        self._stream.set_time(look.CAR_TIME, duration=car_time_s)
+        self._stream.set_time(look.STEP, sequence=step)
+        if self._episode is not None:
+            self._stream.set_time(look.EPISODE, sequence=self._episode)
 
     def states(self, rows: Sequence[Row]) -> None:
         """Send pose, trail, velocities, age of the pose and raw poses of observations."""
@@ -43,13 +72,13 @@ class Columns:
             return
         indexes = self.indexes([t_s for _, t_s, _ in rows], [step for step, _, _ in rows])
         states = np.array([seen.state.to_array() for _, _, seen in rows])
-        self._previous = self._car(look.CAR, look.TRAIL, indexes, states, self._previous)
+        self._previous = self._car(look.CAR, look.TRAIL, indexes, states, self._previous, self._trail)
         speed = np.hypot(states[:, 3], states[:, 4])
         for name, values in zip(
             ("speed_mps", "vx_mps", "vy_mps", "yaw_rate_radps"), (speed, *states[:, 3:].T), strict=True
         ):
-            self._scalars(f"car/state/{name}", indexes, values)
-        self._scalars("car/state/age_ms", indexes, [1e3 * (t_s - seen.t_capture_s) for _, t_s, seen in rows])
+            self.scalars(f"car/state/{name}", indexes, values)
+        self.scalars("car/state/age_ms", indexes, [1e3 * (t_s - seen.t_capture_s) for _, t_s, seen in rows])
         lengths = [sum(pose.tracked for pose in seen.poses) for _, _, seen in rows]
         if any(lengths):
             points = [(pose.x_m, pose.y_m, 0.0) for _, _, seen in rows for pose in seen.poses if pose.tracked]
@@ -64,15 +93,15 @@ class Columns:
         for channel in ACTION_NAMES:
             for which in ("requested", "sent"):
                 values = [getattr(getattr(tick, which), channel) for tick in ticks]
-                self._scalars(f"car/action_{which}/{channel}", indexes, values)
-        self._scalars("episode/tick/late_ms", indexes, [1e3 * tick.late_s for tick in ticks])
-        self._scalars("episode/tick/policy_ms", indexes, [1e3 * tick.policy_s for tick in ticks])
+                self.scalars(f"car/action_{which}/{channel}", indexes, values)
+        self.scalars("episode/tick/late_ms", indexes, [1e3 * tick.late_s for tick in ticks])
+        self.scalars("episode/tick/policy_ms", indexes, [1e3 * tick.policy_s for tick in ticks])
 
     def rewards(self, transitions: Sequence[Transition]) -> None:
         """Send the reward of each transition at the time of its observation."""
         if transitions:
             indexes = self.indexes([row.t_s for row in transitions], [row.step + 1 for row in transitions])
-            self._scalars("episode/transition/reward", indexes, [row.reward for row in transitions])
+            self.scalars("episode/transition/reward", indexes, [row.reward for row in transitions])
 
     def overlay(self, name: str, times_s: Sequence[float], steps: Sequence[int], states: FloatArray) -> None:
         """Send the states of an additional car; rows with NaN are omitted."""
@@ -84,10 +113,16 @@ class Columns:
         indexes = self.indexes(np.asarray(times_s)[:count][whole], np.asarray(steps)[:count][whole].tolist())
         self._car(look.overlay_car(name), look.overlay_trail(name), indexes, states, None)
         for path, values in zip(look.overlay_series(name).values(), states[:, 3:].T, strict=True):
-            self._scalars(path, indexes, values)
+            self.scalars(path, indexes, values)
 
     def _car(
-        self, car: str, trail: str, indexes: list[rr.TimeColumn], states: FloatArray, previous: FloatArray | None
+        self,
+        car: str,
+        trail: str,
+        indexes: list[rr.TimeColumn],
+        states: FloatArray,
+        previous: FloatArray | None,
+        color: Color | None = None,
     ) -> FloatArray:
         places = np.column_stack([states[:, :2], np.zeros(len(states))])
         half_rad = 0.5 * states[:, 2]
@@ -97,13 +132,20 @@ class Columns:
         # One segment of the trail per row, from the previous position: the view shows all segments up to its time.
         starts = np.vstack([places[:1] if previous is None else previous, places[:-1]])
         strips = list(np.stack([starts, places], axis=1))
-        self._stream.send_columns(trail, indexes, rr.LineStrips3D.columns(strips=strips))
+        colors = None if color is None else [color] * len(strips)
+        self._stream.send_columns(trail, indexes, rr.LineStrips3D.columns(strips=strips, colors=colors))
         return places[-1:]
 
-    def _scalars(self, path: str, indexes: list[rr.TimeColumn], values: Sequence[float] | FloatArray) -> None:
+    def scalars(self, path: str, indexes: list[rr.TimeColumn], values: Sequence[float] | FloatArray) -> None:
+        """Send one series (n,), or several of one entity (n, series); nothing if all values are NaN."""
         numbers = np.asarray(values, dtype=np.float64)
-        if not np.isnan(numbers).all():
-            self._stream.send_columns(path, indexes, rr.Scalars.columns(scalars=numbers))
+        if np.isnan(numbers).all():
+            return
+        columns = rr.Scalars.columns(scalars=numbers.ravel())
+        if numbers.ndim > 1:
+            columns = columns.partition(np.full(len(numbers), numbers.shape[1]))
+        self._stream.send_columns(path, indexes, columns)
+        self._logged.add(path)
 
 
 def closed(points_m: Sequence[tuple[float, float]]) -> list[tuple[float, float, float]]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -15,6 +13,7 @@ from pathlib import Path
 
 from carlab.core.clock import monotonic_ns
 from carlab.core.errors import DataError, NotReadyError
+from carlab.recording.rerun.viewer import ADDRESS, free_port, rerun_program, wait_until_open
 from carlab.recording.sink import describe_os_error
 
 _DRIVER_FOLDERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
@@ -34,15 +33,6 @@ def has_vulkan_driver() -> bool:
     if any(Path(part).is_file() for names in named for part in names.split(os.pathsep) if part):
         return True
     return any(next(Path(folder).glob("*.json"), None) is not None for folder in _DRIVER_FOLDERS)
-
-
-def rerun_program() -> Path | None:
-    """The rerun program that belongs to this Python, or one on the search path."""
-    beside = Path(sys.executable).with_name("rerun")
-    if beside.exists():
-        return beside
-    found = shutil.which("rerun")
-    return Path(found) if found else None
 
 
 def save_screenshot(
@@ -68,7 +58,7 @@ def save_screenshot(
         raise NotReadyError(_CANNOT, ["the program 'rerun' is not installed; install rerun-sdk with pip"])
     if not has_vulkan_driver():
         raise NotReadyError(_CANNOT, [_NO_DRIVER])
-    port = _free_port()
+    port = free_port()
     with tempfile.TemporaryDirectory(prefix="carlab-") as folder, (Path(folder) / "log").open("w+") as log:
         command = [
             *(str(program), str(rrd_path.resolve()), "--headless", "--bind", "127.0.0.1", "--port", str(port)),
@@ -103,26 +93,13 @@ def _end(viewer: subprocess.Popen[bytes]) -> None:
     viewer.wait()
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def _settled_picture(viewer: subprocess.Popen[bytes], port: int, folder: Path, give_up_ns: int) -> bytes:
     """Bytes of the first picture that equals the previous one, when axis ranges are final and messages have gone."""
     from rerun.experimental import ViewerClient
 
+    wait_until_open(viewer, port, give_up_ns)
     pause = threading.Event()
-    while True:
-        if viewer.poll() is not None:
-            raise RuntimeError(f"the viewer ended with code {viewer.returncode}")
-        if monotonic_ns() > give_up_ns:
-            raise RuntimeError("the viewer did not start in time")
-        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
-            break
-        pause.wait(0.1)
-    client = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
+    client = ViewerClient(ADDRESS.format(port=port))
     path = folder / "picture.png"
     began_ns, before = monotonic_ns(), b""
     while True:

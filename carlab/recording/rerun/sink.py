@@ -1,14 +1,13 @@
 """Writer of one episode to one .rrd file for the rerun viewer, named .partial until it is complete.
 
-Documents are collected and sent as columns at every flush: a tick costs microseconds, and live recordings and
-conversions from arrays (``episode_to_rrd``) have the same entities.
+Live recordings and conversions from arrays (``episode_to_rrd``) have the same entities. The layout of a complete file
+has no panel without data.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import logging
 import math
 import os
 from collections.abc import Mapping
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from carlab.core.documents import EpisodeEnded, EpisodeStarted, HealthReading, SafetyEvent, Tick, Transition
+from carlab.core.documents import EpisodeEnded, EpisodeStarted
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
@@ -26,8 +25,9 @@ from carlab.core.quantities import FloatArray
 from carlab.recording.episode_builder import documents_from_episode
 from carlab.recording.pipe_file import PipeFile
 from carlab.recording.rerun import blueprint as look
-from carlab.recording.rerun.columns import Columns, Row, entity_part, log_surroundings
-from carlab.recording.sink import Item, LogLine, Sink, claim, describe_os_error, partial_path
+from carlab.recording.rerun.columns import entity_part
+from carlab.recording.rerun.document_stream import DocumentStream
+from carlab.recording.sink import Item, Sink, claim, describe_os_error, partial_path
 
 APPLICATION = "carlab"
 _FLUSH_TIMEOUT_S = 10.0
@@ -59,15 +59,7 @@ class RerunSink(Sink):
         self._stream: rr.RecordingStream | None = None
         self._file = PipeFile(partial_path(self.path))
         self._opened = False
-        self._origin_s = 0.0
-        self._columns: Columns | None = None
-        self._seen: list[Row] = []
-        self._ticks: list[Tick] = []
-        self._transitions: list[Transition] = []
-        self._rows: list[tuple[int, float]] = []
-        self._state = ""
-        self._arrival_s: float | None = None
-        self._step = 0
+        self._documents: DocumentStream | None = None
 
     def open(self) -> None:
         """Create the file. Raises DataError if that fails."""
@@ -82,9 +74,9 @@ class RerunSink(Sink):
 
     def flush(self) -> None:
         """Send the collected rows and wait until rerun has passed them to the operating system."""
-        if self._stream is not None and self._columns is not None:
-            self._send_rows(self._columns)
-            self._flush_stream(self._stream)
+        if self._documents is not None:
+            self._documents.flush()
+            self._flush_stream(self._documents.stream)
 
     def abandon(self) -> None:
         """Close the stream and leave the file as ``.partial``. A file without documents is removed."""
@@ -103,49 +95,21 @@ class RerunSink(Sink):
         if not self._opened:
             raise DataError(f"{self.path} is not open; use the sink in a Recorder.")
         if isinstance(item, EpisodeStarted):
-            self._stream = self._begin(item)
-            self._columns = Columns(self._stream, item.t_s)
+            self._documents = self._begin(item)
             return
-        stream, columns = self._stream, self._columns
-        if stream is None or columns is None:
+        if self._documents is None:
             raise DataError(f"{self.path} has no stream; its start was not written.")
-        match item:
-            case Tick():
-                self._step = item.step
-                self._seen.append((item.step, item.t_s, item.observation))
-                self._ticks.append(item)
-                if item.safety_state != self._state:
-                    self._state = item.safety_state
-                    self._at(stream, item.t_s)
-                    stream.log(look.SAFETY_STATE, rr.StateChange(state=item.safety_state))
-                if len(self._ticks) >= _ROWS_BEFORE_FLUSH:
-                    self._send_rows(columns)
-            case Transition():
-                self._transitions.append(item)
-                self._arrival_s = item.t_s
-            case SafetyEvent():
-                self._text(stream, look.SAFETY_EVENT, f"{item.kind}: {item.text}", "WARN")
-            case HealthReading():
-                self._at(stream, item.t_s)
-                for name, value in item.health.readings.items():
-                    stream.log(f"{look.HEALTH}/{entity_part(name)}", rr.Scalars(value))
-                for problem in item.health.problems:
-                    self._text(stream, look.LOG, f"health: {problem}", "WARN")
-            case LogLine():
-                level = logging.getLevelName(item.level).replace("WARNING", "WARN")
-                self._text(stream, look.LOG, f"{item.name}: {item.message}", level)
-            case EpisodeEnded():
-                self._end(stream, columns, item)
+        self._documents.write(item)
+        if isinstance(item, EpisodeEnded):
+            self._end(self._documents, item)
 
-    def _begin(self, started: EpisodeStarted) -> rr.RecordingStream:
-        self._origin_s = started.t_s
-        outline = [*started.arena_m, *started.path_m, *([started.goal[:2]] if started.goal else [])]
-        points_m = np.array([*outline, *self._extent_m.tolist()], dtype=np.float64).reshape(-1, 2)
+    def _begin(self, started: EpisodeStarted) -> DocumentStream:
+        self._extent_m = np.vstack([look.extent_m(started), self._extent_m])
         overlays = tuple(self._overlays)
         stream = rr.RecordingStream(APPLICATION)
         # abandon() must disconnect the stream from here on.
         self._stream = stream
-        stream.save(self._file.start(), default_blueprint=look.drive_blueprint(points_m, overlays))
+        stream.save(self._file.start(), default_blueprint=look.drive_blueprint(self._extent_m, overlays))
         reality = started.reality.value
         title = self._title or f"Episode {started.episode}: {started.policy} on {started.car}, {reality.upper()}"
         stream.send_recording_name(title)
@@ -167,20 +131,17 @@ class RerunSink(Sink):
         if started.config_toml:
             stream.log("episode/config", rr.TextDocument(started.config_toml), static=True)
         look.log_styles(stream, overlays)
-        log_surroundings(stream, started.arena_m, started.path_m, started.goal)
-        return stream
+        documents = DocumentStream(stream)
+        documents.begin(started)
+        return documents
 
-    def _end(self, stream: rr.RecordingStream, columns: Columns, ended: EpisodeEnded) -> None:
-        if ended.last is not None and ended.steps > self._step:
-            self._seen.append((ended.steps, ended.t_s if self._arrival_s is None else self._arrival_s, ended.last))
-        self._send_rows(columns)
+    def _end(self, documents: DocumentStream, ended: EpisodeEnded) -> None:
         for name, states in self._overlays.items():
-            columns.overlay(name, [t_s for _, t_s in self._rows], [step for step, _ in self._rows], states)
-        self._step = ended.steps
-        level = "WARN" if ended.reason.is_safety_stop else "INFO"
-        sentence = f"{ended.reason.name}: {ended.reason.value} {ended.detail}".rstrip()
-        self._text(stream, look.END, sentence, level)
-        _send_end(stream, ended.reason, ended.detail, ended.steps, ended.total_reward)
+            documents.overlay(name, states)
+        _send_end(documents.stream, ended.reason, ended.detail, ended.steps, ended.total_reward)
+        look.send_blueprint(
+            documents.stream, look.drive_blueprint(self._extent_m, tuple(self._overlays), documents.logged)
+        )
 
     def _finish(self) -> None:
         stream, self._stream = self._stream, None
@@ -200,22 +161,6 @@ class RerunSink(Sink):
         except (RuntimeError, TimeoutError) as error:
             raise OSError(errno.EIO, f"rerun's writer failed ({error})") from error
         self._file.check()
-
-    def _at(self, stream: rr.RecordingStream, t_s: float) -> None:
-        stream.set_time(look.CAR_TIME, duration=t_s - self._origin_s)
-        stream.set_time(look.STEP, sequence=self._step)
-
-    def _text(self, stream: rr.RecordingStream, path: str, text: str, level: str) -> None:
-        self._at(stream, self._last_t_s)
-        stream.log(path, rr.TextLog(text, level=level))
-
-    def _send_rows(self, columns: Columns) -> None:
-        columns.states(self._seen)
-        columns.ticks(self._ticks)
-        columns.rewards(self._transitions)
-        if self._overlays:
-            self._rows.extend((step, t_s) for step, t_s, _ in self._seen)
-        self._seen, self._ticks, self._transitions = [], [], []
 
 
 def _send_end(stream: rr.RecordingStream, reason: EndReason, detail: str, steps: int, total_reward: float) -> None:

@@ -1,0 +1,74 @@
+"""The program of the rerun viewer."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import rerun as rr
+
+from carlab.core.clock import monotonic_ns
+from carlab.core.errors import NotReadyError
+
+ADDRESS = "rerun+http://127.0.0.1:{port}/proxy"
+_START_TIMEOUT_NS = 30 * 10**9
+
+
+def rerun_program() -> Path | None:
+    """The rerun program that belongs to this Python, or one on the search path."""
+    beside = Path(sys.executable).with_name("rerun")
+    if beside.exists():
+        return beside
+    found = shutil.which("rerun")
+    return Path(found) if found else None
+
+
+def free_port() -> int:
+    """A free TCP port of this computer."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_until_open(viewer: subprocess.Popen[bytes], port: int, give_up_ns: int) -> None:
+    """Wait until a viewer listens on its port. Raises RuntimeError if it ends, or at a time of the monotonic clock."""
+    pause = threading.Event()
+    while True:
+        if viewer.poll() is not None:
+            raise RuntimeError(f"the viewer ended with code {viewer.returncode}")
+        if monotonic_ns() > give_up_ns:
+            raise RuntimeError("the viewer did not start in time")
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
+            return
+        pause.wait(0.1)
+
+
+def open_viewer(stream: rr.RecordingStream, program: Path) -> None:
+    """Open a viewer that outlives this process, and connect a stream to it.
+
+    Raises:
+        NotReadyError: it does not start.
+    """
+    port = free_port()
+    viewer = subprocess.Popen(
+        [str(program), "--bind", "127.0.0.1", "--port", str(port)],
+        stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+    )  # fmt: skip
+    try:
+        wait_until_open(viewer, port, monotonic_ns() + _START_TIMEOUT_NS)
+    except RuntimeError as error:
+        raise NotReadyError("The viewer", [f"{error}; run 'rerun' in a terminal to see why."]) from error
+    connect_to_viewer(stream, ADDRESS.format(port=port))
+
+
+def connect_to_viewer(stream: rr.RecordingStream, address: str) -> None:
+    """Connect a stream to an open viewer."""
+    stream.connect_grpc(address)
+
+
+__all__ = ["ADDRESS", "connect_to_viewer", "free_port", "open_viewer", "rerun_program", "wait_until_open"]

@@ -1,0 +1,103 @@
+"""A live view shows what a run emits, and never delays it."""
+
+from __future__ import annotations
+
+import functools
+import queue
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from learning_runs import TICKS, drive
+
+import carlab
+from carlab.core.documents import EpisodeStarted, Tick
+from carlab.core.errors import ConfigError, NotReadyError
+from carlab.experiment.campaign import live_view
+from carlab.experiment.campaign.figures import predict_ahead
+from carlab.experiment.campaign.live_view import Activity, LiveSettings, LiveView, show
+from carlab.recording.mcap.source import read_documents, read_episode
+from tests.helpers.rerun_files import cells, tabs
+
+
+def save_to(stream: Any, path: Path) -> None:
+    stream.save(path)
+
+
+def hang(stream: Any) -> None:
+    threading.Event().wait()
+
+
+def test_view_shows_all_episodes_that_were_emitted(tmp_path: Path) -> None:
+    run = drive(tmp_path, TICKS, episodes=2)
+    messages: queue.Queue[Any] = queue.Queue()
+    messages.put(Activity("learning the car", 0, 10))
+    messages.put(Activity("learning the car", 1, 10))
+    documents = [read_documents(path) for path in run.recordings()]
+    messages.put(documents[0][5])  # Its start was lost: it is omitted.
+    for document in (*documents[0], *documents[1], None):
+        messages.put(document)
+    file = tmp_path / "live.rrd"
+    show(LiveSettings(run.path, 2, False, functools.partial(save_to, path=file)), messages)  # type: ignore[arg-type]
+    rows = [(n, c[0]) for n, c in cells(file, "Scalars:scalars", "episode")["car/state/vx_mps"] if c[0] == c[0]]
+    for number, path in enumerate(run.recordings(), start=1):
+        np.testing.assert_array_equal([v for n, v in rows if n == number], read_episode(path).states[:, 3])
+    assert [cell for _, cell in cells(file, "TextLog:text", "car_time")["log"]] == [["learning the car"]]
+    assert set(tabs(file)) == {"Drive by episode", "Link"}
+
+
+def test_hanging_viewer_loses_documents_and_does_not_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_view, "CLOSE_TIMEOUT_S", 0.1)
+    with LiveView(LiveSettings(tmp_path, 1, False, hang), capacity=5) as view:
+        for step in range(50):
+            view.report_activity("driving", step, 50)
+            view.emit(step)  # type: ignore[arg-type]
+        assert view.dropped >= 45
+
+
+def test_invalid_viewers_are_refused_before_the_car_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="give the address of a viewer"):
+        carlab.drive(viewer="localhost:9876", out=tmp_path)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(NotReadyError, match="has no screen; name a viewer on another one with --viewer"):
+        carlab.learn(live=True, out=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_documents_of_a_drive_reach_a_listener(tmp_path: Path) -> None:
+    documents: list[Any] = []
+    run = carlab.drive(
+        ticks=5, out=tmp_path, rerun=False, picture=False, hooks=carlab.RunHooks(on_document=documents.append)
+    )
+    assert isinstance(documents[0], EpisodeStarted)
+    recorded = [d.step for d in read_documents(run.recordings[0]) if isinstance(d, Tick)]
+    assert [d.step for d in documents if isinstance(d, Tick)] == recorded == list(range(5))
+
+
+class Drifting:
+    """A car that moves by its action along x, and to the left by Gaussian noise of 0.01 m a step."""
+
+    history = 0
+
+    def step(self, features: torch.Tensor, action: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        after = features.clone()
+        after[:, 0] += action[:, 0]
+        after[:, 1] += 0.01 * torch.randn(len(features), generator=generator)
+        return after
+
+
+def test_predicted_path_follows_the_policy_with_the_spread_of_the_model() -> None:
+    start = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [2.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+    ahead = predict_ahead(
+        Drifting(), lambda inputs: np.full((len(inputs), 2), 3.0, np.float32), start, 0.1, n_samples=4000
+    )
+    steps = np.arange(11)
+    np.testing.assert_allclose(
+        ahead.mean[:, :, 0], [steps, 2.0 + steps], atol=1e-5, err_msg="commands are clipped to 1"
+    )
+    np.testing.assert_allclose(ahead.across_std, [0.01 * np.sqrt(steps)] * 2, rtol=0.06, atol=1e-6)
