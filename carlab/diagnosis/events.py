@@ -51,6 +51,22 @@ class Event:
     role: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class EventUse:
+    """Events of the recordings, and what was done about them.
+
+    Attributes:
+        found: the events, in the order of recordings and time.
+        are_left_out: whether no fitted and no scored window contains them.
+        fit_windows, held_out_windows: number of windows that were left out.
+    """
+
+    found: tuple[Event, ...] = ()
+    are_left_out: bool = True
+    fit_windows: int = 0
+    held_out_windows: int = 0
+
+
 def mark_events(
     episodes: Sequence[EpisodeData], config: SimulatorConfig, settings: EventSettings = DEFAULT.events
 ) -> tuple[list[EpisodeData], tuple[Event, ...]]:
@@ -225,4 +241,4 @@ def _merged(t_s: FloatArray, rows: BoolArray, merge_s: float) -> list[tuple[int,
     return [(int(group[0]), int(group[-1])) for group in groups]
 
 
-__all__ = ["Event", "find_events", "grip_limits", "mark_events"]
+__all__ = ["Event", "EventUse", "find_events", "grip_limits", "mark_events"]

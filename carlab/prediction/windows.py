@@ -140,6 +140,12 @@ class PredictionWindows:
         chosen: dict[str, Any] = {name: v[which] for name, v in values.items() if isinstance(v, np.ndarray)}
         return replace(self, **chosen)
 
+    def split_at_events(self) -> tuple[Self, Self]:
+        """Windows without and with rows of events. Raises DataError if all have some."""
+        if self.in_event.all():
+            raise DataError("Each prediction window has rows of an event (collision); keep events, or record again.")
+        return self.take(~self.in_event), self.take(self.in_event)
+
     def thinned(self, max_windows: int) -> Self:
         """Select at most ``max_windows`` windows at even spacing."""
         if len(self) <= max_windows:
@@ -211,8 +217,8 @@ def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every
     if every > 1:
         whole = len(grid) // every * every
         commands = commands[:whole].reshape(-1, every, 2).mean(axis=1)
-        arrays = (grid, states, smooth, curvature_bias, in_event)
-        grid, states, smooth, curvature_bias, in_event = (v[:whole:every] for v in arrays)
+        grid, states, smooth, curvature_bias = (v[:whole:every] for v in (grid, states, smooth, curvature_bias))
+        in_event = in_event[:whole:every]
     return Track(
         recording=index,
         period_s=every * period_s,
