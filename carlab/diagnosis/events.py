@@ -164,9 +164,8 @@ class _Stretch:
 
     def change_over(self, first: int, last: int, settings: EventSettings) -> tuple[float, float]:
         """Size of the change of velocity, and change of yaw rate, from before row ``first`` to after row ``last``."""
-        gap, width = self.rows_of(settings.lasting_gap_s), self.rows_of(settings.lasting_width_s)
-        end = len(self.t_s) - 1
-        before, after = max(first - gap, 1), min(last + gap, end - 1)
+        width, end = self.rows_of(settings.lasting_width_s), len(self.t_s) - 1
+        before, after = max(first - 1, 1), min(last + 1, end - 1)
         early = self._velocities(np.array([max(before - width, 0)]), np.array([before]))
         late = self._velocities(np.array([after]), np.array([min(after + width, end)]))
         vx, vy, yaw_rate = (late - early)[0]
@@ -187,7 +186,7 @@ def _impact_rows(stretches: Sequence[_Stretch], car: CarParameters, settings: Ev
             continue
         usual = _usual_changes(stretches, changes, settings)
         for rows, stretch, change in zip(found, stretches, changes, strict=True):
-            later = stretch.changes(stretch.rows_of(settings.lasting_width_s), stretch.rows_of(settings.lasting_gap_s))
+            later = stretch.changes(stretch.rows_of(settings.lasting_width_s), stretch.rows_of(width_s))
             products = later.values * change.values
             lasting = np.column_stack([products[:, 0] + products[:, 1], products[:, 2]])
             is_fast = change.sizes > np.maximum(limits * change.elapsed_s[:, None], usual)

@@ -20,15 +20,13 @@ class EventSettings:
     """Quantile of the changes of a recording that counts as usual driving: its hardest braking and steering."""
     usual_factor: float = 1.45
     """Minimum change, over the usual one. The ETH car brakes and drives with 1.5 times the grip of its car file."""
-    noise_z: float = 4.5
-    """Minimum change [standard deviations of its noise]."""
+    noise_z: float = 6.0
+    """Minimum change [standard deviations of its noise]. Errors of stamps have long tails."""
     noise_rows: int = 9
     """Rows of a running median; what it leaves of the changes is their noise."""
     lasting_width_s: float = 0.068
-    """Width [s] of the velocities before and after that show whether a change lasts."""
-    lasting_gap_s: float = 0.02
-    """Minimum distance [s] of these velocities from the row, at least one row: a wrong pose or stamp of a single row
-    touches neither."""
+    """Width [s] of the velocities that show whether a change lasts: those before and after the widths above, so that no
+    jump of the pose is in both."""
     lasting_share: float = 0.5
     """Minimum share of a change that lasts. A pose that jumps, and stays there or returns, changes no velocity."""
     moving_mps: float = 0.2
