@@ -177,21 +177,32 @@ class _Stretch:
 
 
 def _impact_rows(stretches: Sequence[_Stretch], car: CarParameters, settings: EventSettings) -> list[BoolArray]:
-    """Rows (n,) of each stretch around which the velocity or the yaw rate changes too fast."""
-    found = [np.zeros(len(s.t_s), dtype=bool) for s in stretches]
+    """Rows (n,) of each stretch around which velocity or yaw rate change too fast: stretches with a lasting change."""
+    fast, lasting = ([np.zeros(len(s.t_s), dtype=bool) for s in stretches] for _ in range(2))
     limits = np.array(settings.grip_factors) * grip_limits(car)
     for width_s in settings.widths_s:
         changes = [s.changes(s.rows_of(width_s), 0) for s in stretches]
         if not any(np.isfinite(c.elapsed_s).any() for c in changes):
             continue
         usual = _usual_changes(stretches, changes, settings)
-        for rows, stretch, change in zip(found, stretches, changes, strict=True):
-            later = stretch.changes(stretch.rows_of(settings.lasting_width_s), stretch.rows_of(width_s))
-            products = later.values * change.values
-            lasting = np.column_stack([products[:, 0] + products[:, 1], products[:, 2]])
+        for k, (stretch, change) in enumerate(zip(stretches, changes, strict=True)):
             is_fast = change.sizes > np.maximum(limits * change.elapsed_s[:, None], usual)
-            rows |= (is_fast & (lasting >= settings.lasting_share * change.sizes**2)).any(axis=1)
-    return found
+            later = stretch.changes(stretch.rows_of(settings.lasting_width_s), stretch.rows_of(width_s))
+            steady = median_filter(np.nan_to_num(change.values), size=(settings.noise_rows, 1))
+            expected = steady * (later.elapsed_s / change.elapsed_s)[:, None]
+            lasts = np.minimum(_along(later.values, change), _along(later.values - expected, change))
+            fast[k] |= is_fast.any(axis=1)
+            lasting[k] |= (is_fast & (lasts >= settings.lasting_share * change.sizes**2)).any(axis=1)
+    for is_fast, is_lasting in zip(fast, lasting, strict=True):
+        for first, end in runs(is_fast):
+            is_fast[first:end] = is_lasting[first:end].any()
+    return fast
+
+
+def _along(later: FloatArray, change: _Changes) -> FloatArray:
+    """Products (n, 2) of later changes (n, 3) with those of velocity and yaw rate: positive in the same direction."""
+    products = later * change.values
+    return np.column_stack([products[:, 0] + products[:, 1], products[:, 2]])
 
 
 def _usual_changes(stretches: Sequence[_Stretch], changes: Sequence[_Changes], settings: EventSettings) -> FloatArray:

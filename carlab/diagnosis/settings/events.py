@@ -23,12 +23,13 @@ class EventSettings:
     noise_z: float = 6.0
     """Minimum change [standard deviations of its noise]. Errors of stamps have long tails."""
     noise_rows: int = 9
-    """Rows of a running median; what it leaves of the changes is their noise."""
+    """Rows of a running median of the changes: the steady acceleration. What it leaves of the changes is their noise."""
     lasting_width_s: float = 0.068
     """Width [s] of the velocities that show whether a change lasts: those before and after the widths above, so that no
     jump of the pose is in both."""
     lasting_share: float = 0.5
-    """Minimum share of a change that lasts. A pose that jumps, and stays there or returns, changes no velocity."""
+    """Minimum share of a change that lasts, with and without the steady acceleration of the rows around it. A pose that
+    jumps, and stays there or returns, changes no velocity."""
     moving_mps: float = 0.2
     """Rows in which the car is faster [m/s] count for the usual change."""
     min_moving_rows: int = 100
