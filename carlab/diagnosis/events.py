@@ -181,15 +181,16 @@ def _impact_rows(stretches: Sequence[_Stretch], car: CarParameters, settings: Ev
     fast, lasting = ([np.zeros(len(s.t_s), dtype=bool) for s in stretches] for _ in range(2))
     limits = np.array(settings.grip_factors) * grip_limits(car)
     for width_s in settings.widths_s:
-        changes = [s.changes(s.rows_of(width_s), 0) for s in stretches]
+        width = stretches[0].rows_of(width_s)
+        changes = [s.changes(width, 0) for s in stretches]
         if not any(np.isfinite(c.elapsed_s).any() for c in changes):
             continue
-        usual = _usual_changes(stretches, changes, settings)
+        steady = [median_filter(np.nan_to_num(c.values), (settings.steady_widths * width, 1)) for c in changes]
+        usual = _usual_changes(stretches, changes, steady, settings)
         for k, (stretch, change) in enumerate(zip(stretches, changes, strict=True)):
             is_fast = change.sizes > np.maximum(limits * change.elapsed_s[:, None], usual)
-            later = stretch.changes(stretch.rows_of(settings.lasting_width_s), stretch.rows_of(width_s))
-            steady = median_filter(np.nan_to_num(change.values), size=(settings.noise_rows, 1))
-            expected = steady * (later.elapsed_s / change.elapsed_s)[:, None]
+            later = stretch.changes(stretch.rows_of(settings.lasting_width_s), width)
+            expected = steady[k] * (later.elapsed_s / change.elapsed_s)[:, None]
             lasts = np.minimum(_along(later.values, change), _along(later.values - expected, change))
             fast[k] |= is_fast.any(axis=1)
             lasting[k] |= (is_fast & (lasts >= settings.lasting_share * change.sizes**2)).any(axis=1)
@@ -205,7 +206,9 @@ def _along(later: FloatArray, change: _Changes) -> FloatArray:
     return np.column_stack([products[:, 0] + products[:, 1], products[:, 2]])
 
 
-def _usual_changes(stretches: Sequence[_Stretch], changes: Sequence[_Changes], settings: EventSettings) -> FloatArray:
+def _usual_changes(
+    stretches: Sequence[_Stretch], changes: Sequence[_Changes], steady: Sequence[FloatArray], settings: EventSettings
+) -> FloatArray:
     """Changes (2,) of velocity and yaw rate that usual driving and noise do not exceed."""
     values, sizes = np.concatenate([c.values for c in changes]), np.concatenate([c.sizes for c in changes])
     is_known = np.isfinite(values).all(axis=1)
@@ -213,7 +216,7 @@ def _usual_changes(stretches: Sequence[_Stretch], changes: Sequence[_Changes], s
     usual = np.zeros(2)
     if is_moving.sum() >= settings.min_moving_rows:
         usual = np.quantile(sizes[is_moving], settings.usual_quantile, axis=0)
-    rough = values[is_known] - median_filter(values[is_known], size=(settings.noise_rows, 1))
+    rough = (values - np.concatenate(steady))[is_known]
     x, y, yaw = (robust_std(column) for column in rough.T)
     return np.asarray(np.maximum(settings.usual_factor * usual, settings.noise_z * np.array([max(x, y), yaw])))
 

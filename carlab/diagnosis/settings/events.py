@@ -22,8 +22,9 @@ class EventSettings:
     """Minimum change, over the usual one. The ETH car brakes and drives with 1.5 times the grip of its car file."""
     noise_z: float = 6.0
     """Minimum change [standard deviations of its noise]. Errors of stamps have long tails."""
-    noise_rows: int = 9
-    """Rows of a running median of the changes: the steady acceleration. What it leaves of the changes is their noise."""
+    steady_widths: int = 9
+    """Widths of a running median of the changes: the steady acceleration. What it leaves of them is their noise. An
+    impulse changes the rows of two widths, a contact those of four."""
     lasting_width_s: float = 0.068
     """Width [s] of the velocities that show whether a change lasts: those before and after the widths above, so that no
     jump of the pose is in both."""
