@@ -150,6 +150,7 @@ def diagnose(
     ceiling: bool = False,
     discrepancy: bool = False,
     adapt: bool = False,
+    keep_events: bool = False,
     seed: int = 0,
     budget_s: float = 300.0,
     out: Path | str | None = None,
@@ -170,6 +171,7 @@ def diagnose(
         ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
         discrepancy: train networks that correct the diagnosed simulator, and report their error; takes minutes.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed; takes a minute.
+        keep_events: fit and score windows with events (collisions, a hand) too; the report lists them in any case.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search. ``inf`` for none.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
@@ -194,7 +196,7 @@ def diagnose(
     fit = read_material(to_fit, "fit", latency_s)
     validation = read_material(to_validate, "held out", latency_s)
     options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
-    options |= {"discrepancy": discrepancy, "adapt": adapt, "budget_s": budget_s}
+    options |= {"discrepancy": discrepancy, "adapt": adapt, "keep_events": keep_events, "budget_s": budget_s}
     report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})
     if out is not None:
         report.save(out)

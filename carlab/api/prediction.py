@@ -15,8 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from carlab.cars import CarFile
+    from carlab.diagnosis.events import EventUse
     from carlab.diagnosis.findings import Change, FitErrors
-    from carlab.diagnosis.score_recording import PartScore, RecordingScore
+    from carlab.diagnosis.score_recording import RecordingScore
     from carlab.prediction.errors import ChannelError
 
 ERROR_COLUMNS = ("position_m", "yaw_rad", "vx", "vy", "yaw_rate", "score")
@@ -44,12 +45,22 @@ class PredictionErrors:
     @property
     def summary(self) -> dict[str, FitErrors]:
         """Root mean square errors in the whole recording of model, constant velocity, no change, and noise floor."""
-        return summary_of(self.score.whole)
+        return self.score.whole.summaries()
+
+    @property
+    def events(self) -> EventUse:
+        """Events of the recordings (collisions, a hand), which are left out of the errors unless they were kept."""
+        return self.score.events
+
+    @property
+    def summary_with_events(self) -> dict[str, FitErrors]:
+        """The errors in the whole recording, including the windows with events."""
+        return self.score.whole.summaries(with_events=True)
 
     @property
     def last_part(self) -> dict[str, FitErrors]:
         """The same for the last part, which a diagnosis of this recording alone holds out; empty if it is too short."""
-        return {} if self.score.last is None else summary_of(self.score.last)
+        return {} if self.score.last is None else self.score.last.summaries()
 
     def channels(self, model: str = "model") -> tuple[ChannelError, ...]:
         """Rms, median, 90th percentile and bias of each state channel in the whole recording.
@@ -132,6 +143,7 @@ def predict(
     stride_s: float = 0.25,
     holdout_share: float = 0.3,
     adapt: bool = False,
+    keep_events: bool = False,
 ) -> PredictionErrors:
     """Predict a recording from many of its states, and compare the predictions with it.
 
@@ -142,6 +154,7 @@ def predict(
         stride_s: time between initial states [s].
         holdout_share: share of the last part of the recording, above 0 and at most 0.5.
         adapt: also predict with adaptation to the recent past: rows before each initial state.
+        keep_events: score windows with events (collisions) too.
 
     Returns:
         The errors of the model, with and without adaptation, of constant velocity and of no change. For a model of a
@@ -163,12 +176,7 @@ def predict(
         stride_s=stride_s,
         holdout_share=holdout_share,
         adapt=adapt,
+        keep_events=keep_events,
     )
     noise = file.recording_noise
     return PredictionErrors(material, score, noise is not None and noise.adaptation is not None)
-
-
-def summary_of(part: PartScore) -> dict[str, FitErrors]:
-    """Root mean square errors of each model in a part of a recording, and its noise floor."""
-    errors = {name: part.held_out.summary(values) for name, values in part.errors.items()}
-    return errors | {"noise floor": part.held_out.floor_summary()}

@@ -66,6 +66,9 @@ class BenchOptions:
     effects: tuple[str, ...] = ()
     """realcars: restrict the search to these effects of the catalogue."""
 
+    keep_events: bool = False
+    """realcars: fit and score prediction windows with events (collisions, a hand) too."""
+
     car: Path = Path("eth_rc_car")
     """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. rollouts: the
     same. priors with --data, and realcars: car file of the nominal simulator, which is diagnosed."""
@@ -137,6 +140,7 @@ PLACES = {
     "data": (REGRESSION, PRIORS, REALCARS, ROLLOUTS),
     "held_out": (REALCARS,),
     "effects": (REALCARS,),
+    "keep_events": (REALCARS,),
     "fit": (REALCARS,),
     "car": (REALCAR, READ, REALCARS, ROLLOUTS),
     "history": (REALCAR, PRIORS, ROLLOUTS),

@@ -18,6 +18,7 @@ def run_realcars(options: BenchOptions) -> int:
     """Diagnose the recordings to fit, and print the errors of all models on the held-out recordings."""
     from carlab.api import diagnose
     from carlab.cli.diagnose import EXIT_INCONCLUSIVE
+    from carlab.diagnosis.report.events import diagnosed_event_sentences
     from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.studies.real_cars import as_json, real_car_errors, split_by_name
 
@@ -36,6 +37,7 @@ def run_realcars(options: BenchOptions) -> int:
             ceiling=True,
             discrepancy=True,
             adapt=True,
+            keep_events=options.keep_events,
             out=None if options.out is None else options.out.with_suffix(""),
             progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),
             stop=interrupts.requested.is_set,
@@ -51,6 +53,8 @@ def run_realcars(options: BenchOptions) -> int:
         for e in errors
     ]  # fmt: skip
     table(f"Prediction errors, fitted to {', '.join(fit)}", columns, rows)
+    for sentence in diagnosed_event_sentences(report.diagnosis):
+        console.print(sentence, markup=False)
     if options.out is not None:
         write_figures(options.out, as_json(errors, command(), {"fit": fit, "held_out": held_out}))
         console.print(f"{options.out}; the report of the diagnosis is in {options.out.with_suffix('')}.")

@@ -57,6 +57,10 @@ class Diagnose:
     adapt: bool = False
     """Adapt the simulator along the held-out recordings, and report what changed in the car since the fitted ones."""
 
+    keep_events: bool = False
+    """Fit and score prediction windows with events too: collisions, a hand. By default they are listed and left
+    out."""
+
     discrepancy: bool = False
     """Train networks that correct the diagnosed simulator, and report their error. Needs 60 s of driving."""
 
@@ -86,6 +90,7 @@ class Diagnose:
                 ceiling=self.ceiling,
                 discrepancy=self.discrepancy,
                 adapt=self.adapt,
+                keep_events=self.keep_events,
                 budget_s=self.budget_s,
                 seed=self.seed,
                 out=self.out,
@@ -103,11 +108,14 @@ class Diagnose:
     def _print(self, diagnosis: Diagnosis) -> None:
         from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences
         from carlab.diagnosis.report.drift import drift_sentences
+        from carlab.diagnosis.report.events import diagnosed_event_sentences
 
         console.print(diagnosis.sentence)
         for effect in diagnosis.effects:
             console.print(f"  {effect.sentence}", markup=False)
         for sentence in (*curve_sentences(diagnosis), ceiling_sentence(diagnosis), *drift_sentences(diagnosis)):
             console.print(f"  {sentence}" if sentence else "", markup=False, end="\n" if sentence else "")
+        for sentence in diagnosed_event_sentences(diagnosis):
+            console.print(f"  {sentence}", markup=False)
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
         console.print(f"Read {self.out / 'report.html'}; drive the diagnosed car with --car {self.out / 'model.toml'}.")

@@ -51,6 +51,9 @@ class Replay:
     adapt: bool = False
     """Also predict with adaptation to the recent past: drive force, steering trim and grip from the rows before."""
 
+    keep_events: bool = False
+    """Score prediction windows with events too: collisions, a hand. By default they are listed and left out."""
+
     save: Path | None = None
     """Write FILE.rrd with the predictions beside the recording."""
 
@@ -86,8 +89,8 @@ class Replay:
 
     def _predict(self) -> None:
         from carlab.api import predict
-        from carlab.api.prediction import summary_of
-        from carlab.diagnosis.score_recording import describe_windows
+        from carlab.diagnosis.report.events import event_sentences
+        from carlab.diagnosis.score_recording import MODEL, describe_windows
 
         car = self.which_car
         if car.vehicle is not None and car.car != "sim":
@@ -99,6 +102,7 @@ class Replay:
             stride_s=self.stride_s,
             holdout_share=self.holdout_share,
             adapt=self.adapt,
+            keep_events=self.keep_events,
         )
         for note in found.material.notes:
             console.print(note, markup=False)
@@ -108,8 +112,11 @@ class Replay:
             if part is None:
                 console.print("The last part is too short to be scored by itself.")
                 continue
-            print_errors(f"Error after {found.horizon_s:.2f} s, {describe_windows(part)}", "model", summary_of(part))
+            print_errors(f"Error after {found.horizon_s:.2f} s, {describe_windows(part)}", "model", part.summaries())
         self._print_channels(found)
+        errors = (found.summary[MODEL], found.summary_with_events[MODEL]) if found.events.held_out_windows else ()
+        for sentence in event_sentences(found.events, *errors):
+            console.print(sentence, markup=False)
         if self.adapt:
             self._print_changes(found)
         if self.save is not None:

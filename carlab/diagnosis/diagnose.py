@@ -78,6 +78,7 @@ class Request:
     ceiling: bool
     discrepancy: bool
     adapt: bool
+    keep_events: bool
 
 
 def diagnose(
@@ -96,6 +97,7 @@ def diagnose(
     ceiling: bool = False,
     discrepancy: bool = False,
     adapt: bool = False,
+    keep_events: bool = False,
     budget_s: float | None = None,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
@@ -117,6 +119,7 @@ def diagnose(
         ceiling: train a black box, and compare with its error.
         discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
+        keep_events: fit and score windows with events (collisions) too; they are listed in any case.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search (``SearchTimer``).
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
@@ -129,7 +132,7 @@ def diagnose(
     share = checked_held_out_share(holdout_share, settings.windows)
     timer = SearchTimer(budget_s, stop, settings.selection.search_time_share)
     nominal = with_known_latency(nominal, (*fit, *held_out))
-    stages = curves, ceiling, discrepancy, adapt
+    stages = curves, ceiling, discrepancy, adapt, keep_events
     request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append, timer.ends_search)
@@ -147,13 +150,16 @@ def _prepare_recordings(
 ) -> tuple[SplitRecordings, tuple[DataFault, ...]]:
     """Repair faults, split the recordings and cut them into windows."""
     settings = request.settings.windows
+    nominal = request.nominal
     progress("reading", 0.0)
-    recorded_s = sum(len(e.times_s) for e in fit) * request.nominal.control_period_s
-    fit, held_out, own_faults = data_faults_of.check(fit, held_out, request.nominal)
+    recorded_s = sum(len(e.times_s) for e in fit) * nominal.control_period_s
+    fit, held_out, own_faults = data_faults_of.check(fit, held_out, nominal)
     faults = (*request.data_faults, *own_faults)
     progress("reading", 0.03)
     try:
-        recordings = split_recordings(fit, held_out, request.held_out_share, settings)
+        recordings = split_recordings(
+            fit, held_out, request.held_out_share, nominal, request.settings, keep_events=request.keep_events
+        )
     except Inconclusive as error:
         error.data_faults = faults
         usable_s = sum(track.duration_s for track in tracks_of(fit))
@@ -169,10 +175,12 @@ def _estimate_noise(
     recordings: SplitRecordings, nominal: SimulatorConfig, settings: IdentificationSettings
 ) -> tuple[SplitRecordings, Noise]:
     """Correct the initial states of the windows, and estimate the noise of the recordings."""
-    fit_windows, held_out_windows = with_initial_states(
-        (recordings.fit_windows, recordings.held_out_windows), nominal, settings
+    fit_windows, held_out_windows, event_windows = with_initial_states(
+        (recordings.fit_windows, recordings.held_out_windows, recordings.event_windows), nominal, settings
     )
-    recordings = replace(recordings, fit_windows=fit_windows, held_out_windows=held_out_windows)
+    recordings = replace(
+        recordings, fit_windows=fit_windows, held_out_windows=held_out_windows, event_windows=event_windows
+    )
     return recordings, estimate_noise(recordings.fit_tracks, fit_windows.curvature_bias, settings=settings)
 
 
@@ -249,11 +257,25 @@ def _assemble_result(
             request.settings.evidence,
         ),
         drift=() if adaptation is None else adaptation.drift,
+        events=recordings.events,
+        held_out_with_events=_errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )
-    exhibits = exhibits_of(scored, recordings.held_out_tracks)
+    exhibits = exhibits_of(scored, recordings)
     noise = replace(held_out.recording_noise, adaptation=None if adaptation is None else adaptation.noise)
     exhibits = replace(exhibits, noise=noise)
     return Outcome(diagnosis, exhibits, model or scored.found.best.config, models, held_out.windows)
+
+
+def _errors_with_events(
+    models: Mapping[str, PredictiveModel],
+    errors: Mapping[str, FloatArray],
+    held_out: HeldOut,
+    event_windows: PredictionWindows,
+) -> dict[str, FitErrors]:
+    """Held-out errors of all models with the windows that events left out; empty without such windows."""
+    if not len(event_windows):
+        return {}
+    return {name: held_out.summary_with(event_windows, errors[name], model) for name, model in models.items()}
 
 
 def _measured_curves(

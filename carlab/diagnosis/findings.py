@@ -12,6 +12,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import Decision
+from carlab.diagnosis.events import Event, EventUse
 from carlab.diagnosis.settings import DEFAULT
 
 SCHEMA = "carlab.diagnosis/1"
@@ -266,8 +267,8 @@ class Diagnosis:
     """Result of a diagnosis.
 
     ``held_out`` has nominal, refit, with_effects, constant_velocity and noise_floor; with measured curves also
-    with_curves, with a ceiling also black_box, with a discrepancy also
-    with_discrepancy.
+    with_curves, with a ceiling also black_box, with a discrepancy also with_discrepancy. ``held_out_with_events`` has
+    the same models, scored with the windows that events left out; empty without such windows.
     """
 
     verdict: Verdict
@@ -287,6 +288,8 @@ class Diagnosis:
     skill: tuple[Skill, ...] = ()
     drift: tuple[Drift, ...] = ()
     search: SearchExtent = field(default_factory=SearchExtent)
+    events: EventUse = field(default_factory=EventUse)
+    held_out_with_events: Mapping[str, FitErrors] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the report's schema, ready for JSON; numbers that are not finite become null."""
@@ -317,6 +320,10 @@ class Diagnosis:
             "skill": [asdict(s) for s in self.skill],
             "drift": [_drift_table(d) for d in self.drift],
             "search": asdict(self.search),
+            "events": {
+                **asdict(self.events),
+                "held_out_with_events": {k: asdict(v) for k, v in self.held_out_with_events.items()},
+            },
             "data_faults": [asdict(f) for f in self.data_faults],
             "recordings": [asdict(r) for r in self.recordings],
             "seed": self.seed,
@@ -351,7 +358,8 @@ class Trace:
     """One held-out recording and its predictions, each restarted every horizon.
 
     times_s (T + 1,); recorded (T + 1, 6); predicted by model (nominal, refit, with_effects), each (T + 1, 6), NaN
-    without a prediction; marked: stretches (start, end) [s] with the largest errors of the refit.
+    without a prediction; marked: stretches (start, end) [s] with the largest errors of the refit. A fitted recording
+    with events is a trace without predictions.
     """
 
     name: str
@@ -359,6 +367,7 @@ class Trace:
     recorded: FloatArray
     predicted: Mapping[str, FloatArray]
     marked: tuple[tuple[float, float], ...] = ()
+    events: tuple[Event, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError, DataError
+from carlab.diagnosis.events import Event, EventUse, mark_events
 from carlab.diagnosis.findings import DataFault, Verdict
-from carlab.diagnosis.settings import WindowSettings
+from carlab.diagnosis.settings import DiagnosisSettings, WindowSettings
 from carlab.prediction.windows import PredictionWindows, Track, cut_windows, split_tracks, tracks_of
+from sim_backends.car_parameters import SimulatorConfig
 
 
 class Inconclusive(DataError):
@@ -28,12 +30,14 @@ class Inconclusive(DataError):
 
 @dataclass(frozen=True, slots=True)
 class SplitRecordings:
-    """Tracks and prediction windows to fit, and held-out ones."""
+    """Tracks and prediction windows to fit, and held-out ones; ``event_windows`` are held-out ones with events."""
 
     fit_tracks: tuple[Track, ...]
     held_out_tracks: tuple[Track, ...]
     fit_windows: PredictionWindows
     held_out_windows: PredictionWindows
+    event_windows: PredictionWindows
+    events: EventUse
 
 
 def checked_held_out_share(given: float | None, settings: WindowSettings) -> float:
@@ -48,19 +52,56 @@ def checked_held_out_share(given: float | None, settings: WindowSettings) -> flo
 
 
 def split_recordings(
-    fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], held_out_share: float, settings: WindowSettings
+    fit: Sequence[EpisodeData],
+    held_out: Sequence[EpisodeData],
+    held_out_share: float,
+    nominal: SimulatorConfig,
+    settings: DiagnosisSettings,
+    *,
+    keep_events: bool = False,
 ) -> SplitRecordings:
-    """Split recordings and cut them into windows.
+    """Split recordings without faults, find their events, and cut them into windows without events.
+
+    Args:
+        fit: recordings to fit.
+        held_out: held-out recordings; if empty, the last part of each recording to fit is held out.
+        held_out_share: share of that part.
+        nominal: simulator of the car file, for the grip.
+        settings: settings of windows and events.
+        keep_events: whether windows may contain events.
 
     Raises:
         Inconclusive: too little driving, speed or variation of the commands.
     """
-    fit_tracks, held_out_tracks = _split(fit, held_out, held_out_share, settings)
-    check_excitation(fit_tracks, settings)
-    fit_windows = _cut(fit_tracks, settings.fit_window_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
-    held_out_windows = _cut(held_out_tracks, settings.held_out_window_s, settings.held_out_stride_s)
-    held_out_windows = held_out_windows.thinned(settings.max_held_out_windows)
-    return SplitRecordings(tuple(fit_tracks), tuple(held_out_tracks), fit_windows, held_out_windows)
+    has_own = bool(held_out)
+    marked_fit, fit_events = mark_events(fit, nominal, settings.events)
+    marked_held_out, held_out_events = mark_events(held_out, nominal, settings.events)
+    if not keep_events:
+        fit, held_out = marked_fit, marked_held_out
+    cut = settings.windows
+    fit_tracks, held_out_tracks = _split(fit, held_out, held_out_share, cut)
+    check_excitation(fit_tracks, cut)
+    fit_windows, fit_event_windows = _cut(fit_tracks, cut.fit_window_s, cut.fit_stride_s, cut.max_fit_windows)
+    held_out_windows, event_windows = _cut(
+        held_out_tracks, cut.held_out_window_s, cut.held_out_stride_s, cut.max_held_out_windows
+    )
+    events = (*_with_roles(fit_events, () if has_own else held_out_tracks), *_held_out(held_out_events))
+    use = EventUse(events, not keep_events, len(fit_event_windows), len(event_windows))
+    return SplitRecordings(tuple(fit_tracks), tuple(held_out_tracks), fit_windows, held_out_windows, event_windows, use)
+
+
+def _held_out(events: Sequence[Event]) -> tuple[Event, ...]:
+    return tuple(replace(event, role="held out") for event in events)
+
+
+def _with_roles(events: Sequence[Event], held_out_tracks: Sequence[Track]) -> tuple[Event, ...]:
+    """Events of recordings to fit: those in a held-out part of their recording are held out."""
+
+    def is_held_out(event: Event) -> bool:
+        own = [track for track in held_out_tracks if track.recording == event.recording - 1]
+        return any(track.t_s[0] <= event.to_s and event.from_s <= track.t_s[-1] for track in own)
+
+    return tuple(replace(event, role="held out" if is_held_out(event) else "fit") for event in events)
 
 
 def _split(
@@ -81,12 +122,14 @@ def _split(
     return split_tracks(fit_tracks, share, settings.held_out_window_s + settings.split_guard_s)
 
 
-def _cut(tracks: Sequence[Track], horizon_s: float, stride_s: float) -> PredictionWindows:
-    """Prediction windows. Raises Inconclusive without windows."""
+def _cut(
+    tracks: Sequence[Track], horizon_s: float, stride_s: float, max_windows: int
+) -> tuple[PredictionWindows, PredictionWindows]:
+    """Prediction windows without and with events. Raises Inconclusive without windows."""
     if not tracks:
         raise Inconclusive("The recording is too short to hold out a part of it; record a longer drive (100 s).")
     try:
-        return cut_windows(tracks, horizon_s, stride_s)
+        return cut_windows(tracks, horizon_s, stride_s, with_events=True).thinned(max_windows).split_at_events()
     except DataError as error:
         raise Inconclusive(str(error)) from error
 

@@ -7,7 +7,7 @@ Faults of the recording are repaired; the initial states are estimated, and the 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise
-from carlab.diagnosis.findings import DataFault
+from carlab.diagnosis.events import EventUse, mark_events
+from carlab.diagnosis.findings import DataFault, FitErrors
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
@@ -25,8 +26,9 @@ from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.prediction.adaptation import AdaptiveModel, choose_noise
 from carlab.prediction.adaptation import adapt as adapt_along
+from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import ConstantVelocity, NoChange, PredictiveModel, SimulatorModel, predicted_at
-from carlab.prediction.windows import Track, cut_windows, split_tracks, tracks_of
+from carlab.prediction.windows import PredictionWindows, Track, cut_windows, split_tracks, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
 
 MODEL, ADAPTED, CONSTANT_VELOCITY, NO_CHANGE = "model", "adapted", "constant velocity", "no change"
@@ -40,11 +42,23 @@ class PartScore:
         part: "whole recording" or "last 30 %".
         held_out: S windows and their noise floor.
         errors: (S, 6) of the model and of the baselines, by name.
+        event_windows: E windows that events left out.
+        event_errors: (E, 6) of the same models.
     """
 
     part: str
     held_out: HeldOut
     errors: Mapping[str, FloatArray]
+    event_windows: PredictionWindows
+    event_errors: Mapping[str, FloatArray]
+
+    def summaries(self, *, with_events: bool = False) -> dict[str, FitErrors]:
+        """Root mean square errors of each model, and the noise floor."""
+        errors = self.errors
+        if with_events:
+            errors = {name: np.concatenate([e, self.event_errors[name]]) for name, e in errors.items()}
+        found = {name: self.held_out.summary(e) for name, e in errors.items()}
+        return found | {"noise floor": self.held_out.floor_summary()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +74,7 @@ class RecordingScore:
             prediction.
         faults: faults of the recording.
         adaptation: the simulator adapted along the recording; None if that was not wanted.
+        events: events of the recording.
     """
 
     horizon_s: float
@@ -69,6 +84,7 @@ class RecordingScore:
     overlays: tuple[FloatArray, ...]
     faults: tuple[DataFault, ...]
     adaptation: AdaptiveModel | None = None
+    events: EventUse = field(default_factory=EventUse)
 
 
 def score_recording(
@@ -80,6 +96,7 @@ def score_recording(
     stride_s: float = DEFAULT.windows.held_out_stride_s,
     holdout_share: float = DEFAULT.windows.default_held_out_share,
     adapt: bool = False,
+    keep_events: bool = False,
 ) -> RecordingScore:
     """Predict a recording from many initial states along it.
 
@@ -92,6 +109,7 @@ def score_recording(
         holdout_share: share of the last part, which is scored separately, above 0 and at most 0.5.
         adapt: also predict with adaptation to the recent past. ``noise`` states the noise of its filter; if absent, it
             is chosen on this recording.
+        keep_events: score windows with events (collisions) too; they are listed in any case.
 
     Raises:
         DataError: the recording contains no window of that length in which the car moves.
@@ -103,7 +121,8 @@ def score_recording(
     if not any(episode.ticks for episode in episodes):
         raise DataError("The recording contains no command; give a recording of a drive.")
     repaired, _, faults = recording_faults.check(episodes, [], config)
-    tracks = tracks_of(repaired)
+    marked, events = mark_events(repaired, config)
+    tracks = tracks_of(repaired if keep_events else marked)
     if not tracks:
         raise DataError("The recording has no unbroken stretch of half a second; record without gaps.")
     whole = _score("whole recording", tracks, tracks, config, noise, horizon_s, stride_s)
@@ -125,6 +144,7 @@ def score_recording(
         _overlays(repaired, tracks, config, horizon_s),
         tuple(faults),
         adaptation,
+        EventUse(events, not keep_events, 0, len(whole.event_windows)),
     )
 
 
@@ -140,8 +160,11 @@ def _adapted(
 
 def _with_model(part: PartScore, adaptation: AdaptiveModel) -> PartScore:
     """The part with the errors of the adapted simulator."""
-    adapted = part.held_out.final_error(adaptation)
-    return replace(part, errors={MODEL: part.errors[MODEL], ADAPTED: adapted, **part.errors})
+    both = [
+        {MODEL: errors[MODEL], ADAPTED: final_errors(adaptation, windows), **errors}
+        for errors, windows in ((part.errors, part.held_out.windows), (part.event_errors, part.event_windows))
+    ]
+    return replace(part, errors=both[0], event_errors=both[1])
 
 
 def _score(
@@ -162,9 +185,12 @@ def _score(
     settings = DEFAULT.windows
     fit_windows = cut_windows(fit_tracks, min(settings.fit_window_s, horizon_s), settings.fit_stride_s)
     fit_windows = fit_windows.thinned(settings.max_fit_windows)
-    windows = cut_windows(tracks, horizon_s, stride_s).thinned(settings.max_held_out_windows)
+    cut = cut_windows(tracks, horizon_s, stride_s, with_events=True).thinned(settings.max_held_out_windows)
+    windows, event_windows = cut.split_at_events()
     window_s2 = None if known is None else known.velocity_window_s2
-    fit_windows, windows = with_initial_states((fit_windows, windows), config, variance_s2=window_s2)
+    fit_windows, windows, event_windows = with_initial_states(
+        (fit_windows, windows, event_windows), config, variance_s2=window_s2
+    )
     if known is None:
         shakes = find_vibration(fit_tracks) is not None
         noise = estimate_noise(fit_tracks, fit_windows.curvature_bias, slowest=shakes)
@@ -177,13 +203,16 @@ def _score(
         CONSTANT_VELOCITY: ConstantVelocity(),
         NO_CHANGE: NoChange(),
     }
-    return PartScore(part, held_out, {name: held_out.final_error(model) for name, model in models.items()})
+    errors, event_errors = (
+        {name: final_errors(model, w) for name, model in models.items()} for w in (windows, event_windows)
+    )
+    return PartScore(part, held_out, errors, event_windows, event_errors)
 
 
 def _overlays(
     episodes: Sequence[EpisodeData], tracks: Sequence[Track], config: SimulatorConfig, horizon_s: float
 ) -> tuple[FloatArray, ...]:
-    windows = cut_windows(tracks, horizon_s, horizon_s)
+    windows = cut_windows(tracks, horizon_s, horizon_s, with_events=True)
     predicted = SimulatorModel(config).predict(windows)
     found = []
     for index, episode in enumerate(episodes):

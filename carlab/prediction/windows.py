@@ -32,6 +32,8 @@ MAX_PERIOD_S = 0.034
 """Maximum period of a thinned recording [s]."""
 MIN_SPEED_MPS = 0.15
 """Windows in which the car is slower [m/s] are omitted, because any model predicts a parked car."""
+EVENT_COLUMN = "event"
+"""Column of ``EpisodeData.extra`` that is 1 in rows of events (collisions); prediction windows do not contain them."""
 BLOCK_S = 5.0
 """Length of a block [s]; windows that start in the same block count as dependent."""
 
@@ -51,6 +53,7 @@ class Track:
         speed: (m,) at the rows of ``residual`` [m/s].
         curvature_bias: (n, 6) states of a local quintic minus ``smooth``.
         sampled_s: period before thinning.
+        in_event: (n,) whether a row, or a pose that its initial state is estimated from, is in an event.
     """
 
     recording: int
@@ -63,6 +66,7 @@ class Track:
     speed: FloatArray
     curvature_bias: FloatArray
     sampled_s: float
+    in_event: NDArray[np.bool_]
 
     @property
     def duration_s(self) -> float:
@@ -78,6 +82,7 @@ class Track:
             smooth=self.smooth[rows],
             curvature_bias=self.curvature_bias[rows],
             commands=self.commands[rows],
+            in_event=self.in_event[rows],
         )
 
 
@@ -99,6 +104,7 @@ class PredictionWindows:
         velocity_window_s2: variance [s2] of the window over which the recording's velocities were differentiated; 0
             if they are instantaneous.
         velocities_from_poses: whether the initial velocities are differentiated poses, not recorded velocities.
+        in_event: (S,) whether the window has rows of an event; only windows that are cut with events have such rows.
     """
 
     period_s: float
@@ -111,6 +117,7 @@ class PredictionWindows:
     t0_s: FloatArray
     recording: IndexArray
     block: IndexArray
+    in_event: NDArray[np.bool_]
     velocity_window_s2: float = 0.0
     velocities_from_poses: bool = True
 
@@ -133,6 +140,12 @@ class PredictionWindows:
         chosen: dict[str, Any] = {name: v[which] for name, v in values.items() if isinstance(v, np.ndarray)}
         return replace(self, **chosen)
 
+    def split_at_events(self) -> tuple[Self, Self]:
+        """Windows without and with rows of events. Raises DataError if all have some."""
+        if self.in_event.all():
+            raise DataError("Each prediction window has rows of an event (collision); keep events, or record again.")
+        return self.take(~self.in_event), self.take(self.in_event)
+
     def thinned(self, max_windows: int) -> Self:
         """Select at most ``max_windows`` windows at even spacing."""
         if len(self) <= max_windows:
@@ -146,7 +159,8 @@ def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) ->
     Faster recordings are thinned to ``MAX_PERIOD_S`` after smoothing; commands become means over the cells.
 
     Args:
-        episodes: recordings; the column ``segment`` in ``extra`` numbers stretches that must not be joined.
+        episodes: recordings; the column ``segment`` in ``extra`` numbers stretches that must not be joined, the column
+            ``event`` marks rows of events.
         period_s: period of the grid; by default that of the first recording.
 
     Raises:
@@ -159,17 +173,18 @@ def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) ->
         if period_s is None:
             period_s = episode.period_s * max(int(MAX_PERIOD_S / episode.period_s + 1e-6), 1)
         every = max(round(period_s / episode.period_s), 1)
-        for rows in _unbroken(episode, episode.period_s):
+        for rows in unbroken_rows(episode):
             track = _track(index, episode, rows, period_s / every, every)
             if track is not None:
                 found.append(track)
     return found
 
 
-def _unbroken(episode: EpisodeData, period_s: float) -> Iterable[slice]:
+def unbroken_rows(episode: EpisodeData) -> Iterable[slice]:
+    """Stretches of a recording without gaps, missing values and changes of the segment."""
     t = episode.times_s
     whole = np.asarray(np.isfinite(episode.states).all(axis=1))
-    broken = np.asarray(np.diff(t) > max(3.0 * period_s, 0.1)) | ~(whole[1:] & whole[:-1])
+    broken = np.asarray(np.diff(t) > max(3.0 * episode.period_s, 0.1)) | ~(whole[1:] & whole[:-1])
     if "segment" in episode.extra:
         broken = broken | np.asarray(np.diff(episode.extra["segment"]) != 0)
     edges = [0, *(np.flatnonzero(broken) + 1), len(t)]
@@ -193,6 +208,7 @@ def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every
         commands = _cell_means(t, commands, grid, period_s)
     smooth = _smoothed(states, width, 3, period_s)
     speed = np.hypot(smooth[:, 3], smooth[:, 4])
+    in_event = _event_rows(t, episode.extra.get(EVENT_COLUMN, np.zeros(len(episode.times_s)))[rows], grid)
     moving = speed > MIN_SPEED_MPS
     moving = moving if moving.sum() >= 20 else np.ones_like(moving)
     residual = (states - savgol_filter(states, width, 3, axis=0))[moving]
@@ -202,6 +218,7 @@ def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every
         whole = len(grid) // every * every
         commands = commands[:whole].reshape(-1, every, 2).mean(axis=1)
         grid, states, smooth, curvature_bias = (v[:whole:every] for v in (grid, states, smooth, curvature_bias))
+        in_event = in_event[:whole:every]
     return Track(
         recording=index,
         period_s=every * period_s,
@@ -213,7 +230,19 @@ def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every
         speed=speed,
         curvature_bias=curvature_bias,
         sampled_s=period_s,
+        in_event=in_event,
     )
+
+
+def _event_rows(t: FloatArray, event: FloatArray, grid: FloatArray) -> NDArray[np.bool_]:
+    """Rows of the grid with a marked row of ``t`` within half the span of the poses of an initial state."""
+    marked = t[event > 0.0]
+    if not len(marked):
+        return np.zeros(len(grid), dtype=bool)
+    index = np.searchsorted(marked, grid)
+    after_s = np.append(marked, np.inf)[index] - grid
+    before_s = grid - np.append(-np.inf, marked)[index]
+    return np.asarray(np.minimum(after_s, before_s) <= 0.5 * SMOOTHING_SPAN_S)
 
 
 def _smoothed(states: FloatArray, width: int, order: int, period_s: float) -> FloatArray:
@@ -248,15 +277,16 @@ def smoothing_width(period_s: float) -> int:
 
 
 def cut_windows(
-    tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: float = BLOCK_S
+    tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: float = BLOCK_S, *, with_events: bool = False
 ) -> PredictionWindows:
-    """Cut tracks into windows in which the car moves.
+    """Cut tracks into windows in which the car moves, without those with rows of events.
 
     Args:
         tracks: at least one track; all have the same period.
         horizon_s: length of a window.
         stride_s: time between the starts of windows.
         block_s: length of the blocks that count as independent.
+        with_events: also cut windows with rows of events.
 
     Raises:
         DataError: the car moves in no window.
@@ -270,6 +300,7 @@ def cut_windows(
         for track in tracks
         for row in range(past, len(track.t_s) - steps, stride)
         if np.hypot(*track.smooth[row : row + steps + 1, 3:5].T).max() >= MIN_SPEED_MPS
+        and (with_events or not track.in_event[row : row + steps + 1].any())
     ]
     if not starts:
         raise DataError(
@@ -287,6 +318,7 @@ def cut_windows(
         t0_s=np.array([track.t_s[row] for track, row in starts]),
         recording=np.array([track.recording for track, _ in starts]),
         block=np.array([track.recording * 1_000_000 + int(track.t_s[row] / block_s) for track, row in starts]),
+        in_event=np.array([track.in_event[row : row + steps + 1].any() for track, row in starts]),
     )
 
 

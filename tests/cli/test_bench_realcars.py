@@ -8,6 +8,7 @@ import pytest
 
 import carlab.api
 from carlab.cli import run
+from carlab.diagnosis.events import EventUse
 from carlab.diagnosis.report.write import JSON_NAME
 from carlab.prediction.predict import ConstantVelocity, NoChange
 from carlab.prediction.windows import cut_windows, tracks_of
@@ -56,7 +57,8 @@ def test_figures_are_printed_and_written(
         asked.update(options, fit=[p.name for p in fit])
         names = tuple(str(p) for p in options["held_out"])
         return SimpleNamespace(
-            outcome=SimpleNamespace(models=models, held_out_windows=windows), held_out_names=names
+            outcome=SimpleNamespace(models=models, held_out_windows=windows), held_out_names=names,
+            diagnosis=SimpleNamespace(events=EventUse(), held_out={}, held_out_with_events={}),
         )  # fmt: skip
 
     monkeypatch.setattr(carlab.api, "diagnose", diagnose)

@@ -74,6 +74,10 @@ class HeldOut:
             score=self.score(error),
         )
 
+    def summary_with(self, others: PredictionWindows, error: FloatArray, model: PredictiveModel) -> FitErrors:
+        """The report's figures of a model with errors (S, 6), for its windows and others together."""
+        return self.summary(np.concatenate([error, final_errors(model, others)]))
+
     def floor_summary(self) -> FitErrors:
         """The floor itself; its score is 1."""
         return self.summary(np.tile(self.floor, (2, 1)))

@@ -27,19 +27,19 @@ def with_initial_states(
     config: SimulatorConfig,
     settings: IdentificationSettings = DEFAULT.identification,
     variance_s2: float | None = None,
-) -> tuple[PredictionWindows, PredictionWindows]:
-    """Estimate velocity window and initial states of two sets of windows.
+) -> tuple[PredictionWindows, ...]:
+    """Estimate velocity window and initial states of sets of windows.
 
     Args:
-        windows: windows for the estimate of the velocity window, and other windows of the same recordings.
+        windows: windows for the estimate of the velocity window, and further windows of the same recordings.
         config: an approximate simulator.
         settings: settings of the estimate.
         variance_s2: variance of the velocity window [s2] if it is known.
     """
     if variance_s2 is None:
         variance_s2 = velocity_window_variance_s2(windows[0], config, settings)
-    first, second = (without_curvature_bias(replace(w, velocity_window_s2=variance_s2), config) for w in windows)
-    return first, second
+    known = [replace(w, velocity_window_s2=variance_s2) for w in windows]
+    return tuple(without_curvature_bias(w, config) if len(w) else w for w in known)
 
 
 def velocity_window_variance_s2(

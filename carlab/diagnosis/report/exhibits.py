@@ -9,8 +9,10 @@ import numpy as np
 
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.events import Event
 from carlab.diagnosis.evidence import ScoredSearch, score_ladder
 from carlab.diagnosis.findings import Exhibits, Trace
+from carlab.diagnosis.recordings import SplitRecordings
 from carlab.diagnosis.settings import ReportSettings
 from carlab.diagnosis.unexplained.description import REGIMES, start_features
 from carlab.prediction.errors import prediction_errors
@@ -23,8 +25,8 @@ TRACES_TRIED = 6
 """Number of the longest held-out recordings that are searched for traces with motion."""
 
 
-def exhibits_of(scored: ScoredSearch, tracks: Sequence[Track]) -> Exhibits:
-    """Data of the figures; ``tracks`` are held-out tracks."""
+def exhibits_of(scored: ScoredSearch, recordings: SplitRecordings) -> Exhibits:
+    """Data of the figures."""
     settings, found = scored.problem.settings.report, scored.found
     correlation = {
         name: _correlation(scored.problem.windows, found.base.config, EFFECTS[name].command == "throttle", settings)
@@ -35,7 +37,7 @@ def exhibits_of(scored: ScoredSearch, tracks: Sequence[Track]) -> Exhibits:
         for c in found.tried
     )
     ladder = (*score_ladder(scored), ("noise floor", 1.0))
-    return Exhibits(_traces(scored, tracks), ladder, _regimes(scored), correlation, candidates)
+    return Exhibits(_traces(scored, recordings), ladder, _regimes(scored), correlation, candidates)
 
 
 def _regimes(scored: ScoredSearch) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
@@ -78,7 +80,8 @@ def _correlation(
     return lags * windows.period_s, np.array(values), settings.correlation_z / math.sqrt(max(blocks, 1))
 
 
-def _traces(scored: ScoredSearch, tracks: Sequence[Track]) -> tuple[Trace, ...]:
+def _traces(scored: ScoredSearch, recordings: SplitRecordings) -> tuple[Trace, ...]:
+    """Held-out recordings with predictions, and fitted recordings with events without predictions."""
     models = {
         "nominal": scored.problem.nominal,
         "refit": scored.found.base.config,
@@ -86,15 +89,34 @@ def _traces(scored: ScoredSearch, tracks: Sequence[Track]) -> tuple[Trace, ...]:
     }
     settings = scored.problem.settings
     horizon_s, worst = settings.windows.held_out_window_s, settings.report.worst_stretches
-    longest = sorted(tracks, key=lambda track: -len(track.t_s))[:TRACES_TRIED]
-    traces = [t for track in longest if (t := _trace(track, models, horizon_s, worst)) is not None]
-    return tuple(traces[: settings.report.max_traces])
+    longest = sorted(recordings.held_out_tracks, key=lambda track: -len(track.t_s))[:TRACES_TRIED]
+    events = recordings.events.found
+    traces = [t for track in longest if (t := _trace(track, models, horizon_s, worst, events)) is not None]
+    fitted = [
+        Trace(f"fitted recording {track.recording + 1}", track.t_s, track.states, {}, (), own)
+        for track in recordings.fit_tracks
+        if (own := _events_in(track, events, "fit"))
+    ]
+    count = settings.report.max_traces
+    return (*traces[:count], *fitted[:count])
 
 
-def _trace(track: Track, models: Mapping[str, SimulatorConfig], horizon_s: float, worst_stretches: int) -> Trace | None:
+def _events_in(track: Track, events: Sequence[Event], role: str) -> tuple[Event, ...]:
+    begin_s, end_s = float(track.t_s[0]), float(track.t_s[-1])
+    own = [e for e in events if e.role == role and e.recording == track.recording + 1]
+    return tuple(e for e in own if begin_s <= e.to_s and e.from_s <= end_s)
+
+
+def _trace(
+    track: Track,
+    models: Mapping[str, SimulatorConfig],
+    horizon_s: float,
+    worst_stretches: int,
+    events: Sequence[Event],
+) -> Trace | None:
     """Predictions along a track, restarted every horizon; None if the car does not move for a horizon."""
     try:
-        windows = cut_windows([track], horizon_s, horizon_s)
+        windows = cut_windows([track], horizon_s, horizon_s, with_events=True)
     except DataError:
         return None
     span_s = windows.horizon_s
@@ -105,9 +127,10 @@ def _trace(track: Track, models: Mapping[str, SimulatorConfig], horizon_s: float
         predicted[name] = predicted_at(track.t_s, windows, out[0])
         if name == "refit":
             final = np.linalg.norm(prediction_errors(out, windows)[0, :, -1, :2], axis=1)
-            order = np.argsort(-final)[:worst_stretches]
+            order = [k for k in np.argsort(-final) if not windows.in_event[k]][:worst_stretches]
             worst = [(float(windows.t0_s[k]), float(windows.t0_s[k] + span_s)) for k in order]
-    return Trace(f"recording {track.recording + 1}", track.t_s, track.states, predicted, tuple(sorted(worst)))
+    own = _events_in(track, events, "held out")
+    return Trace(f"recording {track.recording + 1}", track.t_s, track.states, predicted, tuple(sorted(worst)), own)
 
 
 __all__ = ["exhibits_of"]

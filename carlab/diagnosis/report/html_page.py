@@ -14,6 +14,7 @@ from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve_sentences
 from carlab.diagnosis.report.drift import drift_sentences
 from carlab.diagnosis.report.drift_charts import drift_charts
+from carlab.diagnosis.report.events import diagnosed_event_sentences
 from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import DEFAULT
 
@@ -62,6 +63,7 @@ def page_context(diagnosis: Diagnosis, exhibits: Exhibits) -> dict[str, Any]:
         "ceiling": ceiling_sentence(diagnosis),
         "drift": [(d, drift_charts(d)) for d in diagnosis.drift],
         "drift_sentences": drift_sentences(diagnosis),
+        "event_sentences": diagnosed_event_sentences(diagnosis),
         "rest": rest if rest is not None and rest.share >= DEFAULT.evidence.unexplained_share_min else None,
         "rest_where": text.listed([text.CHANNEL_WORDS.get(c, c) for c in rest.channels]) if rest else "",
         "rest_regime": text.regime_words(rest.regime) if rest else "",

@@ -1,10 +1,10 @@
 """The report as a rerun recording: the recorded car, the predictions, the residuals, and their worst stretches.
 
-Each held-out recording has its entities under ``/NAME`` and one tab. The timeline ``car_time`` is the time since its
-first row [s].
+Each held-out recording, and each fitted one with events, has its entities under ``/NAME`` and one tab. The timeline
+``car_time`` is the time since its first row [s].
 
     NAME/map/{recorded,nominal,refit,with_effects}/{base_link,trail}     plan view
-    NAME/map/worst, NAME/map/place                                       largest errors, places of effects
+    NAME/map/worst, NAME/map/place, NAME/map/events                      largest errors, places of effects, events
     NAME/state/{vx,vy,yaw_rate}/{recorded,nominal,refit,with_effects}    series
     NAME/residual/{position,yaw,vx,vy,yaw_rate}/{nominal,...}            predicted minus recorded
     NAME/marks                                                           text of the stretches and effects
@@ -22,6 +22,7 @@ import rerun.blueprint as rrb
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
+from carlab.diagnosis.report.events import event_label
 from carlab.diagnosis.report.figures import LABELS, MODELS, residual, restarts
 from carlab.diagnosis.report.sentences import number, verdict_sentence
 from carlab.recording.atomic_files import rerun_file
@@ -91,6 +92,11 @@ def _send_trace(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: 
         for channel, series in values.items():
             _send_series(stream, f"{part}/residual/{channel}/{name}", name, indexes, series)
     _send_marks(stream, part, trace, diagnosis)
+    if trace.events:
+        labels = [f"{event.from_s:.2f} s: {event_label(event)}" for event in trace.events]
+        places = [(event.x_m, event.y_m, 0.0) for event in trace.events]
+        dots = rr.Points3D(places, labels=labels, radii=rr.Radius.ui_points(8.0), colors=blueprint.VERMILION)
+        stream.log(f"{part}/map/events", dots, static=True)
 
 
 def _send_car(
@@ -156,6 +162,7 @@ def _send_marks(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: 
             circles.append([(x + radius * math.cos(a), y + radius * math.sin(a), 0.0) for a in around])
         at_s = first_s if effect.where.time is None else max(effect.where.time[0], first_s)
         marks.append((at_s, f"{effect.id}: {effect.sentence}", "INFO"))
+    marks += [(event.from_s, f"Event: {event_label(event)}", "ERROR") for event in trace.events]
     if circles:
         width = rr.Radius.ui_points(2.0)
         stream.log(f"{part}/map/place", rr.LineStrips3D(circles, radii=width, colors=blueprint.PURPLE), static=True)
@@ -180,11 +187,17 @@ def _blueprint(parts: list[str], exhibits: Exhibits) -> rrb.Blueprint:
 
 def _tab(part: str, trace: Trace) -> rrb.Horizontal:
     """Plan, marks and verdict on the left; series and residuals on the right."""
-    residuals = [
-        rrb.TimeSeriesView(origin=f"/{part}/residual/{channel}", name=f"Error of {channel.replace('_', ' ')} [{unit}]")
-        for channel, unit in UNITS.items()
-        if channel in ("position", "yaw_rate")
-    ]
+    residuals = (
+        []
+        if not trace.predicted
+        else [
+            rrb.TimeSeriesView(
+                origin=f"/{part}/residual/{channel}", name=f"Error of {channel.replace('_', ' ')} [{unit}]"
+            )
+            for channel, unit in UNITS.items()
+            if channel in ("position", "yaw_rate")
+        ]
+    )
     series = [
         rrb.TimeSeriesView(origin=f"/{part}/state/{channel}", name=f"{channel.replace('_', ' ')} [{UNITS[channel]}]")
         for channel in CHANNELS

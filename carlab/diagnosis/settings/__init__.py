@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from carlab.diagnosis.settings.comparison import ComparisonSettings
 from carlab.diagnosis.settings.drift import DriftSettings
+from carlab.diagnosis.settings.events import EventSettings
 from carlab.diagnosis.settings.evidence import EvidenceSettings, UnexplainedSettings
 from carlab.diagnosis.settings.prediction import CurveSettings, IdentificationSettings, WindowSettings
 from carlab.diagnosis.settings.quick import QuickSettings
@@ -23,6 +24,7 @@ class DiagnosisSettings:
     """All settings of a diagnosis, by stage."""
 
     windows: WindowSettings = field(default_factory=WindowSettings)
+    events: EventSettings = field(default_factory=EventSettings)
     identification: IdentificationSettings = field(default_factory=IdentificationSettings)
     curves: CurveSettings = field(default_factory=CurveSettings)
     screening: ScreeningSettings = field(default_factory=ScreeningSettings)
@@ -45,6 +47,7 @@ __all__ = [
     "CurveSettings",
     "DiagnosisSettings",
     "DriftSettings",
+    "EventSettings",
     "EvidenceSettings",
     "IdentificationSettings",
     "QuickSettings",
