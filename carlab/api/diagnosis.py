@@ -166,8 +166,7 @@ def diagnose(
         held_out: recordings for validation only; by default the last part of each recording is held out.
         holdout_share: size of that part, above 0 and at most 0.5; 0.3 by default.
         effects: restrict the search to these effects of the catalogue.
-        curves: fit measured curves (drive force, steering, tyres) where named effects leave more than a tenth of the
-            error; takes minutes.
+        curves: fit measured curves where named effects leave more than a tenth of the error; takes minutes.
         ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
         discrepancy: train networks that correct the diagnosed simulator, and report their error; takes minutes.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed; takes a minute.
@@ -192,9 +191,8 @@ def diagnose(
     _check_effects(effects)
     if holdout_share is not None and to_validate:
         raise ConfigError("--holdout-share has no effect together with held-out recordings; remove one of them.")
-    latency_s = file.simulator.mocap.latency_s
-    fit = read_material(to_fit, "fit", latency_s)
-    validation = read_material(to_validate, "held out", latency_s)
+    roles = (to_fit, "fit"), (to_validate, "held out")
+    fit, validation = (read_material(items, role, file.simulator.mocap.latency_s) for items, role in roles)
     options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
     options |= {"discrepancy": discrepancy, "adapt": adapt, "keep_events": keep_events, "budget_s": budget_s}
     report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})

@@ -116,8 +116,7 @@ def diagnose(
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
         curves: fit measured curves where named effects leave a residual.
-        ceiling: train a black box, and compare with its error.
-        discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
+        ceiling, discrepancy: train a black box, or a learned discrepancy of the corrected simulator; report its error.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
         keep_events: fit and score windows with events (collisions) too; they are listed in any case.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search (``SearchTimer``).
@@ -136,10 +135,9 @@ def diagnose(
     request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append, timer.ends_search)
-    search_control = replace(control, progress=timer.progress(progress))
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
-    scored, naming = _search_effects(recordings, noise, request, search_control)
+    scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
     diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=timer.extent())
     return replace(outcome, diagnosis=diagnosis, exhibits=replace(outcome.exhibits, decisions=tuple(decisions)))
