@@ -116,7 +116,8 @@ def diagnose(
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
         curves: fit measured curves where named effects leave a residual.
-        ceiling, discrepancy: train a black box, or a learned discrepancy of the corrected simulator; report its error.
+        ceiling: train a black box, and compare with its error.
+        discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
         keep_events: fit and score windows with events (collisions) too; they are listed in any case.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search (``SearchTimer``).
@@ -124,9 +125,8 @@ def diagnose(
         stop: callback; if it returns true, the search ends and its result is scored and reported.
 
     Raises:
-        Inconclusive: the recordings do not allow a verdict; the message states why and what to record.
         ConfigError: the simulator cannot integrate, or the held-out share or the time limit is out of range.
-        DataError: a ceiling or a discrepancy of recordings that are too short for a network.
+        DataError: recordings too short for a network; ``Inconclusive``: no verdict, with why and what to record.
     """
     share = checked_held_out_share(holdout_share, settings.windows)
     timer = SearchTimer(budget_s, stop, settings.selection.search_time_share)
