@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.live_view import LiveView
+    from carlab.experiment.campaign.prior_repair import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
     from carlab.experiment.campaign.training import TrainingPlan
     from carlab.experiment.episodes.interrupts import Interrupts
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from sim_backends.car_parameters import SimulatorConfig
 
 EPISODES = 20
+AUTO = "auto"
+BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
 Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
 Device = Literal["cpu", "cuda"]
 PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
@@ -53,6 +56,8 @@ class LearnHooks(RunHooks):
         on_figures: receives the figures of a finished episode.
         on_checking: called before the quick check of an episode against the simulator.
         on_check: receives the result of the quick check.
+        on_repairing: called before the repair of the prior (``prior="auto"``).
+        on_prior: receives the version of the prior after the repair, with the sentence that states what changed.
     """
 
     on_training: Callable[[str, int, int], None] = lambda activity, done, total: None
@@ -60,6 +65,8 @@ class LearnHooks(RunHooks):
     on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
     on_checking: Callable[[], None] = lambda: None
     on_check: Callable[[QuickCheck], None] = lambda check: None
+    on_repairing: Callable[[], None] = lambda: None
+    on_prior: Callable[[PriorVersion], None] = lambda version: None
 
 
 @dataclass(frozen=True)
@@ -174,7 +181,9 @@ def learn(
         car: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
         ticks: control periods per episode; by default the task's number (100).
-        prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model.
+        prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model. ``auto`` starts
+            with the nominal one; between episodes, effects and parameters that the recordings support enter it, and
+            those that the recordings contradict leave it.
         method: ``sim-fsvgd``; ``fsvgd`` without a simulator; ``fsvgd-authors`` with the settings of the paper.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
         model_steps: optimiser steps of the model before each episode; 2500 by default.
@@ -242,6 +251,8 @@ class _Progress:
             self.on_figures,
             own.on_checking,
             self.on_check,
+            own.on_repairing,
+            own.on_prior,
             interrupts.requested.is_set,
         )
 
@@ -303,6 +314,8 @@ def _check(request: _Request) -> None:
     above_zero(episodes=request.episodes, updates=request.updates, ticks=request.ticks, model_steps=request.model_steps)
     at_least(0, history=request.history, seed=request.seed)
     available(request.device or "cpu")
+    if request.prior == AUTO and request.method != "sim-fsvgd":
+        raise ConfigError(f"--prior auto: {request.method} has no simulator prior; use --method sim-fsvgd.")
 
 
 def _begun(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
@@ -312,7 +325,7 @@ def _begun(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: conte
     run = stack.enter_context(new_run(request.out, request.name, choice, hooks, keep="models"))
     return Campaign(
         choice, plan, request.episodes or EPISODES, run, CampaignHooks(), request.ticks, request.place, request.rerun,
-        _checked_simulator(request), request.car_options,
+        _checked_simulator(request), request.car_options, request.prior == AUTO,
     )  # fmt: skip
 
 
@@ -326,7 +339,7 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
     check_same_car(run, choice, request.car_options)
     campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
     available(campaign.plan.device)
-    _check_as_before(request, campaign.plan, choice)
+    _check_as_before(request, campaign, choice)
     campaign.move_stopped_episode()
     restore_missing_rows(run, campaign.plan.task)
     return campaign
@@ -336,7 +349,8 @@ def _plan(request: _Request, choice: CarChoice) -> TrainingPlan:
     import tomli_w
 
     from carlab.core.task import ParkingTask
-    from carlab.experiment.campaign.campaign import PAPER_HISTORY, needed_history
+    from carlab.experiment.campaign.campaign import PAPER_HISTORY
+    from carlab.experiment.campaign.prior_repair import needed_history
     from carlab.experiment.campaign.training import TrainingPlan
 
     history = request.history
@@ -355,7 +369,7 @@ def _prior(request: _Request, choice: CarChoice) -> SimulatorConfig:
     """The prior simulator."""
     from carlab.experiment.campaign.campaign import check_period, prior_simulator
 
-    if request.prior == "kinematic" or request.prior == "nominal":
+    if request.prior in BUILT_IN_PRIORS:
         kind: Literal["kinematic", "nominal"] = "kinematic" if request.prior == "kinematic" else "nominal"
         return prior_simulator(choice.simulator, kind)
     simulator = prior_simulator(_prior_file(request.prior).simulator, "nominal")
@@ -370,7 +384,7 @@ def _prior_file(prior: str | Path | CarFile) -> CarFile:
         return prior
     file = Path(prior)
     if file.suffix != ".toml" and not is_preset(file) and not file.is_file():
-        raise ConfigError(f"--prior {prior}: give kinematic, nominal or an existing car file.")
+        raise ConfigError(f"--prior {prior}: give {', '.join(BUILT_IN_PRIORS)} or an existing car file.")
     return load_car_file(file)
 
 
@@ -380,15 +394,17 @@ def _name_of(car: str | CarFile) -> str:
 
 def _checked_simulator(request: _Request) -> SimulatorConfig | None:
     """The simulator of the quick check, if it is not that of the car file."""
-    return None if request.prior in ("kinematic", "nominal") else _prior_file(request.prior).simulator
+    return None if request.prior in BUILT_IN_PRIORS else _prior_file(request.prior).simulator
 
 
-def _check_as_before(request: _Request, plan: TrainingPlan, choice: CarChoice) -> None:
+def _check_as_before(request: _Request, campaign: Campaign, choice: CarChoice) -> None:
     """Raise ConfigError for a given argument that differs from the run to resume."""
+    plan = campaign.plan
     default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
     saved = {name: getattr(plan, name) for name in PLANNED}
     changed = [n for n in PLANNED if getattr(request, n) not in (default[n], saved[n])]
-    if request.prior != default["prior"] and _plan(request, choice).prior_toml != plan.prior_toml:
+    is_same = campaign.repairs_prior == (request.prior == AUTO)
+    if request.prior != default["prior"] and not (is_same and _plan(request, choice).prior_toml == plan.prior_toml):
         raise ConfigError("--prior: this run was started with another prior; remove the option, or start a new run.")
     if changed:
         option = changed[0].replace("_", "-")

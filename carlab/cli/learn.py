@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from carlab.core.documents import Tick
     from carlab.core.outcome import EndReason
     from carlab.experiment.campaign.figures import EpisodeFigures
+    from carlab.experiment.campaign.prior_repair import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
 
 STEPS_PERIOD_S = 600.0
@@ -49,8 +50,9 @@ class Learn:
     """Ticks per episode, more than --history; by default the task's number (100)."""
 
     prior: str = "kinematic"
-    """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), or FILE.toml (for
-    example a diagnosed model.toml with its effects and standard deviations). Ranges are those of the file; without
+    """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), auto (at first nominal;
+    between episodes, effects and parameters that the recordings support enter it, and those that they contradict leave
+    it; the run prints what changed), or FILE.toml (for example a diagnosed model.toml with its effects and standard deviations). Ranges are those of the file; without
     them, 30 % about motor gain, damping and steering angle and, with wheel slip, about yaw inertia and the tyres'
     stiffness and friction."""
 
@@ -161,12 +163,20 @@ class Learn:
         def on_learned(figures: dict[str, Any]) -> None:
             if "history_asked" in figures:
                 bar.console.print(f"  {figures['history_words']}", soft_wrap=True, highlight=False)
+            if "needed_ticks" in figures:
+                bar.console.print(
+                    f"  In the learned car the policy parks only in longer drives: in half of them within "
+                    f"{figures['needed_ticks']} ticks. A run with --ticks {figures['needed_ticks']} has enough time.",
+                    soft_wrap=True,
+                    highlight=False,
+                )
 
         def on_figures(row: EpisodeFigures) -> None:
             parked = "parked" if row.parked else f"{row.distance_m:.2f} m from the goal"
             bar.console.print(
                 f"episode {row.episode}: return {row.total_reward:.1f} "
-                f"(predicted {row.predicted_return:.1f}), {parked}; "
+                f"(predicted {row.predicted_return:.1f}, with 90 % probability {row.predicted_low:.1f} to "
+                f"{row.predicted_high:.1f}), {parked}; "
                 f"learned from {row.rows} rows in {row.model_seconds:.0f} + {row.policy_seconds:.0f} s",
                 soft_wrap=True,
             )
@@ -174,6 +184,9 @@ class Learn:
         def on_check(check: QuickCheck) -> None:
             for sentence in check.sentences:
                 bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False)
+
+        def on_prior(version: PriorVersion) -> None:
+            bar.console.print(f"  {version.sentence}", soft_wrap=True, markup=False, highlight=False)
 
         return LearnHooks(
             on_start=on_start,
@@ -186,6 +199,8 @@ class Learn:
             on_figures=on_figures,
             on_checking=functools.partial(show_progress, "quick check of the simulator", 0, 1),
             on_check=on_check,
+            on_repairing=functools.partial(show_progress, "repair of the prior", 0, 1),
+            on_prior=on_prior,
         )
 
     def _report(self, run: LearnRun) -> int:

@@ -16,6 +16,7 @@ from stable_baselines3.common.logger import Logger
 from torch import Tensor
 
 from carlab.core.errors import DataError, DivergedError
+from carlab.core.observation import STATE_FEATURES
 from carlab.core.policy import PolicyInput
 from carlab.core.quantities import Action
 from learning.networks.array_file import read_arrays, whole_number, write_arrays
@@ -153,6 +154,24 @@ class SacAgent:
         actions: NDArray[np.float32] = self._sac.predict(observations, deterministic=True)[0]
         return actions
 
+    def widen(self, observation_size: int) -> None:
+        """Observe more past commands, with zero weights: the policy acts as before until it is trained again.
+
+        Args:
+            observation_size: number of features; not below the current one.
+        """
+        assert self._sac is not None
+        (width,) = self._sac.observation_space.shape or (0,)
+        if observation_size <= width:
+            return
+        wider = _without_environment(observation_size, self._settings, self._seed)
+        state = self._sac.learned_state()
+        wider.load_learned_state({
+            name: _with_zeros(value, own) if isinstance(own, Tensor) and isinstance(value, Tensor) else value
+            for (name, own), value in zip(wider.learned_state().items(), state.values(), strict=True)
+        })  # fmt: skip
+        self._sac = wider
+
     def save(self, folder: Path) -> None:
         """Write networks, temperature and optimiser state into a folder. Raises OSError if the disk is full."""
         assert self._sac is not None
@@ -187,6 +206,16 @@ class SacAgent:
                 f"The policy in {folder} cannot be read ({error}); remove the folder to train again."
             ) from error
         return agent
+
+
+def _with_zeros(value: Tensor, shape_of: Tensor) -> Tensor:
+    """A tensor with zeros for further past commands, which precede the earlier ones, in the shape of another."""
+    for axis, (old, new) in enumerate(zip(value.shape, shape_of.shape, strict=True)):
+        if old != new:
+            zeros = torch.zeros_like(value.narrow(axis, 0, 1)).repeat_interleave(new - old, dim=axis)
+            state, rest = value.split([STATE_FEATURES, old - STATE_FEATURES], dim=axis)
+            value = torch.cat([state, zeros, rest], dim=axis)
+    return value
 
 
 def _without_environment(observation_size: int, settings: SacSettings, seed: int) -> FastSac:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -151,13 +151,27 @@ class DisturbedRollouts:
         return self._draws.noise_samples(len(self._unit), generator)
 
 
-RolloutModel = OneStep | DisturbedCar
+@runtime_checkable
+class HasRollouts(Protocol):
+    """A model whose rollouts have a state of their own, such as one particle or one car each."""
+
+    @property
+    def history(self) -> int:
+        """H, number of past commands in the features."""
+        ...
+
+    def rollouts(self, count: int, generator: torch.Generator) -> Rollouts:
+        """Start N rollouts."""
+        ...
+
+
+RolloutModel = OneStep | HasRollouts
 """Models that rollouts can be sampled from."""
 
 
 def start_rollouts(model: RolloutModel, count: int, generator: torch.Generator) -> Rollouts:
     """Start N rollouts; steps of a model without a disturbance are independent."""
-    return model.rollouts(count, generator) if isinstance(model, DisturbedCar) else IndependentSteps(model)
+    return model.rollouts(count, generator) if isinstance(model, HasRollouts) else IndependentSteps(model)
 
 
 __all__ = [
@@ -165,6 +179,7 @@ __all__ = [
     "DisturbanceProcess",
     "DisturbedCar",
     "DisturbedRollouts",
+    "HasRollouts",
     "IndependentSteps",
     "RolloutModel",
     "Rollouts",

@@ -140,11 +140,14 @@ class ModelEnv(VecEnv):
             seen[ended] = policy_inputs(self._start(ended))
         return seen, reward.cpu().numpy().astype(np.float32), done, infos
 
-    def roll_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
+    def roll_out(
+        self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]], max_ticks: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Drive one complete episode of every car by a policy, from start states of the task.
 
         Args:
             act: actions (cars, 2) for policy inputs (cars, F).
+            max_ticks: length of the episode; by default that of the task.
 
         Returns:
             Unscaled return of each episode (cars,) and its final features (cars, 7 + 2 H); both on the CPU.
@@ -155,7 +158,7 @@ class ModelEnv(VecEnv):
         ended = torch.zeros(self.num_envs, dtype=torch.bool)
         last, seen = self._features.cpu().clone(), self._seen()
         with torch.no_grad():
-            for _ in range(self._task.max_ticks):
+            for _ in range(max_ticks or self._task.max_ticks):
                 before = self._features
                 action = self._gate(before, torch.as_tensor(act(seen)).to(self._device))
                 after = self._rollouts.step(before, action, self._generator)

@@ -98,11 +98,9 @@ def find_causes(
         simulator: the simulator without the causes.
         settings: amount of work and thresholds.
     """
-    steps = np.unique(np.linspace(windows.steps / settings.used_steps, windows.steps, settings.used_steps).round())
-    steps = steps.astype(int)
-    fitter = Fitter(windows, Scale(steps, floor[steps]))
+    fitter = Fitter(windows, scale_of(windows, floor, settings))
     reference = fitter.loss(simulator, max_error=settings.max_unseen_error)
-    perfect = 0.5 * len(steps) * 6 * len(windows)
+    perfect = 0.5 * len(fitter.scale.steps) * 6 * len(windows)
     excess = max(float(reference.sum()) - perfect, 1e-9)
     halves = _halves(windows)
     singles = _fit_singles(fitter, simulator, settings)
@@ -131,6 +129,13 @@ def find_causes(
         values = _reported_values(t, simulator, settings)
         causes.append(Cause(t.candidate.id, share, own_share, t.candidate.with_refit, ties, values))
     return tuple(causes)
+
+
+def scale_of(windows: PredictionWindows, floor: FloatArray, settings: QuickSettings) -> Scale:
+    """Steps whose errors enter a fit, with their noise floor."""
+    steps = np.unique(np.linspace(windows.steps / settings.used_steps, windows.steps, settings.used_steps).round())
+    steps = steps.astype(int)
+    return Scale(steps, floor[steps])
 
 
 def _own_share(
@@ -257,4 +262,4 @@ def _change(value: float, before: float) -> float:
     return abs(math.log(value / before)) if value > 0.0 and before > 0.0 else abs(value - before)
 
 
-__all__ = ["ALL_PARAMETERS", "Cause", "FittedParameterValue", "find_causes"]
+__all__ = ["ALL_PARAMETERS", "Cause", "FittedParameterValue", "find_causes", "scale_of"]

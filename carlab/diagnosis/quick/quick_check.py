@@ -17,10 +17,11 @@ import numpy as np
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
-from carlab.diagnosis.quick.causes import Cause, find_causes
+from carlab.diagnosis.quick.causes import Cause, find_causes, scale_of
 from carlab.diagnosis.quick.conditions import Condition, find_conditions
 from carlab.diagnosis.recording_faults import find as data_faults
 from carlab.diagnosis.settings import DEFAULT, QuickSettings
@@ -127,6 +128,30 @@ def quick_check(
     return _checked(undecided, windows, floor, simulator, settings)
 
 
+def held_out_loss(
+    episode: EpisodeData, simulators: Sequence[SimulatorConfig], settings: QuickSettings = DEFAULT.quick
+) -> list[float] | None:
+    """Huber's loss of an episode's windows by each simulator, in units of the noise floor of the first.
+
+    Args:
+        episode: a recording that no simulator was fitted to.
+        simulators: to compare.
+        settings: windows and bound of an error.
+
+    Returns:
+        One loss for each simulator; None if the car moves in no window.
+    """
+    first = simulators[0]
+    captured = [align_states(episode, first.mocap.latency_s)] if episode.ticks >= 2 else []
+    repaired, _, _ = data_faults.check(captured, [], with_known_latency(first, captured))
+    try:
+        windows, floor = _windows(repaired, first, window_variance_s2([episode]), settings)
+    except DataError:
+        return None
+    fitter = Fitter(windows, scale_of(windows, floor, settings))
+    return [float(fitter.loss(each, max_error=settings.max_unseen_error).sum()) for each in simulators]
+
+
 def _checked(
     undecided: QuickCheck,
     windows: PredictionWindows,
@@ -206,4 +231,4 @@ def _plain(value: object) -> object:
     return value
 
 
-__all__ = ["SCHEMA", "ChannelError", "QuickCheck", "Verdict", "quick_check"]
+__all__ = ["SCHEMA", "ChannelError", "QuickCheck", "Verdict", "held_out_loss", "quick_check"]

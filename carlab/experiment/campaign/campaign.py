@@ -5,7 +5,7 @@ its next step.
 
 | finished recordings | models/000k, k = recordings + 1 | next step |
 | --- | --- | --- |
-| fewer than the target | absent | train |
+| fewer than the target | absent | train; with ``repairs_prior`` repair the prior before it, unless that is done |
 | fewer than the target | present | drive |
 | target reached | | none |
 """
@@ -27,16 +27,17 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
-from carlab.core.state_estimator import StateEstimator
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
+from carlab.experiment.campaign.prior_process import RepairRequest, read_version, repair_path, run_repair_subprocess
+from carlab.experiment.campaign.prior_repair import PriorVersion, corrected
 from carlab.experiment.campaign.quick_check import QuickCheck, check_path, run_check_subprocess
 from carlab.experiment.campaign.training import (
-    FIGURES_FILE,
     Progress,
     TrainingPlan,
     model_folder,
     plan_as_json,
     plan_from_json,
+    training_figures,
 )
 from carlab.experiment.campaign.training_process import train_in_subprocess
 from carlab.experiment.episodes.session import EpisodeResult, Session, SessionHooks
@@ -48,7 +49,7 @@ from sim_backends.car_parameters import SimulatorConfig
 CAMPAIGN_FILE = "campaign.json"
 CONTINUE_REASONS = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOFENCE, EndReason.OVERSPEED})
 """End reasons after which the run continues; an untrained policy may leave the arena."""
-PAPER_HISTORY, MAX_HISTORY = 3, 8
+PAPER_HISTORY = 3
 STOPPED = frozenset({EndReason.STOP_REQUESTED, EndReason.LOOP_HUNG})
 """End reasons after which the same episode is driven again."""
 PRIOR_HALF_WIDTH = 0.3
@@ -83,16 +84,6 @@ def prior_simulator(car: SimulatorConfig, kind: Literal["kinematic", "nominal"])
     return replace(car, priors={n: _range_about(values[n]) for n in names})
 
 
-def needed_history(car: SimulatorConfig) -> int:
-    """Number of past commands that affect the next measured state, from three to eight.
-
-    It covers the command delay, the latency of motion capture and the window of the velocity estimate.
-    """
-    values = car.values()
-    span_s = values["timing.command_delay"] + values["mocap.latency"] + StateEstimator().window_s
-    return min(max(round(span_s / car.control_period_s), PAPER_HISTORY), MAX_HISTORY)
-
-
 def _range_about(value: float) -> tuple[float, float]:
     return value * (1.0 - PRIOR_HALF_WIDTH), value * (1.0 + PRIOR_HALF_WIDTH)
 
@@ -117,6 +108,8 @@ class CampaignHooks:
     on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
     on_checking: Callable[[], None] = lambda: None
     on_check: Callable[[QuickCheck], None] = lambda check: None
+    on_repairing: Callable[[], None] = lambda: None
+    on_prior: Callable[[PriorVersion], None] = lambda version: None
     stop: Callable[[], bool] = lambda: False
 
 
@@ -125,7 +118,8 @@ class Campaign:
     """A run of ``carlab learn`` on an open car.
 
     ``checked_simulator`` is the simulator of the quick check after each episode; by default that of the car file.
-    ``car`` holds the command-line options that select the car.
+    ``car`` holds the command-line options that select the car. With ``repairs_prior`` the prior is the car file's
+    simulator with the corrections that ``repair`` finds between episodes, and the quick check tests this prior.
     """
 
     choice: CarChoice
@@ -138,11 +132,14 @@ class Campaign:
     record_rerun: bool = True
     checked_simulator: SimulatorConfig | None = None
     car: str = ""
+    repairs_prior: bool = False
+    repair: Callable[[RepairRequest, Callable[[], bool]], PriorVersion | None] = run_repair_subprocess
 
     def write_plan(self) -> None:
         """Write the settings that resuming the run needs."""
         settings: dict[str, Any] = {"episodes": self.episodes, "ticks": self.max_ticks}
         settings |= {"place": self.place, "rerun": self.record_rerun, "car": self.car}
+        settings["repairs_prior"] = self.repairs_prior
         if self.checked_simulator is not None:
             settings["questioned"] = self.checked_simulator.to_tables()
         self.run.write_json(CAMPAIGN_FILE, {**settings, "plan": plan_as_json(self.plan)})
@@ -160,8 +157,10 @@ class Campaign:
         while (done := len(self.run.recordings())) < self.episodes:
             folder = model_folder(self.run.models, done + 1)
             if not folder.is_dir():
+                if not self._repair_prior():
+                    return
                 trained = train_in_subprocess(
-                    self.plan,
+                    self.current_plan(done),
                     self.run.models,
                     self.run.recordings(),
                     self._envelope,
@@ -182,7 +181,7 @@ class Campaign:
             continues = self._may_continue(result.reason)
             if continues and result.reason.is_safety_stop:
                 self.choice.car.reset_fault()
-            self.hooks.on_figures(figures_of(result, self._training(done + 1)))
+            self.hooks.on_figures(figures_of(result, training_figures(self.run, done + 1)))
             self._check()
             yield result
             if not continues:
@@ -204,9 +203,50 @@ class Campaign:
         if not number or not path.parent.is_dir() or path.is_file() or self.hooks.stop():
             return
         self.hooks.on_checking()
-        check = run_check_subprocess(self.run, self.checked_simulator or self.choice.simulator, self.hooks.stop)
+        simulator = self.checked_simulator or self.choice.simulator
+        if self.repairs_prior:
+            simulator = self._simulator(self._version(number - 1))
+        check = run_check_subprocess(self.run, simulator, self.hooks.stop)
         if check is not None:
             self.hooks.on_check(check)
+
+    def current_plan(self, recordings: int) -> TrainingPlan:
+        """The plan with the version of the prior after a number of recordings."""
+        if not self.repairs_prior:
+            return self.plan
+        import tomli_w
+
+        version = self._version(recordings)
+        text = tomli_w.dumps(self._simulator(version).to_tables()) if version.corrections else self.plan.prior_toml
+        return replace(self.plan, prior_toml=text, history=version.history)
+
+    def _version(self, recordings: int) -> PriorVersion:
+        """The newest version of the prior that used at most this number of recordings."""
+        for number in range(recordings, 0, -1):
+            if (version := read_version(self.run, number)) is not None:
+                return version
+        return PriorVersion(history=self.plan.history)
+
+    def _simulator(self, version: PriorVersion) -> SimulatorConfig:
+        return corrected(self._initial_prior(), version.corrections)
+
+    def _initial_prior(self) -> SimulatorConfig:
+        return SimulatorConfig.from_tables(tomllib.loads(self.plan.prior_toml))
+
+    def _repair_prior(self) -> bool:
+        """Repair the prior after the newest episode, unless that is done; False if it was stopped."""
+        number = len(self.run.recordings())
+        path = repair_path(self.run, number)
+        if not self.repairs_prior or not number or path.is_file() or not check_path(self.run, number).is_file():
+            return not self.hooks.stop()
+        self.hooks.on_repairing()
+        request = RepairRequest(
+            tuple(self.run.recordings()), self.plan.prior_toml, self._version(number - 1), path.parent
+        )
+        version = self.repair(request, self.hooks.stop)
+        if version is not None:
+            self.hooks.on_prior(version)
+        return version is not None
 
     def _may_continue(self, reason: EndReason) -> bool:
         """Whether the run may continue; after a safety stop of a real car only if a person places the car."""
@@ -224,7 +264,7 @@ class Campaign:
         session = Session(
             self.choice.car,
             agent.policy(),
-            self.plan.task,
+            self.current_plan(number - 1).task,
             self._envelope,
             self.run,
             self.choice.control_period_s,
@@ -238,14 +278,6 @@ class Campaign:
         )
         results = session.drive(1)
         return results[0] if results else None
-
-    def _training(self, number: int) -> dict[str, Any]:
-        path = model_folder(self.run.models, number) / FIGURES_FILE
-        try:
-            figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise DataError(f"{path} cannot be read ({error}); remove its folder to train again.") from error
-        return figures
 
 
 CONNECTION_TABLES = ("hardware", "mocap")
@@ -298,6 +330,7 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
         return Campaign(
             choice, plan, int(content["episodes"]), run, hooks, None if ticks is None else int(ticks),
             bool(content["place"]), bool(content["rerun"]), checked_simulator, str(content.get("car", "")),
+            bool(content.get("repairs_prior", False)),
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
@@ -312,7 +345,6 @@ __all__ = [
     "CampaignHooks",
     "check_period",
     "check_same_car",
-    "needed_history",
     "prior_simulator",
     "resumed_campaign",
     "saved_seed",

@@ -35,7 +35,7 @@ class EpisodeFigures:
     Attributes:
         episode: from 1.
         total_reward: return on the car.
-        predicted_return: mean return of the same policy in the learned car.
+        predicted_return: median return of the same policy in plausible cars (``predicted_return.py``).
         parked: whether the car ended within 0.2 m and 0.35 rad of the goal and slower than 0.3 m/s (``ParkingTask``).
         distance_m, yaw_error_rad, speed_mps: errors of the final pose, and the final speed.
         rows: number of recorded transitions that the model was fitted to.
@@ -50,6 +50,8 @@ class EpisodeFigures:
         excess: errors of the simulator beyond the noise floor, in noise floors; NaN if unknown.
         excess_std: its standard error.
         diagnosis: messages of the quick check.
+        predicted_low, predicted_high: interval that contains the return with a probability of 90 %; NaN if unknown.
+        prior_change: what changed in the simulator prior before the episode, and why; empty without repair.
     """
 
     episode: int
@@ -70,6 +72,9 @@ class EpisodeFigures:
     excess: float = float("nan")
     excess_std: float = float("nan")
     diagnosis: str = ""
+    predicted_low: float = float("nan")
+    predicted_high: float = float("nan")
+    prior_change: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Values for a JSON file; NaN becomes null."""
@@ -99,7 +104,7 @@ def figures_of(result: EpisodeResult, training: Mapping[str, Any]) -> EpisodeFig
     return EpisodeFigures(
         episode=int(training["episode"]),
         total_reward=result.total_reward,
-        predicted_return=float(training["return_in_model"]),
+        predicted_return=float(training.get("predicted_return", training["return_in_model"])),
         parked=bool(summary["parked"]),
         distance_m=summary["distance_m"],
         yaw_error_rad=summary["yaw_error_rad"],
@@ -111,6 +116,9 @@ def figures_of(result: EpisodeResult, training: Mapping[str, Any]) -> EpisodeFig
         policy_seconds=float(training["policy_seconds"]),
         updates=int(training["updates"]),
         end=result.reason.name,
+        predicted_low=float(training.get("predicted_low", float("nan"))),
+        predicted_high=float(training.get("predicted_high", float("nan"))),
+        prior_change=str(training.get("prior_change", "")),
     )
 
 

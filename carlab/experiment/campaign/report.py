@@ -11,7 +11,7 @@ from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.picture import draw
 from carlab.experiment.campaign.quick_check import QuickCheck
 from carlab.experiment.campaign.run_recording import write_run_recording
-from carlab.experiment.campaign.training import FIGURES_FILE, TrainingPlan, has_ticks, model_folder
+from carlab.experiment.campaign.training import TrainingPlan, has_ticks, training_figures
 from carlab.experiment.episodes.session import result_of
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
@@ -47,9 +47,9 @@ def restore_missing_rows(run: RunDirectory, task: ParkingTask) -> None:
         if number in known or not has_ticks(path):
             continue
         try:
-            training = json.loads((model_folder(run.models, number) / FIGURES_FILE).read_text(encoding="utf-8"))
+            training = training_figures(run, number)
             save_row(run, figures_of(result_of(number, read_episode(path), task, path), training))
-        except (OSError, ValueError, KeyError) as error:
+        except (DataError, OSError, ValueError, KeyError) as error:
             log.warning("The row of episode %d in %s cannot be restored: %s", number, CURVE_FILE, error)
 
 

@@ -19,12 +19,15 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.documents import EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError, DivergedError
-from carlab.core.observation import encode
+from carlab.core.observation import encode, feature_size
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.state_estimator import StateEstimator
 from carlab.core.task import ParkingTask
+from carlab.experiment.campaign.predicted_return import predicted_figures
+from carlab.experiment.campaign.prior_process import read_version
 from carlab.recording.episode_builder import VELOCITY_DELAY
+from carlab.recording.run_folder import RunDirectory
 from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, has_whole_step, transitions_of
 from learning.world.car_fit import LearnedCar, Method
@@ -41,6 +44,7 @@ log = logging.getLogger(__name__)
 
 DYNAMICS_FILE = "dynamics.pt"
 FIGURES_FILE = "training.json"
+PRIOR_FILE = "prior.toml"
 N_EVALUATION_CARS = 64
 PARKED_BONUS, PARKED_SCORE = 0.3, 10.0
 """Reward for each tick at which the learned car is parked, additional to the task's reward; and score of a policy that
@@ -98,6 +102,21 @@ class TrainingPlan:
         return self.updates * 3 // max(episode, 3)
 
 
+def training_figures(run: RunDirectory, episode: int) -> dict[str, Any]:
+    """Figures of the training before an episode, and the change of the prior before it.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    path = model_folder(run.models, episode) / FIGURES_FILE
+    try:
+        figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be read ({error}); remove its folder to train again.") from error
+    version = read_version(run, episode - 1)
+    return figures if version is None else {**figures, "prior_change": version.sentence}
+
+
 def model_folder(models: Path, episode: int) -> Path:
     """Folder of the model and policy that were trained before an episode."""
     return models / f"{episode:04d}"
@@ -142,7 +161,8 @@ def train(
     if len(recordings) == EPISODES_BEFORE_HISTORY_CHOICE:
         figures |= _history_figures(usable, progress)
     seed = plan.seed + 1000 * number
-    dynamics = _fitted(plan, _prior_model(plan, usable), usable, rows, earlier_car, seed, progress)
+    same_inputs = earlier_car if earlier_car is not None and earlier_car.history == plan.history else None
+    dynamics = _fitted(plan, _prior_model(plan, usable), usable, rows, same_inputs, seed, progress)
     figures["model_seconds"] = clock.now_s() - began_s
 
     began_s = clock.now_s()
@@ -151,10 +171,12 @@ def train(
         plan, *worlds, None if earlier_car is None else earlier, plan.updates_before(number), progress
     )
     figures |= {**policy_figures, "policy_seconds": clock.now_s() - began_s}
+    figures |= predicted_figures(plan, agent, worlds[1], usable, envelope, seed)
 
     def write(folder: Path) -> None:
         save_car(dynamics, folder / DYNAMICS_FILE)
         agent.save(folder)
+        (folder / PRIOR_FILE).write_text(plan.prior_toml, encoding="utf-8")
 
     _publish(model_folder(models, number), figures, write)
     return figures
@@ -231,6 +253,7 @@ def _trained_policy(
         agent = SacAgent(settings, plan.seed, plan.device)
         if earlier is not None:
             agent = SacAgent.load(earlier, settings, plan.seed, plan.device)
+            agent.widen(feature_size(plan.history))
         progress("learning to drive", 0, updates)
         figures.update(agent.train(world, updates, lambda done: progress("learning to drive", done, updates), evaluate))
         return agent
@@ -368,4 +391,5 @@ __all__ = [
     "plan_from_json",
     "recorded_features",
     "train",
+    "training_figures",
 ]

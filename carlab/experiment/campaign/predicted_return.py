@@ -1,0 +1,96 @@
+"""Predicted return of the next episode with a 90 % interval, and the time that the car needs to park.
+
+The prediction mixes two kinds of cars in equal parts: the learned car, and simulated cars drawn from the prior with
+plausible unknown effects, of which those that fit the recordings best are used.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.observation import STATE_FEATURES
+from carlab.core.safety import SafetyEnvelope
+from sim_backends.car_parameters import SimulatorConfig
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from carlab.experiment.campaign.training import TrainingPlan
+    from learning.policy.sac_agent import SacAgent
+    from learning.world.model_env import ModelEnv
+
+N_DRAWN, N_SELECTED = 512, 64
+"""Number of drawn cars, and of those that fit the recordings best."""
+INTERVAL = (0.05, 0.95)
+MORE_TICKS = (1.5, 2.0, 3.0)
+"""Lengths of longer drives in the learned car, in lengths of an episode."""
+ENOUGH_PARKED = 0.5
+"""Share of drives in the learned car that must park for the length of a drive to count as sufficient."""
+
+
+def predicted_figures(
+    plan: TrainingPlan,
+    agent: SacAgent,
+    learned: ModelEnv,
+    episodes: Sequence[EpisodeData],
+    envelope: SafetyEnvelope,
+    seed: int,
+) -> dict[str, Any]:
+    """Median return and 90 % interval of a policy, and sufficient ticks if those of an episode are too few.
+
+    Args:
+        plan: settings of the run with the current prior.
+        agent: the policy.
+        learned: the learned car.
+        episodes: recordings so far.
+        envelope: limits of the car's safety gate.
+        seed: of all draws.
+    """
+    import torch
+
+    from learning.world import drawn_cars, model_env
+
+    totals = [learned.roll_out(agent.act)[0]]
+    prior = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+    if plan.method == "sim-fsvgd":
+        cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed))
+        cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)
+        task = replace(plan.task, history_length=drawn_cars.HISTORY)
+        world = model_env.ModelEnv(
+            cars, task, N_SELECTED, envelope=envelope, period_s=prior.control_period_s, seed=seed
+        )
+        totals.append(world.roll_out(lambda seen: agent.act(_own_features(seen, plan.history)))[0])
+    low, high = torch.cat(totals).quantile(torch.tensor(INTERVAL)).tolist()
+    return {
+        "predicted_return": float(torch.cat(totals).median()),
+        "predicted_low": low,
+        "predicted_high": high,
+        **_sufficient_ticks(plan, agent, learned),
+    }
+
+
+def _own_features(seen: NDArray[np.float32], history: int) -> NDArray[np.float32]:
+    """Policy inputs with only the last ``history`` past commands."""
+    import numpy as np
+
+    first = seen.shape[1] - 2 * history
+    return np.concatenate([seen[:, :STATE_FEATURES], seen[:, first:]], axis=1)
+
+
+def _sufficient_ticks(plan: TrainingPlan, agent: SacAgent, learned: ModelEnv) -> dict[str, Any]:
+    """``needed_ticks`` if the policy parks the learned car only in longer drives than an episode; empty otherwise."""
+    ticks = plan.task.max_ticks
+    for factor in (1.0, *MORE_TICKS):
+        length = round(factor * ticks)
+        _, ends = learned.roll_out(agent.act, max_ticks=length)
+        if float(plan.task.parked(ends).float().mean()) >= ENOUGH_PARKED:
+            return {} if length == ticks else {"needed_ticks": length}
+    return {}
+
+
+__all__ = ["predicted_figures"]

@@ -1,0 +1,237 @@
+"""The repair of the prior after an episode, in another process: test of the corrections, and diagnosis.
+
+The result is a file in the model folder of the episode (``models/0003/repair.json``). A failure leaves the prior
+unchanged; the run continues.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import multiprocessing
+import tomllib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from carlab.core.errors import CarlabError, DataError
+from carlab.experiment.campaign.prior_repair import (
+    PARAMETERS,
+    Correction,
+    Findings,
+    PriorVersion,
+    corrected,
+    repaired,
+)
+from carlab.experiment.campaign.quick_check import CHECK_FILE, MIN_DIAGNOSIS_EPISODES
+from carlab.recording.atomic_files import write_text
+from carlab.recording.run_folder import RunDirectory
+from sim_backends.car_parameters import SimulatorConfig
+
+if TYPE_CHECKING:
+    from carlab.core.episode_data import EpisodeData
+    from carlab.diagnosis.findings import Diagnosis
+
+log = logging.getLogger(__name__)
+
+REPAIR_FILE = "repair.json"
+DIAGNOSIS_BUDGET_S = 60.0
+"""Time limit of a diagnosis between two episodes [s]."""
+EPISODES_BETWEEN_DIAGNOSES = 3
+HELD_OUT_EVERY = 3
+"""Every third episode is held out from a diagnosis."""
+POLL_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class RepairRequest:
+    """Input of a repair.
+
+    Attributes:
+        recordings: all recordings of the run.
+        car_toml: simulator of the car file.
+        before: the current version of the prior.
+        folder: model folder of the newest episode, with the file of its quick check.
+        budget_s: time limit of a diagnosis [s].
+    """
+
+    recordings: tuple[Path, ...]
+    car_toml: str
+    before: PriorVersion
+    folder: Path
+    budget_s: float = DIAGNOSIS_BUDGET_S
+
+
+def repair_path(run: RunDirectory, episode: int) -> Path:
+    """File of the repair after an episode."""
+    return run.models / f"{episode:04d}" / REPAIR_FILE
+
+
+def read_version(run: RunDirectory, episode: int) -> PriorVersion | None:
+    """The version of the prior after an episode; None if there is none. Raises DataError for an invalid file."""
+    path = repair_path(run, episode)
+    if not path.is_file():
+        return None
+    try:
+        return PriorVersion.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"{path} cannot be read ({error}); remove it, and the run repeats the repair.") from error
+
+
+def run_repair_subprocess(request: RepairRequest, stop: Callable[[], bool] = lambda: False) -> PriorVersion | None:
+    """Repair the prior in another process, and save the new version; None if ``stop`` ended it.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_child, args=(sender, request), daemon=True, name="repair of the prior")
+    child.start()
+    sender.close()
+    try:
+        while not receiver.poll(POLL_S):
+            if stop():
+                return None
+        version: PriorVersion = receiver.recv()
+    except EOFError:
+        child.join()
+        version = _failed(request, f"its process died (exit code {child.exitcode})")
+    finally:
+        if child.is_alive() and stop():
+            child.terminate()
+        child.join()
+        receiver.close()
+    write_text(request.folder / REPAIR_FILE, json.dumps(version.to_dict(), indent=2) + "\n")
+    return version
+
+
+def repair(request: RepairRequest) -> PriorVersion:
+    """The next version of the prior. Raises CarlabError if a recording cannot be read."""
+    from carlab.experiment.campaign.training import has_ticks
+    from carlab.recording.mcap.source import read_episode
+
+    car = SimulatorConfig.from_tables(tomllib.loads(request.car_toml))
+    episodes = [read_episode(path) for path in request.recordings if has_ticks(path)]
+    number = len(request.recordings)
+    check: dict[str, Any] = json.loads((request.folder / CHECK_FILE).read_text(encoding="utf-8"))
+    newest = episodes[-1] if episodes and has_ticks(request.recordings[-1]) else None
+    tested = [c for c in request.before.corrections if c.episodes < number]
+    contradicted = contradicted_by(newest, car, request.before.corrections, tested) if newest is not None else ()
+    found = Findings(number, check, contradicted)
+    is_due = number - max(request.before.diagnosed, 1) >= EPISODES_BETWEEN_DIAGNOSES
+    is_needed = check.get("verdict") == "left" or bool(contradicted)
+    if len(episodes) >= MIN_DIAGNOSIS_EPISODES and is_due and is_needed:
+        found = diagnosed(found, episodes, car, request.budget_s)
+    return repaired(request.before, car, found)
+
+
+def contradicted_by(
+    newest: EpisodeData, car: SimulatorConfig, all_corrections: Sequence[Correction], tested: Sequence[Correction]
+) -> tuple[str, ...]:
+    """Ids of the corrections without which an episode is predicted better, by Huber's loss of its windows.
+
+    Args:
+        newest: an episode that no tested correction was fitted to.
+        car: simulator of the car file.
+        all_corrections: corrections of the current prior.
+        tested: the corrections to test.
+    """
+    from carlab.diagnosis.quick.quick_check import held_out_loss
+
+    simulators = [corrected(car, all_corrections)]
+    simulators += [corrected(car, [other for other in all_corrections if other is not c]) for c in tested]
+    losses = held_out_loss(newest, simulators) if tested else None
+    if losses is None:
+        return ()
+    return tuple(c.id for c, without in zip(tested, losses[1:], strict=True) if without < losses[0])
+
+
+def diagnosed(found: Findings, episodes: Sequence[EpisodeData], car: SimulatorConfig, budget_s: float) -> Findings:
+    """The findings with a diagnosis of all episodes, of which every third is held out."""
+    from carlab.diagnosis.diagnose import Inconclusive, diagnose
+    from carlab.diagnosis.evidence import Texts
+    from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+    from carlab.diagnosis.state_alignment import align_states
+    from sim_backends.effects import confusable_effects
+
+    aligned = [align_states(e, car.mocap.latency_s) for e in episodes]
+    held_out = aligned[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY]
+    fit = [e for k, e in enumerate(aligned) if k % HELD_OUT_EVERY != HELD_OUT_EVERY - 1]
+    texts = Texts(effect_sentence, separating_drive, confusable_effects())
+    try:
+        outcome = diagnose(fit, held_out, car, texts, budget_s=budget_s)
+    except Inconclusive as error:
+        return replace(found, diagnosis=error.verdict)
+    verdict, is_complete = outcome.diagnosis.verdict, outcome.diagnosis.search.is_complete
+    supported = verdict in ("mismatch", "parameters", "none")
+    corrections = corrections_of(outcome.diagnosis, outcome.model, found.episodes) if supported else None
+    return replace(found, diagnosed=corrections, diagnosis=verdict, is_complete=is_complete)
+
+
+def corrections_of(diagnosis: Diagnosis, model: SimulatorConfig, episodes: int) -> tuple[Correction, ...]:
+    """The named effects and the refitted parameters of a diagnosis as corrections; none for the verdict "none"."""
+    if diagnosis.verdict == "none":
+        return ()
+    values = model.values()
+    corrections = []
+    for effect in diagnosis.effects:
+        own = {name: value for name, value in values.items() if name.startswith(f"effects.{effect.id}.")}
+        std = {f"effects.{effect.id}.{name}": estimate.std for name, estimate in effect.parameters.items()}
+        fall = f"its removal raises the error of held-out episodes by {effect.evidence.held_out_error_reduction:.0%}"
+        corrections.append(Correction(effect.id, own, _valid(std, values), episodes, "diagnosis", fall))
+    refitted = {name: values[name] for name in diagnosis.parameters if name in values}
+    std = _valid({name: estimate.std for name, estimate in diagnosis.parameters.items()}, values)
+    if refitted:
+        fall = f"fitted to {episodes} episodes"
+        corrections.append(Correction(PARAMETERS, refitted, std, episodes, "diagnosis", fall))
+    return tuple(corrections)
+
+
+def _valid(std: dict[str, float], values: dict[str, float]) -> dict[str, float]:
+    from sim_backends.registry import REGISTRY
+
+    return {
+        name: s
+        for name, s in std.items()
+        if name in values and not REGISTRY[name].choices and 0.0 < s < math.inf and math.isfinite(values[name])
+    }
+
+
+def _child(pipe: Any, request: RepairRequest) -> None:
+    import signal
+
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles ^C and terminates this process.
+    torch.set_num_threads(1)
+    try:
+        version = repair(request)
+    except (CarlabError, OSError, ValueError) as error:
+        version = _failed(request, str(error))
+    except Exception as error:
+        log.exception("The repair of the prior failed")
+        version = _failed(request, f"{type(error).__name__}: {error}")
+    pipe.send(version)
+    pipe.close()
+
+
+def _failed(request: RepairRequest, reason: str) -> PriorVersion:
+    text = f"The repair of the prior after episode {len(request.recordings)} failed ({reason.rstrip('.')})"
+    return replace(request.before, sentence=f"{text}; the prior is unchanged.")
+
+
+__all__ = [
+    "DIAGNOSIS_BUDGET_S",
+    "REPAIR_FILE",
+    "RepairRequest",
+    "contradicted_by",
+    "corrections_of",
+    "diagnosed",
+    "read_version",
+    "repair",
+    "repair_path",
+    "run_repair_subprocess",
+]
