@@ -28,12 +28,14 @@ class Curve:
         seed: of all random numbers.
         updates: requested gradient steps of SAC before an episode.
         episodes: figures of its episodes, in order.
+        reality: name of the simulated car; empty for the car of the car file.
     """
 
     method: str
     seed: int
     updates: int
     episodes: tuple[EpisodeFigures, ...]
+    reality: str = ""
 
     @property
     def first_parked(self) -> int | None:
@@ -166,9 +168,12 @@ def as_json(curves: Sequence[Curve], command: str) -> dict[str, Any]:
         return None if isinstance(value, float) and not np.isfinite(value) else value
 
     runs = [
-        {"method": c.method, "seed": c.seed, "updates": c.updates, "episodes": [e.to_dict() for e in c.episodes]}
+        {
+            "method": c.method, "seed": c.seed, "updates": c.updates, "reality": c.reality,
+            "episodes": [e.to_dict() for e in c.episodes],
+        }
         for c in curves
-    ]
+    ]  # fmt: skip
     return {
         "schema": "carlab.parking/1",
         "command": command,
@@ -209,7 +214,7 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
         for curve in own:
             height = -len(ticks)
             ticks.append(height)
-            labels.append(f"{curve.method}, seed {curve.seed}")
+            labels.append(f"{curve.method}, {curve.reality} seed {curve.seed}".replace(",  ", ", "))
             for ended_parked in (True, False):
                 at = [e.episode for e in curve.episodes if e.parked is ended_parked]
                 marker, size = ("s", 5) if ended_parked else ("x", 4)

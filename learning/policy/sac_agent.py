@@ -213,7 +213,8 @@ def _with_zeros(value: Tensor, shape_of: Tensor) -> Tensor:
     for axis, (old, new) in enumerate(zip(value.shape, shape_of.shape, strict=True)):
         if old != new:
             zeros = torch.zeros_like(value.narrow(axis, 0, 1)).repeat_interleave(new - old, dim=axis)
-            state, rest = value.split([STATE_FEATURES, old - STATE_FEATURES], dim=axis)
+            state = value.narrow(axis, 0, STATE_FEATURES)
+            rest = value.narrow(axis, STATE_FEATURES, old - STATE_FEATURES)
             value = torch.cat([state, zeros, rest], dim=axis)
     return value
 

@@ -199,11 +199,13 @@ def _by_check(
 
 
 def _entry(found: Findings) -> Correction | None:
-    """The first cause of the quick check as a correction; None if the prior explains the recordings."""
-    causes = [c for c in found.check.get("causes") or () if _is_usable(c)]
-    if found.check.get("verdict") != "left" or not causes:
+    """The likeliest usable cause of the quick check as a correction; None if the prior explains the recordings."""
+    causes = found.check.get("causes") or ()
+    likely = [c for k, c in enumerate(causes) if k == 0 or c["like_the_first"]]
+    usable = [c for c in likely if _is_usable(c)]
+    if found.check.get("verdict") != "left" or not usable:
         return None
-    cause = causes[0]
+    cause = usable[0]
     values = {name: float(p["value"]) for name, p in cause["parameters"].items()}
     std = {}
     for name, p in cause["parameters"].items():

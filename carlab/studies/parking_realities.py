@@ -1,0 +1,120 @@
+"""Learning to park on cars that differ from the prior: by arm, how early a run parks, and coverage of its predictions.
+
+Every reality is the default car with other parameters or effects. The prior of a run is that of the default car.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from carlab.recording.atomic_files import write_text
+from carlab.studies.parking import Curve
+from sim_backends.car_parameters import SimulatorConfig
+
+EARLY_EPISODE = 4
+REALITIES: dict[str, dict[str, float]] = {
+    "low_grip": {"tyre.front.mu": 0.26, "tyre.rear.mu": 0.25},
+    "servo_lag": {"effects.steering_lag.time_constant": 0.12},
+    "long_delay": {"timing.command_delay": 0.16},
+    "weak_motor": {"motor.drive_gain": 5.0},
+    "patch": {
+        "effects.low_friction_patch.x": 0.7, "effects.low_friction_patch.y": -0.5,
+        "effects.low_friction_patch.radius": 0.5, "effects.low_friction_patch.loss": 0.6,
+    },
+    "slope": {"effects.road_slope.angle": 0.04, "effects.road_slope.direction": 1.0},
+    "load_transfer": {"effects.load_transfer.height": 0.08},
+    "two_lags": {"effects.steering_lag.time_constant": 0.1, "effects.motor_lag.time_constant": 0.1},
+}  # fmt: skip
+"""Numbers that differ from the default car, by name of the reality."""
+ARMS: dict[str, dict[str, str]] = {
+    "nominal": {"prior": "nominal"},
+    "auto": {"prior": "auto"},
+    "no-simulator": {"method": "fsvgd"},
+}
+"""Options of ``carlab learn`` by arm."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmFigures:
+    """The runs of one arm.
+
+    Attributes:
+        arm: name.
+        runs: number of runs.
+        mean_first_parked: mean first episode that ended parked; a run that never parked counts as one episode longer.
+        parked_early: share of runs that parked by episode ``EARLY_EPISODE``.
+        parked_after: share of parked episodes after the first parked one; NaN without any.
+        coverage: share of episodes whose return is in the predicted 90 % interval; NaN without a prediction.
+        latest_against_nominal: largest first parked episode minus that of the nominal arm in the same reality and with
+            the same seed; NaN without such a pair.
+    """
+
+    arm: str
+    runs: int
+    mean_first_parked: float
+    parked_early: float
+    parked_after: float
+    coverage: float
+    latest_against_nominal: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Values for a JSON file; NaN becomes null."""
+        values = {name: getattr(self, name) for name in self.__slots__}
+        return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in values.items()}
+
+
+def write_reality(name: str, folder: Path) -> Path:
+    """Write the car file of a reality, and return its path. Raises DataError if it cannot be written."""
+    import tomli_w
+
+    plain = replace(SimulatorConfig.from_preset(), priors={})
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}.toml"
+    write_text(path, tomli_w.dumps(plain.with_values(REALITIES[name]).to_tables()))
+    return path
+
+
+def compared(curves: Sequence[Curve]) -> list[ArmFigures]:
+    """One row per arm, in the order of the curves."""
+    nominal = {(c.reality, c.seed): _first(c) for c in curves if c.method == "nominal"}
+    rows = []
+    for arm in dict.fromkeys(c.method for c in curves):
+        own = [c for c in curves if c.method == arm and c.episodes]
+        first = [_first(c) for c in own]
+        later = [e.parked for c, f in zip(own, first, strict=True) for e in c.episodes if e.episode > f]
+        inside = [
+            e.predicted_low <= e.total_reward <= e.predicted_high
+            for c in own
+            for e in c.episodes
+            if np.isfinite(e.predicted_low)
+        ]
+        against = [f - nominal[key] for c, f in zip(own, first, strict=True) if (key := (c.reality, c.seed)) in nominal]
+        parked_early = float(np.mean([f <= EARLY_EPISODE and c.first_parked is not None for c, f in zip(own, first)]))
+        rows.append(
+            ArmFigures(
+                arm, len(own), float(np.mean(first)), parked_early, _mean(later), _mean(inside),
+                float(max(against)) if against else float("nan"),
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _first(curve: Curve) -> int:
+    return curve.first_parked if curve.first_parked is not None else len(curve.episodes) + 1
+
+
+def _mean(values: Sequence[bool]) -> float:
+    return float(np.mean(values)) if values else float("nan")
+
+
+def as_json(rows: Sequence[ArmFigures]) -> list[Mapping[str, Any]]:
+    """The rows as values for a JSON file."""
+    return [row.to_dict() for row in rows]
+
+
+__all__ = ["ARMS", "REALITIES", "ArmFigures", "as_json", "compared", "write_reality"]
