@@ -89,6 +89,11 @@ class BenchOptions:
     runs: Path = Path("parking-runs")
     """parking: folder of the runs."""
 
+    realities: int | None = None
+    """parking: number of simulated cars that differ from the prior (at most 8: low grip, servo lag, long delay, weak
+    motor, patch, slope, load transfer, two lags). --methods are then nominal, auto (--prior of carlab learn) and
+    no-simulator."""
+
     episodes: int = 20
     """parking: episodes of each run."""
 
@@ -148,6 +153,7 @@ PLACES = {
     "pair": (CONCEALED,),
     "recorded_s": (CONCEALED,),
     "runs": (PARKING,),
+    "realities": (PARKING,),
     "episodes": (PARKING,),
     "updates": (PARKING,),
     "steps": (REGRESSION, PRIORS, PARKING, ROLLOUTS),

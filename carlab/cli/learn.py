@@ -52,9 +52,9 @@ class Learn:
     prior: str = "kinematic"
     """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), auto (at first nominal;
     between episodes, effects and parameters that the recordings support enter it, and those that they contradict leave
-    it; the run prints what changed), or FILE.toml (for example a diagnosed model.toml with its effects and standard deviations). Ranges are those of the file; without
-    them, 30 % about motor gain, damping and steering angle and, with wheel slip, about yaw inertia and the tyres'
-    stiffness and friction."""
+    it; the run prints what changed), or FILE.toml (for example a diagnosed model.toml with its effects and standard
+    deviations). Ranges are those of the file; without them, 30 % about motor gain, damping and steering angle and, with
+    wheel slip, about yaw inertia and the tyres' stiffness and friction."""
 
     method: Method = "sim-fsvgd"
     """sim-fsvgd: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method). fsvgd:

@@ -5,13 +5,14 @@ Every reality is the default car with other parameters or effects. The prior of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from carlab.core.errors import ConfigError
 from carlab.recording.atomic_files import write_text
 from carlab.studies.parking import Curve
 from sim_backends.car_parameters import SimulatorConfig
@@ -31,7 +32,7 @@ REALITIES: dict[str, dict[str, float]] = {
     "two_lags": {"effects.steering_lag.time_constant": 0.1, "effects.motor_lag.time_constant": 0.1},
 }  # fmt: skip
 """Numbers that differ from the default car, by name of the reality."""
-ARMS: dict[str, dict[str, str]] = {
+ARMS: dict[str, dict[str, Any]] = {
     "nominal": {"prior": "nominal"},
     "auto": {"prior": "auto"},
     "no-simulator": {"method": "fsvgd"},
@@ -79,12 +80,19 @@ def write_reality(name: str, folder: Path) -> Path:
     return path
 
 
+def arm_of(name: str) -> dict[str, Any]:
+    """Options of an arm by its name. Raises ConfigError for another name."""
+    if name not in ARMS:
+        raise ConfigError(f"There is no arm '{name}'; choose among {', '.join(ARMS)}.")
+    return ARMS[name]
+
+
 def compared(curves: Sequence[Curve]) -> list[ArmFigures]:
     """One row per arm, in the order of the curves."""
     nominal = {(c.reality, c.seed): _first(c) for c in curves if c.method == "nominal"}
     rows = []
     for arm in dict.fromkeys(c.method for c in curves):
-        own = [c for c in curves if c.method == arm and c.episodes]
+        own = [c for c in curves if c.method == arm]
         first = [_first(c) for c in own]
         later = [e.parked for c, f in zip(own, first, strict=True) for e in c.episodes if e.episode > f]
         inside = [
@@ -94,10 +102,10 @@ def compared(curves: Sequence[Curve]) -> list[ArmFigures]:
             if np.isfinite(e.predicted_low)
         ]
         against = [f - nominal[key] for c, f in zip(own, first, strict=True) if (key := (c.reality, c.seed)) in nominal]
-        parked_early = float(np.mean([f <= EARLY_EPISODE and c.first_parked is not None for c, f in zip(own, first)]))
+        early = [c.first_parked is not None and c.first_parked <= EARLY_EPISODE for c in own]
         rows.append(
             ArmFigures(
-                arm, len(own), float(np.mean(first)), parked_early, _mean(later), _mean(inside),
+                arm, len(own), float(np.mean(first)), _mean(early), _mean(later), _mean(inside),
                 float(max(against)) if against else float("nan"),
             )
         )  # fmt: skip
@@ -112,9 +120,4 @@ def _mean(values: Sequence[bool]) -> float:
     return float(np.mean(values)) if values else float("nan")
 
 
-def as_json(rows: Sequence[ArmFigures]) -> list[Mapping[str, Any]]:
-    """The rows as values for a JSON file."""
-    return [row.to_dict() for row in rows]
-
-
-__all__ = ["ARMS", "REALITIES", "ArmFigures", "as_json", "compared", "write_reality"]
+__all__ = ["ARMS", "REALITIES", "ArmFigures", "arm_of", "compared", "write_reality"]

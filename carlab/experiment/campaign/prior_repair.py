@@ -21,6 +21,8 @@ from sim_backends.registry import REGISTRY
 
 PARAMETERS = "parameters"
 """Id of a correction of parameters of the car file."""
+MAX_SHOWN = 4
+"""Maximum number of numbers in a message."""
 MIN_HISTORY, MAX_HISTORY = 3, 8
 MIN_ENTRY_SHARE = 0.3
 """Minimum share of the error that a cause of the quick check explains on windows that were not fitted."""
@@ -50,14 +52,14 @@ class Correction:
 
     def text(self) -> str:
         """Name and numbers."""
-        if self.id == PARAMETERS:
-            return f"other parameters ({', '.join(self.values)})" if len(self.values) < 4 else "other parameters"
-        numbers = ", ".join(
-            f"{name.rsplit('.', 1)[1]} {value:.3g} {REGISTRY[name].unit}".removesuffix(" 1")
+        is_effect = self.id != PARAMETERS
+        numbers = [
+            f"{name.rsplit('.', 1)[1] if is_effect else name} {value:.3g} {REGISTRY[name].unit}".removesuffix(" 1")
             for name, value in self.values.items()
             if not REGISTRY[name].choices
-        )
-        return f"{self.id} ({numbers})"
+        ]
+        shown = ", ".join(numbers[:MAX_SHOWN]) + (" ..." if len(numbers) > MAX_SHOWN else "")
+        return f"{self.id if is_effect else 'a change of parameters'} ({shown})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +181,7 @@ def _by_diagnosis(before: PriorVersion, found: Findings) -> tuple[tuple[Correcti
     return tuple(after), why
 
 
-def _by_check(
-    before: PriorVersion, car: SimulatorConfig, found: Findings
-) -> tuple[tuple[Correction, ...], list[str]]:
+def _by_check(before: PriorVersion, car: SimulatorConfig, found: Findings) -> tuple[tuple[Correction, ...], list[str]]:
     after = [c for c in before.corrections if c.id not in found.contradicted]
     why = [
         f"{c.id} leaves (episode {found.episodes} is predicted better without it)"
