@@ -91,7 +91,7 @@ class BenchOptions:
 
     realities: int | None = None
     """parking: number of simulated cars that differ from the prior (at most 8: low grip, servo lag, long delay, weak
-    motor, patch, slope, load transfer, two lags). --methods are then nominal, auto (--prior of carlab learn) and
+    motor, patch, two lags, slope, load transfer). --methods are then nominal, auto (--prior of carlab learn) and
     no-simulator."""
 
     episodes: int = 20

@@ -27,9 +27,9 @@ REALITIES: dict[str, dict[str, float]] = {
         "effects.low_friction_patch.x": 0.7, "effects.low_friction_patch.y": -0.5,
         "effects.low_friction_patch.radius": 0.5, "effects.low_friction_patch.loss": 0.6,
     },
+    "two_lags": {"effects.steering_lag.time_constant": 0.1, "effects.motor_lag.time_constant": 0.1},
     "slope": {"effects.road_slope.angle": 0.04, "effects.road_slope.direction": 1.0},
     "load_transfer": {"effects.load_transfer.height": 0.08},
-    "two_lags": {"effects.steering_lag.time_constant": 0.1, "effects.motor_lag.time_constant": 0.1},
 }  # fmt: skip
 """Numbers that differ from the default car, by name of the reality."""
 ARMS: dict[str, dict[str, Any]] = {

@@ -42,10 +42,21 @@ MEAN_HOLD_TICKS = 8
 
 
 def known_ranges(config: SimulatorConfig) -> dict[str, tuple[float, float]]:
-    """Ranges of all uncertain parameters of a car file; physical bounds for those with only a standard deviation."""
+    """Ranges of all uncertain parameters of a car file; physical bounds for those with only a standard deviation.
+
+    A number that reduces another one (an extra delay) reduces it at most to zero.
+    """
     known = config.values()
-    bounds = {name: REGISTRY[name] for name in config.parameter_std if name in known}
-    return {name: (info.low, info.high) for name, info in bounds.items()} | dict(config.priors)
+    reduced = {
+        f"effects.{name}.{p.name}": p.reduces for name in config.effects for p in EFFECTS[name].parameters if p.reduces
+    }
+    ranges = {}
+    for name in config.parameter_std:
+        if name in known:
+            low, other = REGISTRY[name].low, reduced.get(name, "")
+            smallest = config.priors[other][0] if other in config.priors else known.get(other, 0.0)
+            ranges[name] = (max(low, -smallest) if other else low, REGISTRY[name].high)
+    return ranges | dict(config.priors)
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,8 @@ SCREENED_COORDINATES = ((-3.0, -1.0, 1.0, 3.0), (-3.0, -1.0, -0.3, 0.3, 1.0, 3.0
 """Coordinate steps at which a parameter is screened: of its logarithm, or of its value."""
 ALL_PARAMETERS = "numbers"
 """Id of the cause "all parameters refitted"."""
+GRIP, GRIP_PARAMETERS = "tyre.mu", ("tyre.front.mu", "tyre.rear.mu")
+"""Id of the cause "grip of both axles": another floor or other tyres change both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,8 @@ class Cause:
     """A candidate cause.
 
     Attributes:
-        id: an effect of the catalogue, a parameter by its dotted name, or ``numbers``: all parameters together.
+        id: an effect of the catalogue, a parameter by its dotted name, ``tyre.mu``: the friction of both axles, or
+            ``numbers``: all parameters together.
         share: share of the excess loss that it explains on windows that were not fitted, in [0, 1].
         own_share: of an effect added to a refit, its share of the excess loss that the refit leaves.
         with_refit: whether all parameters were refitted with it; ``share`` is that of both.
@@ -174,7 +177,8 @@ def _screen_parameters(
     """Screening score of parameters of the simulator, and the initial point (n,) of their fit."""
     at = _coordinates(simulator, free)
     sizes = SCREENED_COORDINATES[not free[0].logarithmic]
-    points = np.array([at + z * axis for axis in np.eye(len(free)) for z in sizes])
+    axes = np.eye(len(free)) if free[0].name not in GRIP_PARAMETERS else np.ones((1, len(free)))
+    points = np.array([at + z * axis for axis in axes for z in sizes])
     gains = [screen.gain(whites) for whites in screen.fitter.white(simulator, free, points)]
     best = int(np.argmax([gain for gain, _ in gains]))
     low, high = screen.settings.step_range
@@ -230,9 +234,12 @@ def _new_effects(simulator: SimulatorConfig) -> list[str]:
 
 
 def _simulator_parameters(simulator: SimulatorConfig) -> list[tuple[str, tuple[FitParameter, ...]]]:
-    """Parameters of the simulator: those of the base model one by one, those of each effect together."""
-    single = [(f.name, (f,)) for f in base_parameters(simulator)]
-    return [*single, *((f"effects.{name}", effect_parameters(name, simulator)) for name in simulator.effects)]
+    """Parameters of the simulator: those of the base model one by one, the grip of both axles, those of each effect."""
+    base = base_parameters(simulator)
+    single = [(f.name, (f,)) for f in base]
+    grip = tuple(f for f in base if f.name in GRIP_PARAMETERS)
+    both = [(GRIP, grip)] if len(grip) == len(GRIP_PARAMETERS) else []
+    return [*single, *both, *((f"effects.{name}", effect_parameters(name, simulator)) for name in simulator.effects)]
 
 
 def _coordinates(simulator: SimulatorConfig, free: Sequence[FitParameter]) -> FloatArray:
@@ -249,6 +256,8 @@ def _reported_values(
     if candidate.id == ALL_PARAMETERS:
         ordered = sorted(candidate.free, key=lambda f: -_change(whole[f.name], before[f.name]))
         names = [f.name for f in ordered[: settings.max_causes]]
+    elif candidate.id == GRIP:
+        names = list(GRIP_PARAMETERS)
     else:
         own = f"effects.{candidate.id.removeprefix('effects.')}."
         names = [name for name in whole if name == candidate.id or name.startswith(own)]

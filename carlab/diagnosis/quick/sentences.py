@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from carlab.diagnosis.quick.causes import ALL_PARAMETERS, Cause
+from carlab.diagnosis.quick.causes import ALL_PARAMETERS, GRIP, Cause
 from carlab.diagnosis.quick.quick_check import QuickCheck
 from carlab.diagnosis.report.sentences import CHANNEL_WORDS, number, percent, with_unit
 
@@ -62,10 +62,10 @@ def _likely_causes(check: QuickCheck, decide: str) -> str:
 
 
 def _cause(cause: Cause) -> str:
-    name = "the parameters of the car file" if cause.id == ALL_PARAMETERS else cause.id
+    name = {ALL_PARAMETERS: "the parameters of the car file", GRIP: "the grip of both axles"}.get(cause.id, cause.id)
     values = []
     for key, p in cause.parameters.items():
-        label = key if cause.id == ALL_PARAMETERS else key.rsplit(".", 1)[1]
+        label = key if cause.id in (ALL_PARAMETERS, GRIP) else key.rsplit(".", 1)[1]
         text = f"{label} {with_unit(p.value, p.unit)}"
         if p.before is not None and (cause.id == ALL_PARAMETERS or not key.startswith("effects.")):
             text += f" instead of {number(p.before)}"

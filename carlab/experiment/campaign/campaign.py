@@ -29,7 +29,7 @@ from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.prior_process import RepairRequest, read_version, repair_path, run_repair_subprocess
-from carlab.experiment.campaign.prior_repair import PriorVersion, corrected
+from carlab.experiment.campaign.prior_repair import PriorVersion, corrected, without_ranges
 from carlab.experiment.campaign.quick_check import QuickCheck, check_path, run_check_subprocess
 from carlab.experiment.campaign.training import (
     Progress,
@@ -205,7 +205,7 @@ class Campaign:
         self.hooks.on_checking()
         simulator = self.checked_simulator or self.choice.simulator
         if self.repairs_prior:
-            simulator = self._simulator(self._version(number - 1))
+            simulator = without_ranges(self._simulator(self._version(number - 1)))
         check = run_check_subprocess(self.run, simulator, self.hooks.stop)
         if check is not None:
             self.hooks.on_check(check)

@@ -24,6 +24,7 @@ from carlab.experiment.campaign.prior_repair import (
     PriorVersion,
     corrected,
     repaired,
+    without_ranges,
 )
 from carlab.experiment.campaign.quick_check import CHECK_FILE, MIN_DIAGNOSIS_EPISODES
 from carlab.recording.atomic_files import write_text
@@ -124,7 +125,7 @@ def repair(request: RepairRequest) -> PriorVersion:
     is_due = number - max(request.before.diagnosed, 1) >= EPISODES_BETWEEN_DIAGNOSES
     is_needed = check.get("verdict") == "left" or bool(contradicted)
     if len(episodes) >= MIN_DIAGNOSIS_EPISODES and is_due and is_needed:
-        found = diagnosed(found, episodes, car, request.budget_s)
+        found = diagnosed(found, episodes, without_ranges(car), request.budget_s)
     return repaired(request.before, car, found)
 
 
@@ -172,12 +173,14 @@ def diagnosed(found: Findings, episodes: Sequence[EpisodeData], car: SimulatorCo
 
 
 def corrections_of(diagnosis: Diagnosis, model: SimulatorConfig, episodes: int) -> tuple[Correction, ...]:
-    """The named effects and the refitted parameters of a diagnosis as corrections; none for the verdict "none"."""
+    """Effects of a diagnosis that hold on its held-out episodes, and its parameters; none for the verdict "none"."""
     if diagnosis.verdict == "none":
         return ()
     values = model.values()
     corrections = []
     for effect in diagnosis.effects:
+        if effect.evidence.held_out_error_reduction <= 0.0:
+            continue
         own = {name: value for name, value in values.items() if name.startswith(f"effects.{effect.id}.")}
         std = {f"effects.{effect.id}.{name}": estimate.std for name, estimate in effect.parameters.items()}
         fall = f"its removal raises the error of held-out episodes by {effect.evidence.held_out_error_reduction:.0%}"

@@ -128,6 +128,11 @@ def corrected(car: SimulatorConfig, corrections: Sequence[Correction]) -> Simula
     return replace(replace(car, priors=priors).with_values(values), parameter_std={**car.parameter_std, **std})
 
 
+def without_ranges(simulator: SimulatorConfig) -> SimulatorConfig:
+    """The simulator without the ranges of the car file, which the recordings may contradict."""
+    return replace(simulator, priors={})
+
+
 def needed_history(simulator: SimulatorConfig) -> int:
     """Number of past commands that affect the next measured state, from three to eight.
 
@@ -254,4 +259,5 @@ __all__ = [
     "corrected",
     "needed_history",
     "repaired",
+    "without_ranges",
 ]
