@@ -52,7 +52,7 @@ def _regimes(scored: ScoredSearch) -> dict[str, tuple[FloatArray, FloatArray, Fl
         if len(edges) < 3:
             continue
         index = np.clip(np.searchsorted(edges, feature, side="right") - 1, 0, len(edges) - 2)
-        bins = range(len(edges) - 1)
+        bins = [k for k in range(len(edges) - 1) if np.any(index == k)]
         centres = np.array([feature[index == k].mean() for k in bins])
         curves = [
             np.array([np.sqrt(np.mean(size[which][index == k] ** 2)) for k in bins])

@@ -130,24 +130,30 @@ def repair(request: RepairRequest) -> PriorVersion:
 
 
 def contradicted_by(
-    newest: EpisodeData, car: SimulatorConfig, all_corrections: Sequence[Correction], tested: Sequence[Correction]
+    newest: EpisodeData, car: SimulatorConfig, corrections: Sequence[Correction], tested: Sequence[Correction]
 ) -> tuple[str, ...]:
-    """Ids of the corrections without which an episode is predicted better, by Huber's loss of its windows.
+    """Ids of the corrections without which an episode is predicted better, by backward elimination.
+
+    The loss is Huber's over the windows of the episode.
 
     Args:
         newest: an episode that no tested correction was fitted to.
         car: simulator of the car file.
-        all_corrections: corrections of the current prior.
+        corrections: those of the current prior.
         tested: the corrections to test.
     """
     from carlab.diagnosis.quick.quick_check import held_out_loss
 
-    simulators = [corrected(car, all_corrections)]
-    simulators += [corrected(car, [other for other in all_corrections if other is not c]) for c in tested]
-    losses = held_out_loss(newest, simulators) if tested else None
-    if losses is None:
-        return ()
-    return tuple(c.id for c, without in zip(tested, losses[1:], strict=True) if without < losses[0])
+    kept, removed = list(corrections), []
+    while candidates := [c for c in kept if c in tested]:
+        without = [[other for other in kept if other is not c] for c in candidates]
+        losses = held_out_loss(newest, [corrected(car, each) for each in (kept, *without)])
+        if losses is None or min(losses[1:]) >= losses[0]:
+            break
+        worst = losses.index(min(losses[1:])) - 1
+        kept = without[worst]
+        removed.append(candidates[worst].id)
+    return tuple(removed)
 
 
 def diagnosed(found: Findings, episodes: Sequence[EpisodeData], car: SimulatorConfig, budget_s: float) -> Findings:
