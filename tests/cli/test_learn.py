@@ -75,7 +75,8 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
         ("--ticks 0", "--ticks 0: give a number above zero."),
         ("--history 100", "--ticks 100: give more than --history (100), for at least one transition."),
         ("--ticks 3", "--ticks 3: give more than --history (4), for at least one transition."),
-        ("--prior Kinematic", "--prior Kinematic: give kinematic, nominal or an existing car file."),
+        ("--prior Kinematic", "--prior Kinematic: give kinematic, nominal, auto or an existing car file."),
+        ("--prior auto --method fsvgd", "--prior auto: fsvgd has no simulator prior; use --method sim-fsvgd."),
         ("--updates -5", "--updates -5: give a number above zero."),
         ("--model-steps 0", "--model-steps 0: give a number above zero."),
         ("--prior missing.toml", "There is no car file 'missing.toml'"),
@@ -121,6 +122,7 @@ def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Pat
         ),
         ("--seed 7", "--seed 7: this run was started with"),
         ("--prior nominal", "--prior: this run was started with another prior; remove the option, or start a new"),
+        ("--prior auto", "--prior: this run was started with another prior; remove the option, or start a new"),
     ],
 )
 def test_resume_refuses_changed_options(

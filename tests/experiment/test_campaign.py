@@ -92,7 +92,7 @@ def test_interrupted_run_resumes_at_the_next_episode(interrupted: InterruptedRun
     assert names(interrupted.run) == ["episodes/0001.mcap", "episodes/0002.mcap", "models/0001", "models/0002"]
     assert [r.reason for r in interrupted.results] == [EndReason.COMPLETED] * 2
     assert [p.name for p in sorted((interrupted.run.models / "0002").iterdir())] == [
-        "diagnosis.json", "dynamics.pt", "policy.npz", "training.json",
+        "diagnosis.json", "dynamics.pt", "policy.npz", "prior.toml", "training.json",
     ]  # fmt: skip
     assert (interrupted.run.models / "0001" / "policy.npz").read_bytes() == interrupted.first_model, (
         "the first model is not trained again"
@@ -144,7 +144,8 @@ def test_learning_curve_has_the_figures_of_the_recordings(interrupted: Interrupt
         assert row["speed_mps"] == pytest.approx(np.hypot(vx, vy))
         assert row["parked"] is False
         assert row["end"] == episode.metadata["end_reason"] == "COMPLETED"
-        assert row["predicted_return"] == training_figures["return_in_model"]
+        assert row["predicted_return"] == training_figures["predicted_return"]
+        assert row["predicted_low"] < row["predicted_return"] < row["predicted_high"]
     assert [r["rows"] for r in rows] == [0, TICKS - HISTORY]
     assert rows[0]["updates"] > rows[1]["updates"] == 32, "the first training makes more updates"
     assert [str(r) for r in learning_curve(interrupted.run)] == [str(f) for f in interrupted.figures]

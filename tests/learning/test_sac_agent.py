@@ -269,3 +269,18 @@ def test_agent_of_another_shape_is_refused(saved: Path, kind: str) -> None:
     env = ModelEnv(ConstantChange(history), SignTask(history_length=history), 16)
     with pytest.raises(DataError, match="to train again"):
         SacAgent.load(saved, settings, 0).train(env, 32)
+
+
+def test_agent_with_more_past_commands_acts_as_before_and_learns(tmp_path: Path) -> None:
+    trained_agent = SacAgent(SMALL, 0)
+    trained_agent.train(ModelEnv(ConstantChange(), SignTask(), 16), 8)
+    trained_agent.save(tmp_path)
+    wider = SacAgent.load(tmp_path, SMALL, 0)
+    wider.widen(7 + 2 * 3)
+    seen = np.random.default_rng(0).normal(size=(20, 7 + 2 * 3)).astype(np.float32)
+    own = np.concatenate([seen[:, :7], seen[:, -2 * HISTORY :]], axis=1)
+    np.testing.assert_allclose(wider.act(seen), trained_agent.act(own), atol=1e-6)
+    wider.train(ModelEnv(ConstantChange(history=3), SignTask(history_length=3), 16), 8)
+    changed = seen.copy()
+    changed[:, 7:11] += 1.0
+    assert np.abs(wider.act(changed) - wider.act(seen)).max() > 1e-6, "training uses the new commands"

@@ -10,7 +10,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
 from learning.baselines.system_identification import identify
 from learning.priors.domain_models import draw_parameters
-from learning.priors.simulator_model import CarModel
+from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import transitions_of
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import MocapParameters, SimulatorConfig
@@ -82,3 +82,12 @@ def test_identification_recovers_the_true_parameters():
 def test_range_of_an_unknown_parameter_is_refused():
     with pytest.raises(ConfigError, match=r"'motor\.gain' is not a parameter"):
         CarModel(SimulatorConfig(), 3, {"motor.gain": (1.0, 2.0)})
+
+
+def test_draws_of_an_extra_delay_never_give_a_negative_total_delay():
+    name = "effects.command_delay.extra_delay"
+    known = SimulatorConfig(effects={"command_delay": {"extra_delay": -0.03}}, parameter_std={name: 0.02})
+    model = CarModel(known, 2, known_ranges(known))
+    drawn = model.parameters(torch.randn((5000, 1), generator=torch.Generator().manual_seed(0)))
+    assert -known.command_delay_s <= float(drawn.min()) < -0.06
+    assert bool(torch.isfinite(model(torch.zeros((3, 9)), drawn[:50])).all())
