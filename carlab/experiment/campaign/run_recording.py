@@ -107,7 +107,8 @@ def write_run_recording(
                 driver.draw_paths_ahead(recording, ticks, started.period_s)
                 newest = add_windows(recording, driver.dynamics, number, file) or newest
             if number in figures:
-                recording.add_figures(number, figures[number].to_dict(), figures[number].diagnosis)
+                row = figures[number]
+                recording.add_figures(number, row.to_dict(), f"{row.prior_change} {row.diagnosis}".strip())
         if not n_written:
             raise DataError(f"{run.path} has no recording that can be read; name the folder of another run.")
         send_blueprint(stream, recording.blueprint())
