@@ -31,6 +31,17 @@ if TYPE_CHECKING:
 STEPS_PERIOD_S = 600.0
 
 
+def _training_messages(figures: dict[str, Any]) -> list[str]:
+    """Sentences about past commands and ticks, from the figures of a training."""
+    messages = [str(figures["history_words"])] if "history_asked" in figures else []
+    if (ticks := figures.get("needed_ticks")) is not None:
+        messages.append(
+            f"In the learned car the policy parks only in longer drives: in half of them within {ticks} ticks. A run "
+            f"with --ticks {ticks} has enough time."
+        )
+    return messages
+
+
 @dataclass
 class Learn:
     """Fit the car, train a parking policy in the learned car, drive an episode with it, and repeat.
@@ -161,15 +172,8 @@ class Learn:
             os._exit(EXIT_SAFETY_STOP)
 
         def on_learned(figures: dict[str, Any]) -> None:
-            if "history_asked" in figures:
-                bar.console.print(f"  {figures['history_words']}", soft_wrap=True, highlight=False)
-            if "needed_ticks" in figures:
-                bar.console.print(
-                    f"  In the learned car the policy parks only in longer drives: in half of them within "
-                    f"{figures['needed_ticks']} ticks. A run with --ticks {figures['needed_ticks']} has enough time.",
-                    soft_wrap=True,
-                    highlight=False,
-                )
+            for message in _training_messages(figures):
+                bar.console.print(f"  {message}", soft_wrap=True, highlight=False)
 
         def on_figures(row: EpisodeFigures) -> None:
             parked = "parked" if row.parked else f"{row.distance_m:.2f} m from the goal"
