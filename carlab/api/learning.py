@@ -1,22 +1,24 @@
-"""Learning to park: fit the car, train a policy in the learned car, drive, repeat."""
+"""Learning a task: fit the car, train a policy in the learned car, drive, repeat."""
 
 from __future__ import annotations
 
 import contextlib
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from carlab.api.arguments import above_zero, at_least
 from carlab.api.cars import car_options_text
 from carlab.api.runs import RunHooks, existing_run, html_picture, html_table, new_run, write_result
+from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
     from carlab.core.outcome import EndReason
+    from carlab.core.task import Task
     from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.quick_check import QuickCheck
@@ -59,7 +61,7 @@ class LearnRun:
     Attributes:
         folder: the run's folder; ``carlab.learn(resume=folder)`` resumes the run.
         wanted: target number of episodes.
-        episodes: figures of the episodes of this call: return, predicted return, distance to the goal ...
+        episodes: figures of the episodes of this call: return, predicted return, success, constraint cost ...
         results: the same episodes with their data and end reasons.
     """
 
@@ -96,10 +98,18 @@ class LearnRun:
 
     def _repr_html_(self) -> str:
         rows = [
-            [e.episode, e.total_reward, e.predicted_return, e.distance_m, "yes" if e.parked else "no", e.end.lower()]
+            [
+                e.episode,
+                e.total_reward,
+                e.predicted_return,
+                e.cost,
+                e.outcome,
+                "yes" if e.success else "no",
+                e.end.lower(),
+            ]
             for e in self.episodes
         ]
-        columns = ["episode", "return", "predicted return", "distance [m]", "parked", "end"]
+        columns = ["episode", "return", "predicted return", "constraint cost", "outcome", "success", "end"]
         return html_table(columns, rows) + html_picture(self.picture)
 
 
@@ -125,6 +135,8 @@ class _Request:
     vehicle: Path | CarFile | None
     reality: Path | CarFile | None
     dry_run: bool
+    task: str | Task | None
+    track: Path | str | None
 
     @property
     def car_options(self) -> str:
@@ -135,6 +147,8 @@ class _Request:
 def learn(
     car: str | CarFile = "sim",
     *,
+    task: str | Task | None = None,
+    track: Path | str | None = None,
     episodes: int | None = None,
     ticks: int | None = None,
     prior: str | Path | CarFile = "kinematic",
@@ -154,12 +168,15 @@ def learn(
     dry_run: bool = False,
     hooks: LearnHooks | None = None,
 ) -> LearnRun:
-    """Fit the car to all recordings, train a parking policy in the learned car, drive an episode, and repeat.
+    """Fit the car to all recordings, train a policy of a task in the learned car, drive an episode, and repeat.
 
     Args:
         car: as for ``carlab.drive``.
+        task: as for ``carlab.drive``; by default ``parking``, or that of the resumed run. A run folder keeps no code:
+            a resumed run with a user's task needs its file again.
+        track: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
-        ticks: control periods per episode; by default the task's number (100).
+        ticks: control periods per episode; by default the task's number.
         prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model.
         method: ``sim-fsvgd``; ``fsvgd`` without a simulator; ``fsvgd-authors`` with the settings of the paper.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
@@ -188,6 +205,7 @@ def learn(
     request = _Request(
         car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
         None if resume is None else Path(resume), Path(out), name, rerun, vehicle, reality, dry_run,
+        task, track,
     )  # fmt: skip
     return _learn(request, hooks or LearnHooks())
 
@@ -293,6 +311,9 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
     run = stack.enter_context(existing_run(request.resume, choice, hooks))
     check_same_car(run, choice, request.car_options)
     campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
+    task_choice = campaign.plan.task_choice.named_again(given_task(request.task, request.track, choice.track))
+    campaign.plan = replace(campaign.plan, task_choice=task_choice)
+    load_checked(task_choice, choice.envelope.arena_m)
     available(campaign.plan.device)
     _check_as_before(request, campaign.plan, choice)
     campaign.move_stopped_episode()
@@ -303,19 +324,21 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
 def _plan(request: _Request, choice: CarChoice) -> TrainingPlan:
     import tomli_w
 
-    from carlab.core.task import ParkingTask
+    from carlab.core.task_choice import PARKING
     from carlab.experiment.campaign.campaign import PAPER_HISTORY, needed_history
     from carlab.experiment.campaign.training import TrainingPlan
 
     history = request.history
     if history is None:
         history = PAPER_HISTORY if request.method == "fsvgd-authors" else needed_history(choice.simulator)
-    if (ticks := request.ticks or ParkingTask().max_ticks) <= history:
+    task_choice = given_task(request.task, request.track, choice.track) or PARKING
+    task = load_checked(task_choice, choice.envelope.arena_m)
+    if (ticks := request.ticks or task.max_ticks) <= history:
         raise ConfigError(f"--ticks {ticks}: give more than --history ({history}), for at least one transition.")
     text = tomli_w.dumps(_prior(request, choice).to_tables())
     return TrainingPlan(
         text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,
-        device=request.device or "cpu",
+        device=request.device or "cpu", task_choice=task_choice,
     )  # fmt: skip
 
 

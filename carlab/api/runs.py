@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import logging
+import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -120,7 +121,7 @@ def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
             "episode": result.episode,
             "ticks": result.data.ticks,
             "return": result.total_reward,
-            **{name: float(value) for name, value in result.summary.items()},
+            **{name: None if math.isnan(value) else float(value) for name, value in result.summary.items()},
             "end_reason": result.reason.name,
             "end_detail": result.data.metadata["end_detail"],
         }

@@ -142,6 +142,12 @@ class SacAgent:
         env.restore_seed()
         return sac
 
+    @property
+    def observation_size(self) -> int:
+        """Number of features that the policy observes."""
+        assert self._sac is not None
+        return int((self._sac.observation_space.shape or (0,))[0])
+
     def policy(self) -> SacPolicy:
         """The policy that drives: the mean action, without noise."""
         assert self._sac is not None
@@ -156,8 +162,7 @@ class SacAgent:
     def save(self, folder: Path) -> None:
         """Write networks, temperature and optimiser state into a folder. Raises OSError if the disk is full."""
         assert self._sac is not None
-        (width,) = self._sac.observation_space.shape or (0,)
-        header = {"version": FILE_VERSION, "observation_size": width}
+        header = {"version": FILE_VERSION, "observation_size": self.observation_size}
         write_arrays(folder / AGENT_FILE, header | self._sac.learned_state())
 
     @classmethod

@@ -7,7 +7,7 @@ ticks, at the task's termination, or when the safety gate would stop a real car;
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -41,6 +41,14 @@ def policy_spaces(width: int) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     """Spaces of a policy's inputs (width,) and of its actions (2,)."""
     high = np.full(width, MAX_POLICY_INPUT, dtype=np.float32)
     return gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+class Drives(NamedTuple):
+    """Episodes in the learned car, on the CPU: returns (N,), constraint costs (N,) and final features (N, 7 + 2 H)."""
+
+    returns: Tensor
+    costs: Tensor
+    final: Tensor
 
 
 class ModelEnv(VecEnv):
@@ -140,18 +148,18 @@ class ModelEnv(VecEnv):
             seen[ended] = policy_inputs(self._start(ended))
         return seen, reward.cpu().numpy().astype(np.float32), done, infos
 
-    def roll_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> tuple[Tensor, Tensor]:
+    def roll_out(self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Drives:
         """Drive one complete episode of every car by a policy, from start states of the task.
 
         Args:
             act: actions (cars, 2) for policy inputs (cars, F).
 
         Returns:
-            Unscaled return of each episode (cars,) and its final features (cars, 7 + 2 H); both on the CPU.
+            Unscaled return, constraint cost and final features of each episode.
         """
         share, self._from_recorded = self._from_recorded, 0.0
         self._start(np.arange(self.num_envs))
-        total = torch.zeros(self.num_envs)
+        total, cost = torch.zeros(self.num_envs), torch.zeros(self.num_envs)
         ended = torch.zeros(self.num_envs, dtype=torch.bool)
         last, seen = self._features.cpu().clone(), self._seen()
         with torch.no_grad():
@@ -161,11 +169,12 @@ class ModelEnv(VecEnv):
                 after = self._rollouts.step(before, action, self._generator)
                 here = after.cpu()
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
+                cost += torch.where(ended, 0.0, self._task.cost(here))
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
                 self._features, seen = after, policy_inputs(here.numpy())
         self._from_recorded = share
-        return total, last
+        return Drives(total, cost, last)
 
     @property
     def features(self) -> Tensor:
@@ -244,4 +253,4 @@ class ModelEnv(VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
 
-__all__ = ["FEATURE_UNITS", "ModelEnv", "policy_inputs", "policy_spaces"]
+__all__ = ["FEATURE_UNITS", "Drives", "ModelEnv", "policy_inputs", "policy_spaces"]

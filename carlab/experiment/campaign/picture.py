@@ -11,8 +11,9 @@ import numpy as np
 
 from carlab.core.angles import align_unwrapped
 from carlab.core.episode_data import EpisodeData
+from carlab.core.observation import episode_features
 from carlab.core.quantities import STATE_NAMES
-from carlab.core.task import ParkingTask
+from carlab.core.task import Task
 from carlab.experiment.campaign.figures import EpisodeFigures, WindowPredictions
 
 CAR_M = (0.3, 0.16)
@@ -24,7 +25,7 @@ def draw(
     number: int,
     episode: EpisodeData,
     predictions: WindowPredictions,
-    task: ParkingTask,
+    task: Task,
     path: Path,
 ) -> None:
     """Write a PNG.
@@ -49,15 +50,20 @@ def draw(
     numbers = [r.episode for r in rows]
     curve.plot(numbers, [r.total_reward for r in rows], marker="o", label="on the car")
     curve.plot(numbers, [r.predicted_return for r in rows], marker=".", linestyle="--", label="in the learned car")
-    parked = [r for r in rows if r.parked]
-    curve.plot([r.episode for r in parked], [r.total_reward for r in parked], "*", markersize=14, label="parked")
+    successes = [r for r in rows if r.success]
+    curve.plot([r.episode for r in successes], [r.total_reward for r in successes], "*", markersize=14, label="success")
     curve.set(xlabel="episode", ylabel="return")
     curve.legend(fontsize=8)
+    if task.has_constraint:
+        cost = curve.twinx()
+        cost.plot(numbers, [r.cost for r in rows], marker="x", color="tab:red")
+        cost.set_ylabel("constraint cost", color="tab:red")
     likelihood.plot(numbers, [r.last_episode_nll for r in rows], marker="o", color="tab:purple")
     likelihood.set(xlabel="episode", ylabel="negative log-likelihood of the previous episode [nat per step]")
-    distance = likelihood.twinx()
-    distance.plot(numbers, [r.distance_m for r in rows], marker=".", linestyle=":", color="tab:gray")
-    distance.set_ylabel("final distance from the goal [m]", color="tab:gray")
+    if task.goal is not None:
+        distance = likelihood.twinx()
+        distance.plot(numbers, [r.distance_m for r in rows], marker=".", linestyle=":", color="tab:gray")
+        distance.set_ylabel("final distance from the goal [m]", color="tab:gray")
     for axis in (curve, likelihood):
         axis.grid(alpha=0.3)
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -71,7 +77,7 @@ def draw(
     pyplot.close(figure)
 
 
-def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task: ParkingTask) -> None:
+def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task: Task) -> None:
     from matplotlib.patches import Ellipse, Polygon
 
     axis.plot(*episode.states[:, :2].T, color="black", linewidth=1.5, label="driven")
@@ -79,12 +85,16 @@ def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task:
         axis.plot(mean[:, 0], mean[:, 1], color="tab:orange", linewidth=1.2, label="predicted" if k == 0 else None)
         width, height = 4.0 * std[-1, :2]
         axis.add_patch(Ellipse((mean[-1, 0], mean[-1, 1]), width, height, alpha=0.25, color="tab:orange", linewidth=0))
-    for pose, colour in ((task.goal_pose, "tab:green"), (tuple(episode.states[-1, :3]), "tab:blue")):
-        axis.add_patch(Polygon(_outline(pose), fill=False, edgecolor=colour, linewidth=2))
-    axis.plot([], [], color="tab:green", label="goal")
-    axis.plot([], [], color="tab:blue", label="end")
-    corners = np.array([*task.arena_m, task.arena_m[0]])
-    axis.plot(*corners.T, color="tab:red", linewidth=0.8, alpha=0.5)
+    for name, pose, colour in (("goal", task.goal, "tab:green"), ("end", tuple(episode.states[-1, :3]), "tab:blue")):
+        if pose is not None:
+            axis.add_patch(Polygon(_outline(pose), fill=False, edgecolor=colour, linewidth=2))
+            axis.plot([], [], color=colour, label=name)
+    for outline in (*([task.arena_m] if task.arena_m else []), *task.outlines_m):
+        axis.plot(*np.array([*outline, outline[0]]).T, color="tab:red", linewidth=0.8, alpha=0.5)
+    if task.has_constraint:
+        features = episode_features(episode.states, episode.sent, task.history_length)[1:]
+        violating = episode.states[1:][np.asarray(task.cost(features)) > 0.0]
+        axis.plot(*violating[:, :2].T, "x", color="tab:red", label="violation")
     axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axis.legend(fontsize=8)
 
