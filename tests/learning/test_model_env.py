@@ -249,7 +249,7 @@ def test_rollout_sums_rewards_of_each_car_until_its_episode_ends() -> None:
         views.append(observations.copy())
         return commands
 
-    total, last = env.roll_out(act)
+    total, _, last = env.roll_out(act)
     assert len(views) == 60
     assert views[0].shape == (12, WIDTH)
     lengths = []
@@ -274,9 +274,9 @@ def test_rollout_ends_for_a_parked_car() -> None:
         TASK, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9,
         stop_when_parked=True,
     )  # fmt: skip
-    total, _ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
+    total, *_ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
     assert total.tolist() == pytest.approx([1.0] * 3), "one rewarded tick"
-    total, _ = ModelEnv(StationaryCar(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
+    total, *_ = ModelEnv(StationaryCar(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
     assert total.tolist() == pytest.approx([9.0] * 3)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from carlab.core.errors import ConfigError
 from carlab.core.geofence import as_polygon, contains
-from carlab.core.keep_out import Corners
+from carlab.core.keep_out import Corners, KeepOut
 from carlab.core.observation import ACTION_SIZE, encode
 from carlab.core.quantities import CarState, FloatArray
 from carlab.core.task import Task
@@ -78,12 +78,12 @@ def _check_attributes(task: Task) -> None:
         value = getattr(task, name)
         if type(value) is not int or value < minimum:
             raise _error(task, f"{name} is {value!r}; give a whole number of at least {minimum}")
-    for name in ("arena_m", "path_m", "keep_out", "outlines_m", "goal"):
+    if not all(isinstance(shape, KeepOut) for shape in _call(task, "keep_out", lambda: tuple(task.keep_out))):
+        raise _error(task, "keep_out must be a tuple of Disc and Polygon (carlab.core.keep_out)")
+    for name in ("arena_m", "path_m", "outlines_m", "goal"):
         _call(task, name, lambda name=name: getattr(task, name))
     if len(task.arena_m):
         as_polygon(task.arena_m, f"arena_m of the task {type(task).__name__}")
-    if not all(hasattr(shape, "contains") and hasattr(shape, "outline_m") for shape in task.keep_out):
-        raise _error(task, "keep_out must be a tuple of Disc and Polygon (carlab.core.keep_out)")
 
 
 def _starts(task: Task, arena_m: Corners) -> FloatArray:
