@@ -70,6 +70,15 @@ class _ClosedPathTask(Task):
         dx, dy, turn = rng.uniform(-1.0, 1.0, 3) * (0.05, 0.05, 0.1)
         return CarState(x0 + float(dx), y0 + float(dy), math.atan2(y1 - y0, x1 - x0) + float(turn))
 
+    def sample_training_start(self, rng: np.random.Generator) -> CarState:
+        """Draw a state anywhere on the path, at most half the limit from it, along it within 0.3 rad, up to 1.5 m/s."""
+        at = int(rng.integers(len(self.path_m)))
+        (x0, y0), (x1, y1) = self.path_m[at], self.path_m[(at + 1) % len(self.path_m)]
+        course = math.atan2(y1 - y0, x1 - x0)
+        left = float(rng.uniform(-0.5, 0.5)) * self.path.values_m[at]
+        turn, speed_mps = float(rng.uniform(-0.3, 0.3)), float(rng.uniform(0.0, 1.5))
+        return CarState(x0 - left * math.sin(course), y0 + left * math.cos(course), course + turn, speed_mps)
+
     def reward(self, features: Any, action: Any, next_features: Any) -> Any:
         """Reward (...,) of transitions."""
         xp = array_namespace(next_features)

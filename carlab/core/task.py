@@ -75,6 +75,10 @@ class Task(ABC):
     def sample_start(self, rng: np.random.Generator) -> CarState:
         """Draw an initial state."""
 
+    def sample_training_start(self, rng: np.random.Generator) -> CarState:
+        """Draw an initial state for the training in the learned car; by default that of ``sample_start``."""
+        return self.sample_start(rng)
+
     @abstractmethod
     def reward(self, features: Any, action: Any, next_features: Any) -> Any:
         """Reward (...,) of transitions; features (..., F), action (..., 2)."""

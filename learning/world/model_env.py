@@ -1,7 +1,7 @@
 """A learned car as a vectorised environment of stable-baselines3, with the task of the real car.
 
-Start states are drawn from the task and from recorded states with their past commands. An episode ends after the task's
-ticks, at the task's termination, or when the safety gate would stop a real car; no reward follows.
+Start states of a training are drawn from the task and from recorded states with their past commands. An episode ends
+after the task's ticks, at the task's termination, or when the safety gate would stop a real car; no reward follows.
 """
 
 from __future__ import annotations
@@ -157,8 +157,7 @@ class ModelEnv(VecEnv):
         Returns:
             Unscaled return, constraint cost and final features of each episode.
         """
-        share, self._from_recorded = self._from_recorded, 0.0
-        self._start(np.arange(self.num_envs))
+        self._start(np.arange(self.num_envs), training=False)
         total, cost = torch.zeros(self.num_envs), torch.zeros(self.num_envs)
         ended = torch.zeros(self.num_envs, dtype=torch.bool)
         last, seen = self._features.cpu().clone(), self._seen()
@@ -173,7 +172,6 @@ class ModelEnv(VecEnv):
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
                 self._features, seen = after, policy_inputs(here.numpy())
-        self._from_recorded = share
         return Drives(total, cost, last)
 
     @property
@@ -202,11 +200,12 @@ class ModelEnv(VecEnv):
             stopped |= ~can_stop_inside_batch(self._arena_m, state[:, :2], course, needed)
         return stopped
 
-    def _start(self, cars: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Start new episodes of cars (indices); returns their features."""
-        starts = np.array([self._task.sample_start(self._rng).to_array() for _ in cars])
+    def _start(self, cars: NDArray[np.int64], *, training: bool = True) -> NDArray[np.float32]:
+        """Start new episodes of cars (indices), for a training or as on the car; returns their features."""
+        sample = self._task.sample_training_start if training else self._task.sample_start
+        starts = np.array([sample(self._rng).to_array() for _ in cars])
         rows = encode(starts, np.zeros((len(cars), self._model.history, ACTION_SIZE)))
-        use_recorded = self._rng.random(len(cars)) < self._from_recorded
+        use_recorded = self._rng.random(len(cars)) < (self._from_recorded if training else 0.0)
         if use_recorded.any():
             rows[use_recorded] = self._recorded[self._rng.integers(len(self._recorded), size=int(use_recorded.sum()))]
         start_features = torch.from_numpy(rows).float()

@@ -146,10 +146,10 @@ def test_laps_report_laps_and_track_limits(laps_run: tuple[int, str, Path]) -> N
 def test_learned_policy_drives_again_on_another_car(
     carlab: Carlab, laps_run: tuple[int, str, Path], tmp_path: Path
 ) -> None:
-    """The track is in the run's folder; the same policy on the same simulated car drives the same."""
+    """The track is in the run's folder."""
     code, text = carlab(
         "drive", "--policy", laps_run[2], "--out", tmp_path, "--no-rerun", "--no-picture", "--episodes", 2,
-        "--vehicle", "dart_jetracer",
+        "--vehicle", "eth_rc_car",
     )  # fmt: skip
     assert code == 0, text
     assert "best lap" in text
@@ -160,6 +160,9 @@ def test_learned_policy_drives_again_on_another_car(
     assert episode.metadata["history_length"] == "1"
     assert episode.ticks <= TICKS
     arena = np.array(json.loads(episode.metadata["arena_m"]))
+    code, text = carlab("drive", "--policy", laps_run[2], "--car", "dart_jetracer", "--out", tmp_path)
+    assert code == 2
+    assert "was trained with a control period of 0.03333 s, the car has 0.1 s" in text
     assert arena[:, 0].max() == pytest.approx(0.5 + 1.2 + 1.5, abs=0.05)
 
 

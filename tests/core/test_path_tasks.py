@@ -105,6 +105,17 @@ def test_start_is_at_the_line_in_driving_direction(rng: np.random.Generator) -> 
         assert abs(start.yaw_rad) < 0.11
 
 
+def test_training_starts_lie_on_the_whole_track_in_driving_direction(rng: np.random.Generator) -> None:
+    task = LapTask(track=circle_track(2.0, 0.6))
+    states = np.array([task.sample_training_start(rng).to_array() for _ in range(300)])
+    radius_m, angle = np.hypot(states[:, 0], states[:, 1]), np.arctan2(states[:, 1], states[:, 0])
+    assert np.abs(radius_m - 2.0).max() < 0.16
+    assert np.histogram(angle, bins=6, range=(-math.pi, math.pi))[0].min() > 20
+    error = np.angle(np.exp(1j * (states[:, 2] - angle - math.pi / 2)))
+    assert 0.2 < np.abs(error).max() < 0.32
+    assert states[:, 3].max() <= 1.5
+
+
 def test_track_of_a_csv_file_and_of_a_table_are_equal(tmp_path: Path) -> None:
     file = tmp_path / "track.csv"
     file.write_text("# oval\nx_m, y_m, width_m\n0,0,0.5\n2,0,0.6\n2,2,0.7\n0,0,0.5\n")

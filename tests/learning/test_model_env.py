@@ -280,6 +280,29 @@ def test_rollout_ends_for_a_parked_car() -> None:
     assert total.tolist() == pytest.approx([9.0] * 3)
 
 
+@dataclass(frozen=True)
+class OtherTrainingStart(ParkingTask):
+    """Starts of a training lie at (-1, 0); the x coordinate costs."""
+
+    history_length: int = HISTORY
+    max_ticks: int = 5
+
+    def sample_training_start(self, rng: np.random.Generator) -> CarState:
+        return CarState(-1.0)
+
+    def cost(self, next_features: Tensor) -> Tensor:
+        return next_features[..., 0]
+
+
+def test_rollouts_start_as_the_car_does_and_sum_the_constraint_cost() -> None:
+    env = ModelEnv(StationaryCar(), OtherTrainingStart(), 8, seed=0)
+    env.reset()
+    assert env.features[:, 0].tolist() == [-1.0] * 8
+    drives = env.roll_out(lambda observations: np.zeros((8, 2), np.float32))
+    assert drives.final[:, 0].min() > 1.3
+    torch.testing.assert_close(drives.costs, 5.0 * drives.final[:, 0])
+
+
 def test_equal_seeds_give_equal_starts() -> None:
     first, second, other = (ModelEnv(DelayedCar(), TASK, 30, seed=s) for s in (4, 4, 5))
     assert np.array_equal(first.reset(), second.reset())
