@@ -100,15 +100,11 @@ def drive(
     """Drive episodes with a policy on a car, and record them. ^C ends after the tick, a second ^C at once.
 
     Args:
-        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, the path of a car file, or a car file. A car
-            file with ``[hardware]`` is a real car, another one a simulated car.
-        policy: ``parking`` (feedback), a scripted manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a
-            run of ``carlab.learn`` (its newest policy; RUN/models/0003: the one of episode 3), or an object with
-            ``name``, ``reset()`` and ``act(view)``, see ``carlab.core.policy.Policy``.
-        task: ``parking``, ``obstacles``, ``path``, ``laps``, FILE.py:CLASS, or an object, see
-            ``carlab.core.task.Task``. By default that of a learned policy, else ``parking``.
-        track: CSV file with a centre line x, y and width [m], for ``laps``; by default the car file's track, or an
-            oval.
+        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
+        policy: ``parking`` (feedback), a manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a run of
+            ``carlab.learn`` or of a model in it (RUN/models/0003), or an object, see ``carlab.core.policy.Policy``.
+        task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; by default a learned policy's, or parking.
+        track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
         episodes: number of episodes.
         ticks: control periods per episode; by default the task's number.
         seed: of start poses and sensor noise.
@@ -133,9 +129,7 @@ def drive(
     from carlab.cars import choose_car
 
     hooks = hooks or RunHooks()
-    at_least(1, episodes=episodes, ticks=ticks)
-    at_least(0, seed=seed)
-    _check(policy, max_throttle)
+    _check(policy, max_throttle, episodes=episodes, ticks=ticks, seed=seed)
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
     options = {"seed": seed, "max_ticks": ticks, "place": place, "record_rerun": rerun}
     driver, chosen_task = _policy_and_task(policy, task, track, choice)
@@ -263,7 +257,11 @@ def _policy_names() -> tuple[str, ...]:
     return ("parking", "neutral", "keyboard", "gamepad", *MANOEUVRES)
 
 
-def _check(policy: str | Path | Policy, max_throttle: float | None) -> None:
+def _check(
+    policy: str | Path | Policy, max_throttle: float | None, *, episodes: int, ticks: int | None, seed: int
+) -> None:
+    at_least(1, episodes=episodes, ticks=ticks)
+    at_least(0, seed=seed)
     if isinstance(policy, (str, Path)) and str(policy) not in _policy_names() and not Path(policy).is_dir():
         raise ConfigError(
             f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn."

@@ -172,8 +172,7 @@ def learn(
 
     Args:
         car: as for ``carlab.drive``.
-        task: as for ``carlab.drive``; by default ``parking``, or that of the resumed run. A run folder keeps no code:
-            a resumed run with a user's task needs its file again.
+        task: as for ``carlab.drive``; by default that of the resumed run, else ``parking``.
         track: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
         ticks: control periods per episode; by default the task's number.
@@ -198,16 +197,13 @@ def learn(
         The run; ``is_complete`` is False after an interruption or a safety stop.
 
     Raises:
-        ConfigError: an argument is invalid, or differs from the run to resume.
-        DataError: training failed, or the folder to resume is not a run.
+        ConfigError, DataError: an argument is invalid or differs from the run to resume, or training failed.
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
-    request = _Request(
+    return _learn(_Request(
         car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
-        None if resume is None else Path(resume), Path(out), name, rerun, vehicle, reality, dry_run,
-        task, track,
-    )  # fmt: skip
-    return _learn(request, hooks or LearnHooks())
+        None if resume is None else Path(resume), Path(out), name, rerun, vehicle, reality, dry_run, task, track,
+    ), hooks or LearnHooks())  # fmt: skip
 
 
 @dataclass(slots=True)
