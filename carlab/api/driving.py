@@ -103,7 +103,7 @@ def drive(
         car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
         policy: ``parking`` (feedback), a manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a run of
             ``carlab.learn`` or of a model in it (RUN/models/0003), or an object, see ``carlab.core.policy.Policy``.
-        task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; by default a learned policy's, or parking.
+        task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; default: a learned policy's, or parking.
         track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
         episodes: number of episodes.
         ticks: control periods per episode; by default the task's number.

@@ -216,7 +216,7 @@ def test_track_of_the_car_file_is_driven(carlab: Carlab, tmp_path: Path) -> None
     car = tmp_path / "car.toml"
     track = oval_track(straight_m=1.0, radius_m=1.3)
     points = [list(p) for p in track.centre_line_m]
-    car.write_text(f"[vehicle]\nmass = {{ value = 1.6 }}\n\n[track]\ncentre_line_m = {points}\nwidth_m = 0.9\n")
+    car.write_text(f"[vehicle]\nmass = 1.6\n\n[track]\ncentre_line_m = {points}\nwidth_m = 0.9\n")
     options = ("--policy", "neutral", "--ticks", 5, "--out", tmp_path / "runs", "--no-rerun", "--no-picture")
     code, text = carlab("drive", "--car", car, "--task", "laps", *options)
     assert code == 0, text
