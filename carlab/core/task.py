@@ -24,6 +24,8 @@ from carlab.core.quantities import CarState, FloatArray
 
 # The arena of the paper's laboratory: lasgroup/simulation_transfer, sim_transfer/hardware/car_env.py.
 PAPER_ARENA_M: Corners = rectangle(-1.4, 2.8, -2.6, 1.5)
+START_MARGIN_M = 0.4
+"""Smallest distance of a random start from the edge of the arena."""
 
 
 class Task(ABC):
@@ -226,6 +228,14 @@ class ObstacleParkingTask(ParkingTask):
     def keep_out(self) -> tuple[KeepOut, ...]:
         """The discs."""
         return self.obstacles
+
+    def sample_training_start(self, rng: np.random.Generator) -> CarState:
+        """Draw a state at rest anywhere in the arena outside the discs, with any yaw, as in the authors' simulation."""
+        low, high = np.min(self.arena_m, axis=0), np.max(self.arena_m, axis=0)
+        while True:
+            x, y = rng.uniform(low + START_MARGIN_M, high - START_MARGIN_M)
+            if not any(bool(shape.contains(np.array([x, y]))) for shape in self.keep_out):
+                return CarState(float(x), float(y), float(rng.uniform(-math.pi, math.pi)))
 
     def cost(self, next_features: Any) -> Any:
         """Kinetic energy [J] inside a disc, zero outside."""

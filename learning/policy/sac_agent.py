@@ -86,9 +86,9 @@ class SacAgent:
             env: the environment.
             updates: gradient steps.
             progress: called with the number of gradient steps done.
-            evaluate: score of a policy. ``n_evaluations`` equally spaced policies, including the last one, are
-                evaluated; the best one is kept with its temperature and optimiser state.
-            n_evaluations: number of evaluations.
+            evaluate: score of a policy. An earlier policy and ``n_evaluations`` equally spaced policies, including the
+                last one, are evaluated; the best one is kept with its temperature and optimiser state.
+            n_evaluations: number of evaluations during the training.
 
         Returns:
             Figures of the last gradient step.
@@ -111,6 +111,8 @@ class SacAgent:
         milestones = [updates * (part + 1) // parts for part in range(parts)]
         self._sac = sac
         try:
+            if earlier is not None:
+                check()
             sac.learn(self._settings.warm_up, log_interval=NEVER)
             sac.gradient_steps = self._settings.updates
             callback = _Milestones(milestones, progress, check)

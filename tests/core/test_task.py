@@ -142,6 +142,15 @@ def test_start_and_goal_of_obstacle_parking_cost_nothing_and_the_straight_line_d
     assert task.cost(features_of(line)).max() > 0.5
 
 
+def test_training_starts_of_obstacle_parking_are_outside_the_discs(rng: np.random.Generator) -> None:
+    task = ObstacleParkingTask()
+    states = np.array([task.sample_training_start(rng).to_array() for _ in range(300)])
+    x, y = states[:, 0], states[:, 1]
+    assert min(np.hypot(x - 0.75, y - c).min() for c in (-0.55, -0.15, 0.25, 0.65)) >= 0.25
+    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((-1.0, 2.4, -2.2, 1.1), abs=0.1)
+    assert np.abs(states[:, 2]).max() > 2.8
+
+
 def test_polygon_contains_the_points_that_the_geofence_contains(rng: np.random.Generator) -> None:
     corners = ((-1.0, -1.5), (2.0, -1.5), (2.0, 0.5), (0.5, 0.5), (0.5, -0.5), (-1.0, -0.5))
     points = rng.uniform(-2.5, 2.5, (400, 2))

@@ -136,6 +136,15 @@ def test_policy_with_the_best_evaluation_is_restored(
         np.testing.assert_array_equal(restored[name], value)
 
 
+def test_earlier_policy_is_kept_if_the_training_makes_it_worse() -> None:
+    agent = SacAgent(SMALL, 0)
+    agent.train(world(16), 64)
+    before = actions_of(agent)
+    scores = iter((5.0, 4.0, 3.0))
+    agent.train(world(16), 64, evaluate=lambda agent: next(scores), n_evaluations=2)
+    np.testing.assert_array_equal(actions_of(agent), before)
+
+
 def test_loaded_agent_trains_bit_identically(tmp_path: Path) -> None:
     agent = SacAgent(SMALL, 3)
     agent.train(world(16), 64)
