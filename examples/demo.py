@@ -47,8 +47,7 @@ def progress_hooks() -> carlab.LearnHooks:
     """Hooks that print the progress of learning."""
     hooks = carlab.LearnHooks()
     hooks.on_figures = lambda row: print(
-        f"  episode {row.episode}: {'parked' if row.parked else f'{row.distance_m:.2f} m from the goal'}, "
-        f"trained for {row.model_seconds + row.policy_seconds:.0f} s"
+        f"  episode {row.episode}: {row.outcome}, trained for {row.model_seconds + row.policy_seconds:.0f} s"
     )
     hooks.on_training = lambda activity, done, total: print(f"  {activity} ...") if done == 0 else None
     hooks.on_check = lambda check: print(*(f"    {sentence}" for sentence in check.sentences), sep="\n")

@@ -32,7 +32,7 @@ def main() -> None:
     env = ModelEnv(learned_car, task, settings.cars, seed=1)
     agent = SacAgent(settings, seed=1)
     agent.train(env, options.updates)
-    returns, _ = ModelEnv(learned_car, task, 64, seed=2).roll_out(agent.act)
+    returns, *_ = ModelEnv(learned_car, task, 64, seed=2).roll_out(agent.act)
     print(f"Mean return of the new policy in the learned car: {returns.mean():.1f}")
 
     drive = carlab.drive("sim", policy=agent.policy(), task=task, out=options.out)

@@ -1,11 +1,13 @@
-"""Write a task: drive 1 m forwards and stop there. Takes two seconds.
+"""Write a task: drive 1 m forwards and stop there, and keep out of a disc. Takes two seconds.
 
-A task defines start pose, reward, termination and arena. Reward and termination take arrays (NumPy or torch), so that
-learned and simulated cars use the same functions.
+A task defines start, reward, end and success. Its functions take arrays (NumPy or torch), so that real, emulated,
+simulated and learned cars use the same functions. Check, learn and drive it without a change of the package:
+
+    carlab check --task examples/write_task.py:StopAfterOneMetre
+    carlab learn --task examples/write_task.py:StopAfterOneMetre
 """
 
 import argparse
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,19 +15,19 @@ from array_api_compat import array_namespace
 
 import carlab
 from carlab.core.geofence import rectangle
+from carlab.core.keep_out import Disc
 from carlab.core.policy import PolicyInput
+from carlab.core.task import Task
 
 
-@dataclass(frozen=True)
-class StopAfterOneMetre:
+class StopAfterOneMetre(Task):
     """Features are x, y [m], sin yaw, cos yaw, vx, vy [m/s], yaw rate [rad/s], then past actions."""
 
-    name: str = "stop_after_1_m"
-    history_length: int = 3
-    max_ticks: int = 120
-    arena_m: tuple[tuple[float, float], ...] = rectangle(-2.0, 4.0, -2.0, 2.0)
-    goal: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    path_m: tuple[tuple[float, float], ...] = ()
+    name = "stop_after_1_m"
+    max_ticks = 120
+    arena_m = rectangle(-2.0, 4.0, -2.0, 2.0)
+    goal = (1.0, 0.0, 0.0)
+    keep_out = (Disc(0.5, 0.6, 0.3),)
 
     def sample_start(self, rng: np.random.Generator) -> carlab.CarState:
         return carlab.CarState(y_m=rng.uniform(-0.05, 0.05))
@@ -34,13 +36,13 @@ class StopAfterOneMetre:
         xp = array_namespace(next_features)
         return 1.0 - xp.abs(next_features[..., 0] - self.goal[0])
 
-    def terminated(self, next_features: Any) -> Any:
-        xp = array_namespace(next_features)
-        is_near = xp.abs(next_features[..., 0] - self.goal[0]) < 0.05
-        return is_near & (xp.abs(next_features[..., 4]) < 0.05)
+    def success(self, features: Any) -> Any:
+        xp = array_namespace(features)
+        is_near = xp.abs(features[..., 0] - self.goal[0]) < 0.05
+        return is_near & (xp.abs(features[..., 4]) < 0.05)
 
-    def summary(self, final: carlab.CarState) -> dict[str, float]:
-        return {"distance_m": abs(final.x_m - self.goal[0]), "speed_mps": final.speed_mps}
+    def terminated(self, next_features: Any) -> Any:
+        return self.success(next_features)
 
 
 class Brake:
@@ -62,9 +64,7 @@ def main() -> None:
     parser.add_argument("--out", default="runs")
     run = carlab.drive("sim", policy=Brake(), task=StopAfterOneMetre(), out=parser.parse_args().out)
     (episode,) = run.episodes
-    print(
-        f"{episode.reason.name}: {episode.summary['distance_m']:.2f} m from the line after {episode.data.ticks} ticks"
-    )
+    print(f"{episode.reason.name}: {episode.summary} after {episode.data.ticks} ticks")
 
 
 if __name__ == "__main__":

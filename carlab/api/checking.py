@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 from carlab.api.arguments import above_zero
 from carlab.api.runs import RunHooks, html_table
+from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import NotReadyError
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
     from carlab.cars.latency import LatencyParts
     from carlab.core.quantities import Health
+    from carlab.core.task import Task
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class CarCheck:
 def check(
     car: str | CarFile = "sim",
     *,
+    task: str | Task | None = None,
+    track: Path | str | None = None,
     seconds: float = 2.0,
     wheels: bool = True,
     vehicle: Path | CarFile | None = None,
@@ -60,6 +64,8 @@ def check(
 
     Args:
         car: as for ``carlab.drive``.
+        task: a task to check first, before anything is opened: as for ``carlab.drive``; None: none.
+        track: as for ``carlab.drive``.
         seconds: duration of the motion-capture measurement [s].
         wheels: on an emulated car, also steer at rest to measure the latency of a command; a real car does not move.
         vehicle: as for ``carlab.drive``.
@@ -71,7 +77,7 @@ def check(
         Readings, latency and problems; ``is_ready`` states whether the car can be armed.
 
     Raises:
-        ConfigError: an argument is invalid.
+        ConfigError: an argument is invalid, or the task has an error.
         NotReadyError, ActuatorFaultError: the hardware cannot be opened.
     """
     from carlab.cars import choose_car
@@ -80,6 +86,8 @@ def check(
 
     above_zero(seconds=seconds)
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=0)
+    if (chosen := given_task(task, track, choice.track)) is not None:
+        load_checked(chosen, choice.envelope.arena_m)
     (hooks or RunHooks()).on_start(Path(), choice.car)
     latency: LatencyParts | None = None
     problems: list[str] = []

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from carlab.api.arguments import above_zero, at_least
 from carlab.api.runs import (
@@ -19,6 +19,7 @@ from carlab.api.runs import (
     viewer_connection,
     write_result,
 )
+from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ConfigError, NotReadyError
 
 if TYPE_CHECKING:
@@ -31,25 +32,12 @@ if TYPE_CHECKING:
     from carlab.core.policy import Policy
     from carlab.core.safety import SafetyEnvelope
     from carlab.core.task import Task
+    from carlab.core.task_choice import TaskChoice
     from carlab.experiment.episodes.session import EpisodeResult, SessionHooks
     from carlab.experiment.episodes.teleop_policy import TeleopPolicy
     from carlab.recording import RunDirectory
     from sim_backends.car_parameters import SimulatorConfig
 
-PolicyName = Literal[
-    "parking",
-    "neutral",
-    "keyboard",
-    "gamepad",
-    "steering_steps",
-    "throttle_steps",
-    "steering_chirp",
-    "figure_eight",
-    "throttle_ramp",
-    "coast_down",
-    "slow_circle",
-]
-TaskName = Literal["parking", "path"]
 KEY_THROTTLE = 0.4
 TELEOP_MAX_TICKS = 10**6
 PICTURE_FILE = "summary.png"
@@ -97,34 +85,21 @@ class DriveRun:
 
 
 def drive(
-    car: str | CarFile = "sim",
-    *,
-    policy: PolicyName | Policy = "parking",
-    task: TaskName | Task = "parking",
-    episodes: int = 1,
-    ticks: int | None = None,
-    seed: int = 0,
-    max_throttle: float | None = None,
-    place: bool = True,
-    out: Path | str = "runs",
-    name: str = "drive",
-    rerun: bool = True,
-    picture: bool = True,
-    live: bool = False,
-    viewer: str | None = None,
-    vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None,
-    dry_run: bool = False,
+    car: str | CarFile = "sim", *, policy: str | Path | Policy = "parking", task: str | Task | None = None,
+    track: Path | str | None = None, episodes: int = 1, ticks: int | None = None, seed: int = 0,
+    max_throttle: float | None = None, place: bool = True, out: Path | str = "runs", name: str = "drive",
+    rerun: bool = True, picture: bool = True, live: bool = False, viewer: str | None = None,
+    vehicle: Path | CarFile | None = None, reality: Path | CarFile | None = None, dry_run: bool = False,
     hooks: RunHooks | None = None,
-) -> DriveRun:
+) -> DriveRun:  # fmt: skip
     """Drive episodes with a policy on a car, and record them. ^C ends after the tick, a second ^C at once.
 
     Args:
-        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, the path of a car file, or a car file. A car
-            file with ``[hardware]`` is a real car, another one a simulated car.
-        policy: ``parking`` (feedback), a scripted manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, or an object with
-            ``name``, ``reset()`` and ``act(view)``, see ``carlab.core.policy.Policy``.
-        task: ``parking``, ``path``, or an object, see ``carlab.core.task.Task``: start, reward, end, arena.
+        car: ``sim``, ``emulated`` (serial), ``emulated-can``, a preset, or a car file; real if it has ``[hardware]``.
+        policy: ``parking`` (feedback), a manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a run of
+            ``carlab.learn`` or of a model in it (RUN/models/0003), or an object, see ``carlab.core.policy.Policy``.
+        task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; default: a learned policy's, or parking.
+        track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
         episodes: number of episodes.
         ticks: control periods per episode; by default the task's number.
         seed: of start poses and sensor noise.
@@ -151,12 +126,11 @@ def drive(
     from carlab.cars import choose_car
 
     hooks = hooks or RunHooks()
-    at_least(1, episodes=episodes, ticks=ticks)
-    at_least(0, seed=seed)
-    _check(policy, task, max_throttle)
+    _check(policy, max_throttle, episodes=episodes, ticks=ticks, seed=seed)
     connect = viewer_connection(live, viewer)
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
     options = {"seed": seed, "max_ticks": ticks, "place": place, "record_rerun": rerun}
+    driver, chosen_task = _policy_and_task(policy, task, track, choice)
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(new_run(out, name, choice, hooks))
         if connect is not None:
@@ -164,7 +138,7 @@ def drive(
 
             view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
-        results = _drive(choice, policy, task, max_throttle, run, episodes, hooks, options)
+        results = _drive(choice, driver, chosen_task, max_throttle, run, episodes, hooks, options)
     _write_results(run, results, picture)
     return DriveRun(run.path, tuple(results))
 
@@ -240,8 +214,8 @@ def _recorded_task(episode: EpisodeData, choice: CarChoice, seconds: float | Non
 
 def _drive(
     choice: CarChoice,
-    policy: PolicyName | Policy,
-    task: TaskName | Task,
+    policy: str | Policy,
+    task: Task,
     max_throttle: float | None,
     run: RunDirectory,
     episodes: int,
@@ -249,10 +223,8 @@ def _drive(
     options: dict[str, Any],
 ) -> list[EpisodeResult]:
     """Open policy and car and drive the episodes; ``options`` go to ``Session``."""
-    from carlab.core.task import TASKS
     from carlab.experiment.episodes.session import Session
 
-    chosen: Task = TASKS[task]() if isinstance(task, str) else task
     driver, teleop = _policy(policy, max_throttle, choice.simulator)
     session_hooks = hooks.session()
     with contextlib.ExitStack() as stack:
@@ -261,9 +233,9 @@ def _drive(
             options = {**options, "max_ticks": options["max_ticks"] or TELEOP_MAX_TICKS}
             stack.enter_context(teleop)
         stack.enter_context(choice.car)
-        envelope = _envelope(choice.envelope, chosen, max_throttle)
+        envelope = _envelope(choice.envelope, task, max_throttle)
         session = Session(
-            choice.car, driver, chosen, envelope, run, choice.control_period_s, config_toml=choice.config_toml,
+            choice.car, driver, task, envelope, run, choice.control_period_s, config_toml=choice.config_toml,
             hooks=session_hooks, **options,
         )  # fmt: skip
         return session.drive(episodes)
@@ -278,20 +250,58 @@ def _write_results(run: RunDirectory, results: Sequence[EpisodeResult], picture:
         save_summary([read_episode(r.path) for r in results if r.path.exists()], run.path / PICTURE_FILE)
 
 
-def _check(policy: PolicyName | Policy, task: TaskName | Task, max_throttle: float | None) -> None:
+def _policy_names() -> tuple[str, ...]:
     from carlab.core.manoeuvres import MANOEUVRES
-    from carlab.core.task import TASKS
 
-    policies = ("parking", "neutral", "keyboard", "gamepad", *MANOEUVRES)
-    for option, given, known in (("policy", policy, policies), ("task", task, tuple(TASKS))):
-        if isinstance(given, str) and given not in known:
-            raise ConfigError(f"--{option} {given}: choose one of {', '.join(known)}.")
+    return ("parking", "neutral", "keyboard", "gamepad", *MANOEUVRES)
+
+
+def _check(
+    policy: str | Path | Policy, max_throttle: float | None, *, episodes: int, ticks: int | None, seed: int
+) -> None:
+    at_least(1, episodes=episodes, ticks=ticks)
+    at_least(0, seed=seed)
+    if isinstance(policy, (str, Path)) and str(policy) not in _policy_names() and not Path(policy).is_dir():
+        raise ConfigError(
+            f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn."
+        )
     if max_throttle is not None and not 0.0 < max_throttle <= 1.0:
         raise ConfigError(f"--max-throttle {max_throttle:g}: give a number above 0 and at most 1.")
-    if task == "path" and policy == "parking":
-        raise ConfigError("The parking policy cannot follow a path; choose another --policy for --task path.")
     if policy == "keyboard" and not has_screen():
         raise NotReadyError("Keyboard", ["its window needs a screen, which is missing; use --policy gamepad."])
+
+
+def _policy_and_task(
+    policy: str | Path | Policy, task: str | Task | None, track: Path | str | None, choice: CarChoice
+) -> tuple[str | Policy, Task]:
+    """The policy, which is read if it is a run's, and the task; that of the run by default."""
+    from carlab.core.task import ParkingTask
+    from carlab.core.task_choice import PARKING
+
+    given = given_task(task, track, choice.track)
+    if isinstance(policy, (str, Path)) and str(policy) not in _policy_names():
+        return _learned(Path(policy), given, choice)
+    chosen = load_checked(given or PARKING, choice.envelope.arena_m)
+    if policy == "parking" and not isinstance(chosen, ParkingTask):
+        raise ConfigError(f"The parking policy only parks; choose another --policy for --task {chosen.name}.")
+    return str(policy) if isinstance(policy, Path) else policy, chosen
+
+
+def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple[Policy, Task]:
+    """The policy of a run, and its task or a given one, with the run's past actions and ticks."""
+    from carlab.experiment.campaign.campaign import PERIOD_TOLERANCE
+    from carlab.experiment.campaign.learned_policy import load_policy
+
+    learned = load_policy(folder)
+    period_s, own = learned.control_period_s, learned.plan.task_choice
+    if abs(period_s - choice.control_period_s) > PERIOD_TOLERANCE * period_s:
+        raise ConfigError(
+            f"The policy in {folder} was trained with a control period of {period_s:.4g} s, the car has "
+            f"{choice.control_period_s:.4g} s; choose a car with the same control_period."
+        )
+    chosen = own.named_again(given) if given is None or given.name == own.name else given
+    task = load_checked(chosen, choice.envelope.arena_m)
+    return learned.policy, task.resized(learned.plan.history, learned.plan.ticks)
 
 
 def _envelope(car_limits: SafetyEnvelope, task: Task, max_throttle: float | None) -> SafetyEnvelope:
@@ -301,7 +311,7 @@ def _envelope(car_limits: SafetyEnvelope, task: Task, max_throttle: float | None
 
 
 def _policy(
-    policy: PolicyName | Policy, max_throttle: float | None, simulator: SimulatorConfig
+    policy: str | Policy, max_throttle: float | None, simulator: SimulatorConfig
 ) -> tuple[Policy, TeleopPolicy | None]:
     """The policy, and the same object as a TeleopPolicy if a person drives (else None)."""
     from carlab.core.manoeuvres import MANOEUVRES

@@ -1,4 +1,4 @@
-"""Learning to park: fit the car, train a policy in the learned car, drive, repeat."""
+"""Learning a task: fit the car, train a policy in the learned car, drive, repeat."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from carlab.api.arguments import above_zero, at_least
-from carlab.api.cars import car_options_text
+from carlab.api.learn_request import AUTO, Device, LearnRequest, Method, checked_simulator, training_plan
 from carlab.api.runs import (
     RunHooks,
     existing_run,
@@ -21,27 +21,23 @@ from carlab.api.runs import (
     viewer_connection,
     write_result,
 )
+from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
     from carlab.core.outcome import EndReason
+    from carlab.core.task import Task
     from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.live_view import LiveView
     from carlab.experiment.campaign.prior_repair import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
-    from carlab.experiment.campaign.training import TrainingPlan
     from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.experiment.episodes.session import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
-    from sim_backends.car_parameters import SimulatorConfig
 
 EPISODES = 20
-AUTO = "auto"
-BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
-Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
-Device = Literal["cpu", "cuda"]
 PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
 """Arguments that a run keeps when it is resumed."""
 
@@ -76,7 +72,7 @@ class LearnRun:
     Attributes:
         folder: the run's folder; ``carlab.learn(resume=folder)`` resumes the run.
         wanted: target number of episodes.
-        episodes: figures of the episodes of this call: return, predicted return, distance to the goal ...
+        episodes: figures of the episodes of this call: return, predicted return, success, constraint cost ...
         results: the same episodes with their data and end reasons.
     """
 
@@ -113,74 +109,38 @@ class LearnRun:
 
     def _repr_html_(self) -> str:
         rows = [
-            [e.episode, e.total_reward, e.predicted_return, e.distance_m, "yes" if e.parked else "no", e.end.lower()]
+            [
+                e.episode,
+                e.total_reward,
+                e.predicted_return,
+                e.cost,
+                e.outcome,
+                "yes" if e.success else "no",
+                e.end.lower(),
+            ]
             for e in self.episodes
         ]
-        columns = ["episode", "return", "predicted return", "distance [m]", "parked", "end"]
+        columns = ["episode", "return", "predicted return", "constraint cost", "outcome", "success", "end"]
         return html_table(columns, rows) + html_picture(self.picture)
 
 
-@dataclass(frozen=True, slots=True)
-class _Request:
-    """The arguments of ``learn``."""
-
-    car: str | CarFile
-    episodes: int | None
-    ticks: int | None
-    prior: str | Path | CarFile
-    method: Method
-    history: int | None
-    model_steps: int | None
-    updates: int
-    seed: int
-    device: Device | None
-    place: bool
-    resume: Path | None
-    out: Path
-    name: str
-    rerun: bool
-    live: bool
-    viewer: str | None
-    vehicle: Path | CarFile | None
-    reality: Path | CarFile | None
-    dry_run: bool
-
-    @property
-    def car_options(self) -> str:
-        """Command-line options that select the car."""
-        return car_options_text(self.car, self.vehicle, self.reality, self.dry_run)
-
-
 def learn(
-    car: str | CarFile = "sim",
-    *,
-    episodes: int | None = None,
-    ticks: int | None = None,
-    prior: str | Path | CarFile = "kinematic",
-    method: Method = "sim-fsvgd",
-    history: int | None = None,
-    model_steps: int | None = None,
-    updates: int = 30000,
-    seed: int = 0,
-    device: Device | None = None,
-    place: bool = True,
-    resume: Path | str | None = None,
-    out: Path | str = "runs",
-    name: str = "learn",
-    rerun: bool = True,
-    live: bool = False,
-    viewer: str | None = None,
-    vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None,
-    dry_run: bool = False,
+    car: str | CarFile = "sim", *, task: str | Task | None = None, track: Path | str | None = None,
+    episodes: int | None = None, ticks: int | None = None, prior: str | Path | CarFile = "kinematic",
+    method: Method = "sim-fsvgd", history: int | None = None, model_steps: int | None = None, updates: int = 30000,
+    seed: int = 0, device: Device | None = None, place: bool = True, resume: Path | str | None = None,
+    out: Path | str = "runs", name: str = "learn", rerun: bool = True, live: bool = False, viewer: str | None = None,
+    vehicle: Path | CarFile | None = None, reality: Path | CarFile | None = None, dry_run: bool = False,
     hooks: LearnHooks | None = None,
-) -> LearnRun:
-    """Fit the car to all recordings, train a parking policy in the learned car, drive an episode, and repeat.
+) -> LearnRun:  # fmt: skip
+    """Fit the car to all recordings, train a policy of a task in the learned car, drive an episode, and repeat.
 
     Args:
         car: as for ``carlab.drive``.
+        task: as for ``carlab.drive``; by default that of the resumed run, else ``parking``.
+        track: as for ``carlab.drive``.
         episodes: total number of episodes; by default 20, or the number of the resumed run.
-        ticks: control periods per episode; by default the task's number (100).
+        ticks: control periods per episode; by default the task's number.
         prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model. ``auto`` starts
             with the nominal one; between episodes, effects and parameters that the recordings support enter it, and
             those that the recordings contradict leave it.
@@ -206,15 +166,14 @@ def learn(
         The run; ``is_complete`` is False after an interruption or a safety stop.
 
     Raises:
-        ConfigError: an argument is invalid, or differs from the run to resume.
-        DataError: training failed, or the folder to resume is not a run.
+        ConfigError, DataError: an argument is invalid or differs from the run to resume, or training failed.
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
-    request = _Request(
+    return _learn(LearnRequest(
         car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
         None if resume is None else Path(resume), Path(out), name, rerun, live, viewer, vehicle, reality, dry_run,
-    )  # fmt: skip
-    return _learn(request, hooks or LearnHooks())
+        task, track,
+    ), hooks or LearnHooks())  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -257,7 +216,7 @@ class _Progress:
         )
 
 
-def _learn(request: _Request, hooks: LearnHooks) -> LearnRun:
+def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
     from carlab.cars import choose_car
     from carlab.experiment.campaign.campaign import saved_seed
     from carlab.experiment.campaign.live_view import LiveSettings, LiveView
@@ -308,7 +267,7 @@ def _with_view(hooks: LearnHooks, view: LiveView) -> LearnHooks:
     )
 
 
-def _check(request: _Request) -> None:
+def _check(request: LearnRequest) -> None:
     from learning.devices import available
 
     above_zero(episodes=request.episodes, updates=request.updates, ticks=request.ticks, model_steps=request.model_steps)
@@ -318,18 +277,18 @@ def _check(request: _Request) -> None:
         raise ConfigError(f"--prior auto: {request.method} has no simulator prior; use --method sim-fsvgd.")
 
 
-def _begun(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
+def _begun(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
     from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
 
-    plan = _plan(request, choice)
+    plan = training_plan(request, choice)
     run = stack.enter_context(new_run(request.out, request.name, choice, hooks, keep="models"))
     return Campaign(
         choice, plan, request.episodes or EPISODES, run, CampaignHooks(), request.ticks, request.place, request.rerun,
-        _checked_simulator(request), request.car_options, request.prior == AUTO,
+        checked_simulator(request), request.car_options, request.prior == AUTO,
     )  # fmt: skip
 
 
-def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
+def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:
     from carlab.experiment.campaign.campaign import CampaignHooks, check_same_car, resumed_campaign
     from carlab.experiment.campaign.report import restore_missing_rows
     from learning.devices import available
@@ -338,6 +297,9 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
     run = stack.enter_context(existing_run(request.resume, choice, hooks))
     check_same_car(run, choice, request.car_options)
     campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
+    task_choice = campaign.plan.task_choice.named_again(given_task(request.task, request.track, choice.track))
+    campaign.plan = replace(campaign.plan, task_choice=task_choice)
+    load_checked(task_choice, choice.envelope.arena_m)
     available(campaign.plan.device)
     _check_as_before(request, campaign, choice)
     campaign.move_stopped_episode()
@@ -345,66 +307,16 @@ def _resumed(request: _Request, choice: CarChoice, hooks: LearnHooks, stack: con
     return campaign
 
 
-def _plan(request: _Request, choice: CarChoice) -> TrainingPlan:
-    import tomli_w
-
-    from carlab.core.task import ParkingTask
-    from carlab.experiment.campaign.campaign import PAPER_HISTORY
-    from carlab.experiment.campaign.prior_repair import needed_history
-    from carlab.experiment.campaign.training import TrainingPlan
-
-    history = request.history
-    if history is None:
-        history = PAPER_HISTORY if request.method == "fsvgd-authors" else needed_history(choice.simulator)
-    if (ticks := request.ticks or ParkingTask().max_ticks) <= history:
-        raise ConfigError(f"--ticks {ticks}: give more than --history ({history}), for at least one transition.")
-    text = tomli_w.dumps(_prior(request, choice).to_tables())
-    return TrainingPlan(
-        text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,
-        device=request.device or "cpu",
-    )  # fmt: skip
-
-
-def _prior(request: _Request, choice: CarChoice) -> SimulatorConfig:
-    """The prior simulator."""
-    from carlab.experiment.campaign.campaign import check_period, prior_simulator
-
-    if request.prior in BUILT_IN_PRIORS:
-        kind: Literal["kinematic", "nominal"] = "kinematic" if request.prior == "kinematic" else "nominal"
-        return prior_simulator(choice.simulator, kind)
-    simulator = prior_simulator(_prior_file(request.prior).simulator, "nominal")
-    check_period(simulator, choice.control_period_s, f"car '{_name_of(request.car)}'")
-    return simulator
-
-
-def _prior_file(prior: str | Path | CarFile) -> CarFile:
-    from carlab.cars import CarFile, is_preset, load_car_file
-
-    if isinstance(prior, CarFile):
-        return prior
-    file = Path(prior)
-    if file.suffix != ".toml" and not is_preset(file) and not file.is_file():
-        raise ConfigError(f"--prior {prior}: give {', '.join(BUILT_IN_PRIORS)} or an existing car file.")
-    return load_car_file(file)
-
-
-def _name_of(car: str | CarFile) -> str:
-    return car if isinstance(car, str) else car.name
-
-
-def _checked_simulator(request: _Request) -> SimulatorConfig | None:
-    """The simulator of the quick check, if it is not that of the car file."""
-    return None if request.prior in BUILT_IN_PRIORS else _prior_file(request.prior).simulator
-
-
-def _check_as_before(request: _Request, campaign: Campaign, choice: CarChoice) -> None:
+def _check_as_before(request: LearnRequest, campaign: Campaign, choice: CarChoice) -> None:
     """Raise ConfigError for a given argument that differs from the run to resume."""
     plan = campaign.plan
     default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
     saved = {name: getattr(plan, name) for name in PLANNED}
     changed = [n for n in PLANNED if getattr(request, n) not in (default[n], saved[n])]
     is_same = campaign.repairs_prior == (request.prior == AUTO)
-    if request.prior != default["prior"] and not (is_same and _plan(request, choice).prior_toml == plan.prior_toml):
+    if request.prior != default["prior"] and not (
+        is_same and training_plan(request, choice).prior_toml == plan.prior_toml
+    ):
         raise ConfigError("--prior: this run was started with another prior; remove the option, or start a new run.")
     if changed:
         option = changed[0].replace("_", "-")

@@ -7,6 +7,7 @@ import functools
 import html
 import json
 import logging
+import math
 import os
 import re
 import shutil
@@ -190,7 +191,7 @@ def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
             "episode": result.episode,
             "ticks": result.data.ticks,
             "return": result.total_reward,
-            **{name: float(value) for name, value in result.summary.items()},
+            **{name: None if math.isnan(value) else float(value) for name, value in result.summary.items()},
             "end_reason": result.reason.name,
             "end_detail": result.data.metadata["end_detail"],
         }

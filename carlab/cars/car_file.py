@@ -14,6 +14,7 @@ from carlab.core.geofence import as_polygon
 from carlab.core.recording_noise import RecordingNoise
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.tables import check_keys, from_table, number
+from carlab.core.track import Track, track_from_table
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig, HardwareConfig
 from mocap.config import MocapConfig
@@ -34,13 +35,14 @@ class RealCar:
 
 @dataclass(frozen=True, slots=True)
 class CarFile:
-    """A car file: text, simulator, real car (None without ``[hardware]``), and the noise (only in a ``model.toml``)."""
+    """A car file: text, simulator, and where the file has them the real car, the noise and the track."""
 
     name: str
     text: str
     simulator: SimulatorConfig
     real: RealCar | None
     recording_noise: RecordingNoise | None = None
+    track: Track | None = None
 
     def save(self, path: Path | str) -> Path:
         """Write the file as TOML, replacing an existing file; returns the path.
@@ -76,14 +78,15 @@ def load_car_file(path: Path) -> CarFile:
         raise ConfigError(f"{path} is not a text file; name a car file in TOML.") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML ({error}); correct it.") from error
-    check_keys(tables, (*TABLES, "hardware", "recording_noise"), str(path))
+    check_keys(tables, (*TABLES, "hardware", "recording_noise", "track"), str(path))
     noise = tables.pop("recording_noise", None)
     if noise is not None:
         noise = RecordingNoise.from_table(noise, f"[recording_noise] of {path}")
-    hardware = tables.pop("hardware", None)
+    hardware, track = tables.pop("hardware", None), tables.pop("track", None)
     simulator = SimulatorConfig.from_tables(tables, str(path))
     real = None if hardware is None else _real_car(hardware, path)
-    return CarFile(path.stem if real is None else real.name, text, simulator, real, noise)
+    course = None if track is None else track_from_table(track, f"[track] of {path}")
+    return CarFile(path.stem if real is None else real.name, text, simulator, real, noise, course)
 
 
 def is_preset(path: Path) -> bool:

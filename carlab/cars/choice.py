@@ -12,6 +12,7 @@ from carlab.core.car import Car
 from carlab.core.errors import ConfigError
 from carlab.core.quantities import Action, ActionLimits, Reality
 from carlab.core.safety import SafetyEnvelope
+from carlab.core.track import Track
 from sim_backends.car_parameters import SimulatorConfig, preset_names
 
 PLUGIN_GROUP = "carlab.cars"
@@ -22,7 +23,8 @@ class CarChoice:
     """A car that is built but not open, with the settings for an episode.
 
     ``log_to`` sets the folder for the firmware log of an emulated car; other cars ignore it. ``as_sent`` maps an
-    action to the action that the car would send (rounded by the calibration), for a dry run.
+    action to the action that the car would send (rounded by the calibration), for a dry run. ``track`` is that of the
+    car file.
     """
 
     car: Car
@@ -31,6 +33,7 @@ class CarChoice:
     config_toml: str
     log_to: Callable[[Path], None] = field(default=lambda folder: None)
     as_sent: Callable[[Action], Action] | None = None
+    track: Track | None = None
 
     @property
     def control_period_s(self) -> float:
@@ -120,7 +123,7 @@ def _simulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -
     from sim_backends.simulated_car import SimulatedCar
 
     car = SimulatedCar(truth or file.simulator, seed=seed, name=file.name)
-    return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, "sim"))
+    return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, "sim"), track=file.track)
 
 
 def _emulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None, actuator: str = "serial") -> CarChoice:
@@ -128,7 +131,7 @@ def _emulated(file: CarFile, seed: int, truth: SimulatorConfig | None = None, ac
 
     car = EmulatedCar(file, actuator=actuator, seed=seed, reality=truth)
     name = "emulated" if actuator == "serial" else "emulated-can"
-    return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, name), car.log_to)
+    return CarChoice(car, file.simulator, _envelope(file), _config_toml(file, name), car.log_to, track=file.track)
 
 
 def _emulated_can(file: CarFile, seed: int, truth: SimulatorConfig | None = None) -> CarChoice:
@@ -159,6 +162,7 @@ def _real(file: CarFile, seed: int) -> CarChoice:
         real.envelope,
         _config_toml(file, real.name),
         as_sent=lambda action: calibration.from_device(calibration.to_device(action)),
+        track=file.track,
     )
 
 

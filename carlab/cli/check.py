@@ -8,7 +8,7 @@ from tyro.conf import OmitArgPrefixes
 
 from carlab.api.runs import RunHooks
 from carlab.cli.console import banner, console, fail, table
-from carlab.cli.options import CarOptions
+from carlab.cli.options import CarOptions, TaskOptions
 from carlab.core.errors import NotReadyError
 
 UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM", "count": "", "flag": ""}
@@ -18,10 +18,14 @@ UNITS = {"v": "V", "ms": "ms", "s": "s", "hz": "Hz", "ppm": "ppm", "erpm": "eRPM
 class Check:
     """Open a car without moving it, and measure health, rates and latency of each part.
 
+    With --task, first find errors of shape and unit in a task.
+
     Exit code 0 if the car is ready to be armed, 3 if not; all reasons are listed.
     """
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
+
+    which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     seconds: float = 2.0
     """Duration of the motion-capture measurement [s]."""
@@ -37,7 +41,12 @@ class Check:
         from carlab.api import check
 
         hooks = RunHooks(on_start=lambda folder, car: banner(car.reality, car.name, moves=False))
-        result = check(**self.which_car.arguments(), seconds=self.seconds, wheels=self.wheels, hooks=hooks)
+        result = check(
+            **self.which_car.arguments(), task=self.which_task.task, track=self.which_task.track, seconds=self.seconds,
+            wheels=self.wheels, hooks=hooks,
+        )  # fmt: skip
+        if self.which_task.to_text():
+            console.print("No error found in the task.")
         if readings := result.health.readings:
             rows = [[_label(name), f"{value:.4g}", _unit(name)] for name, value in readings.items()]
             table("Readings", ["reading", "value", "unit"], rows)

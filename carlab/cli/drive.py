@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
-from carlab.api.driving import PolicyName, TaskName
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import CarOptions
-from carlab.cli.runs import ask_to_place
+from carlab.cli.options import CarOptions, TaskOptions
+from carlab.cli.runs import ask_to_place, figure_text, heading
 
 if TYPE_CHECKING:
     from carlab.api import DriveRun
@@ -35,11 +34,12 @@ class Drive:
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    policy: PolicyName = "parking"
-    """parking (feedback), a scripted manoeuvre, neutral, or teleoperation: keyboard, gamepad (hold the dead-man)."""
+    which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
-    task: TaskName = "parking"
-    """Start poses, reward and arena."""
+    policy: str = "parking"
+    """parking (feedback), neutral, teleoperation (keyboard, gamepad: hold the dead-man), a scripted manoeuvre
+    (steering_steps, throttle_steps, steering_chirp, figure_eight, throttle_ramp, coast_down, slow_circle), or the
+    folder of a run of carlab learn: its newest policy (RUN/models/0003: that of episode 3)."""
 
     episodes: int = 1
     """Number of episodes."""
@@ -85,7 +85,8 @@ class Drive:
             run = drive(
                 **self.which_car.arguments(),
                 policy=self.policy,
-                task=self.task,
+                task=self.which_task.task,
+                track=self.which_task.track,
                 episodes=self.episodes,
                 ticks=self.ticks,
                 seed=self.seed,
@@ -144,12 +145,12 @@ class Drive:
                 str(r.episode),
                 str(r.data.ticks),
                 f"{r.total_reward:.1f}",
-                *(_figure(name, r.summary[name]) for name in names),
+                *(figure_text(name, r.summary[name]) for name in names),
                 r.reason.name.lower().replace("_", " "),
             ]
             for r in results
         ]
-        table("", ["episode", "ticks", "return", *(_heading(n) for n in names), "end"], rows)
+        table("", ["episode", "ticks", "return", *(heading(n) for n in names), "end"], rows)
         for r in results:
             if r.reason.is_safety_stop:
                 fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())
@@ -163,13 +164,3 @@ class Drive:
         if last in (EndReason.POLICY_ERROR, EndReason.RECORDER_ERROR):
             return 1
         return EXIT_SAFETY_STOP if last.is_safety_stop else 0
-
-
-def _heading(name: str) -> str:
-    stem, _, unit = name.rpartition("_")
-    units = {"m": "m", "rad": "rad", "mps": "m/s"}
-    return f"{stem.replace('_', ' ')}\n[{units[unit]}]" if unit in units else name.replace("_", " ")
-
-
-def _figure(name: str, value: float) -> str:
-    return ("yes" if value else "no") if name == "parked" else f"{value:.2f}"

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
-from carlab.api.learning import Device, Method
+from carlab.api.learn_request import Device, Method
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
-from carlab.cli.options import CarOptions
-from carlab.cli.runs import ask_to_place
+from carlab.cli.options import CarOptions, TaskOptions
+from carlab.cli.runs import ask_to_place, figure_text, heading
 
 if TYPE_CHECKING:
     from carlab.api import LearnRun
@@ -42,11 +42,21 @@ def _training_messages(figures: dict[str, Any]) -> list[str]:
     return messages
 
 
+def _print_figures(bar: Progress, row: EpisodeFigures) -> None:
+    bar.console.print(
+        f"episode {row.episode}: return {row.total_reward:.1f} "
+        f"(predicted {row.predicted_return:.1f}, with 90 % probability {row.predicted_low:.1f} to "
+        f"{row.predicted_high:.1f}){_cost_text(row)}, {row.outcome}; "
+        f"learned from {row.rows} rows in {row.model_seconds:.0f} + {row.policy_seconds:.0f} s",
+        soft_wrap=True,
+    )
+
+
 @dataclass
 class Learn:
-    """Fit the car, train a parking policy in the learned car, drive an episode with it, and repeat.
+    """Fit the car, train a policy of a task in the learned car, drive an episode with it, and repeat.
 
-    The goal is the origin of the motion capture with heading along x; an episode has 100 ticks (3.3 s at 30 Hz). Before
+    The goal of parking is the origin of the motion capture with heading along x, in 100 ticks (3.3 s at 30 Hz). Before
     each episode a person places a real car at the printed start pose; simulated and emulated cars are placed
     automatically. Between episodes another process trains while the car is in neutral. --resume continues an
     interrupted run.
@@ -54,11 +64,13 @@ class Learn:
 
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
+    which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
+
     episodes: int | None = None
     """Total number of episodes, including those already driven; by default 20, or the number of the resumed run."""
 
     ticks: int | None = None
-    """Ticks per episode, more than --history; by default the task's number (100)."""
+    """Ticks per episode, more than --history; by default the task's number (parking: 100)."""
 
     prior: str = "kinematic"
     """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), auto (at first nominal;
@@ -122,6 +134,8 @@ class Learn:
         with progress(speed_estimate_period_s=STEPS_PERIOD_S) as bar:
             run = learn(
                 **self.which_car.arguments(),
+                task=self.which_task.task,
+                track=self.which_task.track,
                 episodes=self.episodes,
                 ticks=self.ticks,
                 prior=self.prior,
@@ -175,16 +189,6 @@ class Learn:
             for message in _training_messages(figures):
                 bar.console.print(f"  {message}", soft_wrap=True, highlight=False)
 
-        def on_figures(row: EpisodeFigures) -> None:
-            parked = "parked" if row.parked else f"{row.distance_m:.2f} m from the goal"
-            bar.console.print(
-                f"episode {row.episode}: return {row.total_reward:.1f} "
-                f"(predicted {row.predicted_return:.1f}, with 90 % probability {row.predicted_low:.1f} to "
-                f"{row.predicted_high:.1f}), {parked}; "
-                f"learned from {row.rows} rows in {row.model_seconds:.0f} + {row.policy_seconds:.0f} s",
-                soft_wrap=True,
-            )
-
         def on_check(check: QuickCheck) -> None:
             for sentence in check.sentences:
                 bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False)
@@ -200,7 +204,7 @@ class Learn:
             on_abandon=on_abandon,
             on_training=show_progress,
             on_learned=on_learned,
-            on_figures=on_figures,
+            on_figures=functools.partial(_print_figures, bar),
             on_checking=functools.partial(show_progress, "quick check of the simulator", 0, 1),
             on_check=on_check,
             on_repairing=functools.partial(show_progress, "repair of the prior", 0, 1),
@@ -217,31 +221,13 @@ class Learn:
         if not run.results and run.is_complete:
             console.print(f"All {done} episodes are driven; the run in {run.folder} is complete.", soft_wrap=True)
         if run.results:
-            table(
-                "",
-                ["episode", "return", "predicted", "distance\n[m]", "yaw error\n[rad]", "speed\n[m/s]", "parked",
-                 "strictly", "end"],
-                [
-                    [str(r.episode), f"{r.total_reward:.1f}", f"{r.predicted_return:.1f}", f"{r.distance_m:.2f}",
-                     f"{r.yaw_error_rad:.2f}", f"{r.speed_mps:.2f}", "yes" if r.parked else "no",
-                     "yes" if r.is_strictly_parked else "no",
-                     r.end.lower().replace("_", " ")]
-                    for r in run.episodes
-                ],
-            )  # fmt: skip
-            parked, strictly = (sum(r.parked for r in run.episodes), sum(r.is_strictly_parked for r in run.episodes))
-            console.print(
-                f"Parked in {parked} of {len(run.episodes)} episodes: within 0.2 m and 0.35 rad of the goal, slower "
-                f"than 0.3 m/s at the end. Strictly, by the criterion of the authors of Sim-FSVGD, within 0.05 m and "
-                f"0.2 rad: {strictly}.",
-                soft_wrap=True,
-                highlight=False,
-            )
+            self._print_episodes(run)
             console.print(f"Learned and recorded in {run.folder} (learn.png, learn.rrd).", soft_wrap=True)
         if done < run.wanted:
             console.print(
                 f"{done} of {run.wanted} episodes; resume with: "
-                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}",
+                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}"
+                f"{self.which_task.to_text()}",
                 soft_wrap=True,
             )
             last = run.end
@@ -251,3 +237,35 @@ class Learn:
                 else EXIT_INTERRUPTED
             )
         return 0
+
+    def _print_episodes(self, run: LearnRun) -> None:
+        """Table of the episodes, and the number of successes."""
+        names = list(dict.fromkeys(name for r in run.results for name in r.summary if name != "success"))
+        table(
+            "",
+            ["episode", "return", "predicted", *(heading(n) for n in names), "success", "end"],
+            [
+                [str(row.episode), f"{row.total_reward:.1f}", f"{row.predicted_return:.1f}",
+                 *(figure_text(n, result.summary[n]) for n in names), "yes" if row.success else "no",
+                 row.end.lower().replace("_", " ")]
+                for row, result in zip(run.episodes, run.results, strict=True)
+            ],
+        )  # fmt: skip
+        rows = run.episodes
+        text = f"Success in {sum(r.success for r in rows)} of {len(rows)} episodes"
+        if all(r.violations == r.violations for r in rows):
+            text += f", {sum(r.violations > 0 for r in rows)} with a violated constraint"
+        if all(r.data.metadata["task"] in ("parking", "obstacles") for r in run.results):
+            text += (
+                ": within 0.2 m and 0.35 rad of the goal, slower than 0.3 m/s at the end. Strictly, by the criterion "
+                "of the authors of Sim-FSVGD, within 0.05 m and 0.2 rad: "
+                f"{sum(r.is_strictly_parked for r in rows)}"
+            )
+        console.print(f"{text}.", soft_wrap=True, highlight=False)
+
+
+def _cost_text(row: EpisodeFigures) -> str:
+    """Constraint cost and violations of an episode; empty for a task without a constraint."""
+    if row.cost != row.cost:
+        return ""
+    return f", constraint cost {row.cost:.1f} (predicted {row.predicted_cost:.1f}) in {row.violations:.0f} ticks"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +46,25 @@ class CarOptions:
 
         given = self.arguments()
         return choose_car(given.pop("car"), **given, seed=seed, log_folder=log_folder)
+
+
+@dataclass
+class TaskOptions:
+    """Options that select the task."""
+
+    task: str | None = None
+    """parking, obstacles (parking behind four discs), path (figure eight), laps, or FILE.py:CLASS: a class of your own
+    file, derived from carlab.core.task.Task. By default parking, or the task of a run that is resumed or driven again;
+    a run folder keeps no code, so such a run needs FILE.py:CLASS again."""
+
+    track: Path | None = None
+    """CSV file with the columns x, y (centre line in driving direction) and width [m], for laps. By default [track] of
+    the car file, or an oval."""
+
+    def to_text(self) -> str:
+        """These options as command-line text, each with a leading space; default values are omitted."""
+        given = {"--task": self.task, "--track": self.track}
+        return "".join(f" {option} {shlex.quote(str(value))}" for option, value in given.items() if value is not None)
 
 
 def new_file(path: Path, option: str, suffix: str) -> Path:

@@ -1,4 +1,4 @@
-"""Prompt for a person to place the car at its start pose."""
+"""Prompt for a person to place the car at its start pose; figures of tasks in tables."""
 
 from __future__ import annotations
 
@@ -37,3 +37,19 @@ def ask_to_place(bar: Progress, otherwise: str) -> Callable[[CarState], None]:
         bar.start()
 
     return ask
+
+
+def heading(name: str) -> str:
+    """Heading of a column for a figure whose name ends in its unit."""
+    stem, _, unit = name.rpartition("_")
+    units = {"m": "m", "rad": "rad", "mps": "m/s", "s": "s"}
+    return f"{stem.replace('_', ' ')}\n[{units[unit]}]" if unit in units else name.replace("_", " ")
+
+
+def figure_text(name: str, value: float) -> str:
+    """A figure of a task for a table."""
+    if value != value:
+        return "-"
+    if name == "success":
+        return "yes" if value else "no"
+    return f"{value:.0f}" if name == "violations" else f"{value:.2f}"

@@ -46,6 +46,14 @@ def decode_history(features: Any) -> Any:
     return xp.reshape(flat, (*flat.shape[:-1], flat.shape[-1] // ACTION_SIZE, ACTION_SIZE))
 
 
+def episode_features(states: FloatArray, sent: FloatArray, history_length: int) -> FloatArray:
+    """Features (T + 1, 7 + 2 H) of an episode's states (T + 1, 6) and sent actions (T, 2), neutral before the first."""
+    padded = np.concatenate([np.zeros((history_length, ACTION_SIZE)), sent])
+    rows = np.arange(len(states))[:, None] + np.arange(history_length)
+    features: FloatArray = encode(states, padded[rows])
+    return features
+
+
 def push_action(history: Any, action: Any) -> Any:
     """Append ``action`` (..., 2) to a history (..., H, 2) and drop the oldest action. NumPy or torch."""
     if history.shape[-2] == 0:

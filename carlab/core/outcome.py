@@ -10,6 +10,7 @@ class EndReason(enum.Enum):
 
     COMPLETED = "All ticks of the episode were driven."
     GOAL_REACHED = "The goal was reached."
+    TASK_ENDED = "The task ended the episode, for example because the car left the track."
     POLICY_FINISHED = "The script has ended."
     STOP_REQUESTED = "Stopped on request; the recording up to here is complete."
     DEADMAN_RELEASED = "The dead-man control was released; hold it while driving."
@@ -35,6 +36,7 @@ class EndReason(enum.Enum):
         return self not in (
             EndReason.COMPLETED,
             EndReason.GOAL_REACHED,
+            EndReason.TASK_ENDED,
             EndReason.POLICY_FINISHED,
             EndReason.STOP_REQUESTED,
         )

@@ -149,6 +149,15 @@ def polygon_of(metadata: Mapping[str, str], key: str) -> FloatArray:
     return np.array(json.loads(metadata.get(key, "[]")), dtype=np.float64).reshape(-1, 2)
 
 
+def outlines_of(metadata: Mapping[str, str]) -> list[FloatArray]:
+    """Borders of keep-out areas or of a track in an episode's metadata, each (n, 2) [m]; none if malformed."""
+    try:
+        outlines = [np.array(o, dtype=np.float64).reshape(-1, 2) for o in json.loads(metadata.get("outlines_m", "[]"))]
+    except (ValueError, TypeError):
+        return []
+    return [o for o in outlines if len(o) and np.isfinite(o).all()]
+
+
 def documents_from_episode(episode: EpisodeData) -> Iterator[Document]:
     """Convert an episode of arrays to documents, so that every sink can write it.
 

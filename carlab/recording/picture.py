@@ -14,7 +14,7 @@ import numpy as np
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
-from carlab.recording.episode_builder import LATE, POLICY_TIME, POSE_AGE, goal_of, polygon_of
+from carlab.recording.episode_builder import LATE, POLICY_TIME, POSE_AGE, goal_of, outlines_of, polygon_of
 from carlab.recording.rerun.screenshot import save_screenshot as save_screenshot
 from carlab.recording.sink import describe_os_error
 
@@ -105,6 +105,8 @@ def _draw_arena_path_and_goal(plan: Any, episodes: Sequence[EpisodeData]) -> Non
         plan.plot(*closed.T, color=_TEXT_COLOUR, linewidth=1.6, label="arena", zorder=1)
     if len(path):
         plan.plot(*path.T, color=_LIGHT_GREY, linewidth=4, solid_capstyle="round", label="path", zorder=1)
+    for line in next((found for e in episodes if (found := outlines_of(e.metadata))), []):
+        plan.plot(*np.vstack([line, line[:1]]).T, color="#D55E00", linewidth=1.4, zorder=1)
     if goal is not None:
         shape = outline(*goal)
         plan.fill(*shape.T, facecolor="#009E73", alpha=0.25, zorder=2)

@@ -40,7 +40,7 @@ class Curve:
     @property
     def first_parked(self) -> int | None:
         """The first episode that ended parked."""
-        return next((e.episode for e in self.episodes if e.parked), None)
+        return next((e.episode for e in self.episodes if e.success), None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
         mean = np.full(count, np.nan)
         mean[known > 0] = np.nanmean(returns[:, known > 0], axis=0)
         first = tuple(c.first_parked for c in own)
-        parked = [[e.parked for e in c.episodes[-FINAL_EPISODES:]] for c in own]
+        parked = [[e.success for e in c.episodes[-FINAL_EPISODES:]] for c in own]
         seconds = [[e.model_seconds + e.policy_seconds for e in c.episodes] for c in own]
         found.append(
             MethodFigures(
@@ -216,7 +216,7 @@ def draw(curves: Sequence[Curve], path: Path) -> None:
             ticks.append(height)
             labels.append(f"{curve.method}, {curve.reality} seed {curve.seed}".replace(",  ", ", "))
             for ended_parked in (True, False):
-                at = [e.episode for e in curve.episodes if e.parked is ended_parked]
+                at = [e.episode for e in curve.episodes if e.success is ended_parked]
                 marker, size = ("s", 5) if ended_parked else ("x", 4)
                 parked.plot(at, [height] * len(at), marker, color=colour, markersize=size)
     reward.set(xlabel="episode", ylabel="return on the car (mean, standard error)")

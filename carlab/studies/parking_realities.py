@@ -94,7 +94,7 @@ def compared(curves: Sequence[Curve]) -> list[ArmFigures]:
     for arm in dict.fromkeys(c.method for c in curves):
         own = [c for c in curves if c.method == arm]
         first = [_first(c) for c in own]
-        later = [e.parked for c, f in zip(own, first, strict=True) for e in c.episodes if e.episode > f]
+        later = [e.success for c, f in zip(own, first, strict=True) for e in c.episodes if e.episode > f]
         inside = [
             e.predicted_low <= e.total_reward <= e.predicted_high
             for c in own

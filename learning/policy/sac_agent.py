@@ -87,9 +87,9 @@ class SacAgent:
             env: the environment.
             updates: gradient steps.
             progress: called with the number of gradient steps done.
-            evaluate: score of a policy. ``n_evaluations`` equally spaced policies, including the last one, are
-                evaluated; the best one is kept with its temperature and optimiser state.
-            n_evaluations: number of evaluations.
+            evaluate: score of a policy. An earlier policy and ``n_evaluations`` equally spaced policies, including the
+                last one, are evaluated; the best one is kept with its temperature and optimiser state.
+            n_evaluations: number of evaluations during the training.
 
         Returns:
             Figures of the last gradient step.
@@ -112,6 +112,8 @@ class SacAgent:
         milestones = [updates * (part + 1) // parts for part in range(parts)]
         self._sac = sac
         try:
+            if earlier is not None:
+                check()
             sac.learn(self._settings.warm_up, log_interval=NEVER)
             sac.gradient_steps = self._settings.updates
             callback = _Milestones(milestones, progress, check)
@@ -142,6 +144,12 @@ class SacAgent:
         sac.set_logger(Logger(None, []))
         env.restore_seed()
         return sac
+
+    @property
+    def observation_size(self) -> int:
+        """Number of features that the policy observes."""
+        assert self._sac is not None
+        return int((self._sac.observation_space.shape or (0,))[0])
 
     def policy(self) -> SacPolicy:
         """The policy that drives: the mean action, without noise."""
@@ -175,8 +183,7 @@ class SacAgent:
     def save(self, folder: Path) -> None:
         """Write networks, temperature and optimiser state into a folder. Raises OSError if the disk is full."""
         assert self._sac is not None
-        (width,) = self._sac.observation_space.shape or (0,)
-        header = {"version": FILE_VERSION, "observation_size": width}
+        header = {"version": FILE_VERSION, "observation_size": self.observation_size}
         write_arrays(folder / AGENT_FILE, header | self._sac.learned_state())
 
     @classmethod

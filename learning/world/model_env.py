@@ -1,13 +1,13 @@
 """A learned car as a vectorised environment of stable-baselines3, with the task of the real car.
 
-Start states are drawn from the task and from recorded states with their past commands. An episode ends after the task's
-ticks, at the task's termination, or when the safety gate would stop a real car; no reward follows.
+Start states of a training are drawn from the task and from recorded states with their past commands. An episode ends
+after the task's ticks, at the task's termination, or when the safety gate would stop a real car; no reward follows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -41,6 +41,14 @@ def policy_spaces(width: int) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     """Spaces of a policy's inputs (width,) and of its actions (2,)."""
     high = np.full(width, MAX_POLICY_INPUT, dtype=np.float32)
     return gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+class Drives(NamedTuple):
+    """Episodes in the learned car, on the CPU: returns (N,), constraint costs (N,) and final features (N, 7 + 2 H)."""
+
+    returns: Tensor
+    costs: Tensor
+    final: Tensor
 
 
 class ModelEnv(VecEnv):
@@ -142,7 +150,7 @@ class ModelEnv(VecEnv):
 
     def roll_out(
         self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]], max_ticks: int | None = None
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Drives:
         """Drive one complete episode of every car by a policy, from start states of the task.
 
         Args:
@@ -150,11 +158,10 @@ class ModelEnv(VecEnv):
             max_ticks: length of the episode; by default that of the task.
 
         Returns:
-            Unscaled return of each episode (cars,) and its final features (cars, 7 + 2 H); both on the CPU.
+            Unscaled return, constraint cost and final features of each episode.
         """
-        share, self._from_recorded = self._from_recorded, 0.0
-        self._start(np.arange(self.num_envs))
-        total = torch.zeros(self.num_envs)
+        self._start(np.arange(self.num_envs), training=False)
+        total, cost = torch.zeros(self.num_envs), torch.zeros(self.num_envs)
         ended = torch.zeros(self.num_envs, dtype=torch.bool)
         last, seen = self._features.cpu().clone(), self._seen()
         with torch.no_grad():
@@ -164,11 +171,11 @@ class ModelEnv(VecEnv):
                 after = self._rollouts.step(before, action, self._generator)
                 here = after.cpu()
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
+                cost += torch.where(ended, 0.0, self._task.cost(here))
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
                 self._features, seen = after, policy_inputs(here.numpy())
-        self._from_recorded = share
-        return total, last
+        return Drives(total, cost, last)
 
     @property
     def features(self) -> Tensor:
@@ -196,11 +203,12 @@ class ModelEnv(VecEnv):
             stopped |= ~can_stop_inside_batch(self._arena_m, state[:, :2], course, needed)
         return stopped
 
-    def _start(self, cars: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Start new episodes of cars (indices); returns their features."""
-        starts = np.array([self._task.sample_start(self._rng).to_array() for _ in cars])
+    def _start(self, cars: NDArray[np.int64], *, training: bool = True) -> NDArray[np.float32]:
+        """Start new episodes of cars (indices), for a training or as on the car; returns their features."""
+        sample = self._task.sample_training_start if training else self._task.sample_start
+        starts = np.array([sample(self._rng).to_array() for _ in cars])
         rows = encode(starts, np.zeros((len(cars), self._model.history, ACTION_SIZE)))
-        use_recorded = self._rng.random(len(cars)) < self._from_recorded
+        use_recorded = self._rng.random(len(cars)) < (self._from_recorded if training else 0.0)
         if use_recorded.any():
             rows[use_recorded] = self._recorded[self._rng.integers(len(self._recorded), size=int(use_recorded.sum()))]
         start_features = torch.from_numpy(rows).float()
@@ -247,4 +255,4 @@ class ModelEnv(VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
 
-__all__ = ["FEATURE_UNITS", "ModelEnv", "policy_inputs", "policy_spaces"]
+__all__ = ["FEATURE_UNITS", "Drives", "ModelEnv", "policy_inputs", "policy_spaces"]

@@ -14,7 +14,7 @@ from carlab.cli.diagnose import Diagnose
 from carlab.cli.drive import Drive
 from carlab.cli.import_ import Import
 from carlab.cli.learn import Learn
-from carlab.cli.options import CarOptions
+from carlab.cli.options import CarOptions, TaskOptions
 from carlab.cli.replay import Replay
 from carlab.recording.column_mapping import CHANNELS, ColumnMapping
 
@@ -29,13 +29,15 @@ CASES = [
     (Check, carlab.check, {"verbose"}),
 ]
 
+GROUPS = {"which_car": CarOptions, "which_task": TaskOptions}
+
 
 def options_of(verb: type) -> dict[str, object]:
-    """Return the options of a verb with their defaults, including the car options."""
+    """Return the options of a verb with their defaults, including those of car and task."""
     found: dict[str, object] = {}
     for option in dataclasses.fields(verb):
-        if option.name == "which_car":
-            found |= options_of(CarOptions)
+        if option.name in GROUPS:
+            found |= options_of(GROUPS[option.name])
         else:
             found[option.name] = option.default
     return found

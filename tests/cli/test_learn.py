@@ -41,9 +41,9 @@ def run_command(*argv: object) -> tuple[int, str]:
 @pytest.fixture(scope="module", autouse=True)
 def one_thread() -> Any:
     """Train with one thread of torch: more threads are slower if other processes compute."""
-    plan = learning._plan
+    plan = learning.training_plan
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "_plan", lambda request, choice: replace(plan(request, choice), threads=1))
+        patch.setattr(learning, "training_plan", lambda request, choice: replace(plan(request, choice), threads=1))
         yield
 
 

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from carlab.core.geofence import contains
+from carlab.core.keep_out import Disc, Polygon
 from carlab.core.observation import ActionHistory, decode_history, decode_state, encode, feature_size
+from carlab.core.path_tasks import LapTask, PathTask, figure_eight_path
 from carlab.core.quantities import Action, CarState
-from carlab.core.task import ParkingTask, PathTask, figure_eight_path
+from carlab.core.task import ObstacleParkingTask, ParkingTask, Task
 
 
 def features_of(states: np.ndarray, history: int = 3) -> np.ndarray:
@@ -51,8 +54,8 @@ def test_parking_reward_is_the_paper_s_closed_form() -> None:
     assert task.reward(features_of(turned), np.zeros((1, 2)), features_of(turned))[0] == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("task", [ParkingTask(), PathTask()], ids=["parking", "path"])
-def test_numpy_and_torch_give_the_same_reward(task: ParkingTask | PathTask, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("task", [ObstacleParkingTask(), PathTask(), LapTask()], ids=lambda task: task.name)
+def test_numpy_and_torch_give_the_same_reward(task: Task, rng: np.random.Generator) -> None:
     before, after = (features_of(rng.uniform(-2, 2, (200, 6))) for _ in range(2))
     action = rng.uniform(-1, 1, (200, 2))
     expected = task.reward(before, action, after)
@@ -60,6 +63,8 @@ def test_numpy_and_torch_give_the_same_reward(task: ParkingTask | PathTask, rng:
     reward = task.reward(*tensors)
     np.testing.assert_allclose(reward.detach().numpy(), expected, atol=1e-12)
     np.testing.assert_array_equal(task.terminated(tensors[2]).numpy(), task.terminated(after))
+    np.testing.assert_allclose(task.cost(tensors[2]).detach().numpy(), task.cost(after), atol=1e-12)
+    assert task.cost(after).max() > 0.0
     reward.sum().backward()
     assert all(torch.isfinite(t.grad).all() for t in tensors if t.grad is not None)
 
@@ -88,14 +93,14 @@ def test_parking_start_matches_its_description(rng: np.random.Generator) -> None
 )
 def test_parked_requires_position_heading_and_speed(final: CarState, parked: bool) -> None:
     task = ParkingTask()
-    assert bool(task.summary(final)["parked"]) is parked
-    assert bool(task.parked(features_of(final.to_array()[None]))[0]) is parked
+    assert bool(task.summary(np.zeros(1), final.to_array()[None])["success"]) is parked
+    assert bool(task.success(features_of(final.to_array()[None]))[0]) is parked
 
 
 def test_progress_along_a_circle_is_its_arc_length() -> None:
     angles = np.linspace(0, 2 * math.pi, 720, endpoint=False)
     circle = tuple((float(np.cos(a)), float(np.sin(a))) for a in angles)
-    task = PathTask(path_m=circle, speed_mps=1.0, period_s=0.1, action_cost=0.0)
+    task = PathTask(points_m=circle, speed_mps=1.0, period_s=0.1, action_cost=0.0)
     states = np.zeros((3, 6))
     for row, angle in enumerate((0.3, 0.4, -0.05)):
         states[row, :2] = np.cos(angle), np.sin(angle)
@@ -118,3 +123,57 @@ def test_crossing_of_the_path_gives_no_extra_progress() -> None:
     step = np.hypot(*(path[middle + 1] - path[middle])) + np.hypot(*(path[middle] - path[middle - 1]))
     reward = task.reward(features[:1], np.zeros((1, 2)), features[1:])[0]
     assert reward == pytest.approx(step / (task.speed_mps * task.period_s), rel=1e-3)
+
+
+def test_cost_behind_obstacles_is_the_kinetic_energy_inside_a_disc() -> None:
+    """1.65 kg at 2 m/s have 3.3 J; two discs overlap at (0.75, -0.35)."""
+    states = np.zeros((4, 6))
+    states[:, :2] = [(0.75, -0.79), (0.75, -0.81), (1.01, 0.65), (0.75, -0.35)]
+    states[:, 3], states[:, 4] = 1.2, 1.6
+    cost = ObstacleParkingTask().cost(features_of(states))
+    np.testing.assert_allclose(cost, [3.3, 0.0, 0.0, 6.6])
+
+
+def test_start_and_goal_of_obstacle_parking_cost_nothing_and_the_straight_line_does(rng: np.random.Generator) -> None:
+    task = ObstacleParkingTask()
+    starts = np.array([task.sample_start(rng).to_array() for _ in range(100)])
+    assert not task.cost(features_of(starts)).any()
+    line = np.linspace([1.42, -1.04, 0, 1, 0, 0], [0, 0, 0, 1, 0, 0], 50)
+    assert task.cost(features_of(line)).max() > 0.5
+
+
+def test_training_starts_of_obstacle_parking_are_outside_the_discs(rng: np.random.Generator) -> None:
+    task = ObstacleParkingTask()
+    states = np.array([task.sample_training_start(rng).to_array() for _ in range(300)])
+    x, y = states[:, 0], states[:, 1]
+    assert min(np.hypot(x - 0.75, y - c).min() for c in (-0.55, -0.15, 0.25, 0.65)) >= 0.25
+    assert (x.min(), x.max(), y.min(), y.max()) == pytest.approx((-1.0, 2.4, -2.2, 1.1), abs=0.1)
+    assert np.abs(states[:, 2]).max() > 2.8
+
+
+def test_polygon_contains_the_points_that_the_geofence_contains(rng: np.random.Generator) -> None:
+    corners = ((-1.0, -1.5), (2.0, -1.5), (2.0, 0.5), (0.5, 0.5), (0.5, -0.5), (-1.0, -0.5))
+    points = rng.uniform(-2.5, 2.5, (400, 2))
+    expected = [contains(corners, float(x), float(y)) for x, y in points]
+    assert 50 < sum(expected) < 350
+    assert Polygon(corners).contains(points).tolist() == expected
+    assert Polygon(corners).contains(torch.from_numpy(points)).tolist() == expected
+    radii = np.hypot(*(points - [0.3, 0.4]).T)
+    np.testing.assert_array_equal(Disc(0.3, 0.4, 1.0).contains(points), radii < 1.0)
+
+
+def test_default_cost_counts_the_shapes_that_are_entered() -> None:
+    class Field(Task):
+        keep_out = (Disc(0.0, 0.0, 1.0), Polygon(((0.0, -1.0), (2.0, -1.0), (2.0, 1.0), (0.0, 1.0))))
+
+        def sample_start(self, rng: np.random.Generator) -> CarState:
+            return CarState(-2.0)
+
+        def reward(self, features: np.ndarray, action: np.ndarray, next_features: np.ndarray) -> np.ndarray:
+            return next_features[..., 0]
+
+    states = np.zeros((4, 6))
+    states[:, 0] = [-2.0, -0.5, 0.5, 1.5]
+    assert Field().cost(features_of(states)).tolist() == [0.0, 1.0, 2.0, 1.0]
+    assert Field().has_constraint
+    assert not ParkingTask().has_constraint

@@ -142,7 +142,7 @@ def test_learning_curve_has_the_figures_of_the_recordings(interrupted: Interrupt
         assert row["distance_m"] == pytest.approx(np.hypot(x, y))
         assert row["yaw_error_rad"] == pytest.approx(abs(np.angle(np.exp(1j * yaw))))
         assert row["speed_mps"] == pytest.approx(np.hypot(vx, vy))
-        assert row["parked"] is False
+        assert row["success"] is False
         assert row["end"] == episode.metadata["end_reason"] == "COMPLETED"
         assert row["predicted_return"] == training_figures["predicted_return"]
         assert row["predicted_low"] < row["predicted_return"] < row["predicted_high"]

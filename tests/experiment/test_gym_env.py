@@ -59,7 +59,7 @@ def test_parking_episode_has_100_steps_and_reports_its_end() -> None:
         assert not terminated
         assert truncated == (step == 99)
     assert info["end_reason"] == "COMPLETED"
-    assert set(info["summary"]) == {"distance_m", "yaw_error_rad", "speed_mps", "parked"}
+    assert set(info["summary"]) == {"distance_m", "yaw_error_rad", "speed_mps", "success"}
     env.close()
 
 

@@ -99,21 +99,24 @@ def test_learning_curve_rows_are_read_with_and_without_a_check(tmp_path: Path) -
     assert content["episodes"][1]["excess_std"] is None
 
 
-def test_rows_of_schema_version_1_are_read_under_their_new_names(tmp_path: Path) -> None:
+def test_rows_of_earlier_schemas_are_read_under_their_new_names(tmp_path: Path) -> None:
     run = make_run(tmp_path, SIMULATOR, 0)
-    row = replace(ROW, predicted_return=31.5, verdict="left").to_dict()
+    row = replace(ROW, predicted_return=31.5, verdict="left", success=True).to_dict()
     assert row["distance_m"] == ROW.distance_m
     row["foretold"], row["reality"] = row.pop("predicted_return"), row.pop("verdict")
+    row["parked"] = row.pop("success")
+    for added in ("task_figures", "cost", "violations", "predicted_cost", "outcome"):
+        del row[added]
     (run.path / "learn.json").write_text(json.dumps({"schema": "carlab.learn/1", "episodes": [row]}))
     (read,) = learning_curve(run)
-    assert (read.predicted_return, read.verdict) == (31.5, "left")
+    assert (read.predicted_return, read.verdict, read.success) == (31.5, "left", True)
     save_row(run, replace(ROW, episode=ROW.episode + 1))
     content = json.loads((run.path / "learn.json").read_text())
-    assert content["schema"] == "carlab.learn/2"
+    assert content["schema"] == "carlab.learn/3"
     assert content["episodes"][0]["predicted_return"] == 31.5
 
 
-@pytest.mark.parametrize("changed", [{"distance_m": "far"}, {"episode": [1]}, {"unknown": 1.0}])
+@pytest.mark.parametrize("changed", [{"distance_m": "far"}, {"episode": [1]}, {"unknown": 1.0}, {"task_figures": [1]}])
 def test_malformed_row_is_refused_in_one_sentence(tmp_path: Path, changed: dict[str, object]) -> None:
     run = make_run(tmp_path, SIMULATOR, 0)
     (run.path / "learn.json").write_text(json.dumps({"episodes": [{**ROW.to_dict(), **changed}]}))

@@ -20,7 +20,7 @@ from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
 from carlab.core.quantities import CarState
 from carlab.experiment.campaign import training
-from carlab.experiment.campaign.training import PARKED_BONUS, TrainingPlan, train
+from carlab.experiment.campaign.training import SUCCESS_BONUS, TrainingPlan, train
 from carlab.experiment.campaign.training_process import train_in_subprocess
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
@@ -142,7 +142,7 @@ def test_model_env_has_a_larger_stopping_margin_and_a_parking_bonus(
     training_env, evaluation_env = envs
     features = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
     assert training_env._bonus is not None
-    assert training_env._bonus(features).tolist() == pytest.approx([PARKED_BONUS, 0.0])
+    assert training_env._bonus(features).tolist() == pytest.approx([SUCCESS_BONUS, 0.0])
     assert evaluation_env._bonus is None, "the predicted return is the task's reward alone"
 
 

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import feature_size
-from carlab.core.task import ParkingTask, PathTask
+from carlab.core.path_tasks import LapTask
+from carlab.core.task import ObstacleParkingTask
 from carlab.studies.regression.methods import METHODS, Way
 from carlab.studies.regression.study import run_study
 from learning.baselines import system_identification
@@ -289,11 +290,11 @@ def random_car(device: str) -> CarDynamics:
     return CarDynamics(ParticlePosterior(network, numbers, torch.full((6,), 0.1), units, 3.0).to(device), HISTORY)
 
 
-TASKS = [ParkingTask(history_length=HISTORY, max_ticks=6), PathTask(history_length=HISTORY, max_ticks=6)]
+TASKS = [ObstacleParkingTask(history_length=HISTORY, max_ticks=6), LapTask(history_length=HISTORY, max_ticks=6)]
 
 
 @pytest.mark.parametrize("task", TASKS, ids=lambda t: t.name)
-def test_model_env_is_equal_on_the_device(device: str, task: ParkingTask | PathTask) -> None:
+def test_model_env_is_equal_on_the_device(device: str, task: ObstacleParkingTask | LapTask) -> None:
     recorded = np.random.default_rng(0).normal(size=(9, feature_size(HISTORY)))
     commands = np.random.default_rng(1).uniform(-1.0, 1.0, (12, 16, 2)).astype(np.float32)
     on_device, on_cpu = (ModelEnv(random_car(at), task, 16, recorded=recorded, device=at) for at in (device, "cpu"))

@@ -249,7 +249,7 @@ def test_rollout_sums_rewards_of_each_car_until_its_episode_ends() -> None:
         views.append(observations.copy())
         return commands
 
-    total, last = env.roll_out(act)
+    total, _, last = env.roll_out(act)
     assert len(views) == 60
     assert views[0].shape == (12, WIDTH)
     lengths = []
@@ -274,10 +274,33 @@ def test_rollout_ends_for_a_parked_car() -> None:
         TASK, start_pose=(0.1, 0.0, 0.0), start_spread=(0, 0, 0), start_velocity_std=(0, 0, 0), max_ticks=9,
         stop_when_parked=True,
     )  # fmt: skip
-    total, _ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
+    total, *_ = ModelEnv(StationaryCar(), task, 3).roll_out(lambda observations: np.zeros((3, 2), np.float32))
     assert total.tolist() == pytest.approx([1.0] * 3), "one rewarded tick"
-    total, _ = ModelEnv(StationaryCar(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
+    total, *_ = ModelEnv(StationaryCar(), replace(task, stop_when_parked=False), 3).roll_out(lambda s: np.zeros((3, 2)))
     assert total.tolist() == pytest.approx([9.0] * 3)
+
+
+@dataclass(frozen=True)
+class OtherTrainingStart(ParkingTask):
+    """Starts of a training lie at (-1, 0); the x coordinate costs."""
+
+    history_length: int = HISTORY
+    max_ticks: int = 5
+
+    def sample_training_start(self, rng: np.random.Generator) -> CarState:
+        return CarState(-1.0)
+
+    def cost(self, next_features: Tensor) -> Tensor:
+        return next_features[..., 0]
+
+
+def test_rollouts_start_as_the_car_does_and_sum_the_constraint_cost() -> None:
+    env = ModelEnv(StationaryCar(), OtherTrainingStart(), 8, seed=0)
+    env.reset()
+    assert env.features[:, 0].tolist() == [-1.0] * 8
+    drives = env.roll_out(lambda observations: np.zeros((8, 2), np.float32))
+    assert drives.final[:, 0].min() > 1.3
+    torch.testing.assert_close(drives.costs, 5.0 * drives.final[:, 0])
 
 
 def test_equal_seeds_give_equal_starts() -> None:

@@ -75,7 +75,7 @@ def test_training_finds_the_known_optimal_policy(trained: SacAgent) -> None:
     steering, throttle = actions_of(trained).T
     assert np.all(steering < -0.8)
     assert np.all(throttle * np.sign(X_M) > 0.3)
-    total, _ = world(64, seed=3).roll_out(trained.act)
+    total, *_ = world(64, seed=3).roll_out(trained.act)
     assert float(total.mean()) > 15.0, "the maximum return of ten ticks is 20"
 
 
@@ -134,6 +134,15 @@ def test_policy_with_the_best_evaluation_is_restored(
     assert {"log_temperature", "actor/square", "critics/steps"} < restored.keys()
     for name, value in best.items():
         np.testing.assert_array_equal(restored[name], value)
+
+
+def test_earlier_policy_is_kept_if_the_training_makes_it_worse() -> None:
+    agent = SacAgent(SMALL, 0)
+    agent.train(world(16), 64)
+    before = actions_of(agent)
+    scores = iter((5.0, 4.0, 3.0))
+    agent.train(world(16), 64, evaluate=lambda agent: next(scores), n_evaluations=2)
+    np.testing.assert_array_equal(actions_of(agent), before)
 
 
 def test_loaded_agent_trains_bit_identically(tmp_path: Path) -> None:

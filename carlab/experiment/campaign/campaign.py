@@ -47,7 +47,9 @@ from learning.policy.sac_agent import SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
 
 CAMPAIGN_FILE = "campaign.json"
-CONTINUE_REASONS = frozenset({EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.GEOFENCE, EndReason.OVERSPEED})
+CONTINUE_REASONS = frozenset(
+    {EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.TASK_ENDED, EndReason.GEOFENCE, EndReason.OVERSPEED}
+)
 """End reasons after which the run continues; an untrained policy may leave the arena."""
 PAPER_HISTORY = 3
 STOPPED = frozenset({EndReason.STOP_REQUESTED, EndReason.LOOP_HUNG})
@@ -181,7 +183,7 @@ class Campaign:
             continues = self._may_continue(result.reason)
             if continues and result.reason.is_safety_stop:
                 self.choice.car.reset_fault()
-            self.hooks.on_figures(figures_of(result, training_figures(self.run, done + 1)))
+            self.hooks.on_figures(figures_of(result, training_figures(self.run, done + 1), self.plan.task))
             self._check()
             yield result
             if not continues:
@@ -317,6 +319,16 @@ def saved_seed(folder: Path) -> int | None:
         return None
 
 
+def saved_plan(folder: Path) -> TrainingPlan:
+    """The plan of a run, without the file of a user's task. Raises DataError if the folder is not a campaign."""
+    try:
+        plan = plan_from_json(json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"])
+        SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
+        return plan
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{folder} is not the folder of a run of carlab learn ({CAMPAIGN_FILE}: {error}).") from error
+
+
 def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device: str | None = None) -> Campaign:
     """Resume a run with its saved settings, optionally on another device. Raises DataError if it is not a campaign."""
     path = run.path / CAMPAIGN_FILE
@@ -347,5 +359,6 @@ __all__ = [
     "check_same_car",
     "prior_simulator",
     "resumed_campaign",
+    "saved_plan",
     "saved_seed",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import decode_state
 from carlab.core.quantities import FloatArray
+from carlab.core.task import Task
 from carlab.experiment.campaign.quick_check import QuickCheck
 from carlab.experiment.episodes.session import EpisodeResult
 from carlab.prediction.learned import sample_paths
@@ -23,8 +24,10 @@ from learning.world.model_env import policy_inputs
 HORIZON_S = 1.0
 STRICT_POSITION_M, STRICT_YAW_RAD = 0.05, 0.2
 """Maximum errors of the final pose in a successful episode, by the criterion of the authors of Sim-FSVGD."""
-_RENAMED_KEYS = {"foretold": "predicted_return", "reality": "verdict"}
-"""Keys of learn.json, version 1, that version 2 renames."""
+_RENAMED_KEYS = {"foretold": "predicted_return", "reality": "verdict", "parked": "success"}
+"""Keys of learn.json, versions 1 and 2, that version 3 renames."""
+_SUMMARY_FIELDS = ("distance_m", "yaw_error_rad", "speed_mps", "cost", "violations")
+"""Figures of a summary that are fields of a row."""
 _TYPES: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "bool": bool, "str": str}
 
 
@@ -36,8 +39,8 @@ class EpisodeFigures:
         episode: from 1.
         total_reward: return on the car.
         predicted_return: median return of the same policy in plausible cars (``predicted_return.py``).
-        parked: whether the car ended within 0.2 m and 0.35 rad of the goal and slower than 0.3 m/s (``ParkingTask``).
-        distance_m, yaw_error_rad, speed_mps: errors of the final pose, and the final speed.
+        success: whether the task was fulfilled; parking: within 0.2 m and 0.35 rad of the goal, slower than 0.3 m/s.
+        distance_m, yaw_error_rad, speed_mps: errors of the final pose, and the final speed; NaN if the task has none.
         rows: number of recorded transitions that the model was fitted to.
         last_episode_nll: negative log-likelihood of the previous episode under the model fitted before it [nat per
             step]; NaN for the first.
@@ -52,12 +55,17 @@ class EpisodeFigures:
         diagnosis: messages of the quick check.
         predicted_low, predicted_high: interval that contains the return with a probability of 90 %; NaN if unknown.
         prior_change: what changed in the simulator prior before the episode, and why; empty without repair.
+        outcome: result of the episode in the words of the task.
+        cost: sum of the constraint cost; NaN for a task without a constraint.
+        violations: ticks with a constraint cost; NaN for a task without a constraint.
+        predicted_cost: mean cost of the same policy in the learned car.
+        task_figures: other figures of the task, by name with unit.
     """
 
     episode: int
     total_reward: float
     predicted_return: float
-    parked: bool
+    success: bool
     distance_m: float
     yaw_error_rad: float
     speed_mps: float
@@ -75,10 +83,16 @@ class EpisodeFigures:
     predicted_low: float = float("nan")
     predicted_high: float = float("nan")
     prior_change: str = ""
+    outcome: str = ""
+    cost: float = float("nan")
+    violations: float = float("nan")
+    predicted_cost: float = float("nan")
+    task_figures: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Values for a JSON file; NaN becomes null."""
-        return {k: None if isinstance(v, float) and v != v else v for k, v in asdict(self).items()}
+        row = asdict(self)
+        return _with_null({**row, "task_figures": _with_null(row["task_figures"])})
 
     def with_check(self, check: QuickCheck) -> EpisodeFigures:
         """Copy with the result of a quick check."""
@@ -88,8 +102,9 @@ class EpisodeFigures:
     @classmethod
     def from_dict(cls, row: Mapping[str, Any]) -> EpisodeFigures:
         """Read the output of ``to_dict`` of any version. Raises TypeError or ValueError for other content."""
-        values: dict[str, Any] = {_RENAMED_KEYS.get(k, k): float("nan") if v is None else v for k, v in row.items()}
-        types = {f.name: _TYPES[str(f.type)] for f in fields(cls)}
+        values = {_RENAMED_KEYS.get(k, k): v for k, v in _with_nan(row).items()}
+        values["task_figures"] = {k: float(v) for k, v in _with_nan(values.get("task_figures", {})).items()}
+        types = {f.name: _TYPES[str(f.type)] for f in fields(cls) if str(f.type) in _TYPES}
         return cls(**{k: types[k](v) if k in types else v for k, v in values.items()})
 
     @property
@@ -98,14 +113,24 @@ class EpisodeFigures:
         return self.distance_m < STRICT_POSITION_M and self.yaw_error_rad < STRICT_YAW_RAD
 
 
-def figures_of(result: EpisodeResult, training: Mapping[str, Any]) -> EpisodeFigures:
+def _with_null(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: None if isinstance(v, float) and v != v else v for k, v in row.items()}
+
+
+def _with_nan(row: Mapping[str, Any]) -> dict[str, Any]:
+    if not isinstance(row, Mapping):
+        raise TypeError(f"{row!r} is not an object")
+    return {k: float("nan") if v is None else v for k, v in row.items()}
+
+
+def figures_of(result: EpisodeResult, training: Mapping[str, Any], task: Task) -> EpisodeFigures:
     """Combine the result of an episode with the figures of the training before it."""
-    summary = result.summary
+    summary = {**dict.fromkeys(_SUMMARY_FIELDS, float("nan")), **result.summary}
     return EpisodeFigures(
         episode=int(training["episode"]),
         total_reward=result.total_reward,
         predicted_return=float(training.get("predicted_return", training["return_in_model"])),
-        parked=bool(summary["parked"]),
+        success=bool(summary["success"]),
         distance_m=summary["distance_m"],
         yaw_error_rad=summary["yaw_error_rad"],
         speed_mps=summary["speed_mps"],
@@ -119,6 +144,11 @@ def figures_of(result: EpisodeResult, training: Mapping[str, Any]) -> EpisodeFig
         predicted_low=float(training.get("predicted_low", float("nan"))),
         predicted_high=float(training.get("predicted_high", float("nan"))),
         prior_change=str(training.get("prior_change", "")),
+        outcome=task.outcome(summary),
+        cost=summary["cost"],
+        violations=summary["violations"],
+        predicted_cost=float(training.get("cost_in_model", float("nan"))),
+        task_figures={k: float(v) for k, v in summary.items() if k not in (*_SUMMARY_FIELDS, "success")},
     )
 
 

@@ -12,8 +12,9 @@ import numpy as np
 
 from carlab.core.angles import align_unwrapped
 from carlab.core.episode_data import EpisodeData
+from carlab.core.observation import episode_features
 from carlab.core.quantities import STATE_NAMES
-from carlab.core.task import ParkingTask
+from carlab.core.task import Task
 from carlab.experiment.campaign.figures import EpisodeFigures, WindowPredictions
 
 CAR_M = (0.3, 0.16)
@@ -28,7 +29,7 @@ class Curve:
     title: str
     series: Mapping[str, str]
     colors: Mapping[str, str]
-    marks_parked: bool = False
+    marks_success: bool = False
 
 
 CURVES = (
@@ -36,7 +37,7 @@ CURVES = (
         "Return",
         {"total_reward": "on the car", "predicted_return": "in the learned car"},
         {"total_reward": "tab:blue", "predicted_return": "tab:orange"},
-        marks_parked=True,
+        marks_success=True,
     ),
     Curve("Distance from the goal at the end [m]", {"distance_m": "distance"}, {"distance_m": "tab:gray"}),
     Curve(
@@ -52,7 +53,7 @@ def draw(
     number: int,
     episode: EpisodeData,
     predictions: WindowPredictions,
-    task: ParkingTask,
+    task: Task,
     path: Path,
 ) -> None:
     """Write a PNG.
@@ -93,7 +94,7 @@ def _has_data(rows: Sequence[EpisodeFigures], curve: Curve) -> bool:
 
 
 def _curve(axis: Any, rows: Sequence[EpisodeFigures], curve: Curve) -> None:
-    """Plot figures over the episodes; stars mark parked ones."""
+    """Plot figures over the episodes; stars mark successful ones."""
     from matplotlib.ticker import MaxNLocator
 
     numbers = [row.episode for row in rows]
@@ -101,10 +102,10 @@ def _curve(axis: Any, rows: Sequence[EpisodeFigures], curve: Curve) -> None:
     for name, label in curve.series.items():
         style = {"marker": "o"} if name == first else {"marker": ".", "linestyle": "--"}
         axis.plot(numbers, [getattr(row, name) for row in rows], color=curve.colors[name], label=label, **style)
-    parked = [row for row in rows if row.parked]
-    if parked and curve.marks_parked:
-        values = [getattr(row, first) for row in parked]
-        axis.plot([row.episode for row in parked], values, "*", color="tab:green", markersize=14, label="parked")
+    successful = [row for row in rows if row.success]
+    if successful and curve.marks_success:
+        values = [getattr(row, first) for row in successful]
+        axis.plot([row.episode for row in successful], values, "*", color="tab:green", markersize=14, label="success")
     axis.set_title(curve.title, fontsize=10)
     axis.set(xlabel="episode", xlim=(numbers[0] - 0.5, numbers[-1] + 0.5))
     axis.grid(alpha=0.3)
@@ -118,7 +119,7 @@ def _legend_below(axis: Any) -> None:
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, fontsize=8, frameon=False)
 
 
-def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task: ParkingTask) -> None:
+def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task: Task) -> None:
     from matplotlib.patches import Ellipse, Polygon
 
     axis.plot(*episode.states[:, :2].T, color="black", linewidth=1.5, label="driven")
@@ -126,12 +127,16 @@ def _plan(axis: Any, episode: EpisodeData, predictions: WindowPredictions, task:
         axis.plot(mean[:, 0], mean[:, 1], color="tab:orange", linewidth=1.2, label="predicted" if k == 0 else None)
         width, height = 4.0 * std[-1, :2]
         axis.add_patch(Ellipse((mean[-1, 0], mean[-1, 1]), width, height, alpha=0.25, color="tab:orange", linewidth=0))
-    for pose, colour in ((task.goal_pose, "tab:green"), (tuple(episode.states[-1, :3]), "tab:blue")):
-        axis.add_patch(Polygon(_outline(pose), fill=False, edgecolor=colour, linewidth=2))
-    axis.plot([], [], color="tab:green", label="goal")
-    axis.plot([], [], color="tab:blue", label="end")
-    corners = np.array([*task.arena_m, task.arena_m[0]])
-    axis.plot(*corners.T, color="tab:red", linewidth=0.8, alpha=0.5)
+    for name, pose, colour in (("goal", task.goal, "tab:green"), ("end", tuple(episode.states[-1, :3]), "tab:blue")):
+        if pose is not None:
+            axis.add_patch(Polygon(_outline(pose), fill=False, edgecolor=colour, linewidth=2))
+            axis.plot([], [], color=colour, label=name)
+    for outline in (*([task.arena_m] if task.arena_m else []), *task.outlines_m):
+        axis.plot(*np.array([*outline, outline[0]]).T, color="tab:red", linewidth=0.8, alpha=0.5)
+    if task.has_constraint:
+        features = episode_features(episode.states, episode.sent, task.history_length)[1:]
+        violating = episode.states[1:][np.asarray(task.cost(features)) > 0.0]
+        axis.plot(*violating[:, :2].T, "x", color="tab:red", label="violation")
     axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     _legend_below(axis)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from carlab.core.episode_data import EpisodeData
@@ -29,8 +28,8 @@ N_DRAWN, N_SELECTED = 512, 64
 INTERVAL = (0.05, 0.95)
 MORE_TICKS = (1.5, 2.0, 3.0)
 """Lengths of longer drives in the learned car, in lengths of an episode."""
-ENOUGH_PARKED = 0.5
-"""Share of drives in the learned car that must park for the length of a drive to count as sufficient."""
+ENOUGH_SUCCESS = 0.5
+"""Share of drives in the learned car that must succeed for the length of a drive to count as sufficient."""
 
 
 def predicted_figures(
@@ -55,16 +54,16 @@ def predicted_figures(
 
     from learning.world import drawn_cars, model_env
 
-    totals = [learned.roll_out(agent.act)[0]]
+    totals = [learned.roll_out(agent.act).returns]
     prior = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
     if plan.method == "sim-fsvgd":
         cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed))
         cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)
-        task = replace(plan.task, history_length=drawn_cars.HISTORY)
+        task = plan.task.resized(drawn_cars.HISTORY)
         world = model_env.ModelEnv(
             cars, task, N_SELECTED, envelope=envelope, period_s=prior.control_period_s, seed=seed
         )
-        totals.append(world.roll_out(lambda seen: agent.act(_own_features(seen, plan.history)))[0])
+        totals.append(world.roll_out(lambda seen: agent.act(_own_features(seen, plan.history))).returns)
     low, high = torch.cat(totals).quantile(torch.tensor(INTERVAL)).tolist()
     return {
         "predicted_return": float(torch.cat(totals).median()),
@@ -87,8 +86,8 @@ def _sufficient_ticks(plan: TrainingPlan, agent: SacAgent, learned: ModelEnv) ->
     ticks = plan.task.max_ticks
     for factor in (1.0, *MORE_TICKS):
         length = round(factor * ticks)
-        _, ends = learned.roll_out(agent.act, max_ticks=length)
-        if float(plan.task.parked(ends).float().mean()) >= ENOUGH_PARKED:
+        ends = learned.roll_out(agent.act, max_ticks=length).final
+        if float(plan.task.success(ends).float().mean()) >= ENOUGH_SUCCESS:
             return {} if length == ticks else {"needed_ticks": length}
     return {}
 

@@ -6,7 +6,7 @@ import json
 import logging
 
 from carlab.core.errors import DataError
-from carlab.core.task import ParkingTask
+from carlab.core.task import Task
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.picture import draw
 from carlab.experiment.campaign.quick_check import QuickCheck
@@ -23,7 +23,7 @@ PICTURE_FILE = "learn.png"
 
 
 def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
-    """Read the rows of learn.json, version 1 or 2. Raises DataError if the file is invalid."""
+    """Read the rows of learn.json, version 1 to 3. Raises DataError if the file is invalid."""
     path = run.path / CURVE_FILE
     if not path.is_file():
         return []
@@ -36,11 +36,11 @@ def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
 def save_row(run: RunDirectory, row: EpisodeFigures) -> list[EpisodeFigures]:
     """Add or replace the row of an episode in learn.json; returns all rows."""
     rows = sorted([r for r in learning_curve(run) if r.episode != row.episode] + [row], key=lambda r: r.episode)
-    run.write_json(CURVE_FILE, {"schema": "carlab.learn/2", "episodes": [r.to_dict() for r in rows]})
+    run.write_json(CURVE_FILE, {"schema": "carlab.learn/3", "episodes": [r.to_dict() for r in rows]})
     return rows
 
 
-def restore_missing_rows(run: RunDirectory, task: ParkingTask) -> None:
+def restore_missing_rows(run: RunDirectory, task: Task) -> None:
     """Restore the missing rows of recorded episodes: the program ended between their last tick and ``save_row``."""
     known = {row.episode for row in learning_curve(run)}
     for number, path in enumerate(run.recordings(), start=1):
@@ -48,7 +48,7 @@ def restore_missing_rows(run: RunDirectory, task: ParkingTask) -> None:
             continue
         try:
             training = training_figures(run, number)
-            save_row(run, figures_of(result_of(number, read_episode(path), task, path), training))
+            save_row(run, figures_of(result_of(number, read_episode(path), task, path), training, task))
         except (DataError, OSError, ValueError, KeyError) as error:
             log.warning("The row of episode %d in %s cannot be restored: %s", number, CURVE_FILE, error)
 

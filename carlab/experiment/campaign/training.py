@@ -19,11 +19,12 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.documents import EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError, DivergedError
-from carlab.core.observation import encode, feature_size
+from carlab.core.observation import episode_features, feature_size
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.state_estimator import StateEstimator
-from carlab.core.task import ParkingTask
+from carlab.core.task import Task
+from carlab.core.task_choice import PARKING, TaskChoice
 from carlab.experiment.campaign.predicted_return import predicted_figures
 from carlab.experiment.campaign.prior_process import read_version
 from carlab.recording.episode_builder import VELOCITY_DELAY
@@ -46,9 +47,9 @@ DYNAMICS_FILE = "dynamics.pt"
 FIGURES_FILE = "training.json"
 PRIOR_FILE = "prior.toml"
 N_EVALUATION_CARS = 64
-PARKED_BONUS, PARKED_SCORE = 0.3, 10.0
-"""Reward for each tick at which the learned car is parked, additional to the task's reward; and score of a policy that
-always parks, additional to its return. The paper's reward decreases by only 2 % at 0.2 m from the goal."""
+SUCCESS_BONUS, SUCCESS_SCORE = 0.3, 10.0
+"""Reward for each tick with success in the learned car, additional to the task's reward; and score of a policy that
+always succeeds, additional to its return. The paper's parking reward decreases by only 2 % at 0.2 m from the goal."""
 EXTRA_REACTION_S = 0.12
 """Additional reaction time of the learned car's safety gate: a margin of 0.24 m at 2 m/s to the gate of the car."""
 EPISODES_BEFORE_HISTORY_CHOICE = 3
@@ -74,6 +75,7 @@ class TrainingPlan:
         seed: seed of all random numbers.
         threads: number of threads of torch.
         device: device of the training; the policy drives on the CPU.
+        task_choice: the task.
     """
 
     prior_toml: str
@@ -85,12 +87,12 @@ class TrainingPlan:
     seed: int = 0
     threads: int = 1
     device: str = "cpu"
+    task_choice: TaskChoice = PARKING
 
     @property
-    def task(self) -> ParkingTask:
+    def task(self) -> Task:
         """The task with the history of the model and the ticks of this run."""
-        task = ParkingTask(history_length=self.history)
-        return task if self.ticks is None else replace(task, max_ticks=self.ticks)
+        return self.task_choice.load().resized(self.history, self.ticks)
 
     def updates_before(self, episode: int) -> int:
         """Gradient steps of SAC before an episode: 1.5 times ``updates`` before the first, 3 / episode after the third.
@@ -219,8 +221,8 @@ def _worlds(
     recorded = recorded_features(episodes, plan.history) if episodes else None
 
     def bonus(features: Tensor) -> Tensor:
-        parked: Tensor = PARKED_BONUS * task.parked(features).to(features)
-        return parked
+        value: Tensor = SUCCESS_BONUS * task.success(features).to(features)
+        return value - task.cost_weight * task.cost(features) if task.has_constraint else value
 
     training = model_env.ModelEnv(dynamics, task, SacSettings().cars, recorded=recorded, bonus=bonus, seed=seed, **gate)
     return training, model_env.ModelEnv(dynamics, task, N_EVALUATION_CARS, seed=seed + 1, **gate)
@@ -245,8 +247,9 @@ def _trained_policy(
     figures: dict[str, Any] = {}
 
     def evaluate(candidate: SacAgent) -> float:
-        total, ends = evaluation.roll_out(candidate.act)
-        return float(total.mean() + PARKED_SCORE * task.parked(ends).float().mean())
+        drives = evaluation.roll_out(candidate.act)
+        success = SUCCESS_SCORE * task.success(drives.final).float().mean()
+        return float((drives.returns - task.cost_weight * drives.costs).mean() + success)
 
     def trained(rate_factor: float) -> SacAgent:
         settings = replace(sac, learning_rate=rate_factor * sac.learning_rate)
@@ -259,9 +262,10 @@ def _trained_policy(
         return agent
 
     agent = _with_smaller_steps(trained, "policy")
-    total, ends = evaluation.roll_out(agent.act)
-    figures |= {"updates": updates, "return_in_model": float(total.mean())}
-    return agent, figures | {"parked_in_model": float(task.parked(ends).float().mean())}
+    drives = evaluation.roll_out(agent.act)
+    figures |= {"updates": updates, "return_in_model": float(drives.returns.mean())}
+    figures |= {"cost_in_model": float(drives.costs.mean())} if task.has_constraint else {}
+    return agent, figures | {"success_in_model": float(task.success(drives.final).float().mean())}
 
 
 def _fitted(
@@ -340,12 +344,9 @@ def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
     """Features (R, 7 + 2 H) of recorded states with the H commands before each."""
     import numpy as np
 
-    found = []
-    for episode in episodes:
-        rows = np.arange(history, episode.ticks)
-        found.append(encode(episode.states[rows], episode.sent[rows[:, None] - np.arange(history, 0, -1)]))
-    features: FloatArray = np.concatenate(found)
-    return features[np.isfinite(features).all(axis=1)]
+    features = np.concatenate([episode_features(e.states, e.sent, history)[history : e.ticks] for e in episodes])
+    finite: FloatArray = features[np.isfinite(features).all(axis=1)]
+    return finite
 
 
 def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None]) -> None:
@@ -363,13 +364,18 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
 
 
 def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
-    """The plan as values for a JSON file."""
-    return asdict(plan)
+    """The plan as values for a JSON file; of a user's task only the name and the hash of its file."""
+    return {**asdict(replace(plan, task_choice=PARKING)), "task_choice": plan.task_choice.to_table()}
 
 
 def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
-    """Read the output of ``plan_as_json``. Raises TypeError or ValueError for wrong names, types or ranges."""
-    plan = TrainingPlan(**content)
+    """Read the output of ``plan_as_json``; runs no code.
+
+    Raises:
+        KeyError, TypeError, ValueError: wrong names, types or ranges.
+    """
+    task_choice = TaskChoice.from_table(content["task_choice"]) if "task_choice" in content else PARKING
+    plan = TrainingPlan(**{**content, "task_choice": task_choice})
     if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
         raise ValueError("prior, method or device of the plan")
     for name, minimum in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():

@@ -8,6 +8,7 @@ observe ──> encode ──> policy ──> SafeCar (the gate) ──> Car.com
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import math
 from collections import deque
@@ -170,7 +171,7 @@ def run_episode(
         episode=episode, t_s=car.clock.now_s(), wall_ns=wall_clock_ns(), car=car.name, reality=car.reality,
         policy=policy.name, task=task.name, seed=seed, period_s=period_s, history_length=task.history_length,
         goal=task.goal, arena_m=envelope.arena_m, path_m=task.path_m, config_toml=config_toml,
-        metadata=dict(metadata or {}),
+        metadata={**(metadata or {}), **_outlines_text(task)},
     ))  # fmt: skip
     reason, detail = EndReason.CRASHED, ""
     try:
@@ -189,6 +190,10 @@ def run_episode(
         _stop(safe, pacer, rows, hooks, reason, detail)
     origin = {"car": car.name, "reality": car.reality.value, "policy": policy.name, "task": task.name}
     return rows.finish({**origin, "seed": str(seed), **(metadata or {}), **_end_texts(reason, detail)})
+
+
+def _outlines_text(task: Task) -> dict[str, str]:
+    return {"outlines_m": json.dumps(task.outlines_m)} if task.outlines_m else {}
 
 
 def _end_texts(reason: EndReason, detail: str) -> dict[str, str]:
@@ -236,7 +241,7 @@ def _drive(
         hooks.emit(Transition(step, now_s, features, sent, reward, next_features, terminated, truncated))
         features = next_features
         if terminated:
-            return EndReason.GOAL_REACHED if task.goal is not None else EndReason.COMPLETED
+            return EndReason.GOAL_REACHED if bool(task.success(next_features)) else EndReason.TASK_ENDED
         if late.add(timing):
             raise _End(EndReason.LATE_LOOP, f"{pacer.skipped} ticks were skipped.")
     return EndReason.COMPLETED

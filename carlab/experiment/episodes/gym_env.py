@@ -1,6 +1,6 @@
 """A simulated car and a task as a Gymnasium environment, with the observation and reward of real episodes.
 
-``carlab.experiment.episodes.gym_registration`` registers ``carlab/Parking-v0`` and ``carlab/Path-v0``. The observation
+``carlab.experiment.episodes.gym_registration`` registers ``carlab/Parking-v0`` and the other tasks. The observation
 holds the last H actions, oldest first, as in Rothfuss et al., arXiv 2403.16644.
 """
 
@@ -20,8 +20,9 @@ from carlab.core.errors import ConfigError
 from carlab.core.geofence import contains
 from carlab.core.observation import STATE_FEATURES, ActionHistory, encode, feature_size
 from carlab.core.outcome import EndReason
-from carlab.core.quantities import Action, Observation, Reality
-from carlab.core.task import TASKS, Task
+from carlab.core.quantities import Action, FloatArray, Observation, Reality
+from carlab.core.task import Task
+from carlab.core.task_choice import TASKS
 
 # Bounds of the observation space, beyond the range of a car of this size; observations are clipped to them.
 STATE_BOUNDS = np.array([20.0, 20.0, 1.0, 1.0, 20.0, 20.0, 60.0])
@@ -32,7 +33,8 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Action: Box(2,) float32, steering and throttle in [-1, 1]. Observation: Box(7 + 2 H,) float32, the features of
     ``carlab.core.observation``. ``terminated`` is the task's termination; ``truncated`` follows the last tick or the
-    exit from the arena. ``info["end_reason"]`` names the reason; ``info`` also has the task's summary figures.
+    exit from the arena. ``info["end_reason"]`` names the reason,
+    ``info["summary"]`` has the task's figures of the episode.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
@@ -45,6 +47,8 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._car: Car | None = None
         self._pacer: Pacer | None = None
         self._features = np.zeros(feature_size(task.history_length))
+        self._times_s: list[float] = []
+        self._states: list[FloatArray] = []
         self._steps = 0
         high = np.concatenate([STATE_BOUNDS, np.ones(2 * task.history_length)]).astype(np.float32)
         self.observation_space = gym.spaces.Box(-high, high, dtype=np.float32)
@@ -71,8 +75,9 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._pacer = Pacer(self._car.clock, self._period_s)
         self._pacer.start()
         self._steps = 0
-        observation = self._observe()
-        return self._output(), self._info(observation)
+        self._times_s, self._states = [], []
+        self._observe()
+        return self._output(), self._info(is_last=False)
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Send the clipped action and wait one period."""
@@ -90,9 +95,10 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
             self._task.arena_m, observation.state.x_m, observation.state.y_m
         )
         truncated = not terminated and (outside or self._steps >= self._task.max_ticks)
-        info = self._info(observation)
+        info = self._info(is_last=terminated or truncated)
         if terminated or truncated:
-            reason = EndReason.GOAL_REACHED if terminated else EndReason.GEOFENCE if outside else EndReason.COMPLETED
+            task_end = EndReason.GOAL_REACHED if bool(self._task.success(self._features)) else EndReason.TASK_ENDED
+            reason = task_end if terminated else EndReason.GEOFENCE if outside else EndReason.COMPLETED
             info["end_reason"] = reason.name
         return self._output(), reward, terminated, truncated, info
 
@@ -106,6 +112,8 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         assert self._car is not None
         observation = self._car.observe()
         self._features = encode(observation.state.to_array(), self._history.rows)
+        self._times_s.append(self._car.clock.now_s())
+        self._states.append(observation.state.to_array())
         return observation
 
     def _output(self) -> NDArray[np.float32]:
@@ -113,8 +121,12 @@ class CarEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         clipped[:STATE_FEATURES] = np.clip(clipped[:STATE_FEATURES], -STATE_BOUNDS, STATE_BOUNDS)
         return clipped.astype(np.float32)
 
-    def _info(self, observation: Observation) -> dict[str, Any]:
-        return {"summary": self._task.summary(observation.state), "state": observation.state.to_array()}
+    def _info(self, *, is_last: bool) -> dict[str, Any]:
+        """The state; after the last step also the task's summary of the episode."""
+        info: dict[str, Any] = {"state": self._states[-1]}
+        if is_last:
+            info["summary"] = self._task.summary(np.array(self._times_s), np.array(self._states))
+        return info
 
 
 def make_env(task: str = "parking", vehicle: str | Path | None = None) -> CarEnv:

@@ -1,4 +1,4 @@
-"""Importing this module registers the Gymnasium environments ``carlab/Parking-v0`` and ``carlab/Path-v0``.
+"""Importing this module registers the Gymnasium environments: ``carlab/Parking-v0``, ``carlab/Laps-v0`` ...
 
     import gymnasium
     import carlab.experiment.episodes.gym_registration
@@ -11,7 +11,9 @@ from __future__ import annotations
 
 from gymnasium.envs.registration import register, registry
 
-for _task in ("parking", "path"):
+from carlab.core.task_choice import TASKS
+
+for _task in TASKS:
     _id = f"carlab/{_task.capitalize()}-v0"
     if _id not in registry:
         register(id=_id, entry_point="carlab.experiment.episodes.gym_env:make_env", kwargs={"task": _task})

@@ -21,6 +21,7 @@ from carlab.core.clock import wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import PoseLostError
+from carlab.core.observation import episode_features
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy
 from carlab.core.quantities import CarState
@@ -39,7 +40,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
-    """A completed episode. ``summary`` holds the task's figures of the final state."""
+    """A completed episode.
+
+    ``summary`` holds the task's figures; with a constraint also the sum of its cost, and the ticks with a cost.
+    """
 
     episode: int
     data: EpisodeData
@@ -55,8 +59,11 @@ class EpisodeResult:
 
 def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
     """Result of a recorded episode."""
-    final = CarState.from_array(data.states[-1])
-    return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], task.summary(final), path)
+    summary = task.summary(data.times_s, data.states)
+    if task.has_constraint:
+        costs = np.asarray(task.cost(episode_features(data.states, data.sent, task.history_length)[1:]))
+        summary |= {"cost": float(costs.sum()), "violations": float((costs > 0.0).sum())}
+    return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], summary, path)
 
 
 @dataclass(slots=True)

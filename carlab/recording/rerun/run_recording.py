@@ -59,7 +59,9 @@ TABLE_COLUMNS: Mapping[str, str] = {
     "predicted_return": "predicted return",
     "distance_m": "distance [m]",
     "yaw_error_rad": "yaw error [rad]",
-    "parked": "parked",
+    "success": "success",
+    "cost": "constraint cost",
+    "violations": "violations",
     "end": "end",
     "verdict": "quick check",
 }

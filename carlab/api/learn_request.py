@@ -1,0 +1,110 @@
+"""Arguments of ``learn``, and the training plan that follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from carlab.api.cars import car_options_text
+from carlab.api.tasks import given_task, load_checked
+from carlab.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from carlab.cars import CarChoice, CarFile
+    from carlab.core.task import Task
+    from carlab.experiment.campaign.training import TrainingPlan
+    from sim_backends.car_parameters import SimulatorConfig
+
+AUTO = "auto"
+BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
+Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
+Device = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True, slots=True)
+class LearnRequest:
+    """The arguments of ``learn``."""
+
+    car: str | CarFile
+    episodes: int | None
+    ticks: int | None
+    prior: str | Path | CarFile
+    method: Method
+    history: int | None
+    model_steps: int | None
+    updates: int
+    seed: int
+    device: Device | None
+    place: bool
+    resume: Path | None
+    out: Path
+    name: str
+    rerun: bool
+    live: bool
+    viewer: str | None
+    vehicle: Path | CarFile | None
+    reality: Path | CarFile | None
+    dry_run: bool
+    task: str | Task | None
+    track: Path | str | None
+
+    @property
+    def car_options(self) -> str:
+        """Command-line options that select the car."""
+        return car_options_text(self.car, self.vehicle, self.reality, self.dry_run)
+
+
+def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
+    """The settings of a new run. Raises ConfigError if an argument does not fit the car or the task."""
+    import tomli_w
+
+    from carlab.core.task_choice import PARKING
+    from carlab.experiment.campaign.campaign import PAPER_HISTORY
+    from carlab.experiment.campaign.prior_repair import needed_history
+    from carlab.experiment.campaign.training import TrainingPlan
+
+    history = request.history
+    if history is None:
+        history = PAPER_HISTORY if request.method == "fsvgd-authors" else needed_history(choice.simulator)
+    task_choice = given_task(request.task, request.track, choice.track) or PARKING
+    task = load_checked(task_choice, choice.envelope.arena_m)
+    if (ticks := request.ticks or task.max_ticks) <= history:
+        raise ConfigError(f"--ticks {ticks}: give more than --history ({history}), for at least one transition.")
+    text = tomli_w.dumps(_prior(request, choice).to_tables())
+    return TrainingPlan(
+        text, history, request.method, request.model_steps, request.updates, request.ticks, request.seed,
+        device=request.device or "cpu", task_choice=task_choice,
+    )  # fmt: skip
+
+
+def _prior(request: LearnRequest, choice: CarChoice) -> SimulatorConfig:
+    """The prior simulator."""
+    from carlab.experiment.campaign.campaign import check_period, prior_simulator
+
+    if request.prior in BUILT_IN_PRIORS:
+        kind: Literal["kinematic", "nominal"] = "kinematic" if request.prior == "kinematic" else "nominal"
+        return prior_simulator(choice.simulator, kind)
+    simulator = prior_simulator(_prior_file(request.prior).simulator, "nominal")
+    check_period(simulator, choice.control_period_s, f"car '{_name_of(request.car)}'")
+    return simulator
+
+
+def _prior_file(prior: str | Path | CarFile) -> CarFile:
+    from carlab.cars import CarFile, is_preset, load_car_file
+
+    if isinstance(prior, CarFile):
+        return prior
+    file = Path(prior)
+    if file.suffix != ".toml" and not is_preset(file) and not file.is_file():
+        raise ConfigError(f"--prior {prior}: give {', '.join(BUILT_IN_PRIORS)} or an existing car file.")
+    return load_car_file(file)
+
+
+def _name_of(car: str | CarFile) -> str:
+    return car if isinstance(car, str) else car.name
+
+
+def checked_simulator(request: LearnRequest) -> SimulatorConfig | None:
+    """The simulator of the quick check, if it is not that of the car file."""
+    return None if request.prior in BUILT_IN_PRIORS else _prior_file(request.prior).simulator

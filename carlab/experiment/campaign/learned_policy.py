@@ -1,0 +1,54 @@
+"""The policy of a run of ``carlab learn``, to drive it again. Reading a run folder runs no code of it."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from carlab.core.errors import DataError
+from carlab.core.observation import feature_size
+from carlab.core.policy import Policy
+from carlab.experiment.campaign.campaign import saved_plan
+from carlab.experiment.campaign.training import TrainingPlan
+from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
+from sim_backends.car_parameters import SimulatorConfig
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedPolicy:
+    """A learned policy, the plan of its run, and the number of the episode before which it was trained."""
+
+    policy: Policy
+    plan: TrainingPlan
+    episode: int
+
+    @property
+    def control_period_s(self) -> float:
+        """Control period of the training [s]."""
+        return SimulatorConfig.from_tables(tomllib.loads(self.plan.prior_toml)).control_period_s
+
+
+def load_policy(folder: Path) -> LearnedPolicy:
+    """Read the newest policy of a run, or that of an episode (``RUN/models/0003``).
+
+    Raises:
+        DataError: the folder has no policy, or it cannot be read.
+    """
+    is_model = folder.parent.name == "models" and folder.name.isdigit()
+    run = folder.parent.parent if is_model else folder
+    plan = saved_plan(run)
+    folders = [folder] if is_model else sorted(p for p in run.glob("models/*") if p.name.isdigit())
+    folders = [p for p in folders if (p / AGENT_FILE).is_file()]
+    if not folders:
+        raise DataError(f"{folder} has no policy; name the folder of a run of carlab learn with a finished training.")
+    agent = SacAgent.load(folders[-1], SacSettings(), plan.seed)
+    if agent.observation_size != feature_size(plan.history):
+        raise DataError(
+            f"The policy in {folders[-1]} has {agent.observation_size} features, its run {feature_size(plan.history)}; "
+            "remove the folder."
+        )
+    return LearnedPolicy(agent.policy(), plan, int(folders[-1].name))
+
+
+__all__ = ["LearnedPolicy", "load_policy"]

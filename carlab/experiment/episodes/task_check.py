@@ -1,0 +1,192 @@
+"""Check a task before a car moves: types, shapes, agreement of NumPy and torch, units, start and goal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from carlab.core.errors import ConfigError
+from carlab.core.geofence import as_polygon, contains
+from carlab.core.keep_out import Corners, KeepOut
+from carlab.core.observation import ACTION_SIZE, encode
+from carlab.core.quantities import CarState, FloatArray
+from carlab.core.task import Task
+
+N_STARTS = 20
+MAX_REWARD, MAX_SPEED_MPS, MAX_POSITION_M = 100.0, 20.0, 1000.0
+"""Largest plausible reward of a tick, speed and position; larger ones have the wrong unit."""
+TORCH_TOLERANCE = 1e-3
+"""Relative difference of float32 from float64."""
+_METRES = "positions are in metres"
+
+
+def check_task(task: Task, arena_m: Corners = ()) -> None:
+    """Check a task; nothing moves and nothing is written.
+
+    Args:
+        task: the task.
+        arena_m: arena of the car; empty: that of the task.
+
+    Raises:
+        ConfigError: names the method or attribute, what it returned, and what it must return.
+    """
+    _check_attributes(task)
+    arena_m = arena_m or task.arena_m
+    starts = _starts(task, arena_m)
+    _check_goal(task, arena_m)
+    if arena_m and not all(contains(arena_m, x, y) for x, y in task.path_m):
+        raise _error(task, f"its path leaves the arena; {_METRES}; move the path or enlarge [hardware.arena]")
+    rng = np.random.default_rng(0)
+    before = _features(task, starts, rng)
+    after = _features(task, starts + rng.normal(0.0, (0.05, 0.05, 0.1, 0.3, 0.05, 0.3), starts.shape), rng)
+    action = rng.uniform(-1.0, 1.0, (len(starts), ACTION_SIZE))
+    rewards = _check_function(task, "reward", (before, action, after), bool_wanted=False)
+    costs = _check_function(task, "cost", (after,), bool_wanted=False)
+    ends = _check_function(task, "terminated", (before,), bool_wanted=True)
+    _check_function(task, "success", (after,), bool_wanted=True)
+    if np.abs(rewards).max() > MAX_REWARD:
+        raise _error(task, f"reward is {np.abs(rewards).max():.4g} in a tick; scale it so that a good tick is about 1")
+    if np.ptp(rewards) == 0.0 and np.ptp(task.reward(before, 0.5 * action, after + 0.1)) == 0.0:
+        raise _error(task, "reward is the same for all states and actions, so there is nothing to learn")
+    if costs.min() < 0.0:
+        raise _error(task, f"cost is {costs.min():.4g}; it must not be below zero")
+    if ends.any():
+        raise _error(task, "terminated is true at a start of sample_start, so the episode would end at once")
+    if (task.cost(before) > 0.0).any():
+        raise _error(task, "cost is above zero at a start of sample_start; move the start or the keep-out shapes")
+    _check_summary(task, starts)
+
+
+def _error(task: Task, text: str) -> ConfigError:
+    return ConfigError(f"The task {type(task).__name__} has an error: {text}.")
+
+
+def _call(task: Task, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except Exception as error:
+        raise _error(task, f"{name} raises {type(error).__name__}: {error}".rstrip(".")) from error
+
+
+def _check_attributes(task: Task) -> None:
+    if not isinstance(task.name, str) or not task.name:
+        raise _error(task, f"name is {task.name!r}; give a text")
+    for name, minimum in (("history_length", 0), ("max_ticks", 1)):
+        value = getattr(task, name)
+        if type(value) is not int or value < minimum:
+            raise _error(task, f"{name} is {value!r}; give a whole number of at least {minimum}")
+    if not all(isinstance(shape, KeepOut) for shape in _call(task, "keep_out", lambda: tuple(task.keep_out))):
+        raise _error(task, "keep_out must be a tuple of Disc and Polygon (carlab.core.keep_out)")
+    for name in ("arena_m", "path_m", "outlines_m", "goal"):
+        _call(task, name, lambda name=name: getattr(task, name))
+    if len(task.arena_m):
+        as_polygon(task.arena_m, f"arena_m of the task {type(task).__name__}")
+
+
+def _starts(task: Task, arena_m: Corners) -> FloatArray:
+    """States of ``N_STARTS`` starts (N, 6)."""
+    starts = []
+    for seed in range(N_STARTS):
+        start, again = (_call(task, "sample_start", task.sample_start, np.random.default_rng(seed)) for _ in range(2))
+        if not isinstance(start, CarState):
+            raise _error(task, f"sample_start returns a {type(start).__name__}; return a carlab.CarState")
+        state = np.asarray(start.to_array(), dtype=np.float64)
+        if not np.isfinite(state).all() or np.abs(state[:2]).max() > MAX_POSITION_M:
+            raise _error(task, f"sample_start returns {start}; give finite numbers ({_METRES})")
+        if not np.array_equal(state, again.to_array()):
+            raise _error(task, "sample_start gives two starts for one seed; draw random numbers from its argument only")
+        if abs(start.yaw_rad) > 2.0 * math.pi:
+            raise _error(task, f"sample_start has a yaw of {start.yaw_rad:.4g}; angles are in radians")
+        if start.speed_mps > MAX_SPEED_MPS:
+            raise _error(task, f"sample_start has a speed of {start.speed_mps:.4g}; speeds are in m/s")
+        if arena_m and not contains(arena_m, start.x_m, start.y_m):
+            raise _error(
+                task, f"the start ({start.x_m:.2f}, {start.y_m:.2f}) is outside the arena; {_METRES}, in the frame of "
+                "motion capture",
+            )  # fmt: skip
+        starts.append(state)
+    return np.array(starts)
+
+
+def _check_goal(task: Task, arena_m: Corners) -> None:
+    goal = task.goal
+    if goal is None:
+        return
+    values = np.asarray(goal, dtype=np.float64) if len(goal) == 3 else np.full(3, np.nan)
+    if not np.isfinite(values).all():
+        raise _error(task, f"goal is {goal!r}; give x [m], y [m] and yaw [rad], or None")
+    if abs(values[2]) > 2.0 * math.pi:
+        raise _error(task, f"the goal has a yaw of {values[2]:.4g}; angles are in radians")
+    if arena_m and not contains(arena_m, float(values[0]), float(values[1])):
+        raise _error(task, f"the goal ({values[0]:.4g}, {values[1]:.4g}) is outside the arena; {_METRES}")
+    if type(task).success is not Task.success:
+        at_goal = encode(np.array([*values, 0.0, 0.0, 0.0]), np.zeros((task.history_length, ACTION_SIZE)))
+        if not bool(np.all(_call(task, "success", task.success, at_goal))):
+            raise _error(task, "success is false for a car at rest at the goal; check units and indices of features")
+
+
+def _features(task: Task, states: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Features (N, 7 + 2 H) of states (N, 6) after random past actions."""
+    history = rng.uniform(-1.0, 1.0, (len(states), task.history_length, ACTION_SIZE))
+    features: FloatArray = encode(states, history)
+    return features
+
+
+def _check_function(task: Task, name: str, arguments: tuple[FloatArray, ...], *, bool_wanted: bool) -> FloatArray:
+    """Check a function of features with one row, a batch of NumPy and a batch of torch; returns its values (N,)."""
+    import torch
+
+    function = getattr(task, name)
+    copies = [a.copy() for a in arguments]
+    batch = _call(task, f"{name} of a batch", function, *copies)
+    if not all(np.array_equal(a, b) for a, b in zip(arguments, copies, strict=True)):
+        raise _error(task, f"{name} changes its arguments; work on new arrays")
+    values = _values(task, name, batch, (len(arguments[0]),), bool_wanted)
+    single = np.array([
+        _values(task, name, _call(task, f"{name} of one row", function, *(a[k] for a in arguments)), (), bool_wanted)
+        for k in range(len(values))
+    ])  # fmt: skip
+    if not np.allclose(single, values):
+        raise _error(task, f"{name} of a batch differs from {name} row by row; index features with [..., k]")
+    tensors = [torch.from_numpy(a).float() for a in arguments]
+    in_torch = _call(task, f"{name} of torch tensors (use array_api_compat.array_namespace)", function, *tensors)
+    if not isinstance(in_torch, torch.Tensor):
+        raise _error(task, f"{name} of torch tensors returns a {type(in_torch).__name__}; return a tensor")
+    torch_values = _values(task, f"{name} of torch tensors", in_torch.numpy(), values.shape, bool_wanted)
+    if not bool_wanted and not np.allclose(torch_values, values, rtol=TORCH_TOLERANCE, atol=TORCH_TOLERANCE):
+        raise _error(task, f"{name} differs between NumPy and torch")
+    return values
+
+
+def _values(task: Task, name: str, result: Any, shape: tuple[int, ...], bool_wanted: bool) -> FloatArray:
+    """A result of a function of features as an array of the wanted shape and kind."""
+    array = np.asarray(result)
+    if array.shape != shape:
+        raise _error(task, f"{name} returns the shape {array.shape} for features of shape {(*shape, 'F')}; "
+                           f"return one value per row, {shape}")  # fmt: skip
+    kind = "b" if bool_wanted else "fiu"
+    if array.dtype.kind not in kind:
+        wanted = "booleans" if bool_wanted else "numbers"
+        raise _error(task, f"{name} returns {array.dtype}; return {wanted}")
+    if not np.isfinite(array.astype(np.float64)).all():
+        raise _error(task, f"{name} is not finite; avoid a division by zero or a root of a negative number")
+    return array.astype(np.float64)
+
+
+def _check_summary(task: Task, starts: FloatArray) -> None:
+    times_s = np.arange(len(starts)) / 30.0
+    summary = _call(task, "summary", task.summary, times_s, starts)
+    if not isinstance(summary, dict) or not all(isinstance(k, str) for k in summary):
+        raise _error(task, "summary must return a dictionary of numbers by name")
+    for name, value in summary.items():
+        if not isinstance(value, (int, float, np.floating)):
+            raise _error(task, f"summary has {value!r} under {name}; give a number")
+    if "success" not in summary:
+        raise _error(task, "summary lacks 'success' (1.0 or 0.0)")
+    _call(task, "outcome", task.outcome, summary)
+
+
+__all__ = ["check_task"]

@@ -1,0 +1,109 @@
+"""The checker accepts all tasks of carlab and of the examples, and names each error of a wrong task."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from carlab.core.errors import ConfigError
+from carlab.core.geofence import rectangle
+from carlab.core.keep_out import Disc
+from carlab.core.quantities import CarState
+from carlab.core.task import Task
+from carlab.core.task_choice import TASKS, choose_task
+from carlab.experiment.episodes.task_check import check_task
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "write_task.py"
+
+
+class Reach(Task):
+    """A correct task."""
+
+    name = "reach"
+    arena_m = rectangle(-2.0, 4.0, -2.0, 2.0)
+    goal = (1.0, 0.0, 0.0)
+
+    def sample_start(self, rng: np.random.Generator) -> CarState:
+        return CarState(y_m=float(rng.uniform(-0.05, 0.05)))
+
+    def reward(self, features: Any, action: Any, next_features: Any) -> Any:
+        return next_features[..., 0] - 0.01 * (action**2).sum(-1)
+
+    def success(self, features: Any) -> Any:
+        return abs(features[..., 0] - 1.0) < 0.1
+
+
+def changed(**members: Any) -> Task:
+    """A task with other members."""
+    task: Task = type("Changed", (Reach,), members)()
+    return task
+
+
+@pytest.mark.parametrize("name", list(TASKS))
+def test_tasks_of_carlab_have_no_error(name: str) -> None:
+    check_task(TASKS[name]())
+
+
+def test_tasks_of_the_example_and_of_this_page_have_no_error() -> None:
+    check_task(Reach())
+    check_task(choose_task(f"{EXAMPLE}:StopAfterOneMetre").load())
+
+
+def in_place(self: Task, features: Any, action: Any, next_features: Any) -> Any:
+    next_features[..., 0] -= 1.0
+    return next_features[..., 0]
+
+
+def start(**state: float) -> Callable[[Task, np.random.Generator], CarState]:
+    return lambda self, rng: CarState(**state)
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"name": ""}, "name is ''"),
+    ({"max_ticks": 0}, "max_ticks is 0"),
+    ({"max_ticks": 10.0}, "max_ticks is 10.0"),
+    ({"goal": (100.0, 0.0, 0.0)}, "the goal .* is outside the arena; positions are in metres"),
+    ({"goal": (1.0, 0.0, 90.0)}, "yaw of 90; angles are in radians"),
+    ({"goal": (1.0, 0.0)}, "goal is"),
+    ({"goal": (2.0, 0.0, 0.0)}, "success is false for a car at rest at the goal"),
+    ({"keep_out": (Disc(0.0, 0.0, 0.3),)}, "cost is above zero at a start"),
+    ({"keep_out": ((0.0, 0.0, 0.3),)}, "keep_out must be a tuple of Disc and Polygon"),
+    ({"sample_start": start(x_m=150.0)}, "outside the arena"),
+    ({"sample_start": start(yaw_rad=180.0)}, "yaw of 180; angles are in radians"),
+    ({"sample_start": start(vx_mps=30.0)}, "speed of 30; speeds are in m/s"),
+    ({"sample_start": start(x_m=math.nan)}, "give finite numbers"),
+    ({"sample_start": lambda self, rng: (0.0, 0.0, 0.0)}, "returns a tuple; return a carlab.CarState"),
+    ({"sample_start": lambda self, rng: CarState(np.random.default_rng().normal() / 9)}, "two starts for one seed"),
+    ({"reward": lambda self, f, a, n: n[..., 0:1]}, r"reward returns the shape \(20, 1\)"),
+    ({"reward": lambda self, f, a, n: float(np.mean(n[..., 0]))}, r"reward returns the shape \(\)"),
+    ({"reward": lambda self, f, a, n: n[0] * a[0]}, "reward of a batch raises ValueError"),
+    ({"reward": lambda self, f, a, n: n[:, 0]}, "reward of one row raises IndexError"),
+    ({"reward": lambda self, f, a, n: np.hypot(np.asarray(n)[..., 0], 1.0)}, "return a tensor"),
+    ({"reward": lambda self, f, a, n: 1e5 * n[..., 0]}, "in a tick; scale it"),
+    ({"reward": lambda self, f, a, n: 1.0 + 0.0 * n[..., 0]}, "nothing to learn"),
+    ({"reward": lambda self, f, a, n: (n[..., 0] - 100.0) ** 0.5}, "reward is not finite"),
+    ({"reward": in_place}, "reward changes its arguments"),
+    ({"cost": lambda self, n: -1.0 + 0.0 * n[..., 0]}, "must not be below zero"),
+    ({"terminated": lambda self, n: n[..., 0] * 0.0}, "terminated returns float64; return booleans"),
+    ({"terminated": lambda self, n: n[..., 0] < 10.0}, "the episode would end at once"),
+    ({"summary": lambda self, t, s: {"distance_m": 1.0}}, "summary lacks 'success'"),
+    ({"summary": lambda self, t, s: {"success": "yes"}}, "summary has 'yes' under success"),
+    ({"summary": lambda self, t, s: 1.0 / 0.0}, "summary raises ZeroDivisionError"),
+]
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize(("members", "message"), WRONG, ids=[message for _, message in WRONG])
+def test_each_error_is_named_in_one_sentence(members: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
+        check_task(changed(**members))
+    assert "\n" not in str(error.value)
+    assert "The task Changed has an error" in str(error.value)
+
+
+def test_path_outside_the_arena_of_the_car_is_refused() -> None:
+    with pytest.raises(ConfigError, match="its path leaves the arena"):
+        check_task(TASKS["laps"](), rectangle(-1.0, 1.0, -2.0, 2.0))
