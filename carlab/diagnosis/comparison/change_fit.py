@@ -1,4 +1,4 @@
-"""Fit of changed parameters to the second group by Gauss-Newton steps under the reference model's error distribution."""
+"""Fit of changed parameters to the second group, under the error distribution of the reference model."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Comparison of two groups of recordings by forward selection of the parameters that differ.
 
-The simulator is fitted to the first group. The change of its errors by each candidate is computed once; a linear estimate
-in both groups then gives the likelihood ratio and the significance of each candidate. The best ones are fitted to the
-second group. Physics that the simulator lacks is part of the errors of both groups, so it cancels in the difference.
+The simulator is fitted to the first group. The change of its errors by each candidate is computed once. A linear
+estimate in both groups then gives the likelihood ratio and the significance of each candidate. The best ones are fitted
+to the second group. Physics that the simulator lacks is in the errors of both groups, so it cancels in the difference.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class _Secants:
         """The point with the largest likelihood ratio; None without a usable one."""
         found = []
         for k in range(len(self.at.points)):
-            own = [g[k].astype(np.float64) for g in self.of_group]
+            own = [g[k] for g in self.of_group]
             one = difference(own, groups, material.model, settings, known)
             if one is not None and settings.step_range[0] < one.step < settings.step_range[1]:
                 found.append(_Linear(self, k, one))
@@ -145,7 +145,7 @@ def _screen(
         progress(f"influence of {candidate.id}", 0.1 + 0.6 * k / len(candidates))
         at = candidate_points(few, material.config, candidate)
         own = [
-            material.model.decorrelated(at.secants(fitter, errors, settings.max_secant)).astype(np.float32)
+            material.model.decorrelated(at.secants(fitter, errors, settings.max_secant))
             for fitter, errors in zip(material.fitters, material.errors, strict=True)
         ]
         found.append(_Secants(at, (own[0], own[1])))
@@ -170,7 +170,7 @@ def _select(
     while len(found) < settings.max_changes and not stop():
         progress(f"change {len(found) + 1}", 0.7 + 0.1 * len(found))
         groups = (first, GroupErrors(found[-1].fit.errors, second.block) if found else second)
-        known = [row for row in found[-1].fit.jacobian] if found else []
+        known = list(found[-1].fit.jacobian) if found else []
         taken = {f.linear.secants.at.candidate.id for f in found}
         linear = [s.best(groups, material, settings, known) for s in screened if s.at.candidate.id not in taken]
         usable = sorted((x for x in linear if x is not None), key=lambda x: -x.difference.likelihood_ratio)
@@ -206,7 +206,7 @@ def _refine(
     free = (*(before.fit.free if before else ()), *at.candidate.free)
     known = before.fit.z if before else np.zeros(0)
     starts = np.array([np.concatenate([known, z]) for z in (at.z0, linear.z, at.points[linear.point])])
-    offset = linear.difference.common * linear.secants.of_group[1][linear.point].astype(np.float64)
+    offset = linear.difference.common * linear.secants.of_group[1][linear.point]
     offset = offset + (before.offset if before else 0.0)
     fit = fit_change(material.fitters[1], config, free, starts, material.model, offset, settings)
     ratio = 2.0 * fit.gain / linear.difference.borrowed
@@ -242,8 +242,7 @@ def _change(
 ) -> Change:
     z, index, last = joint
     at, found = one.linear.secants.at, one.linear.difference
-    weight_model_covariance = last.naive_covariance[np.ix_(index, index)]
-    std = np.sqrt(np.diag(weight_model_covariance) * found.design_effect * found.borrowed)
+    std = np.sqrt(np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed)
     quantile = float(stats.t.ppf(0.95, max(blocks - len(index), 1)))
     low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))
     parameters, reference = {}, {}

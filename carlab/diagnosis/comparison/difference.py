@@ -1,9 +1,9 @@
 """Difference of one parameter between two groups, from the errors of one model and their secants.
 
 Along a secant g of the errors e, the generalised least-squares step of a group is ``-sum(w g'e) / sum(w g'g)``. The
-difference of the steps of both groups is the change: an error that the model has in both cancels. Its variance is that of
-independent errors times a design effect: the spread of the scores of blocks (Liang and Zeger 1986), and of parts of the
-first group as long as the second, over what the information allows.
+difference of the steps of both groups is the change: an error that the model has in both cancels. Its variance is that
+of independent errors times a design effect: the spread of the scores of blocks (Liang and Zeger 1986), and of parts of
+the first group as long as the second, over that of independent errors.
 """
 
 from __future__ import annotations

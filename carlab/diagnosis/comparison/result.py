@@ -92,7 +92,7 @@ def verdict_sentence(changes: Sequence[Change]) -> str:
         return "These recordings show no change of the car between the two groups."
     falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))
     names = listed([c.name for c in changes])
-    return f"Between the two groups changed: {names}. This lowers the negative log-likelihood of the second group by {falls}."
+    return f"Between the two groups changed: {names}. This lowers the loss of the second group by {falls}."
 
 
 def _product(factors: Sequence[float]) -> float:

@@ -13,9 +13,9 @@ class ComparisonSettings:
     """Length [s] of blocks that count as independent: errors of a wrong model depend on the place and the manoeuvre."""
     min_blocks: int = 10
     """Minimum number of blocks of a group; fewer give no usable standard error."""
-    max_windows: tuple[int, int] = (450, 200)
+    max_windows: tuple[int, int] = (300, 150)
     """Maximum number of windows of the first and the second group, thinned evenly; bounds the time."""
-    max_point_windows: int = 150
+    max_point_windows: int = 80
     """Maximum number of windows that the sizes of the candidates' points are chosen on."""
     max_points: int = 8
     """Maximum number of points of a candidate."""
@@ -35,9 +35,9 @@ class ComparisonSettings:
     """Range of the step along a secant in which the secant counts as linear."""
     part_prior_dof: float = 3.0
     """Degrees of freedom of the prior that estimates spread over long parts as over blocks."""
-    max_refined: int = 6
+    max_refined: int = 5
     """Maximum number of candidates that are fitted after the linear estimate."""
-    iterations: int = 8
+    iterations: int = 6
     """Maximum number of iterations of a fit."""
     tolerance: float = 1e-3
     """Relative fall of the loss at which a fit ends."""
