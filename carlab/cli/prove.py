@@ -57,7 +57,7 @@ class Prove:
     car: str = ""
     """Only --set real: car file or preset of that car."""
 
-    tool: Literal["compare", "diagnose"] = "compare"
+    tool: Literal["diagnose", "compare"] = "diagnose"
     """Only --set real: what answers. compare gets the untouched recordings too; diagnose gets their model only."""
 
     simulator: Literal["own", "commonroad", "commonroad-drift"] = "own"
