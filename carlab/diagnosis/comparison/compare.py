@@ -53,7 +53,7 @@ class _Secants:
         for k in range(len(self.at.points)):
             own = [g[k] for g in self.of_group]
             one = difference(own, groups, material.model, settings, known)
-            if one is not None and settings.step_range[0] < one.step < settings.step_range[1]:
+            if one is not None and one.step > 0.0:
                 found.append(_Linear(self, k, one))
         return max(found, key=lambda linear: linear.difference.likelihood_ratio, default=None)
 
@@ -205,7 +205,9 @@ def _refine(
     config = with_candidate(before.fit.fitted if before else material.config, at.candidate)
     free = (*(before.fit.free if before else ()), *at.candidate.free)
     known = before.fit.z if before else np.zeros(0)
-    starts = np.array([np.concatenate([known, z]) for z in (at.z0, linear.z, at.points[linear.point])])
+    step = min(linear.difference.step, settings.max_start_step)
+    point = at.points[linear.point]
+    starts = np.array([np.concatenate([known, z]) for z in (at.z0, at.z0 + step * (point - at.z0), point)])
     offset = linear.difference.common * linear.secants.of_group[1][linear.point]
     offset = offset + (before.offset if before else 0.0)
     fit = fit_change(material.fitters[1], config, free, starts, material.model, offset, settings)

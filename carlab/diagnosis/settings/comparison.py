@@ -31,8 +31,8 @@ class ComparisonSettings:
     """Added to the diagonal of the errors' covariance: share of the diagonal, and variance [squared floors]."""
     weight_iterations: int = 3
     """Updates of the Student-t weights in a linear estimate."""
-    step_range: tuple[float, float] = (0.1, 3.0)
-    """Range of the step along a secant in which the secant counts as linear."""
+    max_start_step: float = 3.0
+    """Maximum step along a secant at which a fit starts; a larger linear estimate is cut to it."""
     part_prior_dof: float = 3.0
     """Degrees of freedom of the prior that estimates spread over long parts as over blocks."""
     max_refined: int = 5
