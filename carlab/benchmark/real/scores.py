@@ -67,7 +67,21 @@ def score_comparison(answer: Json, report: Json | None, model: Json, seconds: fl
         if change["id"] in effect["names"]
         for size in _sizes(effect, change, model)
     ]
+    if len(answer["effects"]) == 1 and not row["sizes"]:
+        row["unnamed_stds"] = _unnamed_stds(answer["effects"][0], report, model)
     return row
+
+
+def _unnamed_stds(effect: Json, report: Json | None, model: Json) -> float | None:
+    """True size in standard deviations of the tool's estimate of an effect that it does not name."""
+    for tested in (report or {}).get("tested", []):
+        values = tested["parameters"]
+        if tested["id"] in effect["names"] and len(values) == 1 and tested["standard_errors"] > 0.0:
+            truth = effect["truth"][0]
+            value = next(iter(values.values()))
+            true = true_value(truth, tested["id"], model) - _before(tested["id"], truth["parameter"], model)
+            return abs(true) * float(tested["standard_errors"]) / max(abs(float(value)), 1e-12)
+    return None
 
 
 def _sizes(effect: Json, change: Json, model: Json) -> list[dict[str, Any]]:
@@ -80,13 +94,26 @@ def _sizes(effect: Json, change: Json, model: Json) -> list[dict[str, Any]]:
         )
         if estimate is None:
             continue
+        before = _before(change["id"], truth["parameter"], model)
         value = true_value(truth, change["id"], model)
+        size = abs(value - before)
+        if "reference" in change:  # a comparison reports changes
+            value = _true_change(truth, change, value - before)
         found.append({
             "parameter": f"{change['id']}.{truth['parameter']}", "true": value, "value": estimate["value"],
             "std": estimate["std"], "covered": estimate["low90"] <= value <= estimate["high90"],
-            "stds": abs(value - _before(change["id"], truth["parameter"], model)) / max(estimate["std"], 1e-12),
+            "stds": size / max(estimate["std"], 1e-12),
         })  # fmt: skip
     return found
+
+
+def _true_change(truth: Json, change: Json, added: float) -> float:
+    """Change of a parameter in a comparison, from its value in the first group."""
+    reference = change["reference"]
+    first = reference.get(truth["parameter"], next(iter(reference.values())))
+    if truth["composes"] == "multiplies":
+        return float(first) * (float(truth["size"]) - 1.0)
+    return float(truth["size"]) - float(first) if truth["composes"] == "replaces" and not truth["per_lock"] else added
 
 
 def true_value(truth: Json, name: str, model: Json) -> float:
@@ -120,13 +147,13 @@ def _number(entry: Any) -> float:
 def add_visibility(rows: Rows) -> None:
     """Set ``stds`` of each single case: its size in standard deviations of the tool.
 
-    A case without an estimate of its own takes the median ratio of size to deviation of the named cases of its kind and
-    size; without any such case it stays None.
+    An effect that is not named takes its linear estimate, if the report has one. Otherwise it takes the median ratio of
+    size to deviation of the named cases of its kind and size; without any such case it stays None.
     """
     singles = [row for row in rows.values() if row["kind"] == "single"]
     for row in singles:
         own = [size["stds"] for size in row["sizes"]]
-        row["stds"] = max(own) if own else None  # type: ignore[index]
+        row["stds"] = max(own) if own else row.get("unnamed_stds")  # type: ignore[index]
     for row in singles:
         if row["stds"] is None:
             alike = [

@@ -1,4 +1,4 @@
-"""Candidates of a comparison, and their fits in one group with all other parameters fixed."""
+"""Candidates of a comparison, and the changes of the prediction errors by each of them."""
 
 from __future__ import annotations
 
@@ -19,13 +19,9 @@ from carlab.diagnosis.identification.fit import (
 )
 from carlab.diagnosis.selection.problem import is_applicable
 from carlab.diagnosis.selection.screening import Screen
-from carlab.diagnosis.settings import ComparisonSettings
-from carlab.prediction.windows import IndexArray
+from carlab.diagnosis.settings import DEFAULT
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
-
-MAX_STEP = 8.0
-"""Maximum step of a coordinate beyond a bound, as in a fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +33,24 @@ class ChangeCandidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
-    """Prediction windows of one group of recordings with their error scale, and the fold of each window (S,)."""
+class CandidatePoints:
+    """A candidate with the points at which its secants are computed.
 
-    fitter: Fitter
-    folds: IndexArray
+    config  simulator with the candidate, at its value in the reference model
+    z0      (n,) coordinates of that value
+    points  (P, n) coordinates
+    """
+
+    candidate: ChangeCandidate
+    config: SimulatorConfig
+    z0: FloatArray
+    points: FloatArray
+
+    def secants(self, fitter: Fitter, errors: FloatArray, max_secant: float) -> FloatArray:
+        """Changes (P, S, D) of the whitened errors (S, D) from ``z0`` to each point."""
+        moved = fitter.white(self.config, self.candidate.free, self.points)
+        changes = moved.reshape(len(self.points), *errors.shape) - errors
+        return np.asarray(changes.clip(-max_secant, max_secant))
 
 
 def change_candidates(config: SimulatorConfig, only: Sequence[str] | None = None) -> list[ChangeCandidate]:
@@ -61,47 +70,32 @@ def with_candidate(config: SimulatorConfig, candidate: ChangeCandidate) -> Simul
     return with_effect(config, candidate.id) if is_new else config
 
 
-def fit_in_group(
-    group: Group, config: SimulatorConfig, candidate: ChangeCandidate, settings: ComparisonSettings
-) -> Fit:
-    """Fit the candidate's parameters to one group from several initial points; other parameters stay."""
+def candidate_points(fitter: Fitter, config: SimulatorConfig, candidate: ChangeCandidate) -> CandidatePoints:
+    """Points of a candidate: of an absent effect as in a screening, of a known parameter one step to both sides."""
+    settings = DEFAULT.comparison
     whole = with_candidate(config, candidate)
-    fitter = group.fitter
-    starts = [present(whole, candidate)]
-    if candidate.id in CATALOGUE and candidate.id not in config.effects:
-        empty = Fit(config, (), np.zeros(0), 0.0, np.zeros(0))
-        starts += list(Screen(fitter, config, empty).score(candidate.id, candidate.free).starts)
-    start = fitter.best_point(whole, candidate.free, np.array(starts))
-    fit = fitter.fit(whole, candidate.free, start, iterations=settings.iterations)
-    within_bounds = [f.coordinate(float(f.value(z))) for f, z in zip(fit.free, fit.z, strict=True)]
-    return fitter.with_covariance(replace(fit, z=np.array(within_bounds)))
+    values = whole.values()
+    z0 = np.array([f.coordinate(values[f.name]) for f in candidate.free])
+    if whole is config:
+        steps = np.vstack([np.eye(len(z0)), -np.eye(len(z0))])
+        return CandidatePoints(candidate, whole, z0, z0 + steps)
+    screening = replace(
+        DEFAULT.screening,
+        error_rms_changes=settings.error_rms_changes,
+        typical_size_ratios=settings.typical_size_ratios,
+    )
+    screen = Screen(fitter, config, Fit(config, (), np.zeros(0), 0.0, np.zeros(0)), settings=screening)
+    points = screen.points(candidate.id, candidate.free)
+    chosen = np.unique(np.linspace(0, len(points) - 1, settings.max_points).round().astype(int))
+    return CandidatePoints(candidate, whole, z0, points[chosen])
 
 
-def unbounded_optimum(fitter: Fitter, fit: Fit) -> FloatArray:
-    """Coordinates (n,) after one Gauss-Newton step without bounds.
-
-    Missing physics may ask for a negative lag in both groups. A fit that stops at 0 in one group alone would bias the
-    difference.
-    """
-    jacobian, white = fitter.linearised(fit)
-    weight = np.minimum(1.0, fitter.settings.huber_delta / np.maximum(np.abs(white), 1e-12)).reshape(-1)
-    flat = jacobian.reshape(len(fit.free), -1)
-    step = -np.linalg.pinv((flat * weight) @ flat.T) @ (flat @ (weight * white.reshape(-1)))
-    return np.asarray(fit.z + np.clip(step, -MAX_STEP, MAX_STEP))
+def size_of(candidate: ChangeCandidate, z: FloatArray, z0: FloatArray) -> FloatArray:
+    """Change of each parameter's value (n,) from coordinates ``z0`` to ``z``, without bounds."""
+    return np.array([
+        f.origin * (math.exp(f.size * a) - math.exp(f.size * b)) if f.logarithmic else f.size * (a - b)
+        for f, a, b in zip(candidate.free, z, z0, strict=True)
+    ])  # fmt: skip
 
 
-def present(config: SimulatorConfig, candidate: ChangeCandidate) -> FloatArray:
-    """Coordinates (n,) of the candidate's parameters in the simulator."""
-    values = config.values()
-    return np.array([f.coordinate(values[f.name]) for f in candidate.free])
-
-
-__all__ = [
-    "ChangeCandidate",
-    "Group",
-    "change_candidates",
-    "fit_in_group",
-    "present",
-    "unbounded_optimum",
-    "with_candidate",
-]
+__all__ = ["CandidatePoints", "ChangeCandidate", "candidate_points", "change_candidates", "size_of", "with_candidate"]

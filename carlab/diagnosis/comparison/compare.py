@@ -1,8 +1,8 @@
 """Comparison of two groups of recordings by forward selection of the parameters that differ.
 
-The simulator is refitted to both groups together. Each candidate is then fitted in each group with all other parameters
-fixed. Physics that the simulator lacks biases both fits alike, so their difference, not the fitted value, is the
-change. Its covariance is the sum of both sandwich covariances, clustered by blocks of 10 s (Liang and Zeger 1986).
+The simulator is fitted to the first group. The change of its errors by each candidate is computed once. A linear
+estimate in both groups then gives the likelihood ratio and the significance of each candidate. The best ones are fitted
+to the second group. Physics that the simulator lacks is in the errors of both groups, so it cancels in the difference.
 """
 
 from __future__ import annotations
@@ -15,50 +15,83 @@ from scipy import stats
 
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.candidates import (
-    ChangeCandidate,
-    Group,
+    CandidatePoints,
+    candidate_points,
     change_candidates,
-    fit_in_group,
-    unbounded_optimum,
+    size_of,
+    with_candidate,
 )
-from carlab.diagnosis.comparison.result import Change, Comparison, verdict_sentence
+from carlab.diagnosis.comparison.change_fit import ChangeFit, fit_change
+from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
+from carlab.diagnosis.comparison.groups import ComparedGroups, compared_groups
+from carlab.diagnosis.comparison.result import Change, Comparison, Tested, verdict_sentence
 from carlab.diagnosis.findings import Estimate
-from carlab.diagnosis.identification.fit import Fit, FitParameter, Fitter, Scale, clustered_gain
-from carlab.diagnosis.identification.held_out_errors import noise_floor
-from carlab.diagnosis.identification.measurement_noise import estimate_noise
-from carlab.diagnosis.identification.velocity_window import with_initial_states
-from carlab.diagnosis.recording_faults import find as data_faults_of
-from carlab.diagnosis.recordings import check_excitation
-from carlab.diagnosis.selection.problem import SearchProblem
-from carlab.diagnosis.selection.refit import fit_with_scale
+from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.settings import DEFAULT, ComparisonSettings, DiagnosisSettings
-from carlab.diagnosis.state_alignment import with_known_latency
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import CURVES, confusable_effects
 from sim_backends.registry import REGISTRY
 
 
 @dataclass(frozen=True, slots=True)
-class _Tested:
-    """A candidate fitted in both groups.
+class _Secants:
+    """A candidate with its decorrelated secants (P, S, D) in both groups."""
 
-    delta, std   (n,) change of each coordinate and its standard deviation
-    dof          degrees of freedom of the standard deviations
-    p_value      of no change
-    loss         (S,) loss of the second group's unseen blocks with the change
-    """
+    at: CandidatePoints
+    of_group: tuple[FloatArray, FloatArray]
 
-    candidate: ChangeCandidate
-    fits: tuple[Fit, Fit]
-    delta: FloatArray
-    std: FloatArray
-    dof: int
+    def best(
+        self,
+        groups: Sequence[GroupErrors],
+        material: ComparedGroups,
+        settings: ComparisonSettings,
+        known: Sequence[FloatArray],
+    ) -> _Linear | None:
+        """The point with the largest likelihood ratio; None without a usable one."""
+        found = []
+        for k in range(len(self.at.points)):
+            own = [g[k] for g in self.of_group]
+            one = difference(own, groups, material.model, settings, known)
+            if one is not None and one.step > 0.0:
+                found.append(_Linear(self, k, one))
+        return max(found, key=lambda linear: linear.difference.likelihood_ratio, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Linear:
+    """The linear estimate of a candidate along the secant of one of its points."""
+
+    secants: _Secants
+    point: int
+    difference: Difference
+
+    @property
+    def z(self) -> FloatArray:
+        at = self.secants.at
+        return np.asarray(at.z0 + self.difference.step * (at.points[self.point] - at.z0))
+
+    def p_value(self, groups: Sequence[GroupErrors]) -> float:
+        found = self.difference
+        blocks = min(group.blocks for group in groups)
+        return p_value(found.likelihood_ratio, found.design_effect, len(self.secants.at.z0), blocks)
+
+    def tested(self) -> Tested:
+        at = self.secants.at
+        values = size_of(at.candidate, self.z, at.z0).tolist()
+        names = [_short(f.name) for f in at.candidate.free]
+        return Tested(at.candidate.id, dict(zip(names, values, strict=True)), self.difference.standard_errors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Refined:
+    """A candidate fitted to the second group with all changes before it."""
+
+    linear: _Linear
+    fit: ChangeFit
+    likelihood_ratio: float
     p_value: float
-    loss: FloatArray
+    offset: FloatArray
 
 
 def compare(
@@ -86,166 +119,151 @@ def compare(
         DataError: the recordings are too short or too uniform, or have different periods; the message has the remedy.
     """
     began_s = MonotonicClock().now_s()
-    progress("refitting the simulator to both groups", 0.0)
-    base, groups = _prepare(reference, changed, nominal, settings)
-    changes = _select(base, groups, change_candidates(base, candidates), settings.comparison, progress, stop)
+    progress("fitting the simulator to the first group", 0.0)
+    material = compared_groups(reference, changed, nominal, settings)
+    screened = _screen(material, candidates, settings.comparison, progress, stop)
+    changes, tested = _select(material, screened, settings.comparison, progress, stop)
     seconds = MonotonicClock().now_s() - began_s
-    return Comparison("changed" if changes else "nothing", verdict_sentence(changes), changes, seconds)
+    return Comparison("changed" if changes else "nothing", verdict_sentence(changes), changes, seconds, tested)
 
 
-def _prepare(
-    reference: Sequence[EpisodeData],
-    changed: Sequence[EpisodeData],
-    nominal: SimulatorConfig,
-    settings: DiagnosisSettings,
-) -> tuple[SimulatorConfig, tuple[Group, Group]]:
-    """The simulator refitted to both groups, and the groups with one error scale."""
-    nominal = with_known_latency(nominal, (*reference, *changed))
-    reference, changed, _ = data_faults_of.check(reference, changed, nominal)
-    tracks = [_checked_tracks(group, k, settings) for k, group in enumerate((reference, changed))]
-    periods = [t[0].period_s for t in tracks]
-    if max(periods) > settings.comparison.period_ratio_max * min(periods):
-        raise DataError(
-            f"The groups have periods of {periods[0]:.3f} s and {periods[1]:.3f} s; compare recordings of one car."
-        )
-    everything = tracks_of((*reference, *changed), periods[0])
-    windows = _windows(everything, settings)
-    windows, _ = with_initial_states((windows, windows), nominal, settings.identification)
-    noise = estimate_noise(everything, windows.curvature_bias, settings=settings.identification)
-    per_step = noise_floor(windows, noise, nominal, settings.identification)[1:]
-    problem = SearchProblem(nominal, windows, np.sqrt(np.mean(per_step**2, axis=0)), confusable_effects(), (), settings)
-    curves = tuple(f"effects.{curve.id}." for curve in CURVES)
-    free = tuple(f for f in problem.free_parameters(()) if not f.name.startswith(curves))  # measured curves stay
-    model = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))
-    is_first = windows.recording < len(reference)
-    groups = [_group(windows.take(rows), model.scale, settings) for rows in (is_first, ~is_first)]
-    return model.fit.config, (groups[0], groups[1])
-
-
-def _checked_tracks(episodes: Sequence[EpisodeData], k: int, settings: DiagnosisSettings) -> list[Track]:
-    """Tracks of a group. Raises DataError if it is too short or too uniform."""
-    which = ("first", "second")[k]
-    tracks = tracks_of(episodes)
-    seconds = sum(track.duration_s for track in tracks)
-    needed_s = settings.comparison.block_s * settings.comparison.min_blocks
-    if seconds < needed_s:
-        raise DataError(
-            f"The {which} group has {seconds:.0f} s of driving; a comparison needs {needed_s:.0f} s in each group."
-        )
-    check_excitation(tracks, settings.windows)
-    return tracks
-
-
-def _windows(tracks: Sequence[Track], settings: DiagnosisSettings) -> PredictionWindows:
-    cut = cut_windows(tracks, settings.windows.fit_window_s, settings.windows.fit_stride_s, settings.comparison.block_s)
-    return cut.thinned(2 * settings.comparison.max_windows)
-
-
-def _group(windows: PredictionWindows, scale: Scale, settings: DiagnosisSettings) -> Group:
-    blocks = np.unique(windows.block)
-    if len(blocks) < settings.comparison.min_blocks:
-        raise DataError("The car moves too little in one group; record at least one minute of driving.")
-    folds = np.searchsorted(blocks, windows.block) % min(settings.selection.folds, len(blocks))
-    return Group(Fitter(windows, scale, settings.identification), np.asarray(folds))
-
-
-def _select(
-    base: SimulatorConfig,
-    groups: tuple[Group, Group],
-    candidates: Sequence[ChangeCandidate],
+def _screen(
+    material: ComparedGroups,
+    only: Sequence[str] | None,
     settings: ComparisonSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
-) -> tuple[Change, ...]:
-    """Forward selection: the change with the smallest loss on unseen blocks of the second group comes first."""
-    configs = [base, base]
-    found: list[Change] = []
-    first_gain = 0.0
-    while len(found) < settings.max_changes and not stop():
-        known = {c.id for c in found}
-        tested = []
-        for k, candidate in enumerate(candidates):
-            if candidate.id not in known and not stop():
-                progress(f"change {len(found) + 1}: {candidate.id}", k / len(candidates))
-                tested.append(_test(candidate, configs, groups, settings))
-        before = groups[1].fitter.loss(configs[1], max_error=DEFAULT.selection.max_unseen_error)
-        significant = [t for t in tested if _is_significant(t, before, groups[1], len(candidates), settings)]
-        if not significant:
+) -> list[_Secants]:
+    """Secants of all candidates in both groups."""
+    first = material.fitters[0]
+    few = Fitter(first.windows.thinned(settings.max_point_windows), first.scale, first.settings)
+    candidates = change_candidates(material.config, only)
+    found = []
+    for k, candidate in enumerate(candidates):
+        if stop():
             break
-        best = min(significant, key=lambda t: float(t.loss.sum()))
-        gain, error = clustered_gain(before, best.loss, groups[1].fitter.windows)
-        share = gain / float(before.sum())
-        if share < settings.min_unseen_share or gain < settings.min_share_of_first * first_gain:
-            break
-        first_gain = first_gain or gain
-        ties = _ties(best, significant, groups[1], settings)
-        found.append(_change(best, ties, len(candidates), share, gain / error))
-        configs = [fit.config for fit in best.fits]
-    return tuple(found)
+        progress(f"influence of {candidate.id}", 0.1 + 0.6 * k / len(candidates))
+        at = candidate_points(few, material.config, candidate)
+        own = [
+            material.model.decorrelated(at.secants(fitter, errors, settings.max_secant))
+            for fitter, errors in zip(material.fitters, material.errors, strict=True)
+        ]
+        found.append(_Secants(at, (own[0], own[1])))
+    return found
 
 
-def _test(
-    candidate: ChangeCandidate,
-    configs: Sequence[SimulatorConfig],
-    groups: tuple[Group, Group],
+def _select(
+    material: ComparedGroups,
+    screened: Sequence[_Secants],
     settings: ComparisonSettings,
-) -> _Tested:
-    """Fit a candidate in both groups; Hotelling's test of the difference with clustered covariances."""
-    first, second = (fit_in_group(g, c, candidate, settings) for g, c in zip(groups, configs, strict=True))
-    assert first.covariance is not None
-    assert second.covariance is not None
-    optima = [unbounded_optimum(g.fitter, fit) for g, fit in zip(groups, (first, second), strict=True)]
-    delta = optima[1] - optima[0]
-    covariance = first.covariance + second.covariance
-    blocks = min(len(np.unique(g.fitter.windows.block)) for g in groups)
-    count = len(delta)
-    dof = max(blocks - count, 1)
-    squared = float(delta @ np.linalg.pinv(covariance) @ delta)
-    p_value = float(stats.f.sf(squared * dof / (count * max(blocks - 1, 1)), count, dof))
-    loss = groups[1].fitter.leave_fold_out_loss(second, groups[1].folds, DEFAULT.selection.max_unseen_error)
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return _Tested(candidate, (first, second), delta, std, dof, p_value, loss)
+    progress: Callable[[str, float], None],
+    stop: Callable[[], bool],
+) -> tuple[tuple[Change, ...], tuple[Tested, ...]]:
+    """Forward selection: the change with the largest likelihood ratio comes first."""
+    first, second = (
+        GroupErrors(material.model.decorrelated(errors), fitter.windows.block)
+        for errors, fitter in zip(material.errors, material.fitters, strict=True)
+    )
+    found: list[_Refined] = []
+    ties: list[tuple[str, ...]] = []
+    tested: tuple[Tested, ...] = ()
+    while len(found) < settings.max_changes and not stop():
+        progress(f"change {len(found) + 1}", 0.7 + 0.1 * len(found))
+        groups = (first, GroupErrors(found[-1].fit.errors, second.block) if found else second)
+        known = list(found[-1].fit.jacobian) if found else []
+        taken = {f.linear.secants.at.candidate.id for f in found}
+        linear = [s.best(groups, material, settings, known) for s in screened if s.at.candidate.id not in taken]
+        usable = sorted((x for x in linear if x is not None), key=lambda x: -x.difference.likelihood_ratio)
+        tested = tested or tuple(x.tested() for x in usable)
+        if not any(len(screened) * x.p_value(groups) < settings.p_max for x in usable):
+            break
+        refined = [_refine(x, found, material, groups, settings) for x in usable[: settings.max_refined]]
+        significant = [r for r in refined if len(screened) * r.p_value < settings.p_max]
+        best = max(significant, key=lambda r: r.likelihood_ratio, default=None)
+        if best is None or (found and best.likelihood_ratio < settings.min_share_of_first * found[0].likelihood_ratio):
+            break
+        ties.append(_ties(best, refined, settings))
+        found.append(best)
+    blocks = min(first.blocks, second.blocks)
+    changes = [
+        _change(one, _joint(one, found[-1].fit), near, len(screened), blocks)
+        for one, near in zip(found, ties, strict=True)
+    ]
+    return tuple(changes), tested
 
 
-def _is_significant(
-    tested: _Tested, before: FloatArray, group: Group, candidates: int, settings: ComparisonSettings
-) -> bool:
-    """Whether the parameters differ, and the change lowers the loss on unseen blocks of the second group."""
-    gain, error = clustered_gain(before, tested.loss, group.fitter.windows)
-    return tested.p_value < settings.p_max / candidates and gain > settings.min_unseen_z * error
+def _refine(
+    linear: _Linear,
+    found: Sequence[_Refined],
+    material: ComparedGroups,
+    groups: Sequence[GroupErrors],
+    settings: ComparisonSettings,
+) -> _Refined:
+    """Fit a candidate to the second group, together with the changes found before."""
+    at = linear.secants.at
+    before = found[-1] if found else None
+    config = with_candidate(before.fit.fitted if before else material.config, at.candidate)
+    free = (*(before.fit.free if before else ()), *at.candidate.free)
+    known = before.fit.z if before else np.zeros(0)
+    step = min(linear.difference.step, settings.max_start_step)
+    point = at.points[linear.point]
+    starts = np.array([np.concatenate([known, z]) for z in (at.z0, at.z0 + step * (point - at.z0), point)])
+    offset = linear.difference.common * linear.secants.of_group[1][linear.point]
+    offset = offset + (before.offset if before else 0.0)
+    fit = fit_change(material.fitters[1], config, free, starts, material.model, offset, settings)
+    ratio = 2.0 * fit.gain / linear.difference.borrowed
+    blocks = min(group.blocks for group in groups)
+    p = p_value(ratio, linear.difference.design_effect, len(at.z0), blocks)
+    return _Refined(linear, fit, ratio, p, offset)
 
 
-def _ties(best: _Tested, tested: Sequence[_Tested], group: Group, settings: ComparisonSettings) -> tuple[str, ...]:
-    """Candidates whose loss on unseen blocks is not significantly higher, the closest first, at most two."""
-    near = []
-    for other in tested:
-        if other is not best:
-            difference, error = clustered_gain(other.loss, best.loss, group.fitter.windows)
-            if difference < settings.tie_z * error:
-                near.append((difference, other.candidate.id))
+def _ties(best: _Refined, refined: Sequence[_Refined], settings: ComparisonSettings) -> tuple[str, ...]:
+    """Candidates whose likelihood ratio is not clearly smaller, the closest first, at most two."""
+    limit = settings.tie_chi2 * best.linear.difference.design_effect
+    near = [
+        (best.likelihood_ratio - other.likelihood_ratio, other.linear.secants.at.candidate.id)
+        for other in refined
+        if other is not best and best.likelihood_ratio - other.likelihood_ratio < limit
+    ]
     return tuple(name for _, name in sorted(near)[:2])
 
 
-def _change(tested: _Tested, ties: tuple[str, ...], candidates: int, share: float, standard_errors: float) -> Change:
-    first = tested.fits[0]
-    quantile = float(stats.t.ppf(0.95, tested.dof))
+def _joint(one: _Refined, last: ChangeFit) -> tuple[FloatArray, list[int], ChangeFit]:
+    """Coordinates of a change in the last fit, their indices, and the fit."""
+    names = [f.name for f in last.free]
+    index = [names.index(f.name) for f in one.linear.secants.at.candidate.free]
+    return last.z[index], index, last
+
+
+def _change(
+    one: _Refined,
+    joint: tuple[FloatArray, list[int], ChangeFit],
+    ties: tuple[str, ...],
+    candidates: int,
+    blocks: int,
+) -> Change:
+    z, index, last = joint
+    at, found = one.linear.secants.at, one.linear.difference
+    std = np.sqrt(np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed)
+    quantile = float(stats.t.ppf(0.95, max(blocks - len(index), 1)))
+    low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))
     parameters, reference = {}, {}
-    for f, z, delta, std in zip(tested.candidate.free, first.z, tested.delta, tested.std, strict=True):
-        name = f.name.rpartition(".")[2] if f.name.startswith("effects.") else f.name
-        own = float(f.value(np.asarray(z)))
-        low, value, high = sorted(_difference(f, float(z), delta + side * quantile * std) for side in (-1.0, 0.0, 1.0))
-        parameters[name] = Estimate(value, (high - low) / (2.0 * 1.6449), low, high, REGISTRY[f.name].unit)
-        reference[name] = own
+    for k, f in enumerate(at.candidate.free):
+        name = _short(f.name)
+        limits = sorted((float(low[k]), float(high[k])))
+        spread = (limits[1] - limits[0]) / (2.0 * quantile)
+        parameters[name] = Estimate(float(value[k]), spread, limits[0], limits[1], REGISTRY[f.name].unit)
+        reference[name] = float(f.value(np.asarray(at.z0[k])))
+    standard_errors = float(np.sqrt(max(one.likelihood_ratio, 0.0) / found.design_effect))
     return Change(
-        tested.candidate.id, parameters, reference, min(1.0, tested.p_value * candidates), share, standard_errors, ties
-    )
+        at.candidate.id, parameters, reference, min(1.0, one.p_value * candidates), one.fit.loss_share,
+        standard_errors, ties,
+    )  # fmt: skip
 
 
-def _difference(f: FitParameter, z: float, change: float) -> float:
-    """Change of a parameter's value by a change of its coordinate from z, without bounds."""
-    if f.logarithmic:
-        return f.origin * float(np.exp(f.size * z) * np.expm1(f.size * change))
-    return f.size * change
+def _short(name: str) -> str:
+    """Name of an effect's parameter without the effect; a base parameter keeps its dotted name."""
+    return name.rpartition(".")[2] if name.startswith("effects.") else name
 
 
 __all__ = ["Comparison", "compare"]

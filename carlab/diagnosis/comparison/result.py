@@ -23,8 +23,8 @@ class Change:
         parameters: change of each parameter, second group minus first, with its 90 % interval.
         reference: value of each parameter in the first group.
         p_value: of no change, multiplied by the number of candidates.
-        loss_share: fall of the loss on unseen blocks of the second group, as a share of it.
-        standard_errors: that fall in standard errors.
+        loss_share: fall of the negative log-likelihood of the second group, as a share of it.
+        standard_errors: size of the change in standard errors of independent blocks.
         indistinguishable_from: candidates that explain the second group as well.
     """
 
@@ -55,6 +55,15 @@ class Change:
 
 
 @dataclass(frozen=True, slots=True)
+class Tested:
+    """Linear estimate of a candidate's change: values of its parameters, and their size in standard errors."""
+
+    id: str
+    parameters: Mapping[str, float]
+    standard_errors: float
+
+
+@dataclass(frozen=True, slots=True)
 class Comparison:
     """The smallest set of changes that explains the difference between two groups of recordings.
 
@@ -63,12 +72,14 @@ class Comparison:
         sentence: the verdict.
         changes: the changes, the strongest first.
         seconds: run time [s].
+        tested: all candidates before any change is accepted, the most likely first.
     """
 
     verdict: ComparisonVerdict
     sentence: str
     changes: tuple[Change, ...] = ()
     seconds: float = 0.0
+    tested: tuple[Tested, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the schema, ready for JSON."""
@@ -81,7 +92,7 @@ def verdict_sentence(changes: Sequence[Change]) -> str:
         return "These recordings show no change of the car between the two groups."
     falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))
     names = listed([c.name for c in changes])
-    return f"Between the two groups changed: {names}. This lowers the loss on unseen blocks of the second by {falls}."
+    return f"Between the two groups changed: {names}. This lowers the loss of the second group by {falls}."
 
 
 def _product(factors: Sequence[float]) -> float:
@@ -91,4 +102,4 @@ def _product(factors: Sequence[float]) -> float:
     return made
 
 
-__all__ = ["SCHEMA", "Change", "Comparison", "ComparisonVerdict", "verdict_sentence"]
+__all__ = ["SCHEMA", "Change", "Comparison", "ComparisonVerdict", "Tested", "verdict_sentence"]

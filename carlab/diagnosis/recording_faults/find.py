@@ -15,7 +15,7 @@ from sim_backends.car_parameters import SimulatorConfig
 
 
 def check(
-    fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], nominal: SimulatorConfig
+    fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], nominal: SimulatorConfig, *, alike: bool = False
 ) -> tuple[list[EpisodeData], list[EpisodeData], list[DataFault]]:
     """Detect and repair faults of recordings.
 
@@ -26,6 +26,8 @@ def check(
         fit: recordings to fit.
         held_out: held-out recordings.
         nominal: the simulator of the car file, for its control period and command delay.
+        alike: whether a repair that changes the delay of velocities or the stamps needs the fault in all recordings.
+            A comparison of recordings needs it, because such a repair of some would appear as a change.
 
     Returns:
         The recordings to fit and those held out, repaired (the same objects where nothing was changed), and
@@ -35,7 +37,7 @@ def check(
     usable = [repair for repair in repairs if repair.usable]
     for repair in usable:
         check_pose(repair, nominal.control_period_s)
-        check_velocities(repair)
+    check_velocities(usable, alike=alike)
     check_commands([repair for repair in usable if repair.usable], nominal)
     repaired = [repair.result() for repair in repairs]
     faults = merged([fault for repair in repairs for fault in repair.faults])

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair
 from carlab.recording.audit.audit import Channels
 from carlab.recording.column_mapping import POSE_CHANNELS, VELOCITY_CHANNELS
 from carlab.recording.csv.clocks import rebuilt_clock
+from carlab.recording.faults.fault import Fault
 from carlab.recording.faults.robust import fit_column
 from carlab.recording.faults.settings import LIMITS
 from carlab.recording.faults.stamps import nominal_clock
@@ -25,21 +28,39 @@ from carlab.recording.pose_velocity import PoseMotion
 MIN_MOVING_ROWS = 60
 
 
-def check_velocities(repair: EpisodeRepair) -> None:
-    """Check and repair vx, vy and yaw rate: frame, scale, spikes, backward differences."""
-    motion = repair.motion()
-    if not repair.has_velocity_columns or comparable_rows(motion, "vx").sum() < MIN_MOVING_ROWS:
+def check_velocities(repairs: Sequence[EpisodeRepair], *, alike: bool) -> None:
+    """Check and repair vx, vy and yaw rate of recordings: frame, scale, spikes, backward differences.
+
+    Args:
+        repairs: the recordings.
+        alike: whether backward differences and nominal stamps are repaired only if all recordings have them.
+    """
+    motions = {k: r.motion() for k, r in enumerate(repairs) if r.has_velocity_columns}
+    motions = {k: m for k, m in motions.items() if comparable_rows(m, "vx").sum() >= MIN_MOVING_ROWS}
+    for k, motion in motions.items():
+        _check_columns(repairs[k], motion)
+    found = {
+        k: backward_differences(repairs[k].times_s, repairs[k].states, repairs[k].segment, m)
+        for k, m in motions.items()
+    }
+    late = {k: fault for k, fault in found.items() if fault is not None}
+    if alike and len(late) < len(repairs):
         return
+    clocks = {k: clock for k in late if (clock := _clock_fault(repairs[k], motions[k])) is not None}
+    for k, fault in late.items():
+        if k in clocks and not (alike and len(clocks) < len(repairs)):
+            _rebuild_clock(repairs[k], *clocks[k])
+        repairs[k].has_velocity_columns = False
+        repairs[k].repaired(fault, "the velocities were estimated from the pose without delay")
+
+
+def _check_columns(repair: EpisodeRepair, motion: PoseMotion) -> None:
+    """Frame of the velocities, then scale and spikes of each column."""
     _check_frame(repair, motion)
     for channel in VELOCITY_CHANNELS:
         _check_scale(repair, motion, channel)
     for channel in VELOCITY_CHANNELS:
         _check_spikes(repair, motion, channel)
-    fault = backward_differences(repair.times_s, repair.states, repair.segment, motion)
-    if fault is not None:
-        _rebuild_clock(repair, motion)
-        repair.has_velocity_columns = False
-        repair.repaired(fault, "the velocities were estimated from the pose without delay")
 
 
 def _check_frame(repair: EpisodeRepair, motion: PoseMotion) -> None:
@@ -79,13 +100,16 @@ def _check_spikes(repair: EpisodeRepair, motion: PoseMotion, channel: str) -> No
         repair.repaired(fault, "these rows were replaced by the velocity of the pose", len(fault.rows))
 
 
-def _rebuild_clock(repair: EpisodeRepair, motion: PoseMotion) -> None:
-    """Rebuild nominal stamps from distance over speed."""
+def _clock_fault(repair: EpisodeRepair, motion: PoseMotion) -> tuple[Fault, Channels] | None:
+    """Nominal stamps, by distance over speed, with the channels that give the true ones."""
     values = dict(zip((*POSE_CHANNELS, *VELOCITY_CHANNELS), repair.states.T, strict=True))
     channels = Channels(repair.times_s, values, {}, repair.segment, motion)
     fault = nominal_clock(repair.times_s, channels.periods_s())
-    if fault is None:
-        return
+    return None if fault is None else (fault, channels)
+
+
+def _rebuild_clock(repair: EpisodeRepair, fault: Fault, channels: Channels) -> None:
+    """Replace nominal stamps by those from distance over speed."""
     before = repair.times_s
     repair.times_s = rebuilt_clock(channels)[0] + before[0]
     shift_s = repair.times_s[-1] - before[-1]

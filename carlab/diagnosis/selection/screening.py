@@ -79,7 +79,7 @@ class Screen:
         """Score of a candidate: the maximum over its sizes, signs and places."""
         settings = self.settings
         config = with_effect(self.config, effect)
-        points = self._points(config, effect, tuple(free))
+        points = self.points(effect, free)
         gains = np.full(len(points), -math.inf)
         along = np.zeros(len(points))
         for part in np.array_split(np.arange(len(points)), max(1, math.ceil(len(points) / settings.batch_size))):
@@ -107,8 +107,9 @@ class Screen:
         full = np.hstack([np.tile(self.best.z, (len(points), 1)), points])
         return self.fitter.white(config, (*self.best.free, *free), full)
 
-    def _points(self, config: SimulatorConfig, effect: str, free: tuple[FitParameter, ...]) -> FloatArray:
+    def points(self, effect: str, free: Sequence[FitParameter]) -> FloatArray:
         """Coordinates (P, n) at which the candidate is evaluated."""
+        config, free = with_effect(self.config, effect), tuple(free)
         own = EFFECTS[effect].screening_points(_Probe(self, config, free))
         if own is not None:
             return own

@@ -7,27 +7,47 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ComparisonSettings:
-    """Fits of candidates in each group, significance, and the set of changes."""
+    """Windows, noise of the prediction errors, significance, and the set of changes."""
 
     block_s: float = 5.0
     """Length [s] of blocks that count as independent: errors of a wrong model depend on the place and the manoeuvre."""
     min_blocks: int = 10
     """Minimum number of blocks of a group; fewer give no usable standard error."""
-    max_windows: int = 250
-    """Maximum number of windows of a group, thinned evenly; bounds the time."""
+    max_windows: tuple[int, int] = (300, 150)
+    """Maximum number of windows of the first and the second group, thinned evenly; bounds the time."""
+    max_point_windows: int = 80
+    """Maximum number of windows that the sizes of the candidates' points are chosen on."""
+    max_points: int = 8
+    """Maximum number of points of a candidate."""
+    error_rms_changes: tuple[float, ...] = (0.3, 1.5)
+    """Root mean square changes of the whitened errors at the points of a candidate."""
+    typical_size_ratios: tuple[float, ...] = (0.4, 1.2, 3.0)
+    """Shares of the typical size at the points of a candidate with an infinite identity value."""
+    max_secant: float = 50.0
+    """Changes of whitened errors are clipped here [standard deviations]."""
+    student_dof: float = 5.0
+    """Degrees of freedom of the errors' multivariate Student-t distribution."""
+    covariance_ridge: tuple[float, float] = (0.02, 0.01)
+    """Added to the diagonal of the errors' covariance: share of the diagonal, and variance [squared floors]."""
+    weight_iterations: int = 3
+    """Updates of the Student-t weights in a linear estimate."""
+    max_start_step: float = 3.0
+    """Maximum step along a secant at which a fit starts; a larger linear estimate is cut to it."""
+    part_prior_dof: float = 3.0
+    """Degrees of freedom of the prior that estimates spread over long parts as over blocks."""
+    max_refined: int = 5
+    """Maximum number of candidates that are fitted after the linear estimate."""
     iterations: int = 6
-    """Maximum number of iterations of a candidate's fit in one group."""
-    p_max: float = 0.01
+    """Maximum number of iterations of a fit."""
+    tolerance: float = 1e-3
+    """Relative fall of the loss at which a fit ends."""
+    p_max: float = 0.05
     """Maximum p-value of a change, multiplied by the number of candidates (Bonferroni)."""
-    min_unseen_share: float = 0.01
-    """Minimum fall of the loss on unseen blocks by a change, as a share of the loss."""
-    min_unseen_z: float = 3.0
-    """Minimum of that fall [standard errors]: the halves of a real drive differ by up to two without a change."""
-    min_share_of_first: float = 0.1
-    """Minimum fall of the loss by a further change, as a share of that by the first: a weak one imitates the first."""
+    min_share_of_first: float = 0.15
+    """Minimum likelihood ratio of a further change, as a share of that of the first: a weak one imitates the first."""
     max_changes: int = 3
     """Maximum number of changes."""
-    tie_z: float = 2.0
-    """Two candidates are indistinguishable if their losses on unseen blocks differ by less [standard errors]."""
+    tie_chi2: float = 4.0
+    """Two candidates are indistinguishable if their likelihood ratios, over the design effect, differ by less."""
     period_ratio_max: float = 1.2
     """Maximum ratio of the recording periods of one car."""

@@ -1,0 +1,112 @@
+"""Two groups of recordings, prepared alike, and the reference model that is fitted to the first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.core.errors import DataError
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.comparison.error_model import ErrorModel
+from carlab.diagnosis.identification.fit import Fitter
+from carlab.diagnosis.identification.held_out_errors import noise_floor
+from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
+from carlab.diagnosis.recording_faults import find as data_faults_of
+from carlab.diagnosis.recordings import check_excitation
+from carlab.diagnosis.selection.problem import SearchProblem
+from carlab.diagnosis.selection.refit import fit_with_scale
+from carlab.diagnosis.settings import DiagnosisSettings
+from carlab.diagnosis.state_alignment import with_known_latency
+from carlab.prediction.initial_states import without_curvature_bias
+from carlab.prediction.windows import PredictionWindows, Track, cut_windows, tracks_of
+from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import CURVES, confusable_effects
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedGroups:
+    """Reference model and both groups.
+
+    config   simulator fitted to the first group
+    fitters  windows and error scale of each group
+    errors   (S, D) whitened errors of the reference model in each group
+    model    distribution of these errors, from the first group
+    """
+
+    config: SimulatorConfig
+    fitters: tuple[Fitter, Fitter]
+    errors: tuple[FloatArray, FloatArray]
+    model: ErrorModel
+
+
+def compared_groups(
+    reference: Sequence[EpisodeData],
+    changed: Sequence[EpisodeData],
+    nominal: SimulatorConfig,
+    settings: DiagnosisSettings,
+) -> ComparedGroups:
+    """Repair both groups alike, cut them into windows, and fit the base parameters and effects to the first.
+
+    Raises:
+        DataError: the recordings are too short or too uniform, or have different periods; the message has the remedy.
+    """
+    nominal = with_known_latency(nominal, (*reference, *changed))
+    reference, changed, _ = data_faults_of.check(reference, changed, nominal, alike=True)
+    tracks = [_checked_tracks(group, k, settings) for k, group in enumerate((reference, changed))]
+    periods = [t[0].period_s for t in tracks]
+    if max(periods) > settings.comparison.period_ratio_max * min(periods):
+        raise DataError(
+            f"The groups have periods of {periods[0]:.3f} s and {periods[1]:.3f} s; compare recordings of one car."
+        )
+    first, second = (_windows(tracks_of(group, periods[0]), settings) for group in (reference, changed))
+    variance_s2 = velocity_window_variance_s2(first, nominal, settings.identification)
+    first, second = (
+        without_curvature_bias(replace(w, velocity_window_s2=variance_s2), nominal) for w in (first, second)
+    )
+    noise = estimate_noise(tracks[0], first.curvature_bias, settings=settings.identification)
+    per_step = noise_floor(first, noise, nominal, settings.identification)[1:]
+    problem = SearchProblem(nominal, first, np.sqrt(np.mean(per_step**2, axis=0)), confusable_effects(), (), settings)
+    curves = tuple(f"effects.{curve.id}." for curve in CURVES)
+    free = tuple(f for f in problem.free_parameters(()) if not f.name.startswith(curves))  # measured curves stay
+    fitted = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))
+    limits = settings.comparison.max_windows
+    one, two = (
+        Fitter(w.thinned(limit), fitted.scale, settings.identification)
+        for w, limit in zip((first, second), limits, strict=True)
+    )
+    config = fitted.fit.config
+    errors = (_errors(one, config), _errors(two, config))
+    return ComparedGroups(config, (one, two), errors, ErrorModel.of(errors[0], settings.comparison))
+
+
+def _errors(fitter: Fitter, config: SimulatorConfig) -> FloatArray:
+    white = fitter.white(config, (), np.zeros((1, 0)))[0]
+    return np.asarray(white.reshape(len(white), -1))
+
+
+def _checked_tracks(episodes: Sequence[EpisodeData], k: int, settings: DiagnosisSettings) -> list[Track]:
+    """Tracks of a group. Raises DataError if it is too short or too uniform."""
+    which = ("first", "second")[k]
+    tracks = tracks_of(episodes)
+    seconds = sum(track.duration_s for track in tracks)
+    needed_s = settings.comparison.block_s * settings.comparison.min_blocks
+    if seconds < needed_s:
+        raise DataError(
+            f"The {which} group has {seconds:.0f} s of driving; a comparison needs {needed_s:.0f} s in each group."
+        )
+    check_excitation(tracks, settings.windows)
+    return tracks
+
+
+def _windows(tracks: Sequence[Track], settings: DiagnosisSettings) -> PredictionWindows:
+    cut = cut_windows(tracks, settings.windows.fit_window_s, settings.windows.fit_stride_s, settings.comparison.block_s)
+    if len(np.unique(cut.block)) < settings.comparison.min_blocks:
+        raise DataError("The car moves too little in one group; record at least one minute of driving.")
+    return cut.thinned(settings.windows.max_fit_windows)
+
+
+__all__ = ["ComparedGroups", "compared_groups"]
