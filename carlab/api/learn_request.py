@@ -13,7 +13,7 @@ from carlab.core.errors import ConfigError
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
     from carlab.core.task import Task
-    from carlab.experiment.campaign.training import TrainingPlan
+    from carlab.experiment.campaign.training_plan import TrainingPlan
     from sim_backends.car_parameters import SimulatorConfig
 
 AUTO = "auto"
@@ -62,7 +62,7 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
     from carlab.core.task_choice import PARKING
     from carlab.experiment.campaign.campaign import PAPER_HISTORY
     from carlab.experiment.campaign.prior_repair import needed_history
-    from carlab.experiment.campaign.training import TrainingPlan
+    from carlab.experiment.campaign.training_plan import TrainingPlan
 
     history = request.history
     if history is None:

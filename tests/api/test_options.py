@@ -25,7 +25,11 @@ CASES = [
     (Diagnose, carlab.diagnose, {"verbose", "decisions"}),
     # Without --drive, replay predicts with a simulator; with it, it drives, which is carlab.replay.
     (Replay, carlab.predict, {"verbose", "save", "drive", "seconds", "seed", "out", "vehicle", "dry_run", "reality"}),
-    (Replay, carlab.replay, {"verbose", "save", "drive", "horizon_s", "stride_s", "holdout_share", "adapt"}),
+    (
+        Replay,
+        carlab.replay,
+        {"verbose", "save", "drive", "horizon_s", "stride_s", "holdout_share", "adapt", "keep_events"},
+    ),
     (Check, carlab.check, {"verbose"}),
 ]
 

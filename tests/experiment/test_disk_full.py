@@ -17,7 +17,8 @@ from carlab.core.outcome import EndReason
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from carlab.experiment.campaign.campaign import Campaign
-from carlab.experiment.campaign.training import TrainingPlan, model_folder
+from carlab.experiment.campaign.training import model_folder
+from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.episodes.scripted_policies import NeutralPolicy
 from carlab.experiment.episodes.session import Session, SessionHooks
 from carlab.recording.mcap.sink import McapSink

@@ -16,7 +16,7 @@ import torch
 from carlab.cars import choose_car
 from carlab.experiment.campaign import campaign, training
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, prior_simulator, resumed_campaign
-from carlab.experiment.campaign.training import TrainingPlan
+from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.episodes.session import Session
 from carlab.recording.run_folder import RunDirectory
 from learning.policy.sac_agent import SacAgent, SacPolicy

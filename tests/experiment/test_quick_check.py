@@ -15,7 +15,7 @@ from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.quick_check import QuickCheck, check, check_path, run_check_subprocess
 from carlab.experiment.campaign.report import learning_curve, save_check, save_row
-from carlab.experiment.campaign.training import TrainingPlan
+from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
 

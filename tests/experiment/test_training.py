@@ -20,7 +20,8 @@ from carlab.core.geofence import can_stop_inside
 from carlab.core.observation import encode
 from carlab.core.quantities import CarState
 from carlab.experiment.campaign import training
-from carlab.experiment.campaign.training import SUCCESS_BONUS, TrainingPlan, train
+from carlab.experiment.campaign.training import SUCCESS_BONUS, train
+from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.campaign.training_process import train_in_subprocess
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
@@ -133,13 +134,13 @@ def test_model_env_has_a_larger_stopping_margin_and_a_parking_bonus(
     train(plan, tmp_path / "models", [], ENVELOPE, lambda *what: None)
     edge_m = max(x for x, _ in ENVELOPE.arena_m)
     history = np.zeros((HISTORY, 2))
-    for env in envs:
+    training_env, evaluation_env, _drawn_cars = envs
+    for env in (training_env, evaluation_env):
         for margin_m, stopped in ((1.1, True), (1.4, False)):
             state = CarState(edge_m - margin_m, 0.0, 0.0, 2.0, 0.0, 0.0)
             assert can_stop_inside(ENVELOPE.arena_m, state, ENVELOPE.reaction_s, ENVELOPE.deceleration_mps2)
             row = torch.from_numpy(encode(state.to_array()[None], history[None])).float()
             assert env._stopped(row).tolist() == [stopped]
-    training_env, evaluation_env = envs
     features = torch.from_numpy(encode(np.diag([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])[:2], np.zeros((2, HISTORY, 2)))).float()
     assert training_env._bonus is not None
     assert training_env._bonus(features).tolist() == pytest.approx([SUCCESS_BONUS, 0.0])

@@ -15,7 +15,7 @@ from carlab.core.safety import SafetyEnvelope
 from carlab.core.task import ParkingTask
 from carlab.experiment.campaign.campaign import prior_simulator
 from carlab.experiment.campaign.figures import EpisodeFigures
-from carlab.experiment.campaign.training import TrainingPlan
+from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.episodes.session import EpisodeResult, Session
 from carlab.recording.run_folder import RunDirectory
 

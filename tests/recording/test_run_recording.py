@@ -47,7 +47,7 @@ def run_file(tmp_path: Path, make_documents, mean_and_std) -> Path:
         straight[:, 0] = [0.0, 1.0, 2.0]
         recording.add_predicted_path(episode.times_s[4], 4, straight, np.array([0.0, 0.1, 0.3]))
         recording.add_windows(episode, WINDOW, *mean_and_std)
-        figures = {"episode": 2, "total_reward": 4.0, "last_episode_nll": None, "parked": True, "end": "GOAL_REACHED"}
+        figures = {"episode": 2, "total_reward": 4.0, "last_episode_nll": None, "success": True, "end": "GOAL_REACHED"}
         recording.add_figures(2, figures, "The simulator explains it.")
         send_blueprint(stream, recording.blueprint())
     return tmp_path / "run.rrd"
@@ -96,7 +96,7 @@ def test_predictions_and_figures_are_written_with_their_bands(run_file: Path, me
     assert "learning/last_episode_nll" not in by_episode
     ((_, (table,)),) = cells(run_file, "TextDocument:text", "episode")["learning/table"]
     assert table.splitlines() == [
-        "| episode | return | parked | end |", "| --- | --- | --- | --- |", "| 2 | 4.00 | yes | goal reached |"
+        "| episode | return | success | end |", "| --- | --- | --- | --- |", "| 2 | 4.00 | yes | goal reached |"
     ]  # fmt: skip
     assert cells(run_file, "TextLog:text", "episode")["check"] == [(2, ["Episode 2: The simulator explains it."])]
 

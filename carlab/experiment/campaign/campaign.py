@@ -31,14 +31,8 @@ from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.prior_process import RepairRequest, read_version, repair_path, run_repair_subprocess
 from carlab.experiment.campaign.prior_repair import PriorVersion, corrected, without_ranges
 from carlab.experiment.campaign.quick_check import QuickCheck, check_path, run_check_subprocess
-from carlab.experiment.campaign.training import (
-    Progress,
-    TrainingPlan,
-    model_folder,
-    plan_as_json,
-    plan_from_json,
-    training_figures,
-)
+from carlab.experiment.campaign.training import Progress, model_folder, training_figures
+from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from carlab.experiment.campaign.training_process import train_in_subprocess
 from carlab.experiment.episodes.session import EpisodeResult, Session, SessionHooks
 from carlab.recording.mcap.source import read_documents

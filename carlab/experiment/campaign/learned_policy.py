@@ -10,7 +10,7 @@ from carlab.core.errors import DataError
 from carlab.core.observation import feature_size
 from carlab.core.policy import Policy
 from carlab.experiment.campaign.campaign import saved_plan
-from carlab.experiment.campaign.training import TrainingPlan
+from carlab.experiment.campaign.training_plan import TrainingPlan
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
 

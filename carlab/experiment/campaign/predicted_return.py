@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from carlab.experiment.campaign.training import TrainingPlan
+    from carlab.experiment.campaign.training_plan import TrainingPlan
     from learning.policy.sac_agent import SacAgent
     from learning.world.model_env import ModelEnv
 

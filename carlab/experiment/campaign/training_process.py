@@ -12,7 +12,8 @@ from typing import Any
 
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.safety import SafetyEnvelope
-from carlab.experiment.campaign.training import Progress, TrainingPlan, train
+from carlab.experiment.campaign.training import Progress, train
+from carlab.experiment.campaign.training_plan import TrainingPlan
 
 log = logging.getLogger(__name__)
 

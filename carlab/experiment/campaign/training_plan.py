@@ -1,0 +1,82 @@
+"""Settings of model and policy training of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, get_args
+
+from carlab.core.task import Task
+from carlab.core.task_choice import PARKING, TaskChoice
+from learning.world.car_fit import Method
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingPlan:
+    """Settings of model and policy training, the same before every episode of a run.
+
+    Attributes:
+        prior_toml: car file of the prior simulator, with ranges and effects.
+        history: number of past commands that model and policy observe.
+        method: ``sim-fsvgd`` has a simulator prior; ``fsvgd`` has none; ``fsvgd-authors`` has the settings of the
+            authors of Sim-FSVGD.
+        model_steps: steps of the particles' optimiser; None: the default of the method.
+        updates: gradient steps of SAC (``updates_before``).
+        ticks: ticks of an episode; None: those of the task.
+        seed: seed of all random numbers.
+        threads: number of threads of torch.
+        device: device of the training; the policy drives on the CPU.
+        task_choice: the task.
+    """
+
+    prior_toml: str
+    history: int = 3
+    method: Method = "sim-fsvgd"
+    model_steps: int | None = None
+    updates: int = 30_000
+    ticks: int | None = None
+    seed: int = 0
+    threads: int = 1
+    device: str = "cpu"
+    task_choice: TaskChoice = PARKING
+
+    @property
+    def task(self) -> Task:
+        """The task with the history of the model and the ticks of this run."""
+        return self.task_choice.load().resized(self.history, self.ticks)
+
+    def updates_before(self, episode: int) -> int:
+        """Gradient steps of SAC before an episode: 1.5 times ``updates`` before the first, 3 / episode after the third.
+
+        Training continues from the previous policy, and the share of new rows decreases.
+        """
+        if episode == 1:
+            return self.updates * 3 // 2
+        return self.updates * 3 // max(episode, 3)
+
+
+def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
+    """The plan as values for a JSON file; of a user's task only the name and the hash of its file."""
+    return {**asdict(replace(plan, task_choice=PARKING)), "task_choice": plan.task_choice.to_table()}
+
+
+def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
+    """Read the output of ``plan_as_json``; runs no code.
+
+    Raises:
+        KeyError, TypeError, ValueError: wrong names, types or ranges.
+    """
+    task_choice = TaskChoice.from_table(content["task_choice"]) if "task_choice" in content else PARKING
+    plan = TrainingPlan(**{**content, "task_choice": task_choice})
+    if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
+        raise ValueError("prior, method or device of the plan")
+    for name, minimum in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():
+        value = getattr(plan, name)
+        if value is None and name in ("model_steps", "ticks"):
+            continue
+        if type(value) is not int or value < minimum:
+            raise ValueError(f"{name} of the plan is {value!r}")
+    return plan
+
+
+__all__ = ["TrainingPlan", "plan_as_json", "plan_from_json"]
