@@ -28,7 +28,7 @@ from carlab.prediction.windows import tracks_of
 from sim_backends.array_ops import ARRAYS
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.single_track import SingleTrack
-from sim_backends.effects.curves import FrontTyreCurve, RearTyreCurve
+from sim_backends.effects.curves import FrontTyreCurve, RearTyreMap
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -155,15 +155,13 @@ def panels(config: SimulatorConfig, tracks: list[Track]) -> list[Panel]:
                   bench.acceleration(here, grid), time_near(speed[near], grid, period_s))
         )  # fmt: skip
     slips = np.linspace(0.0, 0.6, 31)
-    axles: tuple[tuple[str, Callable[[Array], Array], FrontTyreCurve | RearTyreCurve], ...] = (
+    axles: tuple[tuple[str, Callable[[Array], Array], FrontTyreCurve | RearTyreMap], ...] = (
         ("front", authors_front, FrontTyreCurve()),
-        ("rear", authors_rear, RearTyreCurve()),
+        ("rear", authors_rear, RearTyreMap()),
     )
     for axle, authors, curve in axles:
         moving = [np.abs(f.vx) > 0.5 for f in forces]
-        recorded = np.concatenate(
-            [curve.coordinates(ARRAYS, f)[0][m] for f, m in zip(forces, moving, strict=True)]
-        )
+        recorded = np.concatenate([curve.coordinates(ARRAYS, f)[-1][m] for f, m in zip(forces, moving, strict=True)])
         made.append(
             Panel(f"{axle} side force per load", "slip angle [rad]", slips, authors(slips),
                   bench.side_force(axle, slips), time_near(recorded, slips, period_s))

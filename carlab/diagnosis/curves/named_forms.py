@@ -8,7 +8,8 @@ speed).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -133,19 +134,42 @@ TYRE_FORMS = (
          (_GRIP, FormParameter("B", "1/rad", (4.0, 12.0)), FormParameter("C", "1", (1.5,), 0.5, 2.5)),
          lambda grip, b, c, slip: grip * np.sin(c * np.arctan(b * slip))),
 )  # fmt: skip
-SHARING_FORMS = (
-    Form("no_sharing", "no sharing of forces", (), lambda x: np.ones_like(x)),
-    Form("friction_ellipse", "a friction ellipse", (FormParameter("limit", "m/s2", (6.0, 12.0), 0.1),),
-         lambda limit, x: np.sqrt(np.maximum(1.0 - (x / limit) ** 2, 0.0))),
-    Form("asymmetric_friction_ellipse", "a friction ellipse with different limits of driving and braking",
-         (FormParameter("braking limit", "m/s2", (6.0,), 0.1), FormParameter("driving limit", "m/s2", (6.0,), 0.1)),
-         lambda brake, drive, x: np.sqrt(np.maximum(1.0 - (x / np.where(x < 0.0, brake, drive)) ** 2, 0.0))),
-)  # fmt: skip
+
+
+def _with_ellipse(tyre: Form) -> tuple[Form, Form]:
+    """The tyre with a friction ellipse of one limit, and of different limits of braking and driving."""
+
+    def shared(*values: Any) -> FloatArray:
+        *own, limit, x, slip = values
+        return np.asarray(tyre.function(*own, slip) * np.sqrt(np.maximum(1.0 - (x / limit) ** 2, 0.0)))
+
+    def shared_by_two(*values: Any) -> FloatArray:
+        *own, brake, drive, x, slip = values
+        return shared(*own, np.where(x < 0.0, brake, drive), x, slip)
+
+    limit, brake, drive = (FormParameter(name, "m/s2", (6.0, 12.0), 0.1) for name in _LIMITS)
+    name = f"{tyre.name} with a friction ellipse"
+    return (
+        Form(f"{tyre.id}_friction_ellipse", name, (*tyre.parameters, limit), shared),
+        Form(
+            f"{tyre.id}_two_limits",
+            f"{name} of different limits of braking and driving",
+            (*tyre.parameters, brake, drive),
+            shared_by_two,
+        ),
+    )
+
+
+def _at_any_force(tyre: Form) -> Form:
+    return replace(tyre, function=lambda *values: tyre.function(*values[:-2], values[-1]))
+
+
+_LIMITS = ("longitudinal limit", "braking limit", "driving limit")
+REAR_FORMS = tuple(form for tyre in TYRE_FORMS for form in (_at_any_force(tyre), *_with_ellipse(tyre)))
 FORMS: Mapping[str, tuple[Form, ...]] = {
     "drive_map": DRIVE_FORMS,
     "steering_curve": STEERING_FORMS,
     "front_tyre_curve": TYRE_FORMS,
-    "rear_tyre_curve": TYRE_FORMS,
-    "rear_force_sharing": SHARING_FORMS,
+    "rear_tyre_map": REAR_FORMS,
 }
 """Forms by the id of a measured curve, the simplest first."""

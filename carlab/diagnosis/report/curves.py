@@ -22,7 +22,7 @@ def curve_sentences(diagnosis: Diagnosis) -> list[str]:
     for curve in diagnosis.curves:
         made.append(_largest_difference(curve))
         made.append(form_sentence(curve))
-        if len(curve.axes) == 2:
+        if curve.id == "drive_map":
             made += readings_of_drive(curve, DEFAULT.report)
     return [sentence for sentence in made if sentence]
 
