@@ -191,12 +191,16 @@ def main(model: str, *recordings: str) -> None:
     material = read_material([Path(name) for name in recordings], "fit", config.mocap.latency_s)
     found = panels(config, tracks_of(material.episodes))
     draw(found, IMAGE)
-    print("| curve | driven range | rms difference | rms of the authors' curve about its mean |")
-    print("| --- | --- | --- | --- |")
+    lines = [
+        "| curve | driven range | rms difference | rms of the authors' curve about its mean |",
+        "| --- | --- | --- | --- |",
+    ]
     for panel in found:
         if panel.supported.any():
             low, high = panel.x[panel.supported][[0, -1]]
-            print(f"| {panel.title} | {low:.2f} to {high:.2f} | {panel.rms()[0]:.3f} | {panel.rms()[1]:.3f} |")
+            difference, spread = panel.rms()
+            lines.append(f"| {panel.title} | {low:.2f} to {high:.2f} | {difference:.3f} | {spread:.3f} |")
+    sys.stdout.write("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -107,28 +107,29 @@ TRUTHS = {
         {"grip": 0.7, "braking limit": 5.0, "driving limit": 9.0},
     ),
 }
-NOISE = {"drive_map": 0.8, "steering_curve": 0.02, "front_tyre_curve": 0.04, "rear_tyre_map": 0.08}
-"""Standard deviation of a sample; a curve is regressed on 1500 samples."""
+NOISE = {"drive_map": 1.6, "steering_curve": 0.04, "front_tyre_curve": 0.08, "rear_tyre_map": 0.16}
+"""Standard deviation of a sample; a curve is regressed on this many samples."""
+SAMPLES = 6000
 
 
 def measured_curve(curve_id, truth, seed, anchored=True):
     """A piecewise linear regression of noisy samples of a function, with its covariance."""
     curve, rng = EFFECTS[curve_id], np.random.default_rng(seed)
     knots = [np.array(axis.knots) for axis in curve.axes]
-    x = [rng.uniform(k[0], k[-1], 1500) for k in knots]
-    noise = NOISE.get(curve_id, 0.05)
-    y = truth(*x) + noise * rng.normal(size=1500)
+    x = [rng.uniform(k[0], k[-1], SAMPLES) for k in knots]
+    noise = NOISE[curve_id]
+    y = truth(*x) + noise * rng.normal(size=SAMPLES)
     hats = [np.stack([np.interp(v, k, row) for row in np.eye(len(k))], axis=1) for v, k in zip(x, knots, strict=True)]
-    design = hats[0] if len(hats) == 1 else (hats[0][:, :, None] * hats[1][:, None]).reshape(1500, -1)
+    design = hats[0] if len(hats) == 1 else (hats[0][:, :, None] * hats[1][:, None]).reshape(SAMPLES, -1)
     grid = np.meshgrid(*knots, indexing="ij")
     shape = grid[0].shape
     value = np.array(truth(*(g.ravel() for g in grid)))
     anchor = [g.ravel() == axis.anchor for g, axis in zip(grid, curve.axes, strict=True)]
     free = ~np.any(anchor, axis=0) if anchored else np.ones(len(value), bool)
-    inverse = np.linalg.pinv(design[:, free])
-    value[free] = inverse @ (y - design[:, ~free] @ value[~free])
+    inverse = np.linalg.inv(design[:, free].T @ design[:, free])
+    value[free] = inverse @ (design[:, free].T @ (y - design[:, ~free] @ value[~free]))
     covariance = np.zeros((len(value), len(value)))
-    covariance[np.ix_(free, free)] = noise**2 * inverse @ inverse.T
+    covariance[np.ix_(free, free)] = noise**2 * inverse
     finding = CurveFinding(
         curve_id, curve.quantity, curve.unit, tuple(CurveAxis(a.name, a.unit, a.knots) for a in curve.axes),
         np.zeros(shape), value.reshape(shape), np.sqrt(np.diag(covariance)).reshape(shape), np.full(shape, 9.0),
@@ -146,13 +147,13 @@ def test_every_form_of_one_cause_has_a_truth():
 def test_the_true_form_is_named_with_its_parameters(form_id):
     curve_id, truth, expected = TRUTHS[form_id]
     named, z = [], []
-    for seed in range(8):
+    for seed in range(5):
         form = read_form(*measured_curve(curve_id, truth, seed), DEFAULT.curves)
         named.append(form.id if form.is_within_band else "")
         if form.id == form_id:
             z += [(form.parameters[name].value - value) / form.parameters[name].std for name, value in expected.items()]
             assert all(e.low90 < e.value < e.high90 for e in form.parameters.values())
-    assert named.count(form_id) >= 6, named
+    assert named.count(form_id) >= 4, named
     assert not z or (np.abs(z).max() < 4.0 and np.mean(np.abs(z) < 1.645) >= 0.6)
 
 
@@ -189,7 +190,7 @@ def test_true_forms_have_the_nominal_level():
     """Of curves of a true form, at most a few in a hundred lie outside of the band."""
     curve_id, truth, _ = TRUTHS["steering_asymmetry"]
     inside = [read_form(*measured_curve(curve_id, truth, seed), DEFAULT.curves).is_within_band for seed in range(100)]
-    assert 0.94 <= np.mean(inside)
+    assert np.mean(inside) >= 0.94
 
 
 def test_forms_that_a_wide_band_does_not_distinguish_are_all_named():

@@ -90,7 +90,7 @@ _DRIVE = FormParameter("driving limit", "m/s2", (4.0,))
 _EXPONENT = FormParameter("exponent", "1", (0.6, 1.5), 0.1, 5.0)
 _STEERING_GAIN = FormParameter("gain", "1", (1.0,))
 _STIFFNESS = FormParameter("cornering stiffness per load", "1/rad", (5.0,))
-_GRIP = FormParameter("grip", "1", (0.4, 0.8), 0.0, 5.0)
+_GRIP = FormParameter("grip", "1", (0.6,), 0.0, 5.0)
 
 DRIVE_FORMS = (
     Form("linear_drive", "a drive force proportional to throttle, with viscous damping", (_GAIN, _DAMPING),
@@ -131,7 +131,7 @@ TYRE_FORMS = (
     Form("saturating_tyre", "a tyre that saturates", (_STIFFNESS, _GRIP),
          lambda stiffness, grip, slip: grip * np.tanh(stiffness * slip / max(grip, 1e-9))),
     Form("pacejka_tyre", "a Pacejka tyre",
-         (_GRIP, FormParameter("B", "1/rad", (4.0, 12.0)), FormParameter("C", "1", (1.5,), 0.5, 2.5)),
+         (_GRIP, FormParameter("B", "1/rad", (6.0,)), FormParameter("C", "1", (1.5,), 0.5, 2.5)),
          lambda grip, b, c, slip: grip * np.sin(c * np.arctan(b * slip))),
 )  # fmt: skip
 
@@ -147,7 +147,7 @@ def _with_ellipse(tyre: Form) -> tuple[Form, Form]:
         *own, brake, drive, x, slip = values
         return shared(*own, np.where(x < 0.0, brake, drive), x, slip)
 
-    limit, brake, drive = (FormParameter(name, "m/s2", (6.0, 12.0), 0.1) for name in _LIMITS)
+    limit, brake, drive = (FormParameter(name, "m/s2", (8.0,), 0.1) for name in _LIMITS)
     name = f"{tyre.name} with a friction ellipse"
     return (
         Form(f"{tyre.id}_friction_ellipse", name, (*tyre.parameters, limit), shared),
