@@ -25,6 +25,9 @@ from sim_backends.effects.curves import weights
 Z90 = 1.645
 """Quantile of the normal distribution for a 90 % interval."""
 
+DIFFERENCE_SHARE = 0.02
+"""Step of a parameter for the derivative of a form, over its value."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Candidate:
@@ -111,14 +114,14 @@ def _fitted(form: Form, knots: _Knots, settings: CurveSettings) -> _Candidate:
     low = np.array([p.low for p in form.parameters])
     high = np.array([p.high for p in form.parameters])
     best, values = knots.difference(form, np.zeros(0)) if not form.parameters else None, np.zeros(0)
-    jacobian = np.zeros((len(knots), 0))
     for start in itertools.product(*(p.starts for p in form.parameters)) if form.parameters else ():
         result = least_squares(
             lambda z: knots.difference(form, z), start, bounds=(low, high), x_scale=np.abs(start) + 1e-3
         )
         if best is None or result.cost < 0.5 * float(best @ best):
-            best, values, jacobian = result.fun, result.x, result.jac
+            best, values = result.fun, result.x
     assert best is not None
+    jacobian = _jacobian(form, knots, values)
     gain = np.linalg.pinv(jacobian)
     # Residuals of the true form are (1 - J J+) times the errors of the knots.
     annihilator = np.eye(len(knots)) - jacobian @ gain
@@ -128,6 +131,16 @@ def _fitted(form: Form, knots: _Knots, settings: CurveSettings) -> _Candidate:
     limit = mean / freedom * float(chi2_distribution.ppf(1.0 - settings.form_level, freedom))
     rms = float(np.sqrt(np.mean((best * knots.std) ** 2)))
     return _Candidate(form, values, gain @ knots.correlation @ gain.T, float(best @ best), limit, rms)
+
+
+def _jacobian(form: Form, knots: _Knots, values: FloatArray) -> FloatArray:
+    """Differences (k, n) over steps of 2 %, as a form with a bend has no smooth derivative between the fine points."""
+    steps = np.diag(DIFFERENCE_SHARE * np.maximum(np.abs(values), 1e-2))
+    rows = [
+        (knots.difference(form, values + step) - knots.difference(form, values - step)) / (2.0 * step.sum())
+        for step in steps
+    ]
+    return np.stack(rows, axis=1) if rows else np.zeros((len(knots), 0))
 
 
 def _estimates(candidate: _Candidate) -> dict[str, Estimate]:
