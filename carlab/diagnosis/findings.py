@@ -13,21 +13,15 @@ from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.events import Event, EventUse
+from carlab.diagnosis.measured import CurveAxis as CurveAxis
+from carlab.diagnosis.measured import CurveFinding as CurveFinding
+from carlab.diagnosis.measured import Estimate as Estimate
+from carlab.diagnosis.measured import FormFinding as FormFinding
+from carlab.diagnosis.measured import curve_table
 from carlab.diagnosis.settings import DEFAULT
 
 SCHEMA = "carlab.diagnosis/1"
 Verdict = Literal["mismatch", "parameters", "none", "data", "unexplained", "inconclusive"]
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """A fitted number with its standard deviation and 90 % interval, in ``unit``."""
-
-    value: float
-    std: float
-    low90: float
-    high90: float
-    unit: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,40 +86,6 @@ class Unexplained:
     regime: str
     kind: str
     formula: str
-
-
-@dataclass(frozen=True, slots=True)
-class CurveAxis:
-    """An input of a measured curve with its knots."""
-
-    name: str
-    unit: str
-    knots: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class CurveFinding:
-    """A measured curve beside that of the car file, at the knots of its axes (an array with one dimension an axis).
-
-    Attributes:
-        id: id of the curve.
-        quantity: what the curve gives, in ``unit``.
-        unit: its unit.
-        axes: inputs.
-        car_file: the curve of the car file.
-        measured: the curve of the recordings; NaN at knots without data.
-        std: its standard deviations; NaN at knots without data.
-        support_s: driving time near each knot [s].
-    """
-
-    id: str
-    quantity: str
-    unit: str
-    axes: tuple[CurveAxis, ...]
-    car_file: FloatArray
-    measured: FloatArray
-    std: FloatArray
-    support_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,7 +275,7 @@ class Diagnosis:
             "parameters": {name: asdict(e) for name, e in self.parameters.items()},
             "fit": {"horizon_s": self.horizon_s, "held_out": {k: asdict(v) for k, v in self.held_out.items()}},
             "unexplained": unexplained,
-            "curves": [_curve_table(curve) for curve in self.curves],
+            "curves": [curve_table(curve) for curve in self.curves],
             "ceiling": None if self.ceiling is None else asdict(self.ceiling),
             "skill": [asdict(s) for s in self.skill],
             "drift": [_drift_table(d) for d in self.drift],
@@ -330,12 +290,6 @@ class Diagnosis:
             "seconds": self.seconds,
         }
         return dict(_plain(made))
-
-
-def _curve_table(curve: CurveFinding) -> dict[str, Any]:
-    arrays = ("car_file", "measured", "std", "support_s")
-    plain = {"id": curve.id, "quantity": curve.quantity, "unit": curve.unit, "axes": [asdict(a) for a in curve.axes]}
-    return plain | {name: getattr(curve, name).tolist() for name in arrays}
 
 
 def _drift_table(drift: Drift) -> dict[str, Any]:

@@ -202,7 +202,7 @@ class DriveMap(MeasuredCurve, DynamicsEffect):
     unit, typical, bound = "m/s2", 1.0, 40.0
     axes = (
         Axis("throttle", "1", (-1.0, -0.6, -0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0)),
-        Axis("speed", "m/s", (-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 4.5)),
+        Axis("speed", "m/s", (-4.5, -3.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0, 4.5)),
     )
 
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
@@ -258,19 +258,23 @@ class _SideForceCurve(MeasuredCurve, DynamicsEffect):
         """Slip angle of the axle's wheels, positive where the force is to the right."""
         raise NotImplementedError
 
+    def inputs(self, ops: Ops, forces: Forces, slip_rad: Value) -> tuple[Value, ...]:
+        """The inputs of the curve at a slip angle."""
+        return (ops.abs(slip_rad),)
+
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """Size of the slip angle."""
-        return (ops.abs(self.slip_rad(ops, forces)),)
+        """The inputs at the slip angle of the car."""
+        return self.inputs(ops, forces, self.slip_rad(ops, forces))
 
     def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
         """Pacejka's curve ``mu sin(C atan(B a))`` [1]."""
         mu, b, c = (values[f"tyre.{self.axle}.{k}"] for k in ("mu", "B", "C"))
-        return np.asarray(mu * np.sin(c * np.arctan(b * coordinates[0])))
+        return np.asarray(mu * np.sin(c * np.arctan(b * coordinates[-1])))
 
     def added(self, ops: Ops, forces: Forces, values: Parameters) -> Value:
         """Side force per load to the left."""
         slip = self.slip_rad(ops, forces)
-        return -ops.sign(slip) * self.deviation(ops, (ops.abs(slip),), values)
+        return -ops.sign(slip) * self.deviation(ops, self.inputs(ops, forces, slip), values)
 
 
 _SLIP_AXIS = (Axis("slip angle", "rad", (0.0, 0.04, 0.1, 0.2, 0.4, 0.8), anchor=0.0),)
@@ -298,54 +302,35 @@ class FrontTyreCurve(_SideForceCurve):
         forces.side_front = forces.side_front + forces.load_front * self.added(ops, forces, values)
 
 
-class RearTyreCurve(_SideForceCurve):
-    """``F_y,rear -= F_z a(|slip|) sign(slip)``."""
+class RearTyreMap(_SideForceCurve):
+    """``F_y,rear -= F_z a(F_x / m, |slip|) sign(slip)``.
 
-    id = "rear_tyre_curve"
+    F_x is that of the driven axle. A tyre whose grip is shared by a friction ellipse is one such map (Pacejka 2012,
+    ch. 1).
+    """
+
+    id = "rear_tyre_map"
     axle = "rear"
-    summary = "The rear side force is a measured curve over the slip angle."
-    class_statement = "a curve of the rear side force over the slip angle"
+    summary = "The rear side force is a measured map over longitudinal force and slip angle."
+    class_statement = "a map of the rear side force over longitudinal force and slip angle"
     unit, typical, bound = "1", 0.1, 3.0
-    axes = _SLIP_AXIS
+    axes = (
+        Axis("longitudinal force per mass", "m/s2", (-8.0, -5.0, -2.5, 0.0, 2.5, 5.0, 8.0)),
+        *_SLIP_AXIS,
+    )
 
     def slip_rad(self, ops: Ops, forces: Forces) -> Value:
         """As in the base model."""
         rear = forces.vy - forces.rear_axle * forces.yaw_rate
         return ops.slope_angle(rear, ops.floor(ops.abs(forces.vx), SLIP_FLOOR_MPS))
 
+    def inputs(self, ops: Ops, forces: Forces, slip_rad: Value) -> tuple[Value, ...]:
+        """Force of the driven axle per mass, and size of the slip angle."""
+        return forces.axle_force / forces.mass, ops.abs(slip_rad)
+
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add."""
         forces.side_rear = forces.side_rear + forces.load_rear * self.added(ops, forces, values)
 
 
-class RearForceSharing(MeasuredCurve, DynamicsEffect):
-    """``F_y,rear *= max(1 + a(F_x / m), 0)``: side force that driving and braking leave to the rear tyres.
-
-    F_x is that of the driven axle. A friction ellipse is one such curve (Pacejka 2012, ch. 1).
-    """
-
-    id = "rear_force_sharing"
-    quantity = "share of the rear side force that remains"
-    summary = "The rear side force is scaled by a measured curve over the longitudinal force."
-    class_statement = "a curve of the rear side force over the longitudinal force"
-    command = "throttle"
-    order = 6
-    base_models = ("dynamic", "linear_tyre", "blend")
-    unit, typical, bound = "1", 0.2, 1.0
-    axes = (Axis("longitudinal force per mass", "m/s2", (-8.0, -4.0, 0.0, 4.0, 8.0), anchor=0.0),)
-
-    def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """Force of the driven axle per mass."""
-        return (forces.axle_force / forces.mass,)
-
-    def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
-        """One: the base model does not share the force."""
-        return np.ones_like(coordinates[0])
-
-    def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Scale."""
-        factor = 1.0 + self.deviation(ops, self.coordinates(ops, forces), values)
-        forces.side_rear = forces.side_rear * ops.floor(factor, 0.0)
-
-
-CURVES = (DriveMap(), SteeringCurve(), FrontTyreCurve(), RearTyreCurve(), RearForceSharing())
+CURVES = (DriveMap(), SteeringCurve(), FrontTyreCurve(), RearTyreMap())

@@ -145,7 +145,7 @@ class FrictionEllipse(DynamicsEffect):
     """
 
     id = "friction_ellipse"
-    represented_by = "rear_force_sharing"
+    represented_by = "rear_tyre_map"
     name = "grip shared between driving and cornering"
     summary = "Driving and braking take side force from the rear tyres."
     sentence = (

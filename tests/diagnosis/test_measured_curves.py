@@ -212,7 +212,7 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     free = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ()).free_parameters(("drive_map",))
     names = [f.name for f in free]
-    gain, knot = names.index("motor.drive_gain"), names.index("effects.drive_map.value_8_2")  # throttle 1
+    gain, knot = names.index("motor.drive_gain"), names.index("effects.drive_map.value_8_6")  # throttle 1
     covariance = np.zeros((len(free), len(free)))
     slope = 0.1 * CAR.parameters.drive_gain_n / CAR.parameters.mass_kg  # change of the curve per unit of z
     covariance[gain, gain], covariance[knot, knot] = 1.0, slope**2

@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_fit import CurveFit
+from carlab.diagnosis.curves.form_fit import read_form
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.settings import CurveSettings
 from carlab.prediction.windows import Track
@@ -31,18 +32,19 @@ def curve_findings(
         grid = np.meshgrid(*(np.array(axis.knots) for axis in curve.axes), indexing="ij")
         measured = _curve(found, curve, found.fit.z, grid)
         driven = support_s >= settings.min_support_s
-        made.append(
-            CurveFinding(
-                id=curve.id,
-                quantity=curve.quantity,
-                unit=curve.unit,
-                axes=tuple(CurveAxis(a.name, a.unit, a.knots) for a in curve.axes),
-                car_file=curve.base_curve(nominal.values(), *grid),
-                measured=np.where(driven, measured, np.nan),
-                std=np.where(driven, _std(found, curve, grid), np.nan),
-                support_s=support_s,
-            )
+        covariance = _covariance(found, curve, grid)
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(measured.shape)
+        finding = CurveFinding(
+            id=curve.id,
+            quantity=curve.quantity,
+            unit=curve.unit,
+            axes=tuple(CurveAxis(a.name, a.unit, a.knots) for a in curve.axes),
+            car_file=curve.base_curve(nominal.values(), *grid),
+            measured=np.where(driven, measured, np.nan),
+            std=np.where(driven, std, np.nan),
+            support_s=support_s,
         )
+        made.append(replace(finding, form=read_form(finding, covariance, settings)))
     return tuple(made)
 
 
@@ -106,15 +108,14 @@ def _curve(found: CurveFit, curve: MeasuredCurve, z: FloatArray, grid: Sequence[
     return np.asarray(curve.base_curve(values, *grid) + np.array(curve.table(own)))
 
 
-def _std(found: CurveFit, curve: MeasuredCurve, grid: Sequence[FloatArray]) -> FloatArray:
-    """Standard deviations of the curve at its knots, with the covariances of base parameters and deviations."""
+def _covariance(found: CurveFit, curve: MeasuredCurve, grid: Sequence[FloatArray]) -> FloatArray:
+    """Covariance (k, k) of the curve at its k knots in row-major order, from base parameters and deviations."""
     assert found.fit.covariance is not None
     z, step = found.fit.z, 0.02
     at_z = _curve(found, curve, z, grid)
     moved = [_curve(found, curve, z + step * unit, grid) for unit in np.eye(len(z))]
     jacobian = np.stack([(m - at_z) / step for m in moved]).reshape(len(z), -1)
-    variance = np.einsum("ik,ij,jk->k", jacobian, found.fit.covariance, jacobian)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(at_z.shape))
+    return np.asarray(jacobian.T @ found.fit.covariance @ jacobian)
 
 
 __all__ = ["curve_findings", "driving_time_s", "recorded_forces", "without_extrapolation"]

@@ -9,7 +9,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.findings import CurveFinding, Diagnosis
 from carlab.diagnosis.report.figures import Figure
-from carlab.diagnosis.report.sentences import number, percent, unit_text, with_unit
+from carlab.diagnosis.report.sentences import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.svg import Chart, padded
 from carlab.diagnosis.settings import DEFAULT, ReportSettings
 
@@ -17,11 +17,12 @@ MAX_PANELS = 9
 
 
 def curve_sentences(diagnosis: Diagnosis) -> list[str]:
-    """One sentence for each measured curve, and readings of the drive force."""
+    """Sentences of each measured curve: its largest difference from the car file, its form, readings of the drive."""
     made = []
     for curve in diagnosis.curves:
         made.append(_largest_difference(curve))
-        if len(curve.axes) == 2:
+        made.append(form_sentence(curve))
+        if curve.id == "drive_map":
             made += readings_of_drive(curve, DEFAULT.report)
     return [sentence for sentence in made if sentence]
 
@@ -51,6 +52,27 @@ def _largest_difference(curve: CurveFinding) -> str:
     )
     value, own = (with_unit(float(v[place]), curve.unit) for v in (curve.measured, curve.car_file))
     return f"Measured curve: at {at}, the {curve.quantity} is {value}; the car file has {own}."
+
+
+def form_sentence(curve: CurveFinding) -> str:
+    """The named form of a curve with its parameters, or that none fits; empty with too few knots."""
+    form = curve.form
+    if form is None:
+        return ""
+    misfit = f"chi² per knot {number(form.chi2_per_knot)} at {form.knots} knots"
+    if not form.is_within_band:
+        return (
+            f"No named form fits the {curve.quantity} within its band. The closest, {form.name}, differs by "
+            f"{with_unit(form.rms_difference, curve.unit)} rms ({misfit}; at most {number(form.max_chi2_per_knot)} "
+            "within the band)."
+        )
+    values = [
+        f"{name} {with_unit(e.value, e.unit)} ({number(e.low90)} to {number(e.high90)})"
+        for name, e in form.parameters.items()
+    ]
+    others = f" As well within the band: {listed(form.indistinguishable_from)}." * bool(form.indistinguishable_from)
+    text = f"The {curve.quantity} has the form of {form.name}"
+    return f"{text}{': ' * bool(values)}{', '.join(values)} ({misfit}).{others}"
 
 
 def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str]:

@@ -105,3 +105,13 @@ class CurveSettings:
     """Minimum driving time [s] near a knot; without it the curve ends there in the report."""
     min_fitted_s: float = 0.05
     """The same for a knot whose fitted deviation is used; others have that of the nearest such knot."""
+    form_level: float = 0.01
+    """A named form lies within the band of a curve if a misfit as large has at least this probability."""
+    form_min_spare_knots: int = 2
+    """Minimum number of knots with data in addition to a form's parameters."""
+    form_chi2_per_parameter: float = 4.0
+    """Fall of the misfit for which a form may have one more parameter."""
+    form_tie_chi2: float = 4.0
+    """Forms within the band whose misfits with that penalty differ by less are indistinguishable."""
+    form_points_per_interval: int = 8
+    """Points of each interval between knots at which a form is approximated by a piecewise linear curve."""

@@ -1,0 +1,95 @@
+"""Measured quantities as data: estimates with intervals, and measured curves with their named forms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from carlab.core.quantities import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A fitted number with its standard deviation and 90 % interval, in ``unit``."""
+
+    value: float
+    std: float
+    low90: float
+    high90: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class CurveAxis:
+    """An input of a measured curve with its knots."""
+
+    name: str
+    unit: str
+    knots: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FormFinding:
+    """The named form of a measured curve, or the closest form if none lies within the band of the curve.
+
+    Attributes:
+        id: id of the form.
+        name: a noun phrase.
+        is_within_band: whether the form lies within the band; otherwise the curve has no name.
+        parameters: by name, with 90 % intervals; without a meaning if the form is not within the band.
+        chi2_per_knot: squared difference over the variance, mean over knots.
+        max_chi2_per_knot: its limit for a form within the band.
+        rms_difference: root mean square difference at the knots, in the unit of the curve.
+        knots: number of compared knots.
+        indistinguishable_from: names of other forms within the band that are not worse.
+    """
+
+    id: str
+    name: str
+    is_within_band: bool
+    parameters: Mapping[str, Estimate]
+    chi2_per_knot: float
+    max_chi2_per_knot: float
+    rms_difference: float
+    knots: int
+    indistinguishable_from: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class CurveFinding:
+    """A measured curve beside that of the car file, at the knots of its axes (an array with one dimension an axis).
+
+    Attributes:
+        id: id of the curve.
+        quantity: what the curve gives, in ``unit``.
+        unit: its unit.
+        axes: inputs.
+        car_file: the curve of the car file.
+        measured: the curve of the recordings; NaN at knots without data.
+        std: its standard deviations; NaN at knots without data.
+        support_s: driving time near each knot [s].
+        form: its named form; None with too few knots.
+    """
+
+    id: str
+    quantity: str
+    unit: str
+    axes: tuple[CurveAxis, ...]
+    car_file: FloatArray
+    measured: FloatArray
+    std: FloatArray
+    support_s: FloatArray
+    form: FormFinding | None = None
+
+
+def curve_table(curve: CurveFinding) -> dict[str, Any]:
+    """Plain data of a measured curve, ready for JSON but for NaN."""
+    arrays = ("car_file", "measured", "std", "support_s")
+    plain: dict[str, Any] = {"id": curve.id, "quantity": curve.quantity, "unit": curve.unit}
+    plain["axes"] = [asdict(a) for a in curve.axes]
+    plain["form"] = None if curve.form is None else asdict(curve.form)
+    return plain | {name: getattr(curve, name).tolist() for name in arrays}
+
+
+__all__ = ["CurveAxis", "CurveFinding", "Estimate", "FormFinding", "curve_table"]
