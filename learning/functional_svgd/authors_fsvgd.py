@@ -41,7 +41,7 @@ PATIENCE = 3
 
 
 def authors_settings(steps: int, seed: int) -> FsvgdSettings:
-    """The authors' settings, with the direction and prior weight of their code."""
+    """The authors' settings of online learning, without the slips of their code."""
     noise = tuple(s / o for s, o in zip(NOISE_STD, CHANGE_STD, strict=True))
     return FsvgdSettings(
         particles=PARTICLES, steps=steps, batch=BATCH, measurement_points=POINTS, bandwidth=0.2, natural=False,
