@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sim_backends.car_parameters import SimulatorConfig
 
 EPISODES = 20
-Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
+Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
 Device = Literal["cpu", "cuda"]
 PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
 """Arguments that a run keeps when it is resumed."""
@@ -138,7 +138,7 @@ def learn(
     episodes: int | None = None,
     ticks: int | None = None,
     prior: str | Path | CarFile = "kinematic",
-    method: Method = "sim-fsvgd",
+    method: Method = "gp-sim-posterior",
     history: int | None = None,
     model_steps: int | None = None,
     updates: int = 30000,
@@ -161,7 +161,8 @@ def learn(
         episodes: total number of episodes; by default 20, or the number of the resumed run.
         ticks: control periods per episode; by default the task's number (100).
         prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model.
-        method: ``sim-fsvgd``; ``fsvgd`` without a simulator; ``fsvgd-authors`` with the settings of the paper.
+        method: ``gp-sim-posterior``; ``gp-posterior`` without a simulator; ``sim-fsvgd``, ``sim-fsvgd-mended`` and
+            ``fsvgd`` are the paper's algorithms with its settings.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
         model_steps: optimiser steps of the model before each episode; 2500 by default.
         updates: gradient steps of the policy before an episode.
@@ -306,10 +307,11 @@ def _plan(request: _Request, choice: CarChoice) -> TrainingPlan:
     from carlab.core.task import ParkingTask
     from carlab.experiment.campaign.campaign import PAPER_HISTORY, needed_history
     from carlab.experiment.campaign.training import TrainingPlan
+    from learning.world.car_fit import PAPER_METHODS
 
     history = request.history
     if history is None:
-        history = PAPER_HISTORY if request.method == "fsvgd-authors" else needed_history(choice.simulator)
+        history = PAPER_HISTORY if request.method in PAPER_METHODS else needed_history(choice.simulator)
     if (ticks := request.ticks or ParkingTask().max_ticks) <= history:
         raise ConfigError(f"--ticks {ticks}: give more than --history ({history}), for at least one transition.")
     text = tomli_w.dumps(_prior(request, choice).to_tables())

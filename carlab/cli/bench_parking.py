@@ -29,7 +29,11 @@ def run_parking(options: BenchOptions) -> int:
     for seed, method in itertools.product(range(options.seeds), methods):
         done = run_folder(options.runs, method, seed)
         if done is not None and (done / CAMPAIGN_FILE).is_file():
-            check_run(done, {"updates": ("--updates", options.updates), "model_steps": ("--steps", options.steps)})
+            expected = {
+                "method": ("--methods", method), "updates": ("--updates", options.updates),
+                "model_steps": ("--steps", options.steps),
+            }  # fmt: skip
+            check_run(done, expected)
             begun[(seed, method)] = done
     folders = []
     for seed in range(options.seeds):

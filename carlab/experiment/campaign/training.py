@@ -27,7 +27,7 @@ from carlab.core.task import ParkingTask
 from carlab.recording.episode_builder import VELOCITY_DELAY
 from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, has_whole_step, transitions_of
-from learning.world.car_fit import LearnedCar, Method
+from learning.world.car_fit import PAPER_METHODS, LearnedCar, Method
 from learning.world.history import find_history
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -51,6 +51,9 @@ EPISODES_BEFORE_HISTORY_CHOICE = 3
 """Number of episodes after which the number of relevant past commands is estimated."""
 SMALLER_STEP_FACTOR = 0.25
 """Factor of the learning rate after a divergence."""
+PLAN_VERSION = 2
+EARLIER_NAMES = {"sim-fsvgd": "gp-sim-posterior", "fsvgd": "gp-posterior", "fsvgd-authors": "fsvgd"}
+"""Methods of plans of version 1 by their current names."""
 Progress = Callable[[str, int, int], None]
 Learned = TypeVar("Learned")
 
@@ -62,8 +65,8 @@ class TrainingPlan:
     Attributes:
         prior_toml: car file of the prior simulator, with ranges and effects.
         history: number of past commands that model and policy observe.
-        method: ``sim-fsvgd`` has a simulator prior; ``fsvgd`` has none; ``fsvgd-authors`` has the settings of the
-            authors of Sim-FSVGD.
+        method: ``gp-sim-posterior`` has a simulator prior, ``gp-posterior`` has none; ``sim-fsvgd``,
+            ``sim-fsvgd-mended`` and ``fsvgd`` are the paper's, with its settings.
         model_steps: steps of the particles' optimiser; None: the default of the method.
         updates: gradient steps of SAC (``updates_before``).
         ticks: ticks of an episode; None: those of the task.
@@ -74,7 +77,7 @@ class TrainingPlan:
 
     prior_toml: str
     history: int = 3
-    method: Method = "sim-fsvgd"
+    method: Method = "gp-sim-posterior"
     model_steps: int | None = None
     updates: int = 30_000
     ticks: int | None = None
@@ -255,15 +258,18 @@ def _fitted(
     from learning.world.car_dynamics import CarDynamics
     from learning.world.car_fit import CarFitSettings, fit_car
 
-    is_authors = plan.method == "fsvgd-authors"
-    steps = plan.model_steps or (STEPS if is_authors else CarFitSettings().steps)
+    is_papers = plan.method in PAPER_METHODS
+    steps = plan.model_steps or (STEPS if is_papers else CarFitSettings().steps)
 
     def report_step(done: int) -> None:
         progress("learning the car", done, steps)
 
     report_step(0)
-    if is_authors:
-        return fit_authors_fsvgd(episodes, plan.history, steps, seed, report_step, plan.device)
+    if is_papers:
+        simulator = None if plan.method == "fsvgd" else model
+        return fit_authors_fsvgd(
+            episodes, plan.history, steps, seed, report_step, plan.device, simulator, plan.method == "sim-fsvgd-mended"
+        )
     settings = CarFitSettings(plan.method, steps, seed=seed)
     earlier = before if isinstance(before, CarDynamics) else None
 
@@ -341,12 +347,21 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
 
 def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
     """The plan as values for a JSON file."""
-    return asdict(plan)
+    return {**asdict(plan), "version": PLAN_VERSION}
+
+
+def method_of(plan: Mapping[str, Any]) -> str:
+    """Method of a plan in a JSON file by its current name; files before version 2 have other names."""
+    method: str = plan["method"] if "method" in plan else TrainingPlan.__dataclass_fields__["method"].default
+    return method if plan.get("version", 1) >= PLAN_VERSION else EARLIER_NAMES.get(method, method)
 
 
 def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
     """Read the output of ``plan_as_json``. Raises TypeError or ValueError for wrong names, types or ranges."""
-    plan = TrainingPlan(**content)
+    method = method_of(content)
+    if method != content.get("method", method):
+        log.warning("The run's method '%s' is now called '%s'.", content["method"], method)
+    plan = TrainingPlan(**{**{k: v for k, v in content.items() if k != "version"}, "method": method})
     if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
         raise ValueError("prior, method or device of the plan")
     for name, minimum in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():
@@ -363,6 +378,7 @@ __all__ = [
     "FIGURES_FILE",
     "TrainingPlan",
     "has_ticks",
+    "method_of",
     "model_folder",
     "plan_as_json",
     "plan_from_json",
