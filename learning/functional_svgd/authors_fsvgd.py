@@ -53,9 +53,7 @@ PATIENCE = 3
 """Evaluations without improvement that end a fit. The authors' fit continues but keeps the same networks."""
 
 
-def authors_settings(
-    steps: int, seed: int, *, with_simulator: bool = False, mended: bool = False
-) -> FsvgdSettings:
+def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, mended: bool = False) -> FsvgdSettings:
     """The authors' settings; ``mended`` without the slips of their code."""
     noise = tuple(s / o for s, o in zip(NOISE_STD, CHANGE_STD, strict=True))
     settings = FsvgdSettings(
@@ -170,9 +168,7 @@ def fit_authors_fsvgd(
     return WorldDynamics(posterior, history)
 
 
-def _prior(
-    inputs: Tensor, units: Normaliser, simulator: CarModel | None, generator: torch.Generator
-) -> FunctionPrior:
+def _prior(inputs: Tensor, units: Normaliser, simulator: CarModel | None, generator: torch.Generator) -> FunctionPrior:
     """Prior at raw inputs (M, 7 + 2 (H + 1)) of data and domain."""
     if simulator is None:
         return GaussianProcessPrior(units.inputs(inputs), RbfCovariance((1.0,) * STATE_FEATURES, (LENGTHSCALE,)))

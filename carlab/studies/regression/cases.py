@@ -1,7 +1,8 @@
 """Cases of the regression study: data, simulator and units.
 
 The cases are those of the paper (Rothfuss et al., arXiv 2403.16644, section 6.1) with the domains, priors and units of
-the authors' public code; three more pendulums hide an effect that no family contains. Data is drawn by a simulator here, or read from arrays of the authors' code.
+the authors' public code. Three more pendulums hide an effect that no family contains. Data is drawn by a simulator
+here, or read from arrays of the authors' code.
 """
 
 from __future__ import annotations
@@ -66,8 +67,8 @@ class Case:
     Attributes:
         name: name on the command line and in the file names of the authors' arrays.
         prior: simulator that the methods know.
-        prior_with_structure: the same simulator with further terms inside its dynamics, for ``--structure``, which gives
-            it to all methods; None: there is none.
+        prior_with_structure: the same simulator with further terms inside its dynamics, which ``--structure`` gives to
+            all methods; None: there is none.
         truth: simulator that generates the data, with a distribution of its parameters; None: the authors' arrays only.
         counts: numbers of training rows.
         noise_std: standard deviation of the measurement noise of the outputs (O,).
@@ -292,8 +293,8 @@ _PENDULUM = Case(
     discrepancy_lengthscale=10.0,
     function_lengthscale=0.4,
 )
-# Sizes of the structured terms, chosen without data. Friction by the rate: as for the pendulum, about gravity at the highest
-# rate. Friction by the sign of the rate: a tenth of that. Motor: half of each command.
+# Sizes of the structured terms, chosen without data. Friction by the rate: as for the pendulum, about gravity at the
+# highest rate. Friction by the sign of the rate: a tenth of that. Motor: half of each command.
 _PENDULUM_MOTOR = replace(
     _PENDULUM,
     name="pendulum_motor",

@@ -1,7 +1,7 @@
 """Methods of the regression study and their fits to the rows of a case.
 
 carlab's methods (``gp-...``) condition a Gaussian process (``learning.posterior``) around a simulator, around zero, or
-average several by held-out density. ``sim-fsvgd`` and ``fsvgd`` are the paper's (``learning.functional_svgd.fsvgd``) with
+average several by held-out density. ``sim-fsvgd`` and ``fsvgd`` are the paper's (``functional_svgd.fsvgd``) with
 the steps, batches, points, bandwidth and starting noise of the authors' public code; prior moments come from a fixed
 set of draws. Their ``-mended`` forms correct two slips of that code: the repulsive term divided by the number of
 particles, and the almost absent Gaussian-process prior of FSVGD.

@@ -14,7 +14,14 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.studies.regression.cases import CASES, Case, Data
 from carlab.studies.regression.methods import METHODS, PAPER_METHODS, FitTask
 from carlab.studies.regression.scores import Score
-from learning.evaluation import Mixture, Prediction, WeightedMixture, calibration_error, negative_log_likelihood, root_mean_square_error
+from learning.evaluation import (
+    Mixture,
+    Prediction,
+    WeightedMixture,
+    calibration_error,
+    negative_log_likelihood,
+    root_mean_square_error,
+)
 from learning.world.world_outputs import measured_seven_outputs, seven_outputs
 
 Progress = Callable[[str, int, int], None]
@@ -83,9 +90,7 @@ def run_study(
     progress("", len(plan), len(plan))
 
 
-def scored(
-    case: Case, data: Data, count: int, seed: int, method: str, *, steps: int | None = None
-) -> Score:
+def scored(case: Case, data: Data, count: int, seed: int, method: str, *, steps: int | None = None) -> Score:
     """Fit one method of ``METHODS`` to rows of a case and score it on the test rows; a failed fit gives its reason."""
     clock = MonotonicClock()
     began_s = clock.now_s()
