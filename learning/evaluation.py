@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from scipy.special import stdtr
@@ -97,6 +99,14 @@ class Mixture:
         stds = (scales * self.stds.expand_as(self.means)).flatten(0, 1)
         return Mixture(means.flatten(0, 1), stds, decorrelation=self.decorrelation, correlation=self.correlation)
 
+    def cdf(self, targets: Tensor) -> Tensor:
+        """Marginal distribution function (N, O) at targets (N, O)."""
+        white = (targets - self.means) / self.marginal_scales
+        if math.isinf(self.dof):
+            normal: Tensor = torch.special.ndtr(white)
+            return normal.mean(dim=0)
+        return torch.from_numpy(stdtr(self.dof, white.cpu().double().numpy())).mean(dim=0).to(white)
+
     def log_density(self, targets: Tensor) -> Tensor:
         """Joint log density (N,) of targets (N, O)."""
         white = self._decorrelate(targets - self.means) / self.stds
@@ -112,7 +122,52 @@ class Mixture:
         return torch.logsumexp(component, dim=0) - math.log(len(self.means))
 
 
-def negative_log_likelihood(prediction: Mixture, targets: Tensor) -> float:
+class Prediction(Protocol):
+    """A predictive distribution at N points."""
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean (N, O)."""
+        ...
+
+    def cdf(self, targets: Tensor) -> Tensor:
+        """Marginal distribution function (N, O) at targets (N, O)."""
+        ...
+
+    def log_density(self, targets: Tensor) -> Tensor:
+        """Joint log density (N,) of targets (N, O)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class WeightedMixture:
+    """Weighted average of the predictions of several models; weights (K,) sum to 1."""
+
+    predictions: Sequence[Prediction]
+    weights: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean (N, O)."""
+        return self._average([p.mean for p in self.predictions])
+
+    def cdf(self, targets: Tensor) -> Tensor:
+        """Marginal distribution function (N, O) at targets (N, O)."""
+        return self._average([p.cdf(targets) for p in self.predictions])
+
+    def log_density(self, targets: Tensor) -> Tensor:
+        """Joint log density (N,) of targets (N, O)."""
+        by_model = torch.stack([p.log_density(targets) for p in self.predictions])
+        weighted: Tensor = by_model + self.weights.to(by_model).log()[:, None]
+        return weighted.logsumexp(dim=0)
+
+    def _average(self, values: Sequence[Tensor]) -> Tensor:
+        stacked = torch.stack(list(values))
+        average: Tensor = torch.tensordot(self.weights.to(stacked), stacked, dims=1)
+        return average
+
+
+def negative_log_likelihood(prediction: Prediction, targets: Tensor) -> float:
     """Mean over points of the joint negative log density of all outputs [nat].
 
     Args:
@@ -122,12 +177,12 @@ def negative_log_likelihood(prediction: Mixture, targets: Tensor) -> float:
     return -float(prediction.log_density(targets).mean())
 
 
-def root_mean_square_error(prediction: Mixture, targets: Tensor) -> float:
+def root_mean_square_error(prediction: Prediction, targets: Tensor) -> float:
     """Root of the squared error of the mean, summed over outputs and averaged over points; targets (N, O)."""
     return float(((prediction.mean - targets) ** 2).sum(dim=1).mean().sqrt())
 
 
-def calibration_error(prediction: Mixture, targets: Tensor) -> float:
+def calibration_error(prediction: Prediction, targets: Tensor) -> float:
     """Mean absolute difference of empirical and nominal coverage over ``LEVELS`` and outputs.
 
     Coverage of central intervals of the mixture's distribution function, output by output. For one Gaussian this is the
@@ -137,12 +192,7 @@ def calibration_error(prediction: Mixture, targets: Tensor) -> float:
         prediction: at N points.
         targets: (N, O).
     """
-    white = (targets - prediction.means) / prediction.marginal_scales
-    if math.isinf(prediction.dof):
-        below = torch.special.ndtr(white).mean(dim=0)
-    else:
-        below = torch.from_numpy(stdtr(prediction.dof, white.cpu().double().numpy())).mean(dim=0).to(white)
-    central = (2.0 * below - 1.0).abs()
+    central = (2.0 * prediction.cdf(targets) - 1.0).abs()
     levels = torch.tensor(LEVELS, dtype=central.dtype, device=central.device)
     covered = (central[None] <= levels[:, None, None]).to(central.dtype).mean(dim=1)
     return float((covered - levels[:, None]).abs().mean())
@@ -151,6 +201,8 @@ def calibration_error(prediction: Mixture, targets: Tensor) -> float:
 __all__ = [
     "LEVELS",
     "Mixture",
+    "Prediction",
+    "WeightedMixture",
     "calibration_error",
     "negative_log_likelihood",
     "root_mean_square_error",

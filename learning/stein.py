@@ -64,7 +64,7 @@ def natural_direction(values: Tensor, score: Tensor, precision: Tensor, kernel: 
     return solved.permute(2, 1, 0)
 
 
-def stein_direction(values: Tensor, score: Tensor, kernel: RbfKernel) -> Tensor:
+def stein_direction(values: Tensor, score: Tensor, kernel: RbfKernel, repulsion: float = 1.0) -> Tensor:
     """Ascent direction of each particle in function space.
 
     ``(1/L) sum_i [k(h_i, h_l) grad ln p(h_i) + grad_{h_i} k(h_i, h_l)]``: equation 2 of Rothfuss et al. (arXiv
@@ -74,13 +74,14 @@ def stein_direction(values: Tensor, score: Tensor, kernel: RbfKernel) -> Tensor:
         values: function values (L, N, O).
         score: gradient of the log density with respect to each particle's values (L, N, O).
         kernel: between the flattened values.
+        repulsion: weight of the repulsive term; 1 in Stein's direction.
 
     Returns:
         Directions (L, N, O). With one particle it is the score: gradient ascent to the mode.
     """
     flat = values.flatten(1)
     matrix = kernel(flat)
-    direction = matrix @ score.flatten(1) + kernel.repulsion(flat, matrix)
+    direction = matrix @ score.flatten(1) + repulsion * kernel.repulsion(flat, matrix)
     return (direction / len(values)).view_as(values)
 
 

@@ -306,7 +306,7 @@ def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:
     if not (path / "episodes").is_dir():
         return [path], []
     from carlab.core.errors import ConfigError
-    from carlab.experiment.campaign.training import has_ticks
+    from carlab.recording.mcap.source import has_ticks
 
     driven = [recording for recording in sorted((path / "episodes").glob("*.mcap")) if has_ticks(recording)]
     if not driven:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
-Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
+Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
 Device = Literal["cpu", "cuda"]
 
 
@@ -63,10 +63,11 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
     from carlab.experiment.campaign.campaign import PAPER_HISTORY
     from carlab.experiment.campaign.prior_repair import needed_history
     from carlab.experiment.campaign.training_plan import TrainingPlan
+    from learning.world.car_fit import PAPER_METHODS
 
     history = request.history
     if history is None:
-        history = PAPER_HISTORY if request.method == "fsvgd-authors" else needed_history(choice.simulator)
+        history = PAPER_HISTORY if request.method in PAPER_METHODS else needed_history(choice.simulator)
     task_choice = given_task(request.task, request.track, choice.track) or PARKING
     task = load_checked(task_choice, choice.envelope.arena_m)
     if (ticks := request.ticks or task.max_ticks) <= history:

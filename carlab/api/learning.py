@@ -127,11 +127,11 @@ class LearnRun:
 def learn(
     car: str | CarFile = "sim", *, task: str | Task | None = None, track: Path | str | None = None,
     episodes: int | None = None, ticks: int | None = None, prior: str | Path | CarFile = "kinematic",
-    method: Method = "sim-fsvgd", history: int | None = None, model_steps: int | None = None, updates: int = 30000,
-    seed: int = 0, device: Device | None = None, place: bool = True, resume: Path | str | None = None,
-    out: Path | str = "runs", name: str = "learn", rerun: bool = True, live: bool = False, viewer: str | None = None,
-    vehicle: Path | CarFile | None = None, reality: Path | CarFile | None = None, dry_run: bool = False,
-    hooks: LearnHooks | None = None,
+    method: Method = "gp-sim-posterior", history: int | None = None, model_steps: int | None = None,
+    updates: int = 30000, seed: int = 0, device: Device | None = None, place: bool = True,
+    resume: Path | str | None = None, out: Path | str = "runs", name: str = "learn", rerun: bool = True,
+    live: bool = False, viewer: str | None = None, vehicle: Path | CarFile | None = None,
+    reality: Path | CarFile | None = None, dry_run: bool = False, hooks: LearnHooks | None = None,
 ) -> LearnRun:  # fmt: skip
     """Fit the car to all recordings, train a policy of a task in the learned car, drive an episode, and repeat.
 
@@ -144,7 +144,8 @@ def learn(
         prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model. ``auto`` starts
             with the nominal one; between episodes, effects and parameters that the recordings support enter it, and
             those that the recordings contradict leave it.
-        method: ``sim-fsvgd``; ``fsvgd`` without a simulator; ``fsvgd-authors`` with the settings of the paper.
+        method: ``gp-sim-posterior``; ``gp-posterior`` without a simulator; ``sim-fsvgd``, ``sim-fsvgd-mended`` and
+            ``fsvgd`` are the paper's algorithms with its settings.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
         model_steps: optimiser steps of the model before each episode; 2500 by default.
         updates: gradient steps of the policy before an episode.
@@ -273,8 +274,10 @@ def _check(request: LearnRequest) -> None:
     above_zero(episodes=request.episodes, updates=request.updates, ticks=request.ticks, model_steps=request.model_steps)
     at_least(0, history=request.history, seed=request.seed)
     available(request.device or "cpu")
-    if request.prior == AUTO and request.method != "sim-fsvgd":
-        raise ConfigError(f"--prior auto: {request.method} has no simulator prior; use --method sim-fsvgd.")
+    if request.prior == AUTO and request.method != "gp-sim-posterior":
+        raise ConfigError(
+            f"--prior auto: its repairs are for --method gp-sim-posterior; {request.method} needs another --prior."
+        )
 
 
 def _begun(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack: contextlib.ExitStack) -> Campaign:

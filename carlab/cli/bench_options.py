@@ -18,9 +18,10 @@ class BenchOptions:
 
     what: Positional[Literal["speed", "regression", "priors", "parking", "realcars", "rollouts"]] = "speed"
     """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios within one run.
-    regression: Sim-FSVGD and its baselines on the cases of the paper. priors: Sim-FSVGD without a prior and with the
-    kinematic, the nominal and the diagnosed prior, on a simulated car with two concealed effects or on the recordings
-    in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are continued.
+    regression: gp-sim-posterior, Sim-FSVGD and baselines on the cases of the paper. priors: gp-sim-posterior without a
+    prior and with the kinematic, the nominal and the diagnosed prior, on a simulated car with two concealed effects or
+    on the recordings in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs
+    are continued.
     realcars: prediction errors on held-out drives of a real car in --data, for constant velocity, the car file, refit,
     diagnosis, measured curves, a learned discrepancy, a black box and adaptation. rollouts: coverage and error of the
     rollouts of a learned car on the last recording in --data, with and without a disturbance."""
@@ -32,9 +33,14 @@ class BenchOptions:
     seconds: float = 10.0
     """speed: length of each condition of the sender's measurement [s]."""
 
-    case: Literal["1d", "pendulum", "pendulum_motor", "car", "racecar", "realcar"] = "1d"
+    case: Literal[
+        "1d", "pendulum", "pendulum_motor", "pendulum_detent", "pendulum_saturation", "pendulum_friction", "car",
+        "racecar", "realcar",
+    ] = "1d"  # fmt: skip
     """regression: the system. 1d: sinusoids, two points. pendulum: the prior has no friction and drag, as in the
-    authors' code. pendulum_motor: as in the paper; the prior has no drag, dry friction and motor lag. car: one step of
+    authors' code. pendulum_motor: as in the paper; the prior has no drag, dry friction and motor lag.
+    pendulum_detent, pendulum_saturation, pendulum_friction: the prior has no detent, saturation of the motor, or
+    friction that depends on the angle. car: one step of
     a car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of their car (with --data). realcar:
     recordings in the folder --data, the last one held out."""
 
@@ -46,12 +52,14 @@ class BenchOptions:
     """Repetitions of each fit: with other true systems, other rows of a recording, or (parking) other runs."""
 
     methods: tuple[str, ...] = ()
-    """regression: some of Sim-FSVGD, "Sim-FSVGD without gap", FSVGD, SysID, GreyBox, ensemble, ridge; parking: some of
-    sim-fsvgd, fsvgd, fsvgd-authors. All by default."""
+    """regression: some of gp-sim-average, gp-sim-posterior, sim-posterior, gp-posterior (carlab's: a Gaussian process
+    with a simulator, averaged, alone, or without one), sim-fsvgd, fsvgd (the paper's, as published), sim-fsvgd-mended,
+    fsvgd-mended (without the slips of their code), SysID, GreyBox, ensemble, ridge; parking: some of gp-sim-posterior,
+    gp-posterior, sim-fsvgd, sim-fsvgd-mended, fsvgd. All by default."""
 
-    way: Literal["ours", "authors"] = "ours"
-    """regression: ours fits particles to a Gaussian-process posterior with simulator parameters (carlab's method, also
-    in the rows named Sim-FSVGD); authors is functional SVGD as published, with the sizes of the authors' code."""
+    structure: bool = False
+    """regression with a pendulum: give every method a simulator with further terms (friction by the rate; for
+    pendulum_motor also its sign and both commands)."""
 
     data: Path | None = None
     """regression: folder with the authors' arrays (pendulum_seed0_n5.npz and so on); by default rows are generated.
@@ -127,6 +135,9 @@ class Place:
 SPEED = Place("'bench speed'", lambda given: given.what == "speed")
 REGRESSION = Place("'bench regression'", lambda given: given.what == "regression")
 REALCAR = Place("'bench regression --case realcar'", lambda given: REGRESSION.holds(given) and given.case == "realcar")
+PENDULUM = Place(
+    "'bench regression --case pendulum'", lambda given: REGRESSION.holds(given) and given.case.startswith("pendulum")
+)
 PRIORS = Place("'bench priors'", lambda given: given.what == "priors")
 READ = Place("'bench priors --data FOLDER'", lambda given: PRIORS.holds(given) and given.data is not None)
 CONCEALED = Place("'bench priors' without --data", lambda given: PRIORS.holds(given) and given.data is None)
@@ -141,7 +152,7 @@ PLACES = {
     "rows": (REGRESSION, PRIORS, ROLLOUTS),
     "seeds": (REGRESSION, PRIORS, PARKING, ROLLOUTS),
     "methods": (REGRESSION, PARKING),
-    "way": (REGRESSION,),
+    "structure": (PENDULUM,),
     "data": (REGRESSION, PRIORS, REALCARS, ROLLOUTS),
     "held_out": (REALCARS,),
     "effects": (REALCARS,),

@@ -45,7 +45,10 @@ def run_parking(options: BenchOptions) -> int:
     for run in runs:
         done = run_folder(options.runs, run.label, run.seed)
         if done is not None and (done / CAMPAIGN_FILE).is_file():
-            check_run(done, {"updates": ("--updates", options.updates), "model_steps": ("--steps", options.steps)})
+            expected = {"updates": ("--updates", options.updates), "model_steps": ("--steps", options.steps)}
+            if "method" in run.options:
+                expected["method"] = ("--methods", run.options["method"])
+            check_run(done, expected)
             begun[run.label, run.seed] = done
     curves = []
     for run in runs:

@@ -15,23 +15,19 @@ if TYPE_CHECKING:
 
 def run_regression(options: BenchOptions) -> int:
     """Fit every method to few rows, and print; the figures are written after each fit."""
-    from carlab.studies.regression.cases import CASES
     from carlab.studies.regression.study import run_study
 
     case = _recorded(options) if options.case == "realcar" else options.case
     scores, stopped = run_and_write(
         lambda progress: run_study(
-            case, rows=options.rows, seeds=options.seeds, methods=options.methods, way=options.way, data=options.data,
-            steps=options.steps, device=options.device, progress=progress,
+            case, rows=options.rows, seeds=options.seeds, methods=options.methods, structure=options.structure,
+            data=options.data, steps=options.steps, device=options.device, progress=progress,
         ),
         options,
         options.case,
     )  # fmt: skip
-    code = report(scores, stopped, options, f"{options.case}, {options.seeds} seeds, {options.way}", "method")
-    note = CASES[options.case].comparison_note if options.case in CASES and options.way == "ours" else ""
-    if note:
-        console.print(note, soft_wrap=True)
-    return code
+    structure = ", structured simulator for all methods" if options.structure else ""
+    return report(scores, stopped, options, f"{options.case}, {options.seeds} seeds{structure}", "method")
 
 
 def _recorded(options: BenchOptions) -> RecordedCase:

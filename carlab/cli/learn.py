@@ -79,17 +79,18 @@ class Learn:
     deviations). Ranges are those of the file; without them, 30 % about motor gain, damping and steering angle and, with
     wheel slip, about yaw inertia and the tyres' stiffness and friction."""
 
-    method: Method = "sim-fsvgd"
-    """sim-fsvgd: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method). fsvgd:
-    the same without a simulator. fsvgd-authors: functional SVGD as in the public code of Sim-FSVGD's authors."""
+    method: Method = "gp-sim-posterior"
+    """gp-sim-posterior: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method).
+    gp-posterior: the same without a simulator. sim-fsvgd: the paper's algorithm as in the authors' public code, with
+    the simulator prior; sim-fsvgd-mended: without two slips of that code; fsvgd: the paper's, without a simulator."""
 
     history: int | None = None
     """Number of past commands that model and policy observe. By default it covers the command delay, the latency of
-    motion capture and the window of the velocity estimate (4 for the simulated car; fsvgd-authors has the paper's 3).
+    motion capture and the window of the velocity estimate (4 for the simulated car; the paper's methods have 3).
     After three episodes the number that the recordings support is printed."""
 
     model_steps: int | None = None
-    """Steps of the model's optimiser before each episode: 2500 by default (fsvgd-authors: at most 40 000)."""
+    """Steps of the model's optimiser before each episode: 2500 by default (the paper's methods: at most 40 000)."""
 
     updates: int = 30000
     """Gradient steps of SAC before an episode: 1.5 times as many before the first episode; after the third, the number

@@ -14,6 +14,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.report import CURVE_FILE
+from carlab.experiment.campaign.training_plan import method_of
 
 FINAL_EPISODES = 5
 """Number of last episodes of a run for the share of parked episodes."""
@@ -85,7 +86,7 @@ def run_name(method: str, seed: int) -> str:
     return f"{method}-seed{seed}"
 
 
-def check_run(folder: Path, options: Mapping[str, tuple[str, int | None]]) -> None:
+def check_run(folder: Path, options: Mapping[str, tuple[str, int | str | None]]) -> None:
     """Check that a run was started with the current options.
 
     Args:
@@ -96,6 +97,7 @@ def check_run(folder: Path, options: Mapping[str, tuple[str, int | None]]) -> No
         ConfigError: an option differs.
     """
     plan = _plan(folder)
+    plan["method"] = method_of(plan)
     for name, (option, value) in options.items():
         earlier = plan.get(name)
         if earlier != value:
@@ -117,7 +119,7 @@ def read_curve(folder: Path) -> Curve:
     try:
         rows = json.loads((folder / CURVE_FILE).read_text(encoding="utf-8"))["episodes"]
         episodes = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
-        return Curve(plan["method"], int(plan["seed"]), int(plan["updates"]), tuple(episodes))
+        return Curve(method_of(plan), int(plan["seed"]), int(plan["updates"]), tuple(episodes))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{folder} is not a run of carlab learn with figures ({error}); remove it.") from error
 

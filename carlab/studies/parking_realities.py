@@ -35,7 +35,7 @@ REALITIES: dict[str, dict[str, float]] = {
 ARMS: dict[str, dict[str, Any]] = {
     "nominal": {"prior": "nominal"},
     "auto": {"prior": "auto"},
-    "no-simulator": {"method": "fsvgd"},
+    "no-simulator": {"method": "gp-posterior"},
 }
 """Options of ``carlab learn`` by arm."""
 

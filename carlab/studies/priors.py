@@ -125,7 +125,9 @@ def run_prior_study(
         data = case.recorded(Path(), count, seed).to(device)
         prior = priors[name]
         prior_case = replace(case, prior=domain if prior is None else prior)
-        score = scored(prior_case, data, count, seed, "FSVGD" if prior is None else "Sim-FSVGD", steps=steps)
+        score = scored(
+            prior_case, data, count, seed, "gp-posterior" if prior is None else "gp-sim-posterior", steps=steps
+        )
         yield replace(score, method=name)
     progress("", len(plan), len(plan))
 

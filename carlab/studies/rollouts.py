@@ -130,10 +130,10 @@ def run_rollout_study(
 def fit_rows(
     case: RecordedCase, rows: Transitions, count: int, seed: int, steps: int | None = None, device: str = "cpu"
 ) -> CarDynamics:
-    """Fit Sim-FSVGD of the regression study to ``count`` random rows; the car is on the CPU."""
+    """Fit ``gp-sim-posterior`` of the regression study to ``count`` random rows; the car is on the CPU."""
     chosen = rows.take(np.random.default_rng(seed).choice(len(rows), count, replace=False))
     inputs, outputs = (torch.from_numpy(v).float().to(device) for v in (chosen.inputs, chosen.targets))
-    task = FitTask(case, Data(inputs, outputs, inputs, outputs), seed, "ours", steps)
+    task = FitTask(case, Data(inputs, outputs, inputs, outputs), seed, steps)
     size = case.prior_discrepancy_for(count)
     return CarDynamics(task.distilled(case.prior, outputs, size).posterior.to("cpu"), rows.history)
 

@@ -11,12 +11,9 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.evaluation import Mixture
-from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
-from learning.networks.normaliser import Normaliser
 from learning.outliers import log_student
 from learning.posterior.residuals import ResidualDistribution, fit_residuals
 from learning.priors.domain_models import DomainModel, draw_parameters
-from learning.priors.function_prior import RbfCovariance
 
 N_SCREENED = 1024
 """Draws of the parameters from which restarts are selected."""
@@ -201,31 +198,4 @@ def _best(losses: Losses, starts: Tensor, ends: Tensor) -> Tensor:
     return offsets[values.argmin()]
 
 
-def grey_box(
-    simulator: IdentifiedSimulator,
-    inputs: Tensor,
-    outputs: Tensor,
-    pool: Tensor,
-    covariance: RbfCovariance,
-    normaliser: Normaliser,
-    settings: FsvgdSettings,
-) -> GreyBox:
-    """Fit particles to the residual of an identified simulator, under a Gaussian-process prior (FSVGD).
-
-    Args:
-        simulator: identified on the same data.
-        inputs: (n, D).
-        outputs: (n, O).
-        pool: inputs of the domain (M, D).
-        covariance: of the residual, on normalised inputs and in normalised outputs.
-        normaliser: of inputs and residuals; its output mean is ignored (zero).
-        settings: of the fit.
-    """
-    centred = replace(normaliser, output_mean=torch.zeros_like(normaliser.output_mean))
-    prior = GaussianProcessPrior(centred.inputs(torch.cat([inputs, pool])), covariance)
-    with torch.no_grad():
-        residual = outputs - simulator.mean(inputs)
-    return GreyBox(simulator, fit_fsvgd(inputs, residual, pool, prior, centred, settings))
-
-
-__all__ = ["GreyBox", "IdentifiedSimulator", "grey_box", "identify"]
+__all__ = ["GreyBox", "IdentifiedSimulator", "identify"]

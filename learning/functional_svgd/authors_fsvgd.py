@@ -1,9 +1,10 @@
-"""FSVGD of the online-learning experiment with the settings of the authors' public code, for comparison.
+"""FSVGD and Sim-FSVGD of the online-learning experiment with the settings of the authors' public code.
 
 Settings and state are those of lasgroup/simulation_transfer at 547fa14 (``bnn_fsvgd.py`` and ``online_rl_loop.py``).
 Inputs of a network are pose and velocities in the world frame; it predicts their changes, with sine and cosine
-of the yaw as independent outputs. The weight of the Gaussian-process prior is ``1 / (L (batch + points))``, because the
-authors average its score over particles and points and sum the likelihood. The prior has no simulator.
+of the yaw as independent outputs. Without a simulator the weight of the Gaussian-process prior is ``1 / (L (batch +
+points))``, because the authors average its score over particles and points and sum the likelihood; the repulsive term
+is weaker by ``1 / L``. ``mended`` fits have neither slip. Draws of the simulator are taken once.
 """
 
 from __future__ import annotations
@@ -19,12 +20,20 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.observation import STATE_FEATURES, decode_history, encode, push_action
 from learning.evaluation import calibration_error, negative_log_likelihood
-from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
+from learning.functional_svgd.fsvgd import (
+    FsvgdSettings,
+    FunctionPrior,
+    GaussianProcessPrior,
+    SimulatorPrior,
+    fit_fsvgd,
+)
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.posterior.draws import Draws
 from learning.posterior.particle_posterior import ParticlePosterior
+from learning.priors.domain_models import draw_parameters
 from learning.priors.function_prior import RbfCovariance
+from learning.priors.simulator_model import CarModel
 from learning.transitions import transitions_of
 
 STATE_STD = (3.0, 3.0, 1.0, 1.0, 4.0, 4.0, 5.0)
@@ -34,20 +43,25 @@ NOISE_STD = (0.0222, 0.0222, 0.0366, 0.0366, 0.1642, 0.1642, 0.7358)
 PARTICLES, BATCH, POINTS, STEPS = 10, 32, 16, 40_000
 MAX_POSITION_M, MAX_SPEED_MPS, MAX_YAW_RATE_RADPS = 4.0, 6.0, 8.0
 POOL_POINTS = 4096
+SIMULATOR_POOL_POINTS, SIMULATOR_DRAWS = 1024, 512
 HELD_OUT_SHARE = 0.2
 LENGTHSCALE = 0.2
+DISCREPANCY_STD, DISCREPANCY_LENGTHSCALE = (0.008, 0.008, 0.01, 0.01, 0.08, 0.08, 0.5), 5.0
+"""Of the simulator's discrepancy: standard deviations in the units of the changes, lengthscale on raw inputs."""
+DRAWS_PER_BATCH = 32
 PATIENCE = 3
 """Evaluations without improvement that end a fit. The authors' fit continues but keeps the same networks."""
 
 
-def authors_settings(steps: int, seed: int) -> FsvgdSettings:
-    """The authors' settings, with the direction and prior weight of their code."""
+def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, mended: bool = False) -> FsvgdSettings:
+    """The authors' settings; ``mended`` without the slips of their code."""
     noise = tuple(s / o for s, o in zip(NOISE_STD, CHANGE_STD, strict=True))
-    return FsvgdSettings(
+    settings = FsvgdSettings(
         particles=PARTICLES, steps=steps, batch=BATCH, measurement_points=POINTS, bandwidth=0.2, natural=False,
-        noise_std=noise, noise_rate=1.0, likelihood_exponent=0.5, prior_exponent=1.0 / (PARTICLES * (BATCH + POINTS)),
-        anneal_rate=False, validation_period=min(2000, steps), patience=PATIENCE, seed=seed,
+        noise_std=noise, noise_rate=1.0, likelihood_exponent=0.5, anneal_rate=False,
+        validation_period=min(2000, steps), patience=PATIENCE, seed=seed,
     )  # fmt: skip
+    return settings if mended else settings.with_published_slips(BATCH, with_simulator=with_simulator)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +124,8 @@ def fit_authors_fsvgd(
     seed: int = 0,
     progress: Callable[[int], None] = lambda step: None,
     device: torch.device | str = "cpu",
+    simulator: CarModel | None = None,
+    mended: bool = False,
 ) -> WorldDynamics:
     """Fit from scratch to all episodes; without episodes, return networks with initial weights as the authors do.
 
@@ -120,11 +136,13 @@ def fit_authors_fsvgd(
         seed: of all draws.
         progress: called with the number of steps done.
         device: of the fit; random numbers are drawn on the CPU.
+        simulator: prior of Sim-FSVGD; None: FSVGD.
+        mended: without the slips of the authors' code.
 
     Raises:
         DataError: the episodes hold too few rows.
     """
-    settings = authors_settings(steps, seed)
+    settings = authors_settings(steps, seed, with_simulator=simulator is not None, mended=mended)
     width = STATE_FEATURES + 2 * (history + 1)
     input_std = torch.tensor([*STATE_STD, *(1.0,) * (2 * history + 2)])
     units = Normaliser(torch.zeros(width), input_std, torch.zeros(STATE_FEATURES), torch.tensor(CHANGE_STD))
@@ -140,15 +158,39 @@ def fit_authors_fsvgd(
         raise DataError(f"{len(inputs)} rows are too few for a validation split; record a longer episode.")
     order = torch.randperm(len(inputs), generator=generator).to(device)
     rows, held_out = order[held_out_count:], order[:held_out_count]
-    pool = _domain_points(history, generator).to(device)
+    pool = _domain_points(history, generator)[: POOL_POINTS if simulator is None else SIMULATOR_POOL_POINTS].to(device)
     units = units.to(device)
     inputs, changes = inputs.to(device), changes.to(device)
-    prior_inputs = units.inputs(torch.cat([inputs[rows], pool]))
-    prior = GaussianProcessPrior(prior_inputs, RbfCovariance((1.0,) * STATE_FEATURES, (LENGTHSCALE,)))
+    prior = _prior(torch.cat([inputs[rows], pool]), units, simulator, generator)
     posterior = fit_fsvgd(
         inputs[rows], changes[rows], pool, prior, units, settings, progress, (inputs[held_out], changes[held_out])
     )
     return WorldDynamics(posterior, history)
+
+
+def _prior(inputs: Tensor, units: Normaliser, simulator: CarModel | None, generator: torch.Generator) -> FunctionPrior:
+    """Prior at raw inputs (M, 7 + 2 (H + 1)) of data and domain."""
+    if simulator is None:
+        return GaussianProcessPrior(units.inputs(inputs), RbfCovariance((1.0,) * STATE_FEATURES, (LENGTHSCALE,)))
+    parameters = draw_parameters(simulator, SIMULATOR_DRAWS, generator).to(inputs)
+    with torch.no_grad():
+        draws = [
+            units.outputs(simulated_changes(simulator, inputs, p)) for p in torch.split(parameters, DRAWS_PER_BATCH)
+        ]
+    scales = tuple(s / o for s, o in zip(DISCREPANCY_STD, CHANGE_STD, strict=True))
+    return SimulatorPrior(torch.cat(draws), inputs, RbfCovariance(scales, (DISCREPANCY_LENGTHSCALE,)))
+
+
+def simulated_changes(simulator: CarModel, inputs: Tensor, parameters: Tensor) -> Tensor:
+    """Changes (P, N, 7) in the world frame of a simulator at inputs (N, 7 + 2 (H + 1)) for parameters (P, K)."""
+    yaw = torch.atan2(inputs[:, 2], inputs[:, 3])
+    ahead, left = _in_body(inputs[:, 4], inputs[:, 5], yaw)
+    body = torch.cat([ahead[:, None], left[:, None], inputs[:, 6:]], dim=1)
+    dx, dy, turn, d_ahead, d_left, d_rate = simulator(body, parameters).unbind(dim=2)
+    x, y = _in_body(dx, dy, -yaw)
+    velocity_x, velocity_y = _in_body(ahead + d_ahead, left + d_left, -(yaw + turn))
+    heading = torch.sin(yaw + turn) - inputs[:, 2], torch.cos(yaw + turn) - inputs[:, 3]
+    return torch.stack([x, y, *heading, velocity_x - inputs[:, 4], velocity_y - inputs[:, 5], d_rate], dim=2)
 
 
 def _domain_points(history: int, generator: torch.Generator) -> Tensor:
@@ -173,4 +215,4 @@ def _in_body(x: Tensor, y: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
     return cos * x + sin * y, cos * y - sin * x
 
 
-__all__ = ["WorldDynamics", "authors_settings", "fit_authors_fsvgd", "in_world", "world_rows"]
+__all__ = ["WorldDynamics", "authors_settings", "fit_authors_fsvgd", "in_world", "simulated_changes", "world_rows"]

@@ -5,17 +5,17 @@ Space Particle Optimization for Bayesian Neural Networks"). Each step draws a me
 and points of the domain), adds the score of the likelihood to that of the prior's Gaussian marginal at the set, and
 moves the particles along Stein's direction, pulled back to their parameters.
 
-Departures from the authors' code: driving and repulsive term are both averaged over the particles; draws of the
-simulator are taken once, for the data and for a pool of domain points, from which measurement sets are drawn;
-``FsvgdSettings.natural`` preconditions the direction. What carlab calls Sim-FSVGD is another method:
-``learning.posterior.distillation``.
+Departures from the authors' code: draws of the simulator are taken once, for the data and for a pool of domain points,
+from which measurement sets are drawn; ``FsvgdSettings.natural`` preconditions the direction. The authors' code divides
+only the repulsive term by the number of particles (``FsvgdSettings.repulsion``). carlab's own method
+(``gp-sim-posterior``) is another one: ``learning.posterior.distillation``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
@@ -90,6 +90,7 @@ class FsvgdSettings:
         measurement_points: points of the domain in a measurement set.
         bandwidth: of the kernel; None: the median heuristic at each step.
         interacting: whether particles interact; if not, they are an ensemble of maximum a posteriori estimates.
+        repulsion: weight of the repulsive term relative to Stein's direction; the authors' code has 1 / L.
         natural: precondition by the posterior's covariance on the measurement set (a matrix-valued kernel). False is
             the update of the paper.
         learning_rate: initial rate of Adam; it falls to a hundredth along a half cosine.
@@ -113,6 +114,7 @@ class FsvgdSettings:
     measurement_points: int = 16
     bandwidth: float | None = None
     interacting: bool = True
+    repulsion: float = 1.0
     natural: bool = True
     learning_rate: float = 1e-3
     weight_decay: float = 1e-3
@@ -126,6 +128,20 @@ class FsvgdSettings:
     validation_period: int = 2000
     patience: int = 0
     seed: int = 0
+
+    def with_published_slips(self, rows: int, *, with_simulator: bool) -> FsvgdSettings:
+        """Copy with the slips of the authors' code (lasgroup/simulation_transfer at 547fa14).
+
+        Only the driving term is summed over the particles, so repulsion is weaker by 1 / L. Without a simulator, the
+        prior's score is averaged over particles and measurement points, whereas the likelihood is summed.
+
+        Args:
+            rows: number of rows of the data.
+            with_simulator: whether the prior has a simulator.
+        """
+        points = min(self.batch, rows) + self.measurement_points
+        prior = self.prior_exponent if with_simulator else 1.0 / (self.particles * points)
+        return replace(self, repulsion=1.0 / self.particles, prior_exponent=prior)
 
 
 def check_rows(inputs: Tensor, outputs: Tensor, *others: Tensor) -> None:
@@ -293,7 +309,7 @@ def _step(problem: _Problem, optimiser: _Optimiser, rows: Tensor, domain: Tensor
             total = likelihood if marginal is None else likelihood + marginal.precision()
             direction = natural_direction(values, score, total, kernel)
         else:
-            direction = stein_direction(values, score, kernel)
+            direction = stein_direction(values, score, kernel, settings.repulsion)
     optimiser.networks.grad = -pullback(direction)
     optimiser.adam.step()
 

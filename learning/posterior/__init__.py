@@ -1,1 +1,1 @@
-"""carlab's Sim-FSVGD: the posterior over functions around a simulator, and its distillation into particles."""
+"""carlab's own method: the posterior over functions around a simulator, and its distillation into particles."""

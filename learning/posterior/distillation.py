@@ -1,4 +1,4 @@
-"""Distillation of a posterior over functions into particles of a network: what carlab calls Sim-FSVGD.
+"""Distillation of a posterior over functions into particles of a network: ``gp-sim-posterior``.
 
 This method is carlab's, not the algorithm of Rothfuss et al. (arXiv 2403.16644); theirs is
 ``learning.functional_svgd.fsvgd`` with a ``SimulatorPrior``. Here the posterior's moments are in closed form

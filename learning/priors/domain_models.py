@@ -7,7 +7,7 @@ the authors' public code (lasgroup/simulation_transfer, commit 547fa14, MIT).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -85,6 +85,25 @@ class Sinusoids:
         return (a * torch.sin(w * x) + b * x)[:, :, None]
 
 
+HiddenAcceleration = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+"""Missing angular acceleration [rad/s2] by angle [rad], rate [rad/s], commanded torque [N m] and inertia [kg m2]."""
+
+
+def detent(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
+    """A detent with three positions a turn: ``4 sin(3 theta)`` rad/s2."""
+    return 4.0 * torch.sin(3.0 * angle)
+
+
+def motor_saturation(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
+    """A motor that saturates smoothly at 1 N m: its torque is ``tanh(command)``."""
+    return (torch.tanh(torque) - torque) / inertia
+
+
+def position_friction(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
+    """Viscous friction that depends on the angle: ``(1 + cos theta)`` N m s, zero at the bottom."""
+    return -(1.0 + torch.cos(angle)) * rate / inertia
+
+
 @dataclass(frozen=True, slots=True)
 class Pendulum:
     """Change of (sin, cos, rate) of a pendulum over 50 ms: ``theta'' = (g/l) sin theta + u / (m l^2) - friction``.
@@ -96,6 +115,7 @@ class Pendulum:
         masses, lengths, gravities, frictions, drags: ranges of m [kg], l [m], g [m/s2], nu and drag.
         rate_discrepancy: standard deviations of the coefficients of rate [1/s], rate |rate| and rate^2 [1] in a missing
             angular acceleration: a discrepancy process inside the dynamics, with a polynomial kernel.
+        hidden_acceleration: further angular acceleration of a true system; None: zero.
     """
 
     masses: Range = (0.5, 1.5)
@@ -105,6 +125,7 @@ class Pendulum:
     drags: Range = (0.0, 0.0)
     dissipative: bool = False
     rate_discrepancy: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    hidden_acceleration: HiddenAcceleration | None = None
     period_s: float = 0.05
     substeps: int = 10
 
@@ -129,13 +150,15 @@ class Pendulum:
         mass, length, gravity, friction, drag, linear, odd, even = (parameters[:, k, None] for k in range(8))
         angle = torch.atan2(inputs[:, 0], inputs[:, 1])[None]
         rate, torque = inputs[None, :, 2], inputs[None, :, 3]
-        step = self.period_s / self.substeps
+        step, inertia = self.period_s / self.substeps, mass * length**2
         theta, omega = angle.expand(len(parameters), -1), rate.expand(len(parameters), -1)
         for _ in range(self.substeps):
             square = omega * omega.abs() if self.dissipative else omega * omega
             resistance = friction * omega / (mass * length) + drag / mass * square
             missing = (linear + odd * omega.abs() + even * omega) * omega
-            acceleration = gravity / length * torch.sin(theta) + torque / (mass * length**2) - resistance + missing
+            acceleration = gravity / length * torch.sin(theta) + torque / inertia - resistance + missing
+            if self.hidden_acceleration is not None:
+                acceleration = acceleration + self.hidden_acceleration(theta, omega, torque, inertia)
             theta, omega = theta + step * omega, omega + step * acceleration
         after = torch.stack([torch.sin(theta), torch.cos(theta), omega], dim=-1)
         return after - inputs[None, :, :3]
@@ -212,4 +235,15 @@ class KinematicCar:
         return after - inputs[None, :, :7]
 
 
-__all__ = ["DomainModel", "KinematicCar", "Pendulum", "Sinusoids", "draw_parameters", "uniform", "within"]
+__all__ = [
+    "DomainModel",
+    "KinematicCar",
+    "Pendulum",
+    "Sinusoids",
+    "detent",
+    "draw_parameters",
+    "motor_saturation",
+    "position_friction",
+    "uniform",
+    "within",
+]

@@ -25,7 +25,9 @@ from learning.priors.simulator_model import CarModel
 from learning.transitions import OUTPUTS, Transitions
 from learning.world.car_dynamics import CarDynamics
 
-Method = Literal["sim-fsvgd", "fsvgd", "fsvgd-authors"]
+Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
+PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-mended", "fsvgd")
+"""The paper's algorithms; the others are carlab's."""
 LearnedCar = CarDynamics | WorldDynamics
 FILE_VERSION = 6
 NOISE_STD = (0.001, 0.001, 0.003, 0.02, 0.02, 0.1)
@@ -43,15 +45,15 @@ class CarFitSettings:
     """Settings of the fit.
 
     Attributes:
-        method: ``sim-fsvgd`` has a simulator prior, ``fsvgd`` a zero-mean prior; both are distilled posteriors
-            (``learning.posterior``). ``fsvgd-authors`` is FSVGD as published (``functional_svgd.authors_fsvgd``).
+        method: ``gp-sim-posterior`` has a simulator prior, ``gp-posterior`` a zero-mean prior; both are distilled
+            posteriors (``learning.posterior``). The others are the paper's (``functional_svgd.authors_fsvgd``).
         steps: of the particles' optimiser.
         particles: their number.
         seed: of all draws.
         learning_rate: of the particles.
     """
 
-    method: Method = "sim-fsvgd"
+    method: Method = "gp-sim-posterior"
     steps: int = 2500
     particles: int = 20
     seed: int = 0
@@ -88,7 +90,7 @@ def fit_car(
 
     Args:
         rows: recorded transitions; None: the prior alone is distilled.
-        model: the simulator: the prior, or (``fsvgd``) only the source of units and domain.
+        model: the simulator: the prior, or (``gp-posterior``) only the source of units and domain.
         settings: of the fit.
         before: an earlier fit of the same car, on any device, with the units and initial particles.
         device: of the fit; random numbers are drawn on the CPU.
@@ -115,7 +117,7 @@ def fit_car(
         chosen = torch.randperm(len(inputs), generator=generator)[:MAX_ROWS]
         inputs, outputs = inputs[chosen], outputs[chosen]
     inputs, outputs = inputs.to(device), outputs.to(device)
-    with_simulator = settings.method == "sim-fsvgd"
+    with_simulator = settings.method == "gp-sim-posterior"
     discrepancy_std = (PRIOR_DISCREPANCY if with_simulator else PRIOR_FUNCTION) * units.output_std
     target = infer(
         model if with_simulator else None, inputs, outputs, units, torch.tensor(NOISE_STD).to(device),
@@ -245,4 +247,4 @@ def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
-__all__ = ["CarFitSettings", "LearnedCar", "Method", "car_units", "fit_car", "load_car", "save_car"]
+__all__ = ["PAPER_METHODS", "CarFitSettings", "LearnedCar", "Method", "car_units", "fit_car", "load_car", "save_car"]

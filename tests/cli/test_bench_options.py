@@ -17,15 +17,16 @@ from carlab.core.errors import ConfigError
 
 README = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
 GIVEN = {
-    "seconds": 1.0, "case": "car", "rows": (5,), "seeds": 1, "methods": ("ridge",), "way": "authors",
+    "seconds": 1.0, "case": "car", "rows": (5,), "seeds": 1, "methods": ("ridge",), "structure": True,
     "data": Path("folder"), "car": Path("mine.toml"), "history": 0, "diagnosed": Path("model.toml"), "pair": 2,
     "recorded_s": (40.0, 20.0), "runs": Path("others"), "episodes": 3, "updates": 50, "steps": 70,
 }  # fmt: skip
 ACCEPTED = {
     ("speed", ()): {"seconds"},
-    ("regression", ()): {"case", "rows", "seeds", "methods", "way", "data", "steps"},
+    ("regression", ()): {"case", "rows", "seeds", "methods", "data", "steps"},
+    ("regression", (("case", "pendulum"),)): {"case", "rows", "seeds", "methods", "structure", "data", "steps"},
     ("regression", (("case", "realcar"),)): {
-        "case", "rows", "seeds", "methods", "way", "data", "steps", "car", "history",
+        "case", "rows", "seeds", "methods", "data", "steps", "car", "history",
     },
     ("priors", ()): {"rows", "seeds", "data", "history", "diagnosed", "pair", "recorded_s", "steps"},
     ("priors", (("data", Path("folder")),)): {"rows", "seeds", "data", "car", "history", "diagnosed", "steps"},
@@ -72,7 +73,10 @@ def test_option_is_accepted_or_refused_as_listed(
             "priors --data here --recorded-s 40 20",
             "--recorded-s has no effect in 'bench priors --data here'; use it with 'bench priors' without --data.",
         ),
-        ("parking --way authors", "--way has no effect in 'bench parking'; use it with 'bench regression'."),
+        (
+            "parking --structure",
+            "--structure has no effect in 'bench parking'; use it with 'bench regression --case pendulum'.",
+        ),
     ],
 )
 def test_refusal_names_the_studies_in_which_the_option_has_an_effect(

@@ -9,7 +9,7 @@ import pytest
 
 from carlab.cli import run
 
-SMALL = ["--methods", "sim-fsvgd", "fsvgd-authors", "--updates", "40", "--steps", "50", "--seeds", "1"]
+SMALL = ["--methods", "gp-sim-posterior", "fsvgd", "--updates", "40", "--steps", "50", "--seeds", "1"]
 
 
 def test_two_methods_are_driven_resumed_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -20,8 +20,8 @@ def test_two_methods_are_driven_resumed_and_compared(tmp_path: Path, capsys: pyt
     assert len(first_mtimes) == 2
     study = json.loads(out.read_text())
     assert [(r["method"], r["seeds"], r["episodes"]) for r in study["methods"]] == [
-        ("sim-fsvgd", 1, 1),
-        ("fsvgd-authors", 1, 1),
+        ("gp-sim-posterior", 1, 1),
+        ("fsvgd", 1, 1),
     ]
     assert study["command"].startswith("carlab")
     assert out.with_suffix(".png").stat().st_size > 10_000

@@ -42,7 +42,19 @@ def test_residuals_of_the_true_simulator_have_the_noise_of_the_case():
 
 def test_printed_scores_are_written_to_the_file(tmp_path, capsys, monkeypatch):
     out = tmp_path / "study.json"
-    arguments = ["bench", "regression", "--case", "1d", "--seeds", "2", "--methods", "SysID", "FSVGD", "--steps", "40"]
+    arguments = [
+        "bench",
+        "regression",
+        "--case",
+        "1d",
+        "--seeds",
+        "2",
+        "--methods",
+        "SysID",
+        "gp-posterior",
+        "--steps",
+        "40",
+    ]
     monkeypatch.setattr("sys.argv", ["carlab", *arguments, "--out", str(out)])
     assert run([*arguments, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
@@ -51,9 +63,9 @@ def test_printed_scores_are_written_to_the_file(tmp_path, capsys, monkeypatch):
     assert study["command"].startswith("carlab bench regression --case 1d")
     assert [(s["method"], s["seed"]) for s in study["scores"]] == [
         ("SysID", 0),
-        ("FSVGD", 0),
+        ("gp-posterior", 0),
         ("SysID", 1),
-        ("FSVGD", 1),
+        ("gp-posterior", 1),
     ]
     for row in study["rows"]:
         for name in ("nll", "rmse", "calibration", "seconds"):
@@ -74,7 +86,7 @@ def test_authors_settings_are_those_of_their_public_code(monkeypatch, rows, step
         return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
 
     monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
-    list(run_study("pendulum", rows=(rows,), seeds=1, methods=("Sim-FSVGD",), way="authors"))
+    list(run_study("pendulum", rows=(rows,), seeds=1, methods=("sim-fsvgd",)))
     (used,) = received
     assert (used.particles, used.hidden, used.batch, used.measurement_points) == (20, (64, 64, 64), 8, 32)
     assert (used.bandwidth, used.learning_rate, used.weight_decay, used.steps) == (2.0, 1e-3, 1e-3, steps)
@@ -94,7 +106,7 @@ def test_authors_settings_of_the_1d_case_differ_between_the_methods(monkeypatch)
         return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
 
     monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
-    list(run_study("1d", seeds=1, methods=("Sim-FSVGD", "FSVGD"), way="authors"))
+    list(run_study("1d", seeds=1, methods=("sim-fsvgd", "fsvgd")))
     sim_fsvgd, fsvgd = received
     assert (sim_fsvgd.steps, sim_fsvgd.bandwidth) == (20_000, 1.0)
     assert (fsvgd.steps, fsvgd.bandwidth) == (10_000, 0.5)
@@ -103,7 +115,7 @@ def test_authors_settings_of_the_1d_case_differ_between_the_methods(monkeypatch)
 
 
 def test_study_is_reproducible():
-    first, second = (list(run_study("1d", seeds=1, methods=("Sim-FSVGD",), steps=30)) for _ in range(2))
+    first, second = (list(run_study("1d", seeds=1, methods=("gp-sim-posterior",), steps=30)) for _ in range(2))
     assert (first[0].nll, first[0].rmse) == (second[0].nll, second[0].rmse)
     assert np.isnan(summarised(first)[0].nll_standard_error)
 
@@ -157,11 +169,53 @@ def test_invalid_options_are_refused_before_the_study(tmp_path, monkeypatch, cap
     assert message in " ".join((printed.out + printed.err).split())
 
 
-@pytest.mark.parametrize(("case", "way", "has_note"), [("pendulum", "ours", True), ("pendulum", "authors", False)])
-def test_pendulum_table_notes_that_its_priors_are_unequal(carlab, case, way, has_note):
-    code, text = carlab(
-        "bench", "regression", "--case", case, "--way", way, "--rows", 5, "--seeds", 1, "--methods", "ridge"
-    )
-    assert code == 0
-    assert ("contains the form of the truth" in text) is has_note
-    assert ("-5.55 / -6.73 / -7.35 / -7.34" in " ".join(text.split())) is has_note
+def test_structure_is_given_to_every_method(monkeypatch):
+    seen = []
+    monkeypatch.setattr("carlab.studies.regression.study.scored", lambda case, *a, **k: seen.append((a[3], case.prior)))
+    list(run_study("pendulum_detent", rows=(5,), seeds=1, structure=True))
+    assert {name for name, _ in seen} == set(regression_methods.METHODS)
+    assert {prior for _, prior in seen} == {CASES["pendulum"].prior_with_structure}
+    with pytest.raises(ConfigError, match="no structured simulator"):
+        list(run_study("1d", structure=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "acceleration"),
+    [
+        ("detent", lambda angle, rate, torque, inertia: 4.0 * np.sin(3.0 * angle)),
+        ("saturation", lambda angle, rate, torque, inertia: (np.tanh(torque) - torque) / inertia),
+        ("friction", lambda angle, rate, torque, inertia: -(1.0 + np.cos(angle)) * rate / inertia),
+    ],
+)
+def test_hidden_effect_changes_the_rate_as_its_equation(name, acceleration):
+    """Over a very short step the effect adds its acceleration times the step to the rate."""
+    truth, step_s = CASES[f"pendulum_{name}"].truth, 1e-3
+    generator = torch.Generator().manual_seed(0)
+    inputs, system = truth.inputs(50, generator).double(), draw_parameters(truth, 1, generator).double()
+    with_effect = replace(truth, period_s=step_s, substeps=1)(inputs, system)[0, :, 2]
+    without = replace(truth, period_s=step_s, substeps=1, hidden_acceleration=None)(inputs, system)[0, :, 2]
+    angle = np.arctan2(inputs[:, 0].numpy(), inputs[:, 1].numpy())
+    mass, length = system[0, :2].tolist()
+    expected = step_s * acceleration(angle, inputs[:, 2].numpy(), inputs[:, 3].numpy(), mass * length**2)
+    assert np.allclose((with_effect - without).numpy(), expected, atol=1e-9)
+
+
+def test_published_slips_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
+    """Authors' bnn_fsvgd.py: only the driving term is summed; the Gaussian process has weight 1 / (L (batch + k))."""
+    received = {}
+
+    def spy(inputs, outputs, pool, prior, normaliser, settings):
+        received[len(received)] = settings
+        return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
+
+    monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
+    names = ("sim-fsvgd", "sim-fsvgd-mended", "fsvgd", "fsvgd-mended")
+    list(run_study("pendulum", rows=(20,), seeds=1, methods=names))
+    assert [(s.repulsion, s.prior_exponent) for s in received.values()] == [
+        (0.05, 1.0), (1.0, 1.0), (0.05, 1.0 / (20 * (8 + 32))), (1.0, 1.0),
+    ]  # fmt: skip
+
+
+def test_grey_box_improves_on_the_simulator_with_missing_friction():
+    sysid, grey_box = run_study("pendulum", rows=(20,), seeds=1, methods=("SysID", "GreyBox"), steps=300)
+    assert grey_box.nll < sysid.nll - 0.5

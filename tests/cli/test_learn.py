@@ -76,12 +76,15 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
         ("--history 100", "--ticks 100: give more than --history (100), for at least one transition."),
         ("--ticks 3", "--ticks 3: give more than --history (4), for at least one transition."),
         ("--prior Kinematic", "--prior Kinematic: give kinematic, nominal, auto or an existing car file."),
-        ("--prior auto --method fsvgd", "--prior auto: fsvgd has no simulator prior; use --method sim-fsvgd."),
+        (
+            "--prior auto --method fsvgd",
+            "--prior auto: its repairs are for --method gp-sim-posterior; fsvgd needs another --prior.",
+        ),
         ("--updates -5", "--updates -5: give a number above zero."),
         ("--model-steps 0", "--model-steps 0: give a number above zero."),
         ("--prior missing.toml", "There is no car file 'missing.toml'"),
         ("--car nosuch", "There is no car 'nosuch'"),
-        ("--method guessing", "'sim-fsvgd', 'fsvgd'"),
+        ("--method guessing", "'gp-sim-posterior', 'gp-posterior'"),
     ],
 )
 def test_invalid_options_are_refused_and_write_nothing(
@@ -118,7 +121,7 @@ def test_resume_refuses_another_car(carlab: Carlab, learned: tuple[int, str, Pat
     [
         (
             "--method fsvgd",
-            "--method fsvgd: this run was started with sim-fsvgd; remove the option, or start a",
+            "--method fsvgd: this run was started with gp-sim-posterior; remove the option, or start a",
         ),
         ("--seed 7", "--seed 7: this run was started with"),
         ("--prior nominal", "--prior: this run was started with another prior; remove the option, or start a new"),

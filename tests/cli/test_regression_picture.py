@@ -19,12 +19,12 @@ def row(method, rows, nll, calibration=0.05, **others):
 
 
 ROWS = [
-    row("Sim-FSVGD", 5, -6.4),
-    row("Sim-FSVGD without gap", 5, -4.5),
+    row("gp-sim-posterior", 5, -6.4),
+    row("sim-posterior", 5, -4.5),
     row("SysID", 5, -4.4),
     row("ridge", 5, 314.7, 0.49),
-    row("Sim-FSVGD", 50, -7.2),
-    row("Sim-FSVGD without gap", 50, -4.8),
+    row("gp-sim-posterior", 50, -7.2),
+    row("sim-posterior", 50, -4.8),
     row("SysID", 50, -4.7),
     row("ridge", 50, -1.9),
 ]
@@ -39,16 +39,16 @@ def panels():
 
 def test_each_method_has_a_line_and_its_variant_another_line_style(panels):
     lines = {line.get_label(): line for line in panels.axes[0].get_lines()}
-    assert list(lines) == ["Sim-FSVGD", "Sim-FSVGD without gap", "SysID", "ridge"]
+    assert list(lines) == ["gp-sim-posterior", "sim-posterior", "SysID", "ridge"]
     assert [text.get_text() for text in panels.legends[0].get_texts()] == list(lines)
     for name, line in lines.items():
         assert list(line.get_ydata()) == [r.nll for r in ROWS if r.method == name]
-    full, without_gap = lines["Sim-FSVGD"], lines["Sim-FSVGD without gap"]
+    full, without_gap = lines["gp-sim-posterior"], lines["sim-posterior"]
     assert full.get_color() == without_gap.get_color()
     assert full.get_linestyle() != without_gap.get_linestyle()
 
 
-@pytest.mark.parametrize("known", [(), ("Sim-FSVGD", "SysID")])
+@pytest.mark.parametrize("known", [(), ("gp-sim-posterior", "SysID")])
 def test_methods_of_another_study_have_different_colours(known):
     priors = ("none (FSVGD)", "kinematic", "nominal", "diagnosed")
     figure = picture([row(name, n, -6.0 - k) for k, name in enumerate(known + priors) for n in (20, 50)])
@@ -72,7 +72,7 @@ def test_outlier_is_printed_at_the_edge_and_does_not_stretch_the_axis(panels):
 
 
 def test_axis_covers_all_values_if_most_of_them_are_outliers():
-    figure = picture([row("Sim-FSVGD", 2, -0.2), row("FSVGD", 2, 168.0), row("GreyBox", 2, 36.0)])
+    figure = picture([row("gp-sim-posterior", 2, -0.2), row("FSVGD", 2, 168.0), row("GreyBox", 2, 36.0)])
     try:
         assert figure.axes[0].get_ylim()[1] > 168.0
         assert not figure.axes[0].texts
@@ -81,7 +81,7 @@ def test_axis_covers_all_values_if_most_of_them_are_outliers():
 
 
 def test_axis_of_distant_likelihoods_has_at_least_three_ticks():
-    values = {"Sim-FSVGD": (-23.5, -25.3), "ridge": (-12.6, -15.8)}
+    values = {"gp-sim-posterior": (-23.5, -25.3), "ridge": (-12.6, -15.8)}
     figure = picture([row(m, n, nll) for m, both in values.items() for n, nll in zip((50, 800), both, strict=True)])
     axis = figure.axes[0]
     low, high = axis.get_ylim()
@@ -110,7 +110,7 @@ def test_every_figure_has_a_panel_with_standard_error_bands(panels):
     assert len(panels.axes) == len(FIGURES) == 4
     for axis, name in zip(panels.axes, FIGURES, strict=True):
         lines = {line.get_label(): line for line in axis.get_lines()}
-        assert list(lines) == ["Sim-FSVGD", "Sim-FSVGD without gap", "SysID", "ridge"]
+        assert list(lines) == ["gp-sim-posterior", "sim-posterior", "SysID", "ridge"]
         for (method, line), band in zip(lines.items(), axis.collections, strict=True):
             assert list(line.get_ydata()) == [getattr(r, name) for r in ROWS if r.method == method]
             edges = {tuple(corner) for corner in np.round(band.get_paths()[0].vertices, 6)}

@@ -94,7 +94,12 @@ def test_too_few_rows_for_a_validation_split_are_refused() -> None:
 
 
 def test_prior_exponent_is_that_of_the_authors() -> None:
-    assert authors_settings(1000, 0).prior_exponent == pytest.approx(1 / 480)
+    published, simulator, mended = (
+        authors_settings(1000, 0, with_simulator=s, mended=m) for s, m in ((False, False), (True, False), (True, True))
+    )
+    assert (published.prior_exponent, published.repulsion) == (pytest.approx(1 / 480), 0.1)
+    assert (simulator.prior_exponent, simulator.repulsion) == (1.0, 0.1)
+    assert (mended.prior_exponent, mended.repulsion) == (1.0, 1.0)
 
 
 @pytest.fixture(scope="module")

@@ -20,10 +20,9 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import feature_size
 from carlab.core.path_tasks import LapTask
 from carlab.core.task import ObstacleParkingTask
-from carlab.studies.regression.methods import METHODS, Way
+from carlab.studies.regression.methods import METHODS
 from carlab.studies.regression.study import run_study
 from learning.baselines import system_identification
-from learning.baselines.system_identification import grey_box, identify
 from learning.devices import synchronise
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.functional_svgd.authors_fsvgd import fit_authors_fsvgd
@@ -207,26 +206,6 @@ def test_fsvgd_particles_are_equal_on_the_device(device: str, natural: bool, int
     assert_close(on_device.noise_std, on_cpu.noise_std)
 
 
-def test_grey_box_predictions_are_equal_on_the_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("STEPS", "REFINEMENT_STEPS"):
-        monkeypatch.setattr(system_identification, name, 50)
-    inputs, outputs = pendulum()
-    pool = TRUE.inputs(40, torch.Generator().manual_seed(4))
-
-    def found(at: str) -> Mixture:
-        data = inputs.to(at), outputs.to(at)
-        simulator = identify(Pendulum(), *data, NOISE.to(at))
-        settings = FsvgdSettings(particles=2, hidden=(8,), steps=5)
-        box = grey_box(
-            simulator, *data, pool.to(at), RbfCovariance((1.0,) * 3, (0.8,)), PENDULUM_UNITS.to(at), settings
-        )
-        return box.predict(inputs.to(at))
-
-    on_device, on_cpu = on_both(found, device)
-    assert_close(on_device.means, on_cpu.means, 1e-3)
-    assert_close(on_device.stds, on_cpu.stds, 1e-3)
-
-
 def test_figures_of_merit_are_equal_on_the_device(device: str) -> None:
     generator = torch.Generator().manual_seed(5)
     means, stds = torch.randn((4, 30, 3), generator=generator), 0.1 + torch.rand((4, 1, 3), generator=generator)
@@ -360,13 +339,12 @@ def test_sac_gradient_steps_are_equal_on_the_device(device: str) -> None:
     assert_close(on_device.log_ent_coef, on_cpu.log_ent_coef)
 
 
-@pytest.mark.parametrize("way", ["ours", "authors"])
-def test_regression_study_is_equal_on_the_device(device: str, way: Way, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("STEPS", "REFINEMENT_STEPS"):
         monkeypatch.setattr(system_identification, name, 20)
     on_device = None
     for on_device, on_cpu in zip(
-        *(run_study("pendulum", rows=(5,), seeds=1, way=way, steps=10, device=at) for at in (device, "cpu")),
+        *(run_study("pendulum", rows=(5,), seeds=1, steps=10, device=at) for at in (device, "cpu")),
         strict=True,
     ):
         assert on_device.method == on_cpu.method

@@ -9,12 +9,9 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from carlab.core.errors import DataError
-from learning.baselines.system_identification import grey_box, identify
+from learning.baselines.system_identification import identify
 from learning.evaluation import negative_log_likelihood
-from learning.functional_svgd.fsvgd import FsvgdSettings
-from learning.networks.normaliser import Normaliser
 from learning.priors.domain_models import Pendulum, Sinusoids, draw_parameters
-from learning.priors.function_prior import RbfCovariance
 
 
 def generator(seed=0):
@@ -106,23 +103,6 @@ def test_correlated_errors_gain_likelihood_by_the_closed_form():
     residuals = (noisy[400:] - simulator.mean(inputs[400:])).double().numpy()
     independent_nll = -norm(0.0, residuals.std(axis=0)).logpdf(residuals).sum(axis=1).mean()
     assert independent_nll - nll == pytest.approx(-0.5 * math.log(1.0 - 0.9**2), abs=0.15)
-
-
-def test_grey_box_improves_on_the_simulator_with_missing_friction():
-    inputs, outputs, _ = pendulum(300, 0.02, frictions=(0.5, 0.5), drags=(0.5, 0.5))
-    noise = torch.full((3,), 0.02)
-    simulator = identify(Pendulum(), inputs[:200], outputs[:200], noise)
-    zero, one = torch.zeros(4), torch.tensor([1.0, 1.0, 3.5, 2.0])
-    normaliser = Normaliser(zero, one, torch.zeros(3), torch.tensor([0.1, 0.1, 0.3]))
-    settings = FsvgdSettings(particles=10, steps=1500, hidden=(32, 32), noise_std=0.2, measurement_points=16)
-    covariance = RbfCovariance((1.0, 1.0, 1.0), (1.0,))
-    pool = Pendulum().inputs(256, generator(9))
-    model = grey_box(simulator, inputs[:200], outputs[:200], pool, covariance, normaliser, settings)
-    test_inputs, test_outputs = inputs[200:], outputs[200:]
-    simulator_nll, grey_box_nll = (
-        negative_log_likelihood(m.predict(test_inputs), test_outputs) for m in (simulator, model)
-    )
-    assert grey_box_nll < simulator_nll - 0.5
 
 
 def test_identification_without_data_is_refused():

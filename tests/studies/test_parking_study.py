@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.experiment.campaign.figures import EpisodeFigures
-from carlab.studies.parking import as_json, draw, read_curve, run_folder, summarised
+from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
+from carlab.studies.parking import as_json, check_run, draw, read_curve, run_folder, summarised
 
 
 def figures(episode: int, reward: float, *, parked: bool) -> dict[str, object]:
@@ -24,7 +25,7 @@ def figures(episode: int, reward: float, *, parked: bool) -> dict[str, object]:
 def write_run(runs: Path, method: str, seed: int, rewards: list[float], parked: set[int]) -> Path:
     folder = runs / f"2026-01-01_00000{seed}_{method}-seed{seed}"
     folder.mkdir(parents=True)
-    plan = {"method": method, "seed": seed, "updates": 1000}
+    plan = {"method": method, "seed": seed, "updates": 1000, "version": 2}
     (folder / "campaign.json").write_text(json.dumps({"plan": plan}))
     rows = [figures(k, r, parked=k in parked) for k, r in enumerate(rewards, start=1)]
     (folder / "learn.json").write_text(json.dumps({"schema": "carlab.learn/1", "episodes": rows[::-1]}))
@@ -34,17 +35,17 @@ def write_run(runs: Path, method: str, seed: int, rewards: list[float], parked: 
 @pytest.fixture
 def runs(tmp_path: Path) -> list[Path]:
     return [
-        write_run(tmp_path, "sim-fsvgd", 0, [10.0, 20.0, 30.0], {2, 3}),
-        write_run(tmp_path, "sim-fsvgd", 1, [14.0, 26.0, 30.0], {3}),
-        write_run(tmp_path, "sim-fsvgd", 2, [12.0, 26.0, 30.0, 99.0], {1, 2, 3, 4}),
-        write_run(tmp_path, "fsvgd-authors", 0, [1.0, 2.0, 3.0], set()),
-        write_run(tmp_path, "fsvgd-authors", 1, [3.0, 2.0, 1.0], {3}),
+        write_run(tmp_path, "gp-sim-posterior", 0, [10.0, 20.0, 30.0], {2, 3}),
+        write_run(tmp_path, "gp-sim-posterior", 1, [14.0, 26.0, 30.0], {3}),
+        write_run(tmp_path, "gp-sim-posterior", 2, [12.0, 26.0, 30.0, 99.0], {1, 2, 3, 4}),
+        write_run(tmp_path, "fsvgd", 0, [1.0, 2.0, 3.0], set()),
+        write_run(tmp_path, "fsvgd", 1, [3.0, 2.0, 1.0], {3}),
     ]
 
 
 def test_summary_equals_hand_computed_values(runs: list[Path]) -> None:
     sim_fsvgd, authors = summarised([read_curve(r) for r in runs])
-    assert (sim_fsvgd.method, sim_fsvgd.seeds, sim_fsvgd.episodes) == ("sim-fsvgd", 3, 3)
+    assert (sim_fsvgd.method, sim_fsvgd.seeds, sim_fsvgd.episodes) == ("gp-sim-posterior", 3, 3)
     assert sim_fsvgd.first_parked == (2, 3, 1)
     assert sim_fsvgd.median_first_parked == 2.0
     assert authors.first_parked == (None, 3)
@@ -57,11 +58,11 @@ def test_summary_equals_hand_computed_values(runs: list[Path]) -> None:
 
 
 def test_missing_episode_row_does_not_shift_other_episodes(tmp_path: Path) -> None:
-    folder = write_run(tmp_path, "sim-fsvgd", 0, [10.0, 20.0, 30.0], {3})
+    folder = write_run(tmp_path, "gp-sim-posterior", 0, [10.0, 20.0, 30.0], {3})
     content = json.loads((folder / "learn.json").read_text())
     kept_rows = [row for row in content["episodes"] if row["episode"] != 2]
     (folder / "learn.json").write_text(json.dumps({**content, "episodes": kept_rows}))
-    other = write_run(tmp_path, "sim-fsvgd", 1, [14.0, 22.0, 34.0], {3})
+    other = write_run(tmp_path, "gp-sim-posterior", 1, [14.0, 22.0, 34.0], {3})
     curves = [read_curve(r) for r in (folder, other)]
     (found,) = summarised(curves)
     assert found.episodes == 3
@@ -73,7 +74,7 @@ def test_missing_episode_row_does_not_shift_other_episodes(tmp_path: Path) -> No
 
 
 def test_episode_without_any_row_has_no_mean(tmp_path: Path) -> None:
-    folders = [write_run(tmp_path, "sim-fsvgd", seed, [10.0, 20.0, 30.0], {3}) for seed in (0, 1)]
+    folders = [write_run(tmp_path, "gp-sim-posterior", seed, [10.0, 20.0, 30.0], {3}) for seed in (0, 1)]
     for folder in folders:
         content = json.loads((folder / "learn.json").read_text())
         kept_rows = [row for row in content["episodes"] if row["episode"] != 2]
@@ -95,13 +96,31 @@ def test_result_is_valid_json_and_picture_is_drawn(runs: list[Path], tmp_path: P
 
 
 def test_run_folder_is_found_by_method_and_seed(runs: list[Path], tmp_path: Path) -> None:
-    assert run_folder(tmp_path, "sim-fsvgd", 1) == runs[1]
-    assert run_folder(tmp_path, "fsvgd", 1) is None
-    (tmp_path / "2026-01-02_000000_sim-fsvgd-seed1").mkdir()
+    assert run_folder(tmp_path, "gp-sim-posterior", 1) == runs[1]
+    assert run_folder(tmp_path, "gp-posterior", 1) is None
+    (tmp_path / "2026-01-02_000000_gp-sim-posterior-seed1").mkdir()
     with pytest.raises(DataError, match="remove all but one"):
-        run_folder(tmp_path, "sim-fsvgd", 1)
+        run_folder(tmp_path, "gp-sim-posterior", 1)
 
 
 def test_read_curve_refuses_a_folder_without_figures(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="not a run of carlab learn"):
         read_curve(tmp_path)
+
+
+def test_earlier_names_of_methods_are_read_with_their_current_names(caplog: pytest.LogCaptureFixture) -> None:
+    plan = TrainingPlan("")
+    assert plan_from_json(plan_as_json(plan)) == plan
+    assert not caplog.records
+    earlier = {k: v for k, v in plan_as_json(plan).items() if k != "version"}
+    for old, new in (("sim-fsvgd", "gp-sim-posterior"), ("fsvgd", "gp-posterior"), ("fsvgd-authors", "fsvgd")):
+        assert plan_from_json({**earlier, "method": old}).method == new
+        assert caplog.records[-1].getMessage() == f"The run's method '{old}' is now called '{new}'."
+
+
+def test_a_run_of_the_earlier_method_of_that_name_is_refused(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, "sim-fsvgd", 0, [1.0], set())
+    (folder / "campaign.json").write_text(json.dumps({"plan": {"method": "sim-fsvgd", "seed": 0, "updates": 1000}}))
+    assert read_curve(folder).method == "gp-sim-posterior"
+    with pytest.raises(ConfigError, match="was started with --methods gp-sim-posterior; use the same option"):
+        check_run(folder, {"method": ("--methods", "sim-fsvgd")})

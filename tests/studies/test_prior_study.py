@@ -131,7 +131,7 @@ def test_expected_discrepancy_is_smaller_with_few_rows_and_for_pose_outputs(
     for name in ("STEPS", "REFINEMENT_STEPS"):  # faster GreyBox; its result is not used
         monkeypatch.setattr(f"learning.baselines.system_identification.{name}", 10)
     few, many = 100, 450
-    list(run_study(case, rows=(few, many), seeds=1, methods=("Sim-FSVGD", "GreyBox"), data=Path()))
+    list(run_study(case, rows=(few, many), seeds=1, methods=("gp-sim-posterior", "GreyBox"), data=Path()))
     assert [a.tolist() for a in received] == [pytest.approx([0.03] * 3 + [0.1] * 3)] * 2 + [
         pytest.approx([0.3] * 6)
     ] * 2
@@ -241,7 +241,7 @@ def test_failed_fit_of_one_prior_does_not_stop_the_others(monkeypatch: pytest.Mo
 
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
-    monkeypatch.setitem(regression_methods.METHODS, "FSVGD", broken)
+    monkeypatch.setitem(regression_methods.METHODS, "gp-posterior", broken)
     scores = list(run_prior_study(case, {n: models[n] for n in (NONE, NOMINAL)}, rows=(20,), seeds=1, steps=20))
     assert [(s.method, s.failed is None) for s in scores] == [(NONE, False), (NOMINAL, True)]
     assert "The fit diverged" in str(scores[0].failed)

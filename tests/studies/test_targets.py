@@ -13,8 +13,8 @@ from carlab.studies.regression.recordings import recorded_case
 from carlab.studies.regression.scores import Score
 from carlab.studies.regression.study import run_study
 
-SIM_FSVGD = "Sim-FSVGD"
-BASELINES = ("FSVGD", "SysID", "GreyBox")
+OURS = "gp-sim-posterior"
+BASELINES = ("gp-posterior", "SysID")
 
 
 def means(scores: Iterable[Score], figure: str = "nll") -> dict[tuple[str, int], float]:
@@ -26,20 +26,20 @@ def means(scores: Iterable[Score], figure: str = "nll") -> dict[tuple[str, int],
     return {key: float(np.mean(values)) for key, values in found.items()}
 
 
-def test_sim_fsvgd_beats_baselines_on_ten_pendulum_rows() -> None:
+def test_simulator_posterior_beats_baselines_on_ten_pendulum_rows() -> None:
     """Drag, friction and motor lag are not in the prior."""
-    nll = means(run_study("pendulum_motor", rows=(10,), seeds=1, methods=(SIM_FSVGD, *BASELINES), steps=1000))
-    assert nll[SIM_FSVGD, 10] < -6.0
-    assert all(nll[SIM_FSVGD, 10] < nll[name, 10] - 1.0 for name in BASELINES), nll
+    nll = means(run_study("pendulum_motor", rows=(10,), seeds=1, methods=(OURS, *BASELINES), steps=1000))
+    assert nll[OURS, 10] < -6.0
+    assert all(nll[OURS, 10] < nll[name, 10] - 1.0 for name in BASELINES), nll
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_sim_fsvgd_beats_baselines_at_each_number_of_pendulum_rows() -> None:
-    nll = means(run_study("pendulum_motor", seeds=3, methods=(SIM_FSVGD, *BASELINES, "ridge")))
+def test_simulator_posterior_beats_baselines_at_each_number_of_pendulum_rows() -> None:
+    nll = means(run_study("pendulum_motor", seeds=3, methods=(OURS, *BASELINES, "ridge")))
     for count in (5, 10, 20, 50):
         others = {name: nll[name, count] for name in (*BASELINES, "ridge") if (name, count) in nll}
-        assert nll[SIM_FSVGD, count] < min(others.values()), (count, nll[SIM_FSVGD, count], others)
+        assert nll[OURS, count] < min(others.values()), (count, nll[OURS, count], others)
 
 
 @pytest.mark.slow
@@ -54,8 +54,8 @@ def test_sim_fsvgd_beats_baselines_at_each_number_of_pendulum_rows() -> None:
 )
 def test_nll_limits_on_the_authors_data(shared: Path, case: str, limits: dict[int, float]) -> None:
     folder = shared / "data" / "regression"
-    nll = means(run_study(case, rows=tuple(limits), seeds=3, methods=(SIM_FSVGD,), data=folder))
-    assert all(nll[SIM_FSVGD, count] <= limit for count, limit in limits.items()), nll
+    nll = means(run_study(case, rows=tuple(limits), seeds=3, methods=(OURS,), data=folder))
+    assert all(nll[OURS, count] <= limit for count, limit in limits.items()), nll
 
 
 @pytest.mark.slow
@@ -65,8 +65,8 @@ def test_nll_and_calibration_limits_on_a_real_car(shared: Path, count: int, limi
     folder = shared / "data" / "eth_rc_car"
     recordings = [import_csv(folder / f"train_{k}.csv.gz").episodes for k in (1, 2)]
     case = recorded_case(recordings, Path("eth_rc_car"), history=6)
-    scores = list(run_study(case, rows=(count,), seeds=3, methods=(SIM_FSVGD, "ridge"), data=folder, steps=4000))
+    scores = list(run_study(case, rows=(count,), seeds=3, methods=(OURS, "ridge"), data=folder, steps=4000))
     nll = means(scores)
-    assert nll[SIM_FSVGD, count] <= limit
-    assert nll[SIM_FSVGD, count] <= nll["ridge", count] - 2.0
-    assert means(scores, "calibration")[SIM_FSVGD, count] <= 0.05
+    assert nll[OURS, count] <= limit
+    assert nll[OURS, count] <= nll["ridge", count] - 2.0
+    assert means(scores, "calibration")[OURS, count] <= 0.05

@@ -56,7 +56,7 @@ def predicted_figures(
 
     totals = [learned.roll_out(agent.act).returns]
     prior = SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
-    if plan.method == "sim-fsvgd":
+    if plan.method == "gp-sim-posterior":
         cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed))
         cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)
         task = plan.task.resized(drawn_cars.HISTORY)

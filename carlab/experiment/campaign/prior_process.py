@@ -111,8 +111,7 @@ def run_repair_subprocess(request: RepairRequest, stop: Callable[[], bool] = lam
 
 def repair(request: RepairRequest) -> PriorVersion:
     """The next version of the prior. Raises CarlabError if a recording cannot be read."""
-    from carlab.experiment.campaign.training import has_ticks
-    from carlab.recording.mcap.source import read_episode
+    from carlab.recording.mcap.source import has_ticks, read_episode
 
     car = SimulatorConfig.from_tables(tomllib.loads(request.car_toml))
     episodes = [read_episode(path) for path in request.recordings if has_ticks(path)]

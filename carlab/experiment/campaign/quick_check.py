@@ -94,8 +94,7 @@ def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict
     """
     from carlab.diagnosis.quick.quick_check import quick_check
     from carlab.diagnosis.quick.sentences import sentences, short
-    from carlab.experiment.campaign.training import has_ticks
-    from carlab.recording.mcap.source import read_episode
+    from carlab.recording.mcap.source import has_ticks, read_episode
 
     driven = [path for path in recordings if has_ticks(path)]
     result = quick_check([read_episode(path) for path in driven], simulator)

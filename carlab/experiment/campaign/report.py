@@ -11,10 +11,10 @@ from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.picture import draw
 from carlab.experiment.campaign.quick_check import QuickCheck
 from carlab.experiment.campaign.run_recording import write_run_recording
-from carlab.experiment.campaign.training import has_ticks, training_figures
+from carlab.experiment.campaign.training import training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.episodes.session import result_of
-from carlab.recording.mcap.source import read_episode
+from carlab.recording.mcap.source import has_ticks, read_episode
 from carlab.recording.run_folder import RunDirectory
 
 log = logging.getLogger(__name__)

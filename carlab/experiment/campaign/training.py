@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from carlab.core.clock import MonotonicClock
-from carlab.core.documents import EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError, DivergedError
 from carlab.core.observation import episode_features, feature_size
@@ -30,7 +29,7 @@ from carlab.recording.episode_builder import VELOCITY_DELAY
 from carlab.recording.run_folder import RunDirectory
 from learning.priors.simulator_model import CarModel, known_ranges
 from learning.transitions import Transitions, has_whole_step, transitions_of
-from learning.world.car_fit import LearnedCar
+from learning.world.car_fit import PAPER_METHODS, LearnedCar
 from learning.world.history import find_history
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -141,7 +140,7 @@ def train(
 
 def _usable_episodes(recordings: list[Path], history: int) -> tuple[list[EpisodeData], EpisodeData | None]:
     """Recorded episodes with at least one complete transition, and the newest recording if it is one of them."""
-    from carlab.recording.mcap.source import read_episode
+    from carlab.recording.mcap.source import has_ticks, read_episode
 
     episodes = [read_episode(path) if has_ticks(path) else None for path in recordings]
     usable = [e for e in episodes if e is not None and has_whole_step(e, history)]
@@ -237,15 +236,18 @@ def _fitted(
     from learning.world.car_dynamics import CarDynamics
     from learning.world.car_fit import CarFitSettings, fit_car
 
-    is_authors = plan.method == "fsvgd-authors"
-    steps = plan.model_steps or (STEPS if is_authors else CarFitSettings().steps)
+    is_papers = plan.method in PAPER_METHODS
+    steps = plan.model_steps or (STEPS if is_papers else CarFitSettings().steps)
 
     def report_step(done: int) -> None:
         progress("learning the car", done, steps)
 
     report_step(0)
-    if is_authors:
-        return fit_authors_fsvgd(episodes, plan.history, steps, seed, report_step, plan.device)
+    if is_papers:
+        simulator = None if plan.method == "fsvgd" else model
+        return fit_authors_fsvgd(
+            episodes, plan.history, steps, seed, report_step, plan.device, simulator, plan.method == "sim-fsvgd-mended"
+        )
     settings = CarFitSettings(plan.method, steps, seed=seed)
     earlier = before if isinstance(before, CarDynamics) else None
 
@@ -285,16 +287,6 @@ def velocity_delay_s(episodes: Sequence[EpisodeData]) -> float:
     return float(np.median(known)) if len(known) else 0.5 * StateEstimator().window_s
 
 
-def has_ticks(recording: Path) -> bool:
-    """Whether a recording has a completed tick; the safety gate or a hang may end an episode before the first one."""
-    from carlab.recording.mcap.source import read_documents
-
-    documents = read_documents(recording)
-    steps = [document.step for document in documents if isinstance(document, Tick)]
-    completed = [d.steps for d in documents if isinstance(d, EpisodeEnded) and d.last is not None]
-    return len(steps) > 1 or bool(steps and completed and completed[0] > steps[-1])
-
-
 def recorded_features(episodes: list[EpisodeData], history: int) -> FloatArray:
     """Features (R, 7 + 2 H) of recorded states with the H commands before each."""
     import numpy as np
@@ -321,7 +313,6 @@ def _publish(folder: Path, figures: dict[str, Any], write: Callable[[Path], None
 __all__ = [
     "DYNAMICS_FILE",
     "FIGURES_FILE",
-    "has_ticks",
     "model_folder",
     "recorded_features",
     "train",

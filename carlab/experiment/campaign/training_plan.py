@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
@@ -9,6 +10,12 @@ from typing import Any, get_args
 from carlab.core.task import Task
 from carlab.core.task_choice import PARKING, TaskChoice
 from learning.world.car_fit import Method
+
+log = logging.getLogger(__name__)
+
+PLAN_VERSION = 2
+EARLIER_NAMES = {"sim-fsvgd": "gp-sim-posterior", "fsvgd": "gp-posterior", "fsvgd-authors": "fsvgd"}
+"""Methods of plans of version 1 by their current names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +25,8 @@ class TrainingPlan:
     Attributes:
         prior_toml: car file of the prior simulator, with ranges and effects.
         history: number of past commands that model and policy observe.
-        method: ``sim-fsvgd`` has a simulator prior; ``fsvgd`` has none; ``fsvgd-authors`` has the settings of the
-            authors of Sim-FSVGD.
+        method: ``gp-sim-posterior`` has a simulator prior, ``gp-posterior`` has none; ``sim-fsvgd``,
+            ``sim-fsvgd-mended`` and ``fsvgd`` are the paper's, with its settings.
         model_steps: steps of the particles' optimiser; None: the default of the method.
         updates: gradient steps of SAC (``updates_before``).
         ticks: ticks of an episode; None: those of the task.
@@ -31,7 +38,7 @@ class TrainingPlan:
 
     prior_toml: str
     history: int = 3
-    method: Method = "sim-fsvgd"
+    method: Method = "gp-sim-posterior"
     model_steps: int | None = None
     updates: int = 30_000
     ticks: int | None = None
@@ -57,7 +64,14 @@ class TrainingPlan:
 
 def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
     """The plan as values for a JSON file; of a user's task only the name and the hash of its file."""
-    return {**asdict(replace(plan, task_choice=PARKING)), "task_choice": plan.task_choice.to_table()}
+    values = asdict(replace(plan, task_choice=PARKING))
+    return {**values, "task_choice": plan.task_choice.to_table(), "version": PLAN_VERSION}
+
+
+def method_of(plan: Mapping[str, Any]) -> str:
+    """Method of a plan in a JSON file by its current name; files before version 2 have other names."""
+    method = str(plan["method"]) if "method" in plan else "gp-sim-posterior"
+    return method if plan.get("version", 1) >= PLAN_VERSION else EARLIER_NAMES.get(method, method)
 
 
 def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
@@ -67,7 +81,11 @@ def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
         KeyError, TypeError, ValueError: wrong names, types or ranges.
     """
     task_choice = TaskChoice.from_table(content["task_choice"]) if "task_choice" in content else PARKING
-    plan = TrainingPlan(**{**content, "task_choice": task_choice})
+    method = method_of(content)
+    if method != content.get("method", method):
+        log.warning("The run's method '%s' is now called '%s'.", content["method"], method)
+    values = {k: v for k, v in content.items() if k != "version"}
+    plan = TrainingPlan(**{**values, "method": method, "task_choice": task_choice})
     if not (isinstance(plan.prior_toml, str) and plan.method in get_args(Method) and plan.device in ("cpu", "cuda")):
         raise ValueError("prior, method or device of the plan")
     for name, minimum in {"history": 0, "updates": 1, "seed": 0, "threads": 1, "model_steps": 1, "ticks": 1}.items():
@@ -79,4 +97,4 @@ def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
     return plan
 
 
-__all__ = ["TrainingPlan", "plan_as_json", "plan_from_json"]
+__all__ = ["TrainingPlan", "method_of", "plan_as_json", "plan_from_json"]

@@ -208,3 +208,11 @@ class _Collector:
         yield from self._documents
         if "end_t_s" in self._episode:
             yield messages.ended_from_metadata(self._episode, self._state[1] if self._state else None)
+
+
+def has_ticks(recording: Path) -> bool:
+    """Whether a recording has a completed tick; the safety gate or a hang may end an episode before the first one."""
+    documents = read_documents(recording)
+    steps = [document.step for document in documents if isinstance(document, Tick)]
+    completed = [d.steps for d in documents if isinstance(d, EpisodeEnded) and d.last is not None]
+    return len(steps) > 1 or bool(steps and completed and completed[0] > steps[-1])

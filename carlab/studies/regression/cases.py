@@ -1,7 +1,8 @@
 """Cases of the regression study: data, simulator and units.
 
 The cases are those of the paper (Rothfuss et al., arXiv 2403.16644, section 6.1) with the domains, priors and units of
-the authors' public code. Data is drawn by a simulator here, or read from arrays of the authors' code.
+the authors' public code. Three more pendulums hide an effect that no family contains. Data is drawn by a simulator
+here, or read from arrays of the authors' code.
 """
 
 from __future__ import annotations
@@ -14,9 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from learning.networks.normaliser import Normaliser
-from learning.priors.domain_models import DomainModel, KinematicCar, Pendulum, Sinusoids, draw_parameters
+from learning.priors.domain_models import (
+    DomainModel,
+    KinematicCar,
+    Pendulum,
+    Sinusoids,
+    detent,
+    draw_parameters,
+    motor_saturation,
+    position_friction,
+)
 from learning.priors.function_prior import RbfCovariance
 from learning.priors.motor_pendulum import MotorPendulum
 from learning.priors.simulator_model import CarModel
@@ -57,8 +67,8 @@ class Case:
     Attributes:
         name: name on the command line and in the file names of the authors' arrays.
         prior: simulator that the methods know.
-        prior_with_discrepancy: the same simulator with a discrepancy inside its dynamics, as the prior of Sim-FSVGD;
-            None: ``prior`` with a discrepancy of its outputs.
+        prior_with_structure: the same simulator with further terms inside its dynamics, which ``--structure`` gives to
+            all methods; None: there is none.
         truth: simulator that generates the data, with a distribution of its parameters; None: the authors' arrays only.
         counts: numbers of training rows.
         noise_std: standard deviation of the measurement noise of the outputs (O,).
@@ -69,16 +79,15 @@ class Case:
         discrepancy_std: standard deviation of the authors' discrepancy process (O,); None: the simulator is exact.
         discrepancy_lengthscale: lengthscale of that process on raw inputs.
         function_lengthscale: lengthscale of the Gaussian-process prior of FSVGD and GreyBox on normalised inputs.
-        prior_discrepancy: prior size of the discrepancy with ``--way ours``, in units of the outputs; None: the
-            simulator is exact.
-        ours: the same case in other coordinates for ``--way ours``; None: the same coordinates.
+        prior_discrepancy: prior size of carlab's discrepancy, in units of the outputs; None: the simulator is exact.
+        body_frame: the same case in the body frame for all methods but those of the paper; None: the same coordinates.
         in_body_frame: whether rows are transformed to the car's frame at the start of the step.
-        comparison_note: sentence below the table of this case with ``--way ours``.
+        plain_prior: the simulator without structure, if ``prior`` has it.
     """
 
     name: str
     prior: DomainModel
-    prior_with_discrepancy: DomainModel | None
+    prior_with_structure: DomainModel | None
     truth: DomainModel | None
     counts: tuple[int, ...]
     noise_std: tuple[float, ...]
@@ -90,9 +99,9 @@ class Case:
     discrepancy_lengthscale: float
     function_lengthscale: float
     prior_discrepancy: float | None = 0.3
-    ours: Case | None = None
+    body_frame: Case | None = None
     in_body_frame: bool = False
-    comparison_note: str = ""
+    plain_prior: DomainModel | None = None
 
     @property
     def prior_noise_std(self) -> tuple[float, ...]:
@@ -102,6 +111,12 @@ class Case:
     def prior_discrepancy_for(self, count: int) -> float | tuple[float, ...] | None:
         """Prior size of the discrepancy with ``count`` rows, in units of all outputs or of each (O,); None: exact."""
         return self.prior_discrepancy
+
+    def structured(self) -> Case:
+        """The case in which every method knows the simulator with structure. Raises ConfigError without structure."""
+        if self.prior_with_structure is None:
+            raise ConfigError(f"Case '{self.name}' has no structured simulator; remove --structure.")
+        return replace(self, prior=self.prior_with_structure, plain_prior=self.prior)
 
     @property
     def normaliser(self) -> Normaliser:
@@ -241,7 +256,7 @@ KINEMATIC_RANGES = {
 _RACECAR_WORLD_FRAME = Case(
     name="racecar",
     prior=KinematicCar(place_m=4.0, speed_mps=6.0, rate_radps=8.0),
-    prior_with_discrepancy=None,
+    prior_with_structure=None,
     truth=None,
     counts=(20, 50, 100, 200, 400),
     noise_std=_CAR_NOISE,
@@ -261,12 +276,12 @@ _RACECAR_BODY_FRAME = replace(
     function_lengthscale=2.0,
     in_body_frame=True,
 )
-_RACECAR = replace(_RACECAR_WORLD_FRAME, ours=_RACECAR_BODY_FRAME)
+_RACECAR = replace(_RACECAR_WORLD_FRAME, body_frame=_RACECAR_BODY_FRAME)
 
 _PENDULUM = Case(
     name="pendulum",
     prior=Pendulum(),
-    prior_with_discrepancy=Pendulum(rate_discrepancy=(1.0, 0.5, 0.5)),
+    prior_with_structure=Pendulum(rate_discrepancy=(1.0, 0.5, 0.5)),
     truth=Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6)),
     counts=(5, 10, 20, 50),
     noise_std=(0.02, 0.02, 0.02),
@@ -277,27 +292,22 @@ _PENDULUM = Case(
     discrepancy_std=(0.025, 0.025, 0.25),
     discrepancy_lengthscale=10.0,
     function_lengthscale=0.4,
-    prior_discrepancy=0.03,
-    comparison_note=(
-        "The discrepancy given to Sim-FSVGD here contains the form of the truth (friction by the rate), which SysID "
-        "and GreyBox do not have. Given the same family, SysID scores -5.55 / -6.73 / -7.35 / -7.34 at n = 5 / 10 / "
-        "20 / 50."
-    ),
 )
-# Sizes of the discrepancy, chosen without data. Friction by the rate: as for the pendulum, about gravity at the highest
-# rate. Friction by the sign of the rate: a tenth of that. Motor: half of each command.
+# Sizes of the structured terms, chosen without data. Friction by the rate: as for the pendulum, about gravity at the
+# highest rate. Friction by the sign of the rate: a tenth of that. Motor: half of each command.
 _PENDULUM_MOTOR = replace(
     _PENDULUM,
     name="pendulum_motor",
     prior=MotorPendulum(),
-    prior_with_discrepancy=MotorPendulum(rate_discrepancy=(1.0, 0.5, 0.5, 1.0), command_discrepancy=0.5),
+    prior_with_structure=MotorPendulum(rate_discrepancy=(1.0, 0.5, 0.5, 1.0), command_discrepancy=0.5),
     truth=MotorPendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6), dry=(0.1, 0.4), lags=(0.02, 0.06)),
     input_std=(1.0, 1.0, 3.5, 2.0, 2.0),
-    comparison_note=(
-        "The discrepancy given to Sim-FSVGD here contains the form of the truth (friction by the rate and its sign, "
-        "both commands), which SysID and GreyBox do not have."
-    ),
 )
+_HIDDEN_EFFECTS = tuple(
+    replace(_PENDULUM, name=f"pendulum_{name}", truth=Pendulum(hidden_acceleration=effect))
+    for name, effect in (("detent", detent), ("saturation", motor_saturation), ("friction", position_friction))
+)
+"""One effect that no method knows. The structured simulator has friction by the rate, which is wrong here."""
 
 CASES = {
     case.name: case
@@ -305,7 +315,7 @@ CASES = {
         Case(
             name="1d",
             prior=Sinusoids(),
-            prior_with_discrepancy=None,
+            prior_with_structure=None,
             truth=Sinusoids(),
             counts=(2,),
             noise_std=(0.0,),
@@ -320,10 +330,11 @@ CASES = {
         ),
         _PENDULUM,
         _PENDULUM_MOTOR,
+        *_HIDDEN_EFFECTS,
         Case(
             name="car",
             prior=CarModel(KINEMATIC, CAR_HISTORY, KINEMATIC_RANGES),
-            prior_with_discrepancy=None,
+            prior_with_structure=None,
             truth=CarModel(PACEJKA, CAR_HISTORY, PACEJKA_RANGES),
             counts=(20, 50, 100, 200, 400),
             noise_std=(0.001, 0.001, 0.002, 0.008, 0.008, 0.04),

@@ -1,17 +1,17 @@
 """Methods of the regression study and their fits to the rows of a case.
 
-Particles are fitted in one of two ways. ``ours`` distils the posterior over functions (``learning.posterior``;
-Sim-FSVGD around a simulator, FSVGD and the residual of GreyBox around zero). ``authors`` is functional SVGD as
-published (``learning.functional_svgd.fsvgd``) with the steps, batches, points, bandwidth and starting noise of the
-authors' public code; prior moments come from a fixed set of draws, and the Gaussian process of FSVGD has its full
-weight.
+carlab's methods (``gp-...``) condition a Gaussian process (``learning.posterior``) around a simulator, around zero, or
+average several by held-out density. ``sim-fsvgd`` and ``fsvgd`` are the paper's (``functional_svgd.fsvgd``) with
+the steps, batches, points, bandwidth and starting noise of the authors' public code; prior moments come from a fixed
+set of draws. Their ``-mended`` forms correct two slips of that code: the repulsive term divided by the number of
+particles, and the almost absent Gaussian-process prior of FSVGD.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -19,18 +19,19 @@ from torch import Tensor
 from carlab.studies.regression.cases import Case, Data
 from learning.baselines.ensemble import deep_ensemble
 from learning.baselines.ridge import Ridge
-from learning.baselines.system_identification import GreyBox, IdentifiedSimulator, grey_box, identify
-from learning.evaluation import Mixture
+from learning.baselines.system_identification import GreyBox, IdentifiedSimulator, identify
+from learning.evaluation import Mixture, Prediction
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, SimulatorPrior, fit_fsvgd
 from learning.networks.normaliser import Normaliser
+from learning.posterior.averaging import average
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
+from learning.posterior.function_posterior import FunctionPosterior
 from learning.posterior.inference import infer
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.posterior.residuals import fit_residuals
 from learning.priors.domain_models import DomainModel, draw_parameters
 from learning.priors.function_prior import RbfCovariance
 
-Way = Literal["ours", "authors"]
 PRIOR_FUNCTION = 1.0
 """Prior size of a function without a simulator, in units of the outputs."""
 MIN_DISCREPANCY = 0.03
@@ -40,12 +41,14 @@ HIDDEN, STEPS = (64, 64), 12_000
 POOL_POINTS = 1024
 PRIOR_DRAWS = 2048
 NOISE_ROWS = 2.0
+Size = float | tuple[float, ...] | None
+"""Prior size of a discrepancy in units of the outputs; None: no discrepancy."""
 
 
 class Model(Protocol):
     """A fitted method."""
 
-    def predict(self, inputs: Tensor) -> Mixture:
+    def predict(self, inputs: Tensor) -> Prediction:
         """Prediction at inputs (N, D)."""
         ...
 
@@ -72,12 +75,11 @@ class _Linear:
 
 @dataclass(frozen=True, slots=True)
 class FitTask:
-    """One fit: a case, its rows, a seed, the way and the number of optimiser steps (None: the way's default)."""
+    """One fit: a case, its rows, a seed, and the number of optimiser steps (None: the method's default)."""
 
     case: Case
     data: Data
     seed: int
-    way: Way
     steps: int | None
 
     @property
@@ -90,27 +92,31 @@ class FitTask:
         """Prior noise (O,), on the data's device."""
         return torch.tensor(self.case.prior_noise_std).to(self.data.inputs.device)
 
-    def fsvgd_settings(self, *, with_simulator: bool = False) -> FsvgdSettings:
-        """Settings of functional SVGD and of the ensemble's networks."""
+    def network_settings(self) -> FsvgdSettings:
+        """Settings of the ensemble's networks."""
+        case = self.case
+        noise = tuple(s / o for s, o in zip(case.prior_noise_std, case.output_std, strict=True))
+        return FsvgdSettings(
+            steps=self.steps or STEPS, noise_std=noise, fit_noise=case.fit_noise, noise_rows=NOISE_ROWS, seed=self.seed
+        )
+
+    def authors_settings(self, *, with_simulator: bool, mended: bool) -> FsvgdSettings:
+        """The authors' settings of functional SVGD."""
         case, rows = self.case, len(self.data.inputs)
-        if self.way == "ours":
-            noise = tuple(s / o for s, o in zip(case.prior_noise_std, case.output_std, strict=True))
-            return FsvgdSettings(
-                steps=self.steps or STEPS, noise_std=noise, fit_noise=case.fit_noise, noise_rows=NOISE_ROWS,
-                seed=self.seed,
-            )  # fmt: skip
         noise = tuple(s / o for s, o in zip(case.likelihood_std, case.output_std, strict=True))
         steps = self.steps or min(60 * rows // 8 + 5000, 100_000) // 1000 * 1000
         if case.name == "1d":
-            return FsvgdSettings(
+            settings = FsvgdSettings(
                 steps=self.steps or (20_000 if with_simulator else 10_000), batch=4, measurement_points=8,
                 bandwidth=1.0 if with_simulator else 0.5, natural=False, anneal_rate=False, noise_std=noise,
                 fit_noise=False, seed=self.seed,
             )  # fmt: skip
-        return FsvgdSettings(
-            steps=steps, batch=8, measurement_points=32, bandwidth=10.0 if case.name == "realcar" else 2.0,
-            natural=False, anneal_rate=False, noise_std=noise, noise_rate=1.0, seed=self.seed,
-        )  # fmt: skip
+        else:
+            settings = FsvgdSettings(
+                steps=steps, batch=8, measurement_points=32, bandwidth=10.0 if case.name == "realcar" else 2.0,
+                natural=False, anneal_rate=False, noise_std=noise, noise_rate=1.0, seed=self.seed,
+            )  # fmt: skip
+        return settings if mended else settings.with_published_slips(rows, with_simulator=with_simulator)
 
     def pool(self) -> Tensor:
         """Inputs of the domain (M, D)."""
@@ -121,61 +127,68 @@ class FitTask:
         """Gaussian-process prior of FSVGD and of GreyBox: one normalised unit everywhere."""
         return RbfCovariance((1.0,) * len(self.case.output_std), (self.case.function_lengthscale,))
 
-    def distilled(
-        self,
-        simulator: DomainModel | None,
-        outputs: Tensor,
-        prior_discrepancy: float | tuple[float, ...] | None,
-        noise_std: tuple[float, ...] | None = None,
-    ) -> SmoothedParticles:
-        """Particles distilled from the posterior over functions.
+    def posterior(
+        self, simulator: DomainModel | None, inputs: Tensor, outputs: Tensor, size: Size
+    ) -> FunctionPosterior:
+        """Posterior over functions.
 
         Args:
             simulator: the simulator; None: a zero mean.
+            inputs: raw (n, D).
             outputs: raw (n, O).
-            prior_discrepancy: prior size of the discrepancy in units of the outputs; None: no discrepancy.
-            noise_std: known noise (O,), raw; by default the case's prior noise.
+            size: of the discrepancy.
         """
-        case = self.case
-        noise = self.noise_std if noise_std is None else torch.tensor(noise_std).to(self.noise_std)
-        generator = torch.Generator().manual_seed(30_000 + self.seed)
-        normaliser = self.normaliser
-        discrepancy_std = None
-        if prior_discrepancy is not None:
-            discrepancy_std = torch.tensor(prior_discrepancy).to(noise) * normaliser.output_std
-        posterior = infer(
-            simulator, self.data.inputs, outputs, normaliser, noise, discrepancy_std=discrepancy_std,
-            with_discrepancy=discrepancy_std is not None, noise_known=noise_std is not None or not case.fit_noise,
-            seed=self.seed,
+        normaliser, noise = self.normaliser, self.noise_std
+        discrepancy_std = None if size is None else torch.tensor(size).to(noise) * normaliser.output_std
+        return infer(
+            simulator, inputs, outputs, normaliser, noise, discrepancy_std=discrepancy_std,
+            with_discrepancy=size is not None, noise_known=not self.case.fit_noise, seed=self.seed,
         )  # fmt: skip
-        points = measurement_points(simulator or case.prior, self.data.inputs, normaliser, generator)
+
+    def distilled(self, simulator: DomainModel | None, outputs: Tensor, size: Size) -> SmoothedParticles:
+        """Particles distilled from the posterior over functions at the rows; arguments as for ``posterior``."""
+        generator = torch.Generator().manual_seed(30_000 + self.seed)
+        posterior = self.posterior(simulator, self.data.inputs, outputs, size)
+        points = measurement_points(simulator or self.case.prior, self.data.inputs, self.normaliser, generator)
         settings = DistillationSettings(hidden=HIDDEN, steps=self.steps or STEPS, seed=self.seed)
         return SmoothedParticles(distil(posterior, points, settings))
 
-    def sim_fsvgd(self, *, discrepancy: bool) -> Model:
-        """Sim-FSVGD: particles with a simulator prior."""
+    @property
+    def discrepancy_size(self) -> Size:
+        """Prior size of the simulator's discrepancy."""
+        return self.case.prior_discrepancy_for(len(self.data.inputs))
+
+    def average(self) -> Model:
+        """The simulators with and without discrepancy, and no simulator, averaged by held-out density."""
+        case = self.case
+        candidates: list[tuple[DomainModel | None, Size]] = [(case.prior, None), (None, PRIOR_FUNCTION)]
+        if self.discrepancy_size is not None:
+            simulators = [case.prior] if case.plain_prior is None else [case.prior, case.plain_prior]
+            candidates += [(simulator, self.discrepancy_size) for simulator in simulators]
+
+        def fit(simulator: DomainModel | None, size: Size) -> Callable[[Tensor, Tensor], FunctionPosterior]:
+            return lambda inputs, outputs: self.posterior(simulator, inputs, outputs, size)
+
+        return average([fit(*candidate) for candidate in candidates], self.data.inputs, self.data.outputs, self.seed)
+
+    def sim_fsvgd(self, *, mended: bool) -> Model:
+        """The paper's Sim-FSVGD."""
         case, normaliser = self.case, self.normaliser
-        if self.way == "ours":
-            if discrepancy and case.prior_with_discrepancy is not None:
-                return self.distilled(case.prior_with_discrepancy, self.data.outputs, None, case.noise_std)
-            size = case.prior_discrepancy_for(len(self.data.inputs)) if discrepancy else None
-            return self.distilled(case.prior, self.data.outputs, size)
         pool, generator = self.pool(), torch.Generator().manual_seed(30_000 + self.seed)
         prior_inputs = torch.cat([self.data.inputs, pool])
         with torch.no_grad():
             parameters = draw_parameters(case.prior, PRIOR_DRAWS, generator).to(prior_inputs)
             draws = normaliser.outputs(case.prior(prior_inputs, parameters))
-        prior = SimulatorPrior(draws, prior_inputs, case.discrepancy() if discrepancy else None)
-        settings = self.fsvgd_settings(with_simulator=True)
+        prior = SimulatorPrior(draws, prior_inputs, case.discrepancy())
+        settings = self.authors_settings(with_simulator=True, mended=mended)
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
-    def fsvgd(self) -> Model:
-        """FSVGD: particles with a Gaussian-process prior."""
-        if self.way == "ours":
-            return self.distilled(None, self.data.outputs, PRIOR_FUNCTION)
+    def fsvgd(self, *, mended: bool) -> Model:
+        """The paper's FSVGD: a Gaussian-process prior."""
         normaliser, pool = self.normaliser, self.pool()
         prior = GaussianProcessPrior(normaliser.inputs(torch.cat([self.data.inputs, pool])), self.function_prior())
-        return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, self.fsvgd_settings())
+        settings = self.authors_settings(with_simulator=False, mended=mended)
+        return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
     def sysid(self) -> IdentifiedSimulator:
         """SysID: the simulator at its maximum-likelihood parameters."""
@@ -184,19 +197,13 @@ class FitTask:
     def grey_box(self) -> Model:
         """GreyBox: SysID, and particles for its residual."""
         simulator = self.sysid()
-        if self.way == "ours":
-            size = self.case.prior_discrepancy_for(len(self.data.inputs)) or MIN_DISCREPANCY
-            with torch.no_grad():
-                residual = self.data.outputs - simulator.mean(self.data.inputs)
-            return GreyBox(simulator, self.distilled(None, residual, size))
-        return grey_box(
-            simulator, self.data.inputs, self.data.outputs, self.pool(), self.function_prior(), self.normaliser,
-            self.fsvgd_settings(),
-        )  # fmt: skip
+        with torch.no_grad():
+            residual = self.data.outputs - simulator.mean(self.data.inputs)
+        return GreyBox(simulator, self.distilled(None, residual, self.discrepancy_size or MIN_DISCREPANCY))
 
     def ensemble(self) -> Model:
         """Deep ensemble."""
-        return deep_ensemble(self.data.inputs, self.data.outputs, self.normaliser, self.fsvgd_settings())
+        return deep_ensemble(self.data.inputs, self.data.outputs, self.normaliser, self.network_settings())
 
     def ridge(self) -> Model:
         """Ridge regression."""
@@ -204,14 +211,21 @@ class FitTask:
 
 
 METHODS: dict[str, Callable[[FitTask], Model]] = {
-    "Sim-FSVGD": lambda task: task.sim_fsvgd(discrepancy=True),
-    "Sim-FSVGD without gap": lambda task: task.sim_fsvgd(discrepancy=False),
-    "FSVGD": FitTask.fsvgd,
+    "gp-sim-average": FitTask.average,
+    "gp-sim-posterior": lambda task: task.distilled(task.case.prior, task.data.outputs, task.discrepancy_size),
+    "sim-posterior": lambda task: task.distilled(task.case.prior, task.data.outputs, None),
+    "gp-posterior": lambda task: task.distilled(None, task.data.outputs, PRIOR_FUNCTION),
+    "sim-fsvgd": lambda task: task.sim_fsvgd(mended=False),
+    "sim-fsvgd-mended": lambda task: task.sim_fsvgd(mended=True),
+    "fsvgd": lambda task: task.fsvgd(mended=False),
+    "fsvgd-mended": lambda task: task.fsvgd(mended=True),
     "SysID": FitTask.sysid,
     "GreyBox": FitTask.grey_box,
     "ensemble": FitTask.ensemble,
     "ridge": FitTask.ridge,
 }
-"""Methods by their name in tables and on the command line; "without gap" means without model discrepancy."""
+"""Methods by their name in tables and on the command line; ``sim-posterior`` has no model discrepancy."""
+PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-mended", "fsvgd", "fsvgd-mended")
+"""The paper's algorithms; their inputs are in the world frame."""
 
-__all__ = ["METHODS", "STEPS", "FitTask", "Model", "SmoothedParticles", "Way"]
+__all__ = ["METHODS", "PAPER_METHODS", "STEPS", "FitTask", "Model", "SmoothedParticles"]
