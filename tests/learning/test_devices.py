@@ -22,7 +22,6 @@ from carlab.core.task import ParkingTask, PathTask
 from carlab.studies.regression.methods import METHODS
 from carlab.studies.regression.study import run_study
 from learning.baselines import system_identification
-from learning.baselines.system_identification import identify
 from learning.devices import synchronise
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
 from learning.functional_svgd.authors_fsvgd import fit_authors_fsvgd
