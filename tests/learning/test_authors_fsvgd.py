@@ -17,6 +17,7 @@ from learning.functional_svgd.authors_fsvgd import (
     authors_settings,
     fit_authors_fsvgd,
     in_world,
+    simulated_changes,
     world_rows,
 )
 from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, fit_fsvgd
@@ -24,6 +25,8 @@ from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.priors.function_prior import RbfCovariance
+from learning.priors.simulator_model import CarModel, known_ranges
+from sim_backends.car_parameters import SimulatorConfig
 
 HISTORY = 2
 
@@ -147,3 +150,38 @@ class TestHeldOutRows:
                 found[exponent, length] = fit_fsvgd(x, y, others, prior, self.UNITS, settings).parameters
         assert torch.equal(found[0.0, 0.1], found[0.0, 3.0])
         assert not torch.allclose(found[1.0, 0.1], found[1.0, 3.0], atol=1e-3)
+
+
+def test_changes_of_a_simulator_are_rotated_to_the_world() -> None:
+    """A simulator that predicts the recorded change in the body frame has the recorded change in the world."""
+    episode = circling()
+    inputs, changes = world_rows([episode], HISTORY)
+    body = cmath.exp(1j * 0.2).conjugate()  # The velocity in the frame of the car, constant on the circle.
+    place = (cmath.exp(1j * 1.5 / 30.0) - 1.0) / 1.5j * cmath.exp(-0.2j)
+    change = torch.tensor([place.real, place.imag, 1.5 / 30.0, 0.0, 0.0, 0.0])
+    seen = []
+
+    def simulator(rows: torch.Tensor, parameters: torch.Tensor) -> torch.Tensor:
+        seen.append(rows)
+        return change.expand(len(parameters), len(rows), 6)
+
+    found = simulated_changes(simulator, inputs, torch.zeros(2, 1))
+    assert found.shape == (2, len(inputs), 7)
+    assert torch.allclose(found[1], changes, atol=1e-5)
+    assert torch.allclose(seen[0][:, :3], torch.tensor([body.real, body.imag, 1.5]), atol=1e-5)
+    assert torch.equal(seen[0][:, 3:], inputs[:, 7:])
+
+
+def test_simulator_prior_changes_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("SIMULATOR_POOL_POINTS", 40), ("SIMULATOR_DRAWS", 16)):
+        monkeypatch.setattr(f"learning.functional_svgd.authors_fsvgd.{name}", value)
+    config = SimulatorConfig(kind="kinematic")
+    model = CarModel(config, HISTORY, known_ranges(config))
+    without, published, mended = (
+        fit_authors_fsvgd([circling()], HISTORY, 3, simulator=simulator, mended=is_mended)
+        for simulator, is_mended in ((None, False), (model, False), (model, True))
+    )
+    parameters = [fit.posterior.parameters for fit in (without, published, mended)]
+    assert all(torch.isfinite(p).all() for p in parameters)
+    assert not torch.equal(parameters[0], parameters[1])
+    assert not torch.equal(parameters[1], parameters[2])
