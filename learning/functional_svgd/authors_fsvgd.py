@@ -4,13 +4,15 @@ Settings and state are those of lasgroup/simulation_transfer at 547fa14 (``bnn_f
 Inputs of a network are pose and velocities in the world frame; it predicts their changes, with sine and cosine
 of the yaw as independent outputs. Without a simulator the weight of the Gaussian-process prior is ``1 / (L (batch +
 points))``, because the authors average its score over particles and points and sum the likelihood; the repulsive term
-is weaker by ``1 / L``. ``mended`` fits have neither slip. Draws of the simulator are taken once.
+is weaker by ``1 / L``; and at their bandwidth the kernel matrix is the identity, so that particles do not interact.
+``mended`` fits have none of these slips; their bandwidth follows the median heuristic. Draws of the simulator are taken
+once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -61,7 +63,9 @@ def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, men
         noise_std=noise, noise_rate=1.0, likelihood_exponent=0.5, anneal_rate=False,
         validation_period=min(2000, steps), patience=PATIENCE, seed=seed,
     )  # fmt: skip
-    return settings if mended else settings.with_published_slips(BATCH, with_simulator=with_simulator)
+    if mended:
+        return replace(settings, bandwidth=None)
+    return settings.with_published_slips(BATCH, with_simulator=with_simulator)
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,7 +102,8 @@ def test_prior_exponent_is_that_of_the_authors() -> None:
     )
     assert (published.prior_exponent, published.repulsion) == (pytest.approx(1 / 480), 0.1)
     assert (simulator.prior_exponent, simulator.repulsion) == (1.0, 0.1)
-    assert (mended.prior_exponent, mended.repulsion) == (1.0, 1.0)
+    assert (mended.prior_exponent, mended.repulsion, mended.bandwidth) == (1.0, 1.0, None)
+    assert published.bandwidth == simulator.bandwidth == 0.2
 
 
 @pytest.fixture(scope="module")
