@@ -16,20 +16,24 @@ from carlab.core.errors import ConfigError
 from carlab.recording.atomic_files import write_text
 from carlab.studies.parking import Curve
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects.body import RoadSlope
+from sim_backends.effects.lags import MotorLag, SteeringLag
+from sim_backends.effects.loads import LoadTransfer
+from sim_backends.effects.tyres import LowFrictionPatch
 
 EARLY_EPISODE = 4
 REALITIES: dict[str, dict[str, float]] = {
     "low_grip": {"tyre.front.mu": 0.26, "tyre.rear.mu": 0.25},
-    "servo_lag": {"effects.steering_lag.time_constant": 0.12},
+    "servo_lag": {f"effects.{SteeringLag.id}.time_constant": 0.12},
     "long_delay": {"timing.command_delay": 0.16},
     "weak_motor": {"motor.drive_gain": 5.0},
     "patch": {
-        "effects.low_friction_patch.x": 0.7, "effects.low_friction_patch.y": -0.5,
-        "effects.low_friction_patch.radius": 0.5, "effects.low_friction_patch.loss": 0.6,
+        f"effects.{LowFrictionPatch.id}.x": 0.7, f"effects.{LowFrictionPatch.id}.y": -0.5,
+        f"effects.{LowFrictionPatch.id}.radius": 0.5, f"effects.{LowFrictionPatch.id}.loss": 0.6,
     },
-    "two_lags": {"effects.steering_lag.time_constant": 0.1, "effects.motor_lag.time_constant": 0.1},
-    "slope": {"effects.road_slope.angle": 0.04, "effects.road_slope.direction": 1.0},
-    "load_transfer": {"effects.load_transfer.height": 0.08},
+    "two_lags": {f"effects.{SteeringLag.id}.time_constant": 0.1, f"effects.{MotorLag.id}.time_constant": 0.1},
+    "slope": {f"effects.{RoadSlope.id}.angle": 0.04, f"effects.{RoadSlope.id}.direction": 1.0},
+    LoadTransfer.id: {f"effects.{LoadTransfer.id}.height": 0.08},
 }  # fmt: skip
 """Numbers that differ from the default car, by name of the reality."""
 ARMS: dict[str, dict[str, Any]] = {

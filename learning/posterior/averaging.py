@@ -72,9 +72,10 @@ def held_out_log_densities(
     for fold in torch.arange(count).tensor_split(min(max_folds, count)):
         held_out, kept = order[fold], torch.ones(count, dtype=torch.bool)
         kept[held_out] = False
+        at_kept, at_held_out = kept.to(inputs.device), held_out.to(inputs.device)
         for k, fit in enumerate(fits):
-            prediction = fit(inputs[kept], outputs[kept]).prediction(inputs[held_out])
-            densities[k, held_out] = prediction.log_density(outputs[held_out]).double().cpu()
+            prediction = fit(inputs[at_kept], outputs[at_kept]).prediction(inputs[at_held_out])
+            densities[k, held_out] = prediction.log_density(outputs[at_held_out]).double().cpu()
     return densities
 
 

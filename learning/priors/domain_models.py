@@ -94,7 +94,7 @@ def detent(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tens
     return 4.0 * torch.sin(3.0 * angle)
 
 
-def motor_saturation(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
+def saturated_torque(angle: Tensor, rate: Tensor, torque: Tensor, inertia: Tensor) -> Tensor:
     """A motor that saturates smoothly at 1 N m: its torque is ``tanh(command)``."""
     return (torch.tanh(torque) - torque) / inertia
 
@@ -242,8 +242,8 @@ __all__ = [
     "Sinusoids",
     "detent",
     "draw_parameters",
-    "motor_saturation",
     "position_friction",
+    "saturated_torque",
     "uniform",
     "within",
 ]

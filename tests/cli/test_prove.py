@@ -87,11 +87,12 @@ def test_proof_is_sealed_scored_and_not_repeated(proof_dir: Path, carlab: Carlab
 
 
 def test_cases_do_not_depend_on_the_number_of_jobs(proof_dir: Path, tmp_path: Path) -> None:
+    from carlab.benchmark.proof.child_jobs import LocalExecutor
     from carlab.benchmark.proof.runner import Proof
 
     files = []
     for jobs in (1, 2):
-        proof = Proof(tmp_path / str(jobs), SPECS, jobs=jobs)
+        proof = Proof(tmp_path / str(jobs), SPECS, executor=LocalExecutor(jobs))
         assert proof.make() is not None
         plan = json.loads((proof.root / "answers" / "plan.json").read_text())
         files.append([(proof.root / "handed" / name / "fit.csv").read_bytes() for name in plan["names"]])

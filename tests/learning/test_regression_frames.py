@@ -56,7 +56,8 @@ def test_kinematic_car_in_the_body_frame_equals_the_one_at_the_origin() -> None:
 
 def test_output_norms_are_equal_in_the_world_and_body_frames(shared: Path) -> None:
     data = shared / "data" / "regression"
-    world, body = CASES["racecar"].recorded(data, 20, 0), CASES["racecar"].ours.recorded(data, 20, 0)
+    assert CASES["racecar"].body_frame is not None
+    world, body = CASES["racecar"].recorded(data, 20, 0), CASES["racecar"].body_frame.recorded(data, 20, 0)
     assert torch.allclose(world.outputs.square().sum(dim=1), body.outputs.square().sum(dim=1), rtol=1e-4)
 
 

@@ -14,6 +14,10 @@ from typing import Any
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from sim_backends.effects.curves import DriveMap, FrontTyreCurve, RearTyreMap, SteeringCurve
+from sim_backends.effects.drive import MotorSaturation
+from sim_backends.effects.steering import SteeringAsymmetry, SteeringDeadband, SteeringNonlinearity
+from sim_backends.effects.throttle import ThrottleDeadband, ThrottleNonlinearity
 
 SLOW_MPS = 0.1
 """Speed below which dry friction and a drag brake fall to 0, so that a form is continuous."""
@@ -95,11 +99,11 @@ _GRIP = FormParameter("grip", "1", (0.6,), 0.0, 5.0)
 DRIVE_FORMS = (
     Form("linear_drive", "a drive force proportional to throttle, with viscous damping", (_GAIN, _DAMPING),
          lambda gain, damping, u, v: gain * u - damping * v),
-    Form("throttle_deadband", "a throttle dead band", (_GAIN, _WIDTH, _DAMPING),
+    Form(ThrottleDeadband.id, "a throttle dead band", (_GAIN, _WIDTH, _DAMPING),
          lambda gain, width, damping, u, v: gain * dead_band(u, width) - damping * v),
-    Form("throttle_nonlinearity", "an exponent of the throttle", (_GAIN, _EXPONENT, _DAMPING),
+    Form(ThrottleNonlinearity.id, "an exponent of the throttle", (_GAIN, _EXPONENT, _DAMPING),
          lambda gain, exponent, damping, u, v: gain * power(u, exponent) - damping * v),
-    Form("motor_saturation", "a limit of the motor's force", (_GAIN, _BRAKE, _DRIVE, _DAMPING), _saturated_drive),
+    Form(MotorSaturation.id, "a limit of the motor's force", (_GAIN, _BRAKE, _DRIVE, _DAMPING), _saturated_drive),
     Form("drag_brake", "a drag brake with the throttle released",
          (_GAIN, _DAMPING, _WIDTH, FormParameter("brake", "m/s2", (2.0,))), _drag_brake),
     Form("speed_controller", "a controller that holds a speed, with limited force",
@@ -111,13 +115,13 @@ DRIVE_FORMS = (
 )  # fmt: skip
 STEERING_FORMS = (
     Form("linear_steering", "a constant gain of the steering", (_STEERING_GAIN,), lambda gain, d: gain * d),
-    Form("steering_asymmetry", "an asymmetry of the steering",
+    Form(SteeringAsymmetry.id, "an asymmetry of the steering",
          (FormParameter("gain to the right", "1", (1.0,)), FormParameter("gain to the left", "1", (1.0,))),
          _two_slopes),
-    Form("steering_nonlinearity", "a saturation of the steering towards full lock",
+    Form(SteeringNonlinearity.id, "a saturation of the steering towards full lock",
          (_STEERING_GAIN, FormParameter("limit", "rad", (0.3, 0.6), 1e-3)),
          lambda gain, limit, d: limit * np.tanh(gain * d / limit)),
-    Form("steering_deadband", "a dead band of the steering",
+    Form(SteeringDeadband.id, "a dead band of the steering",
          (_STEERING_GAIN, FormParameter("dead band", "rad", (0.03, 0.1), 0.0, 0.4)),
          lambda gain, width, d: gain * np.sign(d) * np.maximum(np.abs(d) - width, 0.0)),
     Form("steering_exponent", "an exponent of the steering",
@@ -167,9 +171,9 @@ def _at_any_force(tyre: Form) -> Form:
 _LIMITS = ("longitudinal limit", "braking limit", "driving limit")
 REAR_FORMS = tuple(form for tyre in TYRE_FORMS for form in (_at_any_force(tyre), *_with_ellipse(tyre)))
 FORMS: Mapping[str, tuple[Form, ...]] = {
-    "drive_map": DRIVE_FORMS,
-    "steering_curve": STEERING_FORMS,
-    "front_tyre_curve": TYRE_FORMS,
-    "rear_tyre_map": REAR_FORMS,
+    DriveMap.id: DRIVE_FORMS,
+    SteeringCurve.id: STEERING_FORMS,
+    FrontTyreCurve.id: TYRE_FORMS,
+    RearTyreMap.id: REAR_FORMS,
 }
 """Forms by the id of a measured curve, the simplest first."""

@@ -12,6 +12,7 @@ from carlab.diagnosis.report.figures import Figure
 from carlab.diagnosis.report.sentences import listed, number, percent, unit_text, with_unit
 from carlab.diagnosis.report.svg import Chart, padded
 from carlab.diagnosis.settings import DEFAULT, ReportSettings
+from sim_backends.effects.curves import DriveMap
 
 MAX_PANELS = 9
 
@@ -22,7 +23,7 @@ def curve_sentences(diagnosis: Diagnosis) -> list[str]:
     for curve in diagnosis.curves:
         made.append(_largest_difference(curve))
         made.append(form_sentence(curve))
-        if curve.id == "drive_map":
+        if curve.id == DriveMap.id:
             made += readings_of_drive(curve, DEFAULT.report)
     return [sentence for sentence in made if sentence]
 

@@ -24,8 +24,8 @@ from learning.priors.domain_models import (
     Sinusoids,
     detent,
     draw_parameters,
-    motor_saturation,
     position_friction,
+    saturated_torque,
 )
 from learning.priors.function_prior import RbfCovariance
 from learning.priors.motor_pendulum import MotorPendulum
@@ -305,7 +305,7 @@ _PENDULUM_MOTOR = replace(
 )
 _HIDDEN_EFFECTS = tuple(
     replace(_PENDULUM, name=f"pendulum_{name}", truth=Pendulum(hidden_acceleration=effect))
-    for name, effect in (("detent", detent), ("saturation", motor_saturation), ("friction", position_friction))
+    for name, effect in (("detent", detent), ("saturation", saturated_torque), ("friction", position_friction))
 )
 """One effect that no method knows. The structured simulator has friction by the rate, which is wrong here."""
 
