@@ -28,7 +28,7 @@ from carlab.prediction.windows import tracks_of
 from sim_backends.array_ops import ARRAYS
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.single_track import SingleTrack
-from sim_backends.effects.curves import FrontTyreCurve, RearTyreMap
+from sim_backends.effects.curves import FrontTyreMap, RearTyreMap
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -155,8 +155,8 @@ def panels(config: SimulatorConfig, tracks: list[Track]) -> list[Panel]:
                   bench.acceleration(here, grid), time_near(speed[near], grid, period_s))
         )  # fmt: skip
     slips = np.linspace(0.0, 0.6, 31)
-    axles: tuple[tuple[str, Callable[[Array], Array], FrontTyreCurve | RearTyreMap], ...] = (
-        ("front", authors_front, FrontTyreCurve()),
+    axles: tuple[tuple[str, Callable[[Array], Array], FrontTyreMap | RearTyreMap], ...] = (
+        ("front", authors_front, FrontTyreMap()),
         ("rear", authors_rear, RearTyreMap()),
     )
     for axle, authors, curve in axles:

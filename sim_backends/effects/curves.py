@@ -201,7 +201,7 @@ class DriveMap(MeasuredCurve, DynamicsEffect):
     order = 25
     unit, typical, bound = "m/s2", 1.0, 40.0
     axes = (
-        Axis("throttle", "1", (-1.0, -0.6, -0.3, -0.1, 0.0, 0.1, 0.3, 0.6, 1.0)),
+        Axis("throttle", "1", (-1.0, -0.6, -0.35, -0.2, -0.1, -0.04, 0.0, 0.04, 0.1, 0.2, 0.35, 0.6, 1.0)),
         Axis("speed", "m/s", (-4.5, -3.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0, 4.5)),
     )
 
@@ -246,25 +246,29 @@ class SteeringCurve(MeasuredCurve, ActuatorEffect):
         return command + self.deviation(ops, (command,), values)
 
 
-class _SideForceCurve(MeasuredCurve, DynamicsEffect):
-    """Side force of one axle per load over the slip angle, odd in it."""
+class _SideForceMap(MeasuredCurve, DynamicsEffect):
+    """Side force of one axle per load over longitudinal force and slip angle, odd in the slip angle.
+
+    The longitudinal force F_x is that of the driven axle. On the driven axle it uses up grip (friction ellipse: Pacejka
+    2012, ch. 1); on the other axle it changes the load, or the car drives and brakes with all wheels.
+    """
 
     axle: ClassVar[str]
     order = 5
     base_models = ("dynamic", "linear_tyre", "blend")
     quantity = "side force per axle load"
+    unit, typical, bound = "1", 0.1, 3.0
 
     def slip_rad(self, ops: Ops, forces: Forces) -> Value:
         """Slip angle of the axle's wheels, positive where the force is to the right."""
         raise NotImplementedError
 
-    def inputs(self, ops: Ops, forces: Forces, slip_rad: Value) -> tuple[Value, ...]:
-        """The inputs of the curve at a slip angle."""
-        return (ops.abs(slip_rad),)
-
     def coordinates(self, ops: Ops, forces: Forces) -> tuple[Value, ...]:
-        """The inputs at the slip angle of the car."""
-        return self.inputs(ops, forces, self.slip_rad(ops, forces))
+        """F_x per mass of the car, and size of the slip angle."""
+        return self._at(ops, forces, self.slip_rad(ops, forces))
+
+    def _at(self, ops: Ops, forces: Forces, slip_rad: Value) -> tuple[Value, ...]:
+        return forces.axle_force / forces.mass, ops.abs(slip_rad)
 
     def base_curve(self, values: Mapping[str, float], *coordinates: FloatArray) -> FloatArray:
         """Pacejka's curve ``mu sin(C atan(B a))`` [1]."""
@@ -274,21 +278,21 @@ class _SideForceCurve(MeasuredCurve, DynamicsEffect):
     def added(self, ops: Ops, forces: Forces, values: Parameters) -> Value:
         """Side force per load to the left."""
         slip = self.slip_rad(ops, forces)
-        return -ops.sign(slip) * self.deviation(ops, self.inputs(ops, forces, slip), values)
+        return -ops.sign(slip) * self.deviation(ops, self._at(ops, forces, slip), values)
 
 
-_SLIP_AXIS = (Axis("slip angle", "rad", (0.0, 0.04, 0.1, 0.2, 0.4, 0.8), anchor=0.0),)
+_FORCE_NAME, _FORCE_UNIT = "longitudinal force per mass", "m/s2"
+_SLIP_AXIS = Axis("slip angle", "rad", (0.0, 0.04, 0.1, 0.2, 0.4, 0.8), anchor=0.0)
 
 
-class FrontTyreCurve(_SideForceCurve):
-    """``F_y,front -= F_z a(|slip|) sign(slip)`` in the front wheels' frame."""
+class FrontTyreMap(_SideForceMap):
+    """``F_y,front -= F_z a(F_x / m, |slip|) sign(slip)`` in the front wheels' frame."""
 
-    id = "front_tyre_curve"
+    id = "front_tyre_map"
     axle = "front"
-    summary = "The front side force is a measured curve over the slip angle."
-    class_statement = "a curve of the front side force over the slip angle"
-    unit, typical, bound = "1", 0.1, 3.0
-    axes = _SLIP_AXIS
+    summary = "The front side force is a measured map over longitudinal force and slip angle."
+    class_statement = "a map of the front side force over longitudinal force and slip angle"
+    axes = (Axis(_FORCE_NAME, _FORCE_UNIT, (-6.0, -3.0, 0.0, 3.0, 6.0)), _SLIP_AXIS)
 
     def slip_rad(self, ops: Ops, forces: Forces) -> Value:
         """As in the base model."""
@@ -302,35 +306,23 @@ class FrontTyreCurve(_SideForceCurve):
         forces.side_front = forces.side_front + forces.load_front * self.added(ops, forces, values)
 
 
-class RearTyreMap(_SideForceCurve):
-    """``F_y,rear -= F_z a(F_x / m, |slip|) sign(slip)``.
-
-    F_x is that of the driven axle. A tyre whose grip is shared by a friction ellipse is one such map (Pacejka 2012,
-    ch. 1).
-    """
+class RearTyreMap(_SideForceMap):
+    """``F_y,rear -= F_z a(F_x / m, |slip|) sign(slip)``."""
 
     id = "rear_tyre_map"
     axle = "rear"
     summary = "The rear side force is a measured map over longitudinal force and slip angle."
     class_statement = "a map of the rear side force over longitudinal force and slip angle"
-    unit, typical, bound = "1", 0.1, 3.0
-    axes = (
-        Axis("longitudinal force per mass", "m/s2", (-8.0, -5.0, -2.5, 0.0, 2.5, 5.0, 8.0)),
-        *_SLIP_AXIS,
-    )
+    axes = (Axis(_FORCE_NAME, _FORCE_UNIT, (-8.0, -5.0, -2.5, 0.0, 2.5, 5.0, 8.0)), _SLIP_AXIS)
 
     def slip_rad(self, ops: Ops, forces: Forces) -> Value:
         """As in the base model."""
         rear = forces.vy - forces.rear_axle * forces.yaw_rate
         return ops.slope_angle(rear, ops.floor(ops.abs(forces.vx), SLIP_FLOOR_MPS))
 
-    def inputs(self, ops: Ops, forces: Forces, slip_rad: Value) -> tuple[Value, ...]:
-        """Force of the driven axle per mass, and size of the slip angle."""
-        return forces.axle_force / forces.mass, ops.abs(slip_rad)
-
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add."""
         forces.side_rear = forces.side_rear + forces.load_rear * self.added(ops, forces, values)
 
 
-CURVES = (DriveMap(), SteeringCurve(), FrontTyreCurve(), RearTyreMap())
+CURVES = (DriveMap(), SteeringCurve(), FrontTyreMap(), RearTyreMap())

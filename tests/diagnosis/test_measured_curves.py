@@ -133,13 +133,13 @@ def test_car_without_missing_physics_has_no_measured_curves():
 def test_penalty_of_a_curve_is_that_of_its_roughness():
     windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     problem = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ())
-    free = problem.free_parameters(("front_tyre_curve",))
+    free = problem.free_parameters(("front_tyre_map",))
     fitter = Fitter(windows, Scale(np.array([1]), np.ones((1, 6))))
     z = np.zeros((1, len(free)))
-    own = [k for k, f in enumerate(free) if f.name.startswith("effects.front_tyre_curve.")]
+    own = [k for k, f in enumerate(free) if f.name.startswith("effects.front_tyre_map.")]
     z[0, own] = np.random.default_rng(0).normal(size=len(own))
     settings = DEFAULT.identification
-    bends = EFFECTS["front_tyre_curve"].roughness() @ z[0, own]
+    bends = EFFECTS["front_tyre_map"].roughness() @ z[0, own]
     expected = 0.5 * (bends**2).sum() / settings.curve_roughness_std**2
     expected += 0.5 * (z[0, own] ** 2).sum() / settings.curve_std**2
     assert fitter.prior(free, z)[0] == pytest.approx(expected)
@@ -212,7 +212,7 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     free = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ()).free_parameters(("drive_map",))
     names = [f.name for f in free]
-    gain, knot = names.index("motor.drive_gain"), names.index("effects.drive_map.value_8_6")  # throttle 1
+    gain, knot = names.index("motor.drive_gain"), names.index("effects.drive_map.value_12_6")  # throttle 1
     covariance = np.zeros((len(free), len(free)))
     slope = 0.1 * CAR.parameters.drive_gain_n / CAR.parameters.mass_kg  # change of the curve per unit of z
     covariance[gain, gain], covariance[knot, knot] = 1.0, slope**2
@@ -221,7 +221,7 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     tracks = tuple(tracks_of([drive(CAR, 60.0, 7)]))
     settings = replace(DEFAULT.curves, min_support_s=0.0)
     found = curve_findings(CurveFit(("drive_map",), (), fit, 5.0), CAR, tracks, settings)[0]
-    assert found.std[8, 6] == pytest.approx(slope * np.sqrt(2.0 - 1.8), rel=0.02)
+    assert found.std[12, 6] == pytest.approx(slope * np.sqrt(2.0 - 1.8), rel=0.02)
     assert found.std[8, 7] == pytest.approx(slope, rel=0.02)
     assert found.std[4, 7] == pytest.approx(0.0, abs=1e-9)  # no throttle
 

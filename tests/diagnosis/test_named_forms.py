@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from carlab.diagnosis.curves.form_fit import read_form
-from carlab.diagnosis.curves.named_forms import FORMS
+from carlab.diagnosis.curves.named_forms import FORMS, TYRE_FORMS
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.report.curves import form_sentence
 from carlab.diagnosis.settings import DEFAULT
@@ -75,20 +75,20 @@ TRUTHS = {
         {"gain": 1.0, "dead band": 0.08},
     ),
     "steering_exponent": ("steering_curve", lambda d: 1.4 * d * np.sqrt(np.abs(d)), {"exponent": 1.5}),
-    "linear_tyre": ("front_tyre_curve", lambda a: 2.2 * a, {"cornering stiffness per load": 2.2}),
+    "linear_tyre": ("front_tyre_map", lambda x, a: 2.2 * a, {"cornering stiffness per load": 2.2}),
     "limited_tyre": (
-        "front_tyre_curve",
-        lambda a: np.where(a < 0.1, 6.0 * a, 0.6),
+        "front_tyre_map",
+        lambda x, a: np.where(a < 0.1, 6.0 * a, 0.6),
         {"cornering stiffness per load": 6.0, "grip": 0.6},
     ),
     "saturating_tyre": (
-        "front_tyre_curve",
-        lambda a: 0.7 * np.tanh(3.5 * a / 0.7),
+        "front_tyre_map",
+        lambda x, a: 0.7 * np.tanh(3.5 * a / 0.7),
         {"cornering stiffness per load": 3.5, "grip": 0.7},
     ),
     "pacejka_tyre": (
-        "front_tyre_curve",
-        lambda a: 0.8 * np.sin(1.9 * np.arctan(9.0 * a)),
+        "front_tyre_map",
+        lambda x, a: 0.8 * np.sin(1.9 * np.arctan(9.0 * a)),
         {"grip": 0.8, "C": 1.9, "B": 9.0},
     ),
     "limited_tyre_friction_ellipse": (
@@ -107,7 +107,7 @@ TRUTHS = {
         {"grip": 0.7, "braking limit": 5.0, "driving limit": 9.0},
     ),
 }
-NOISE = {"drive_map": 1.6, "steering_curve": 0.04, "front_tyre_curve": 0.08, "rear_tyre_map": 0.16}
+NOISE = {"drive_map": 1.6, "steering_curve": 0.04, "front_tyre_map": 0.08, "rear_tyre_map": 0.16}
 """Standard deviation of a sample; a curve is regressed on this many samples."""
 SAMPLES = 6000
 
@@ -138,7 +138,8 @@ def measured_curve(curve_id, truth, seed, anchored=True):
 
 
 def test_every_form_of_one_cause_has_a_truth():
-    assert {form.id for name, forms in FORMS.items() for form in forms if name != "rear_tyre_map"} <= set(TRUTHS)
+    assert {form.id for name, forms in FORMS.items() for form in forms if "_tyre_map" not in name} <= set(TRUTHS)
+    assert {form.id for form in TYRE_FORMS} <= set(TRUTHS)
     assert {curve_id for curve_id, *_ in TRUTHS.values()} == set(FORMS)
     assert set(FORMS) == {curve.id for curve in CURVES}
 
@@ -194,7 +195,7 @@ def test_true_forms_have_the_nominal_level():
 
 
 def test_forms_that_a_wide_band_does_not_distinguish_are_all_named():
-    curve, covariance = measured_curve("front_tyre_curve", TRUTHS["saturating_tyre"][1], 0)
+    curve, covariance = measured_curve("front_tyre_map", TRUTHS["saturating_tyre"][1], 0)
     wide = replace(curve, std=12.0 * curve.std)
     form = read_form(wide, 144.0 * covariance, DEFAULT.curves)
     assert form.is_within_band
@@ -203,12 +204,15 @@ def test_forms_that_a_wide_band_does_not_distinguish_are_all_named():
 
 
 def test_knots_without_data_are_not_compared_and_too_few_have_no_form():
-    curve, covariance = measured_curve("front_tyre_curve", TRUTHS["limited_tyre"][1], 1)
+    curve, covariance = measured_curve("steering_curve", TRUTHS["steering_asymmetry"][1], 1)
     wrong = curve.measured.copy()
     wrong[-1] = np.nan
     form = read_form(replace(curve, measured=wrong), covariance, DEFAULT.curves)
-    assert form.knots == 4  # of six knots, one is anchored at 0
-    assert form.id != "pacejka_tyre"  # three parameters for four knots
+    assert form.knots == 7  # of nine knots, one is anchored at 0
+    assert form.id == "steering_asymmetry"
+    wrong[3:] = np.nan
+    form = read_form(replace(curve, measured=wrong), covariance, DEFAULT.curves)
+    assert (form.knots, form.id) == (3, "linear_steering")  # others have two parameters
     wrong[2:] = np.nan
     assert read_form(replace(curve, measured=wrong), covariance, DEFAULT.curves) is None
     assert form_sentence(curve) == ""

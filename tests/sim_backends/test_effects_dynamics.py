@@ -31,7 +31,7 @@ def curve_values(name, size):
     return {name: {p.name: float(v) for p, v in zip(curve.parameters, drawn, strict=True)}}
 
 
-CURVE_SIZES = {"drive_map": 1.0, "front_tyre_curve": 0.3, "rear_tyre_map": 0.3}
+CURVE_SIZES = {"drive_map": 1.0, "front_tyre_map": 0.3, "rear_tyre_map": 0.3}
 CASES = {
     **TYPICAL,
     **{name: curve_values(name, size) for name, size in CURVE_SIZES.items()},
@@ -52,7 +52,7 @@ CASES = {
     },
     "changed_measured_tyres": {
         "grip_change": {"share": -0.3},
-        "front_tyre_curve": curve_values("front_tyre_curve", 0.3)["front_tyre_curve"],
+        "front_tyre_map": curve_values("front_tyre_map", 0.3)["front_tyre_map"],
         "rear_tyre_map": curve_values("rear_tyre_map", 0.3)["rear_tyre_map"],
     },
     "sag_with_brakes": {
@@ -70,14 +70,10 @@ CASES = {
 }
 
 
-THROTTLES, SPEEDS = (-1, -0.6, -0.3, -0.1, 0, 0.1, 0.3, 0.6, 1), (-4.5, -3, -2, -1, -0.5, 0, 0.5, 1, 2, 3, 4.5)
-SLIPS, ACCELERATIONS = (0, 0.04, 0.1, 0.2, 0.4, 0.8), (-8, -5, -2.5, 0, 2.5, 5, 8)
-
-
-def curve_at(e, name, knots, x):
-    """A one-dimensional measured curve by NumPy's interpolation; its deviation is 0 at the knot 0."""
-    values = iter(e[name].values())
-    return float(np.interp(x, knots, [0.0 if k == 0 else next(values) for k in knots]))
+THROTTLES = (-1, -0.6, -0.35, -0.2, -0.1, -0.04, 0, 0.04, 0.1, 0.2, 0.35, 0.6, 1)
+SPEEDS = (-4.5, -3, -2, -1, -0.5, 0, 0.5, 1, 2, 3, 4.5)
+SLIPS = (0, 0.04, 0.1, 0.2, 0.4, 0.8)
+ACCELERATIONS = {"front_tyre_map": (-6, -3, 0, 3, 6), "rear_tyre_map": (-8, -5, -2.5, 0, 2.5, 5, 8)}
 
 
 def drive_map_at(e, throttle, speed):
@@ -87,12 +83,13 @@ def drive_map_at(e, throttle, speed):
     return float(RegularGridInterpolator((THROTTLES, SPEEDS), grid)(within)[0])
 
 
-def rear_map_at(e, acceleration, slip):
-    """The rear tyre map by scipy's interpolation on a regular grid; its deviation is 0 at the slip 0."""
-    grid = np.array(list(e["rear_tyre_map"].values())).reshape(len(ACCELERATIONS), len(SLIPS) - 1)
-    grid = np.hstack([np.zeros((len(ACCELERATIONS), 1)), grid])
-    within = [np.clip(acceleration, ACCELERATIONS[0], ACCELERATIONS[-1]), np.clip(slip, 0, SLIPS[-1])]
-    return float(RegularGridInterpolator((ACCELERATIONS, SLIPS), grid)(within)[0])
+def tyre_map_at(e, name, acceleration, slip):
+    """A tyre map by scipy's interpolation on a regular grid; its deviation is 0 at the slip 0."""
+    knots = ACCELERATIONS[name]
+    grid = np.array(list(e[name].values())).reshape(len(knots), len(SLIPS) - 1)
+    grid = np.hstack([np.zeros((len(knots), 1)), grid])
+    within = [np.clip(acceleration, knots[0], knots[-1]), np.clip(slip, 0, SLIPS[-1])]
+    return float(RegularGridInterpolator((knots, SLIPS), grid)(within)[0])
 
 
 def reference_rates(t, s, d, u, p, e):
@@ -179,10 +176,11 @@ def reference_rates(t, s, d, u, p, e):
         transferred_load = m_ax * height / (a + b)
     z_front, z_rear = z_front - transferred_load, z_rear + transferred_load
     f_front, f_rear = front_each * z_front, rear_each * z_rear
-    if has("front_tyre_curve"):
-        f_front -= z_front * curve_at(e, "front_tyre_curve", SLIPS, abs(slip_front)) * math.copysign(1.0, slip_front)
+    if has("front_tyre_map"):
+        front_map = tyre_map_at(e, "front_tyre_map", force / m, abs(slip_front))
+        f_front -= z_front * front_map * math.copysign(1.0, slip_front)
     if has("rear_tyre_map"):
-        f_rear -= z_rear * rear_map_at(e, force / m, abs(slip_rear)) * math.copysign(1.0, slip_rear)
+        f_rear -= z_rear * tyre_map_at(e, "rear_tyre_map", force / m, abs(slip_rear)) * math.copysign(1.0, slip_rear)
     if has("grip_change"):
         f_front, f_rear = ((1 + e["grip_change"]["share"]) * f for f in (f_front, f_rear))
     rim_rate = 0.0

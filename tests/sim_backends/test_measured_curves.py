@@ -55,9 +55,9 @@ def test_roughness_vanishes_for_linear_deviations_only(curve_id):
 
 
 def test_roughness_is_the_change_of_slope_times_the_mean_distance():
-    curve = BY_ID["front_tyre_curve"]
-    knots, values = curve.axes[0].knots, np.array([0.3, -0.2, 0.5, 0.1, 0.7])
-    slopes = np.diff([0.0, *values]) / np.diff(knots)
+    curve = BY_ID["steering_curve"]
+    knots, values = curve.axes[0].knots, np.array([0.3, -0.2, 0.5, 0.1, 0.7, -0.4, 0.2, 0.6])
+    slopes = np.diff([*values[:4], 0.0, *values[4:]]) / np.diff(knots)
     distances = np.diff(knots)
     expected = np.diff(slopes) * 0.5 * (distances[:-1] + distances[1:])
     assert curve.roughness() @ values == pytest.approx(expected)
@@ -76,10 +76,12 @@ def test_table_of_a_car_file_has_every_knot(curve_id):
     assert again.parameter_std == config.parameter_std
 
 
-@pytest.mark.parametrize("wrong", [3.0, "flat", [1.0, 2.0], [[0.0] * 7] * 8, [[float("nan")] * 7] * 9, [["a"] * 7] * 9])
+@pytest.mark.parametrize(
+    "wrong", [3.0, "flat", [1.0, 2.0], [[0.0] * 7] * 8, [[float("nan")] * 11] * 13, [["a"] * 11] * 13]
+)
 def test_table_of_a_wrong_shape_is_refused_in_one_sentence(wrong):
     with pytest.raises(
-        ConfigError, match=r"'values' in \[effects.drive_map\] of car.toml must be a list of 9 lists of 11"
+        ConfigError, match=r"'values' in \[effects.drive_map\] of car.toml must be a list of 13 lists of 11"
     ):
         SimulatorConfig.from_tables({"effects": {"drive_map": {"values": wrong}}}, "car.toml")
 

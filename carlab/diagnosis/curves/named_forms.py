@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from sim_backends.effects.curves import DriveMap, FrontTyreCurve, RearTyreMap, SteeringCurve
+from sim_backends.effects.curves import DriveMap, FrontTyreMap, RearTyreMap, SteeringCurve
 from sim_backends.effects.drive import MotorSaturation
 from sim_backends.effects.steering import SteeringAsymmetry, SteeringDeadband, SteeringNonlinearity
 from sim_backends.effects.throttle import ThrottleDeadband, ThrottleNonlinearity
@@ -169,11 +169,11 @@ def _at_any_force(tyre: Form) -> Form:
 
 
 _LIMITS = ("longitudinal limit", "braking limit", "driving limit")
-REAR_FORMS = tuple(form for tyre in TYRE_FORMS for form in (_at_any_force(tyre), *_with_ellipse(tyre)))
+TYRE_MAP_FORMS = tuple(form for tyre in TYRE_FORMS for form in (_at_any_force(tyre), *_with_ellipse(tyre)))
 FORMS: Mapping[str, tuple[Form, ...]] = {
     DriveMap.id: DRIVE_FORMS,
     SteeringCurve.id: STEERING_FORMS,
-    FrontTyreCurve.id: TYRE_FORMS,
-    RearTyreMap.id: REAR_FORMS,
+    FrontTyreMap.id: TYRE_MAP_FORMS,
+    RearTyreMap.id: TYRE_MAP_FORMS,
 }
 """Forms by the id of a measured curve, the simplest first."""
