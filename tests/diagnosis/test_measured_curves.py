@@ -28,8 +28,8 @@ CAR = SimulatorConfig(control_period_s=PERIOD_S)
 GAIN, TOP_SPEED, LIMIT = 4.0, 3.0, 4.0
 SETTINGS = replace(
     DEFAULT,
-    curves=CurveSettings(max_windows=60, first_iterations=8, iterations=2, last_iterations=2),
-    windows=replace(DEFAULT.windows, max_fit_windows=80),
+    curves=CurveSettings(max_windows=50, first_iterations=6, iterations=2, last_iterations=2),
+    windows=replace(DEFAULT.windows, max_fit_windows=60),
 )
 
 
@@ -124,7 +124,8 @@ def test_report_and_model_file_contain_the_curves(outcome, tmp_path):
 def test_car_without_missing_physics_has_no_measured_curves():
     fit = drive(CAR, 40.0, 5)
     windows = cut_windows(tracks_of([fit]), 0.8, 0.3).thinned(30)
-    problem = SearchProblem(CAR, windows, np.full(6, 2e-3), {}, (), SETTINGS)
+    settings = replace(SETTINGS, curves=replace(SETTINGS.curves, first_iterations=3, last_iterations=1))
+    problem = SearchProblem(CAR, windows, np.full(6, 2e-3), {}, (), settings)
     from carlab.diagnosis.selection.search import search
 
     assert fit_curves(problem, search(problem, RunControl()), RunControl()) is None
@@ -222,8 +223,8 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     settings = replace(DEFAULT.curves, min_support_s=0.0)
     found = curve_findings(CurveFit(("drive_map",), (), fit, 5.0), CAR, tracks, settings)[0]
     assert found.std[12, 6] == pytest.approx(slope * np.sqrt(2.0 - 1.8), rel=0.02)
-    assert found.std[8, 7] == pytest.approx(slope, rel=0.02)
-    assert found.std[4, 7] == pytest.approx(0.0, abs=1e-9)  # no throttle
+    assert found.std[12, 7] == pytest.approx(slope, rel=0.02)
+    assert found.std[6, 7] == pytest.approx(0.0, abs=1e-9)  # no throttle
 
 
 def test_verdict_states_the_error_with_measured_curves(outcome):
