@@ -125,6 +125,8 @@ class Derivative:
         self._hooks = [tuple(world.hooks[stage]) for stage in STAGES]
         self._extras = len(world.hidden(0.0))
         self._mass = car.mass
+        self._loads = car.load_front, car.load_rear
+        self._axles = car.front_axle, car.rear_axle
         self._inertia = car.yaw_inertia
         self._kinematic = car.kind == "kinematic"
         self._blend = car.kind == "blend"
@@ -132,7 +134,7 @@ class Derivative:
     def __call__(self, t: float, values: Any) -> list[float]:
         """Evaluate at time t [s]; ``values`` is an array of the state."""
         now, world = self._now, self._world
-        car = world.car
+        car, (front_axle, rear_axle) = world.car, self._axles
         steer, throttle, drive, load, grip, limit, tyre, body = self._hooks
         state = values.tolist()
         now.t = t
@@ -153,12 +155,12 @@ class Derivative:
             hook(now)
         now.fx = now.drive - car.damping * vx
         now.fx_front = 0.0
-        front_y = vy + car.front_axle * r
+        front_y = vy + front_axle * r
         now.alpha_f = math.atan2(front_y * cos_d - vx * sin_d, max(abs(vx * cos_d + front_y * sin_d), SLIP_FLOOR_MPS))
-        now.alpha_r = math.atan2(vy - car.rear_axle * r, max(abs(vx), SLIP_FLOOR_MPS))
+        now.alpha_r = math.atan2(vy - rear_axle * r, max(abs(vx), SLIP_FLOOR_MPS))
         now.shape_f = world.shape_front(now.alpha_f)
         now.shape_r = world.shape_rear(now.alpha_r)
-        now.fz_f, now.fz_r = car.load_front, car.load_rear
+        now.fz_f, now.fz_r = self._loads
         now.mu_f, now.mu_r = car.mu_front, car.mu_rear
         for hook in load:
             hook(now)
