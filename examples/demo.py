@@ -84,6 +84,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--car", default="emulated", choices=("sim", "emulated", "emulated-can"))
     parser.add_argument("--updates", type=int, default=12000, help="gradient steps of the policy before an episode")
+    parser.add_argument("--model-steps", type=int, default=None, help="optimiser steps of the learned car")
     parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--effects", nargs="*", default=(), help="try only these effects, which is faster")
     parser.add_argument("--out", type=Path, default=Path("runs"))
@@ -93,8 +94,8 @@ def main() -> None:
     reality = CarFile("reality", "", nominal.simulator.with_values(CONCEALED), None)
     print(f"Learning to park in {options.episodes} episodes ({options.car} car; it differs from its car file)")
     learned = carlab.learn(
-        options.car, reality=reality, episodes=options.episodes, updates=options.updates, out=options.out, name="demo",
-        hooks=progress_hooks(),
+        options.car, reality=reality, episodes=options.episodes, updates=options.updates,
+        model_steps=options.model_steps, out=options.out, name="demo", hooks=progress_hooks(),
     )  # fmt: skip
     if not learned.is_complete:
         raise SystemExit(f"The run ended early; resume it with carlab learn --resume {learned.folder}")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import multiprocessing
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.core.errors import CarlabError, DataError
+from carlab.experiment.campaign.child_process import child_context
 from carlab.experiment.campaign.prior_repair import (
     PARAMETERS,
     Correction,
@@ -87,7 +87,7 @@ def run_repair_subprocess(request: RepairRequest, stop: Callable[[], bool] = lam
     Raises:
         DataError: the file cannot be written.
     """
-    context = multiprocessing.get_context("spawn")
+    context = child_context()
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(target=_child, args=(sender, request), daemon=True, name="repair of the prior")
     child.start()

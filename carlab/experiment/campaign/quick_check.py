@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import multiprocessing
 import os
 import tomllib
 from collections.abc import Callable, Mapping
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from carlab.core.errors import CarlabError
+from carlab.experiment.campaign.child_process import child_context
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -68,7 +68,7 @@ def run_check_subprocess(
     number = len(recordings)
     path = check_path(run, number)
     text = tomli_w.dumps(simulator.to_tables())
-    context = multiprocessing.get_context("spawn")
+    context = child_context()
     child = context.Process(target=_child, args=(path, run.path, recordings, text), daemon=True, name="quick check")
     try:
         (run.path / SIMULATOR_FILE).write_text(text, encoding="utf-8")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import shutil
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -12,6 +11,7 @@ from typing import Any
 
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.safety import SafetyEnvelope
+from carlab.experiment.campaign.child_process import child_context
 from carlab.experiment.campaign.training import Progress, train
 from carlab.experiment.campaign.training_plan import TrainingPlan
 
@@ -44,7 +44,7 @@ def train_in_subprocess(
     Raises:
         DataError: ``train`` raised an error, or its process died.
     """
-    context = multiprocessing.get_context("spawn")
+    context = child_context()
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(
         target=_child, args=(sender, plan, models, recordings, envelope), daemon=True, name="training"
