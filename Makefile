@@ -38,13 +38,15 @@ layers:
 	$(YIELD) $(BIN)/lint-imports
 
 # Tests that drive against the clock mostly wait; tests that only compute take the processors whenever those wait.
-COMPUTING := tests/benchmark tests/studies tests/prediction tests/diagnosis tests/learning tests/recording tests/sim_backends tests/cli tests/api tests/examples tests/test_architecture.py \
-	$(addprefix tests/experiment/,test_quick_check.py test_priors_and_predictions.py test_training.py test_learning_on_a_device.py)
+# Each file runs in one process, which shares its fixtures; files with few long tests come first, so that none is last.
+COMPUTING := tests/examples tests/diagnosis tests/cli tests/studies tests/benchmark tests/learning \
+	$(addprefix tests/experiment/,test_child_process.py test_quick_check.py test_priors_and_predictions.py test_training.py test_learning_on_a_device.py) \
+	tests/prediction tests/sim_backends tests/api tests/recording tests/test_architecture.py
 YIELD := nice -n 19
 computing driving: export OMP_NUM_THREADS := 1
 
 computing:
-	$(YIELD) $(BIN)/pytest --numprocesses auto --dist worksteal $(COMPUTING)
+	$(YIELD) $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder $(COMPUTING)
 
 driving:
 	$(BIN)/pytest --numprocesses 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))

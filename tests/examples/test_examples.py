@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+FEW_STEPS = ["--updates", "64", "--model-steps", "20"]
 SCRIPTS = {
     "own_policy.py": [],
     "write_task.py": [],
     "add_effect.py": [],
     "diagnose_csv.py": ["--effects", "steering_lag"],
-    "train_in_learned_car.py": ["--updates", "64", "--model-steps", "20"],
-    "demo.py": ["--car", "sim", "--episodes", "1", "--updates", "64", "--effects", "steering_lag"],
+    "train_in_learned_car.py": FEW_STEPS,
+    "demo.py": ["--car", "sim", "--episodes", "1", *FEW_STEPS, "--effects", "steering_lag"],
 }
 
 

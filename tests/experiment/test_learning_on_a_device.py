@@ -22,7 +22,7 @@ from carlab.recording.run_folder import RunDirectory
 from learning.policy.sac_agent import SacAgent, SacPolicy
 from learning.world.car_fit import load_car, save_car
 
-SMALL = {"history": 1, "model_steps": 20, "updates": 32, "ticks": 12, "threads": 1}
+SMALL = {"history": 1, "model_steps": 20, "updates": 8, "ticks": 6, "threads": 1}
 
 
 @pytest.fixture(autouse=True)
@@ -33,6 +33,7 @@ def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
         return training.train(plan, models, recordings, envelope, on_progress)
 
     monkeypatch.setattr(campaign, "train_in_subprocess", train_here)
+    monkeypatch.setattr("carlab.experiment.campaign.predicted_return.MORE_TICKS", (1.5,))
     monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 10)
     monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
     monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)

@@ -27,7 +27,7 @@ ENVELOPE = SafetyEnvelope(arena_m=ParkingTask().arena_m)
 def tiny_plan(choice: CarChoice, **changes: Any) -> TrainingPlan:
     """Training plan with the kinematic prior, few steps and one thread."""
     text = tomli_w.dumps(prior_simulator(choice.simulator, "kinematic").to_tables())
-    return replace(TrainingPlan(text, HISTORY, model_steps=60, updates=32, threads=1), **changes)
+    return replace(TrainingPlan(text, HISTORY, model_steps=60, updates=32, ticks=TICKS, threads=1), **changes)
 
 
 def names(run: RunDirectory) -> list[str]:

@@ -30,6 +30,7 @@ from learning.functional_svgd.fsvgd import FsvgdSettings, GaussianProcessPrior, 
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
 from learning.policy.sac_agent import SacAgent, SacSettings
+from learning.posterior import averaging, discrepancy, parameter_posterior
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
 from learning.posterior.function_posterior import FunctionPosterior
 from learning.posterior.inference import infer
@@ -340,8 +341,16 @@ def test_sac_gradient_steps_are_equal_on_the_device(device: str) -> None:
 
 
 def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("STEPS", "REFINEMENT_STEPS"):
-        monkeypatch.setattr(system_identification, name, 20)
+    for module, name, value in (
+        (system_identification, "STEPS", 5),
+        (system_identification, "REFINEMENT_STEPS", 5),
+        (system_identification, "N_RESTARTS", 4),
+        (averaging, "MAX_FOLDS", 2),
+        (discrepancy, "STEPS", 5),
+        (parameter_posterior, "RANDOM_WALK_STEPS", 1),
+        (parameter_posterior, "MAX_TEMPERING_STEPS", 2),
+    ):
+        monkeypatch.setattr(module, name, value)
     on_device = None
     for on_device, on_cpu in zip(
         *(run_study("pendulum", rows=(5,), seeds=1, steps=10, device=at) for at in (device, "cpu")),
@@ -358,6 +367,7 @@ def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -
     from learning import speed
 
     monkeypatch.setattr(speed, "STEPS", 400)
+    monkeypatch.setattr(speed, "FITTED_ROWS", 12)
     monkeypatch.setattr(speed, "SIZES", {"small": (4, 2, 9)})
     monkeypatch.setattr(speed, "CAR_FIT", CarFitSettings(steps=20))
     synchronise(device)

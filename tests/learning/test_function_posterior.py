@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -185,15 +186,20 @@ class TestOutliers:
         errors = torch.tensor([[1.0, 0.3], [-1.0, 0.25], [1.2, -0.25], [0.9, -0.3]])
         return self.y.index_add(0, torch.tensor([3, 30, 60, 90]), size * errors)
 
+    @staticmethod
+    @functools.cache
+    def clean(model):
+        """Infer the posterior without outliers."""
+        return infer(model, TestOutliers.x, TestOutliers.y, UNITS, TestOutliers.noise)
+
     def error(self, mean):
         return np.sqrt(((np.asarray(mean) - truth(self.query)) ** 2).mean(axis=0))
 
-    @pytest.mark.parametrize("model", [None, Linear()])
-    @pytest.mark.parametrize("size", [3.0, 30.0])
+    @pytest.mark.parametrize(("model", "size"), [(None, 3.0), (Linear(), 3.0), (Linear(), 30.0)])
     def test_outliers_hardly_change_the_prediction(self, model, size):
         """A Gaussian process with the same covariance and Gaussian noise follows the outliers."""
         y = self.with_outliers(size)
-        posterior, clean = (infer(model, self.x, v, UNITS, self.noise) for v in (y, self.y))
+        posterior, clean = infer(model, self.x, y, UNITS, self.noise), self.clean(model)
         robust_error = self.error(posterior.predict(self.query)[0])
         assert (robust_error < self.error(clean.predict(self.query)[0]) + 0.2 * self.noise.numpy()).all()
         assert posterior.dof < 10.0
@@ -260,9 +266,9 @@ class TestRestarts:
         ("model", "expected"), [(None, 0.01), (None, PRIOR_DISCREPANCY_STD), (Linear(), PRIOR_DISCREPANCY_STD)], ids=str
     )
     def test_restarts_raise_the_held_out_density(self, model, expected):
-        """The average gain over three data sets is clear and no data set loses."""
+        """The average gain over two data sets is clear and no data set loses."""
         gains = []
-        for seed in range(3):
+        for seed in range(2):
             query, y = rows(300, 100 + seed)
             single, restarted = (
                 infer(

@@ -9,9 +9,15 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from carlab.core.errors import DataError
+from learning.baselines import system_identification
 from learning.baselines.system_identification import identify
 from learning.evaluation import negative_log_likelihood
 from learning.priors.domain_models import Pendulum, Sinusoids, draw_parameters
+
+
+@pytest.fixture(autouse=True)
+def half_of_the_steps(monkeypatch):
+    monkeypatch.setattr(system_identification, "STEPS", 300)
 
 
 def generator(seed=0):

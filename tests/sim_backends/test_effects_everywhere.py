@@ -1,5 +1,6 @@
 """Test properties of each effect: identity, engines, gradients, files, symmetries, hidden states."""
 
+import functools
 import math
 import tomllib
 
@@ -83,23 +84,27 @@ def test_catalogue_is_complete():
         assert {c.effect for c in effect.confusable} <= set(EFFECTS)
 
 
+@functools.cache
+def with_gradients(name, engine):
+    """Return the rollout with an effect at its identity or without one, and its leaves and values with gradients."""
+    config = SimulatorConfig(effects={} if name is None else {name: {}})
+    numbers = {k: v for k, v in config.values().items() if k != "timing.control_period"}
+    # The latency effect replaces the base model's latency, so their gradients differ.
+    numbers = {k: v for k, v in numbers.items() if not k.startswith("mocap.")}
+    values = {k: torch.full((4,), v, dtype=torch.float64, requires_grad=True) for k, v in numbers.items()}
+    (start, commands), history = some(), past()
+    commands[:, 2] = 0.0  # the kink of a dead band and a power
+    leaves = [t.requires_grad_() for t in (start, commands, history)]
+    out = rollout(config, start, commands, history=history, values=values, measured=True, t0_s=2.0, engine=engine)
+    (out.states.square().sum() + out.measured.square().sum()).backward()
+    return out, leaves, values
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("engine", ["fastest", "operators"])
 def test_effect_at_its_identity_changes_neither_states_nor_gradients(name, engine):
-    found = []
-    for effects in ({}, {name: {}}):
-        config = SimulatorConfig(effects=effects)
-        numbers = {k: v for k, v in config.values().items() if k != "timing.control_period"}
-        # The latency effect replaces the base model's latency, so their gradients differ.
-        numbers = {k: v for k, v in numbers.items() if not k.startswith("mocap.")}
-        values = {k: torch.full((4,), v, dtype=torch.float64, requires_grad=True) for k, v in numbers.items()}
-        (start, commands), history = some(), past()
-        commands[:, 2] = 0.0  # the kink of a dead band and a power
-        leaves = [t.requires_grad_() for t in (start, commands, history)]
-        out = rollout(config, start, commands, history=history, values=values, measured=True, t0_s=2.0, engine=engine)
-        (out.states.square().sum() + out.measured.square().sum()).backward()
-        found.append((out, leaves, values))
-    (plain, plain_leaves, plain_values), (same, leaves, values) = found
+    plain, plain_leaves, plain_values = with_gradients(None, engine)
+    same, leaves, values = with_gradients(name, engine)
     assert (plain.states - same.states).abs().max() <= 1e-12
     assert (plain.measured - same.measured).abs().max() <= 1e-12
     for key, value in values.items():
