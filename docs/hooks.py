@@ -73,7 +73,7 @@ def _curve(curve: Any) -> str:
 
 
 def _effect(effect: Any) -> str:
-    from sim_backends.effects import confusable_effects
+    from sim_backends.effects import confusable_effects, separation
 
     rows = "\n".join(
         f"| `{p.name}` | {p.unit} | {p.same_as or p.identity} | {p.low:g} to {p.high:g} | {p.typical:g} |"
@@ -85,12 +85,15 @@ def _effect(effect: Any) -> str:
         if picture.is_file()
         else ""
     )
-    others = confusable_effects()[effect.id]
-    links = ", ".join(f"[`{name}`](#{name})" for name in others) or "none"
+    links = []
+    for name in confusable_effects()[effect.id]:
+        found = separation(effect.id, name)
+        drive = f" (`{found.drive}`)" if found is not None and found.drive else " (no drive separates them)"
+        links.append(f"[`{name}`](#{name}){drive}")
     return (
-        f"## `{effect.id}` {{ #{effect.id} }}\n\n{effect.summary}\n\n"
+        f"## `{effect.id}` {{ #{effect.id} }}\n\n{effect.summary} In reports: {effect.name}.\n\n"
         f"| parameter | unit | identity | range | typical |\n| --- | --- | --- | --- | --- |\n{rows}\n\n"
-        f"Kind: {effect.kind}. Confusable: {links}.\n\n{shown}"
+        f"Kind: {effect.kind}. Confusable with: {', '.join(links) or 'none'}.\n\n{shown}"
     )
 
 
