@@ -200,7 +200,7 @@ def test_forms_that_a_wide_band_does_not_distinguish_are_all_named():
     form = read_form(wide, 144.0 * covariance, DEFAULT.curves)
     assert form.is_within_band
     assert len(form.indistinguishable_from) >= 1
-    assert "As well within the band: a " in form_sentence(replace(wide, form=form))
+    assert "Also within the band: a " in form_sentence(replace(wide, form=form))
 
 
 def test_knots_without_data_are_not_compared_and_too_few_have_no_form():
