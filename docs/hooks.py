@@ -66,8 +66,9 @@ def _curve(curve: Any) -> str:
         for axis in curve.axes
     )
     equation = (type(curve).__doc__ or "").split("\n\n")[0]
+    unit = "The curve has no unit." if curve.unit == "1" else f"Unit: {curve.unit}."
     return (
-        f"### {curve.id}\n\n{curve.summary} {equation} Values in {curve.unit}.\n\n"
+        f"### {curve.id}\n\n{curve.summary} {equation} {unit}\n\n"
         f"| over | unit | knots | deviation is 0 at |\n| --- | --- | --- | --- |\n{axes}\n"
     )
 
