@@ -96,7 +96,7 @@ class Replay:
 
         car = self.which_car
         if car.vehicle is not None and car.car != "sim":
-            raise ConfigError(f"--vehicle goes with --car sim; '{car.car}' is a car of its own.")
+            raise ConfigError(f"--vehicle needs --car sim; '{car.car}' has its own physics.")
         found = predict(
             self.recording,
             car.vehicle or car.car,
