@@ -97,7 +97,8 @@ class Learn:
     is multiplied by 3 / episode."""
 
     seed: int = 0
-    """Seed of all random numbers; the same seed gives the same run."""
+    """Seed of all random numbers; the same seed gives the same run (with --prior auto, up to the first diagnosis, which
+    has a time limit)."""
 
     device: Device | None = None
     """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""
