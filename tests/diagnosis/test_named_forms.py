@@ -184,7 +184,7 @@ def test_random_smooth_curves_are_not_named(curve_id):
     ]
     assert sum(form.is_within_band for form in forms) <= 1
     curve = replace(measured_curve(curve_id, random_smooth(curve_id, 0), 0, anchored=False)[0], form=forms[0])
-    assert form_sentence(curve).startswith(f"No named form fits the {curve.quantity} within its band. The closest form, ")
+    assert form_sentence(curve).startswith(f"No named form fits the {curve.quantity} within its band. The closest ")
 
 
 def test_true_forms_have_the_nominal_level():
