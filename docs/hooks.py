@@ -66,14 +66,15 @@ def _curve(curve: Any) -> str:
         for axis in curve.axes
     )
     equation = (type(curve).__doc__ or "").split("\n\n")[0]
+    unit = "The curve has no unit." if curve.unit == "1" else f"Unit: {curve.unit}."
     return (
-        f"### {curve.id}\n\n{curve.summary} {equation} Values in {curve.unit}.\n\n"
+        f"### {curve.id}\n\n{curve.summary} {equation} {unit}\n\n"
         f"| over | unit | knots | deviation is 0 at |\n| --- | --- | --- | --- |\n{axes}\n"
     )
 
 
 def _effect(effect: Any) -> str:
-    from sim_backends.effects import confusable_effects
+    from sim_backends.effects import confusable_effects, separation
 
     rows = "\n".join(
         f"| `{p.name}` | {p.unit} | {p.same_as or p.identity} | {p.low:g} to {p.high:g} | {p.typical:g} |"
@@ -85,12 +86,15 @@ def _effect(effect: Any) -> str:
         if picture.is_file()
         else ""
     )
-    others = confusable_effects()[effect.id]
-    links = ", ".join(f"[`{name}`](#{name})" for name in others) or "none"
+    links = []
+    for name in confusable_effects()[effect.id]:
+        found = separation(effect.id, name)
+        drive = f" (`{found.drive}`)" if found is not None and found.drive else " (no drive separates them)"
+        links.append(f"[`{name}`](#{name}){drive}")
     return (
-        f"## `{effect.id}` {{ #{effect.id} }}\n\n{effect.summary}\n\n"
+        f"## `{effect.id}` {{ #{effect.id} }}\n\n{effect.summary} In reports: {effect.name}.\n\n"
         f"| parameter | unit | identity | range | typical |\n| --- | --- | --- | --- | --- |\n{rows}\n\n"
-        f"Kind: {effect.kind}. Confusable: {links}.\n\n{shown}"
+        f"Kind: {effect.kind}. Confusable with: {', '.join(links) or 'none'}.\n\n{shown}"
     )
 
 

@@ -56,7 +56,7 @@ def run(argv: Sequence[str]) -> int:
         return 1
 
 
-_DESCRIPTION = "Drive, learn and diagnose small race cars: real, emulated on the wire, or simulated."
+_DESCRIPTION = "Drive, learn and diagnose small race cars: real cars, cars with emulated hardware, and simulated cars."
 
 
 def _verbs() -> dict[str, Callable[..., Any]]:

@@ -13,7 +13,7 @@ from carlab.cli.options import json_file
 
 @dataclass
 class Bench(BenchOptions):
-    """Measure the speed of the components, or the accuracy of models fitted to few rows."""
+    """Run a study: speed of the components, models fitted to few rows, priors, parking, real cars or rollouts."""
 
     def run(self) -> int:
         """Measure and print."""

@@ -54,7 +54,7 @@ class BenchOptions:
     methods: tuple[str, ...] = ()
     """regression: some of gp-sim-average, gp-sim-posterior, sim-posterior, gp-posterior (carlab's: a Gaussian process
     with a simulator, averaged, alone, or without one), sim-fsvgd, fsvgd (the paper's, as published), sim-fsvgd-mended,
-    fsvgd-mended (without the slips of their code), SysID, GreyBox, ensemble, ridge; parking: some of gp-sim-posterior,
+    fsvgd-mended (without the errors of their code), SysID, GreyBox, ensemble, ridge; parking: some of gp-sim-posterior,
     gp-posterior, sim-fsvgd, sim-fsvgd-mended, fsvgd. All by default."""
 
     structure: bool = False
@@ -75,7 +75,7 @@ class BenchOptions:
     """realcars: restrict the search to these effects of the catalogue."""
 
     keep_events: bool = False
-    """realcars: fit and score prediction windows with events (collisions, a hand) too."""
+    """realcars: also fit and score prediction windows with events (collisions, a hand that moves the car)."""
 
     car: Path = Path("eth_rc_car")
     """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. rollouts: the

@@ -26,7 +26,7 @@ class Compare:
     """Recordings of the second group."""
 
     car: str = "sim"
-    """Simulator of the car, best the model.toml of a diagnosis: a car file, a preset (eth_rc_car ...), or sim."""
+    """Simulator of the car: a car file (preferably model.toml of a diagnosis), a preset (eth_rc_car ...), or sim."""
 
     candidates: tuple[str, ...] = ()
     """Restrict the changes to these effects and base parameters (motor.drive_gain ...)."""

@@ -31,7 +31,7 @@ error_console = _console(stderr=True)
 STYLES = {Reality.SIMULATED: "cyan", Reality.EMULATED: "green", Reality.DRY_RUN: "yellow", Reality.REAL: "bold red"}
 SENTENCES = {
     Reality.SIMULATED: "physics in this process; nothing can move",
-    Reality.EMULATED: "real wire protocols, emulated firmware and motion capture; nothing can move",
+    Reality.EMULATED: "real protocols, emulated firmware and motion capture; nothing can move",
     Reality.DRY_RUN: "real inputs, no command is sent",
     Reality.REAL: "A REAL CAR WILL MOVE. Keep clear, a hand on the power switch; ^C stops it",
 }

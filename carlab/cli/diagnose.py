@@ -36,7 +36,7 @@ class Diagnose:
     """Recordings for validation only; by default the last part of each recording is held out."""
 
     holdout_share: float | None = None
-    """Size of that part as a share of the recording, above 0 and at most 0.5; 0.3 by default."""
+    """Size of the held-out last part as a share of the recording, above 0 and at most 0.5; 0.3 by default."""
 
     out: Path = Path("diagnosis")
     """Folder for the report."""
@@ -49,17 +49,19 @@ class Diagnose:
     """Restrict the search to these effects of the catalogue."""
 
     curves: bool = False
-    """Fit measured curves (drive force, steering, tyres) where named effects leave more than a tenth of the error."""
+    """Fit measured curves (drive force, steering, tyres) if named effects leave more than a tenth of the squared error
+    above the noise."""
 
     ceiling: bool = False
     """Train a black box, to show how much of the error can be explained at all. Needs 60 s of driving."""
 
     adapt: bool = False
-    """Adapt the simulator along the held-out recordings, and report what changed in the car since the fitted ones."""
+    """Adapt the simulator along the held-out recordings, and report what changed in the car since the fitted
+    recordings."""
 
     keep_events: bool = False
-    """Fit and score prediction windows with events too: collisions, a hand. By default they are listed and left
-    out."""
+    """Also fit and score prediction windows with events (collisions, a hand that moves the car). By default they are
+    listed and left out."""
 
     discrepancy: bool = False
     """Train networks that correct the diagnosed simulator, and report their error. Needs 60 s of driving."""

@@ -13,9 +13,10 @@ from carlab.core.errors import ConfigError, NotReadyError
 
 @dataclass
 class Emulate:
-    """Run emulated hardware as a process: a VESC on a pty or CAN bus and a NatNet server with common physics.
+    """Run emulated hardware as a process: a VESC and a NatNet server that share one simulated car.
 
-    Any program with these protocols can use it; carlab does so with a car file that names the port. It runs until ^C.
+    The VESC is on a pseudo-terminal or a CAN bus. Any program with these protocols can use the hardware; carlab uses it
+    with a car file that names the port. It runs until ^C.
     """
 
     actuator: Literal["serial", "can"] = "serial"

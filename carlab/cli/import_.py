@@ -26,8 +26,8 @@ OTHER_OPTIONS = ("recording", "out", "mapping", "report", "verbose")
 class Import:
     """Convert a CSV of another program (.csv, .csv.gz) to an MCAP recording, and report its data faults.
 
-    Known layouts are recognised by their header; others need --mapping. Only declared properties are converted;
-    detected ones are reported with the option that would convert them.
+    Known layouts are recognised by their header; others need --mapping. Only what the layout, the
+    mapping or an option declares is converted; suspected faults are reported with the option that corrects them.
     """
 
     recording: Positional[Path]

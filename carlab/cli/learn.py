@@ -47,7 +47,7 @@ def _print_figures(bar: Progress, row: EpisodeFigures) -> None:
         f"episode {row.episode}: return {row.total_reward:.1f} "
         f"(predicted {row.predicted_return:.1f}, with 90 % probability {row.predicted_low:.1f} to "
         f"{row.predicted_high:.1f}){_cost_text(row)}, {row.outcome}; "
-        f"learned from {row.rows} rows in {row.model_seconds:.0f} + {row.policy_seconds:.0f} s",
+        f"learned from {row.rows} rows (model {row.model_seconds:.0f} s, policy {row.policy_seconds:.0f} s)",
         soft_wrap=True,
     )
 
@@ -82,7 +82,7 @@ class Learn:
     method: Method = "gp-sim-posterior"
     """gp-sim-posterior: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method).
     gp-posterior: the same without a simulator. sim-fsvgd: the paper's algorithm as in the authors' public code, with
-    the simulator prior; sim-fsvgd-mended: without the slips of that code; fsvgd: the paper's, without a simulator."""
+    the simulator prior; sim-fsvgd-mended: without the errors of that code; fsvgd: the paper's, without a simulator."""
 
     history: int | None = None
     """Number of past commands that model and policy observe. By default it covers the command delay, the latency of
@@ -97,7 +97,8 @@ class Learn:
     is multiplied by 3 / episode."""
 
     seed: int = 0
-    """Seed of all random numbers; the same seed gives the same run."""
+    """Seed of all random numbers; the same seed gives the same run (with --prior auto, up to the first diagnosis, which
+    has a time limit)."""
 
     device: Device | None = None
     """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""

@@ -58,7 +58,8 @@ class Prove:
     """Only --set real: car file or preset of that car."""
 
     tool: Literal["diagnose", "compare"] = "diagnose"
-    """Only --set real: what answers. compare gets the untouched recordings too; diagnose gets their model only."""
+    """Only --set real: the command that is scored. compare also gets the untouched recordings; diagnose gets only their
+    model."""
 
     simulator: Literal["own", "commonroad", "commonroad-drift"] = "own"
     """own: effects concealed in carlab's simulator; commonroad: no seal, recordings of an independent simulator, the

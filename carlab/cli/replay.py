@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class Replay:
-    """Send recorded actions to any car, real or simulated, and compare.
+    """Print the prediction errors of a simulator on a recording, or send the recorded actions to a car again.
 
-    On a simulated car: predict --horizon seconds ahead from many initial states along the recording and print the
-    errors beside those of constant velocity, as carlab diagnose does: in the whole recording, and in the last part,
-    which a diagnosis of this recording alone holds out. On any other car (or with --drive): put it at the recorded
-    start, send the recorded actions at their times, record that, and print how far it strays.
+    On a simulated car: predict --horizon seconds ahead from many initial states along the recording, and print the
+    errors and those of constant velocity, as carlab diagnose does: in the whole recording, and in the last part, which
+    a diagnosis of this recording alone holds out. On any other car (or with --drive): put the car at the recorded
+    start, send the recorded actions at their times, record the drive, and print its difference from the recording.
     """
 
     recording: Positional[Path]
@@ -40,34 +40,36 @@ class Replay:
     which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
     horizon_s: Annotated[float, arg(name="horizon")] = 1.0
-    """How far to predict [s]."""
+    """Prediction horizon [s]."""
 
     stride_s: Annotated[float, arg(name="stride")] = 0.25
-    """From one start to the next [s]."""
+    """Time between the starts of two predictions [s]."""
 
     holdout_share: float = 0.3
-    """How much of the recording the last part is, above 0 and at most 0.5."""
+    """Length of the last part as a share of the recording, above 0 and at most 0.5."""
 
     adapt: bool = False
-    """Also predict with adaptation to the recent past: drive force, steering trim and grip from the rows before."""
+    """Also predict with adaptation to the recent past: drive force, steering trim, grip and force forward are estimated
+    from the rows before each prediction."""
 
     keep_events: bool = False
-    """Score prediction windows with events too: collisions, a hand. By default they are listed and left out."""
+    """Also score prediction windows with events (collisions, a hand that moves the car). By default they are listed and
+    left out."""
 
     save: Path | None = None
-    """Write FILE.rrd with the predictions beside the recording."""
+    """Write FILE.rrd with the recording and the predictions."""
 
     drive: bool = False
-    """Drive a simulated car too."""
+    """Drive also if the car is simulated, instead of predicting."""
 
     seconds: float | None = None
-    """Drive only this much of the recording."""
+    """Drive only this first part of the recording [s]."""
 
     seed: int = 0
-    """Of sensor noise."""
+    """Seed of the sensor noise."""
 
     out: Path = Path("runs")
-    """Folder for the recording of what was driven."""
+    """Parent of the folder with the new recording."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -94,7 +96,7 @@ class Replay:
 
         car = self.which_car
         if car.vehicle is not None and car.car != "sim":
-            raise ConfigError(f"--vehicle goes with --car sim; '{car.car}' is a car of its own.")
+            raise ConfigError(f"--vehicle needs --car sim; '{car.car}' has its own physics.")
         found = predict(
             self.recording,
             car.vehicle or car.car,
@@ -186,7 +188,7 @@ class Replay:
 
 
 def _print_difference(driven: EpisodeData, episode: EpisodeData) -> None:
-    """Print how far what was driven strays from the recording."""
+    """Print the difference between the drive and the recording."""
     elapsed_s = driven.times_s - driven.times_s[0]
     recorded = np.stack([np.interp(elapsed_s, episode.times_s - episode.times_s[0], c) for c in _unwrapped(episode).T])
     error = np.abs(_unwrapped(driven) - recorded.T)

@@ -16,7 +16,7 @@ class EndReason(enum.Enum):
     DEADMAN_RELEASED = "The dead-man control was released; hold it while driving."
     EMERGENCY_STOP = "Emergency stop; check the car, then start and arm it again."
     GEOFENCE = "The car could not have stopped inside the arena; move it back inside, or enlarge [hardware.arena]."
-    OVERSPEED = "The car was faster than its speed limit; lower the throttle or raise max_speed."
+    OVERSPEED = "The car was faster than its speed limit; lower the throttle or raise max_speed_mps."
     POSE_STALE = "Motion capture sends no poses; check the camera software, the network and that the body is visible."
     POSE_JUMP = "The pose jumped further than the car can drive; check that Motive confuses no other body with the car."
     POSE_FROZEN = "The pose did not change while the motor turned; check that motion capture streams live poses."

@@ -46,7 +46,7 @@ def episode_from_documents(
     ticks, rows = _observed(documents, transitions, ended)
     if not ticks:
         how = f"it ended as {ended.reason.name}. {ended.detail}".rstrip() if ended else "its writer was stopped"
-        raise DataError(f"The recording holds no complete tick ({how}); record it anew.")
+        raise DataError(f"The recording holds no complete tick ({how}); record it again.")
     seen = [observation for _, _, observation in rows]
     missing = ticks[-1].step + 1 - ticks[0].step - len(ticks)
     return EpisodeData(

@@ -24,8 +24,8 @@ class YawDamping(DynamicsEffect):
 
     id = "yaw_damping"
     name = "a yaw damping moment"
-    summary = "A yaw damping moment proportional to the yaw rate, as of a locked axle."
-    sentence = "a moment of {coefficient} of yaw rate holds the car from turning, as a locked axle does"
+    summary = "A yaw damping moment proportional to the yaw rate, as with a locked axle."
+    sentence = "a moment of {coefficient} times the yaw rate opposes turning, as with a locked axle"
     refuted_if = "circles at full lock and walking pace have the radius of the steering geometry"
     parameters = (EffectParameter("coefficient", "N m s/rad", 0.0, 0.0, 10.0, 0.05),)
 
@@ -41,7 +41,7 @@ class TorqueSteer(DynamicsEffect):
     name = "torque steer"
     summary = "Torque steer: a yaw moment proportional to the throttle."
     sentence = "full throttle turns the car to the {coefficient:left|right} with a moment of {coefficient:size}"
-    refuted_if = "the car pulls to that side when it rolls with no throttle, too"
+    refuted_if = "the car also pulls to that side when it rolls without throttle"
     parameters = (EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.1),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -57,7 +57,7 @@ class LateralBias(DynamicsEffect):
     summary = "A constant side force pulls the car to one side."
     sentence = "a constant force of {force:size} pushes the car to the {force:left|right}"
     refuted_if = (
-        "the path's curvature from it does not fade as speed grows (then the steering is off centre), or it turns "
+        "the path's curvature does not fall as speed grows (then the steering has an offset), or the pull turns "
         "with the heading (then the floor slopes)"
     )
     parameters = (EffectParameter("force", "N", 0.0, -50.0, 50.0, 0.5),)
@@ -77,7 +77,7 @@ class RoadSlope(DynamicsEffect):
     id = "road_slope"
     name = "a slope of the floor"
     summary = "The floor slopes."
-    sentence = "the floor slopes by {angle}; straight up is where a heading of {direction} points"
+    sentence = "the floor slopes by {angle}, upwards in the direction of a heading of {direction}"
     refuted_if = "the pull does not change sign when the car drives the other way"
     parameters = (
         EffectParameter("angle", "rad", 0.0, -0.5, 0.5, 0.03),
@@ -96,7 +96,7 @@ class RoadSlope(DynamicsEffect):
         Confusable(
             "lateral_bias",
             "figure_eight",
-            "a slope pulls the other way when the heading turns round, a side force of the car turns with it",
+            "a slope pulls to the other side of the car after a half turn; a side force keeps its side",
         ),
     )
 

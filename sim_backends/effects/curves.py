@@ -195,7 +195,7 @@ class DriveMap(MeasuredCurve, DynamicsEffect):
 
     id = "drive_map"
     quantity = "acceleration by the motor"
-    summary = "The motor's force is a measured map over throttle and speed."
+    summary = "The drive acceleration is a measured map over throttle and speed."
     class_statement = "a map of the drive force over throttle and speed"
     command = "throttle"
     order = 25

@@ -11,11 +11,11 @@ class CommandDelay(DelayEffect):
 
     id = "command_delay"
     fitted_with_curves = True
-    name = "a command delay that is not the car file's"
+    name = "a command delay that differs from the car file"
     summary = "Both commands act later than the car file states."
     sentence = "both commands act {extra_delay:size} {extra_delay:later|earlier} than the car file states"
     refuted_if = (
-        "steering and throttle turn out late by different amounts, or a delay measured at the car is the car file's"
+        "steering and throttle have different delays, or a delay measured at the car equals that of the car file"
     )
     lag_parameter = "extra_delay"
     parameters = (EffectParameter("extra_delay", "s", 0.0, -1.0, 1.0, 0.03, reduces="timing.command_delay"),)
@@ -58,7 +58,7 @@ class ThrottleDelay(DelayEffect):
     name = "a delay of the throttle"
     summary = "The throttle command acts later than the steering command."
     sentence = "the throttle command acts {delay} later than the steering command"
-    refuted_if = "the car starts to gain speed at once after a step of throttle, only more gently"
+    refuted_if = "the car accelerates at once after a step of throttle, but less at first"
     lag_parameter = "delay"
     parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03),)
     confusable = (

@@ -19,9 +19,7 @@ class BatterySag(DynamicsEffect):
     name = "a drive that changes as the battery runs down"
     summary = "The drive weakens with time as the battery runs down."
     sentence = "the drive {rate:weakens|strengthens} by {rate:size each minute}"
-    refuted_if = (
-        "cornering changes along with it (then it is grip), or the drive stays weak after the battery is charged"
-    )
+    refuted_if = "cornering changes too (then grip changes), or the drive stays weak after the battery is charged"
     order = 10
     depends_on = frozenset({"time"})
     parameters = (EffectParameter("rate", "1/s", 0.0, -1.0, 1.0, 0.003),)
@@ -29,7 +27,7 @@ class BatterySag(DynamicsEffect):
         Confusable(
             "friction_drift",
             "figure_eight",
-            "driven over and over for some minutes: a weak battery slows the car, lost grip widens its turns",
+            "repeated for some minutes, a weak battery slows the car, while lost grip widens its turns",
         ),
     )
 
@@ -66,14 +64,14 @@ class MotorSaturation(DynamicsEffect):
     name = "a limit of the motor's force"
     summary = "The motor's drive force is limited."
     sentence = "the motor's drive force is limited to {force} at any throttle"
-    refuted_if = "the limit moves with the grip of the floor, or with the load on the wheels"
+    refuted_if = "the limit changes with the grip of the floor, or with the load on the wheels"
     order = 30
     parameters = (EffectParameter("force", "N", math.inf, 0.0, math.inf, 3.0),)
     confusable = (
         Confusable(
             "traction_limit",
             "throttle_ramp",
-            "the limit of traction sinks as the turn takes grip, the motor's stays",
+            "a limit of traction falls in turns, which need grip; a limit of the motor does not",
         ),
     )
 
@@ -105,7 +103,7 @@ class TractionLimit(DynamicsEffect):
         Confusable(
             "friction_ellipse",
             "throttle_ramp",
-            "a limit caps the drive force; shared grip takes side force long before the cap",
+            "a limit of traction acts only at large drive force; shared grip lowers the side force at any drive force",
         ),
     )
 

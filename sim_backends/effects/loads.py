@@ -22,9 +22,9 @@ class AerodynamicDownforce(DynamicsEffect):
 
     id = "aerodynamic_downforce"
     name = "downforce"
-    summary = "Aerodynamic downforce: the faster, the more grip."
+    summary = "Aerodynamic downforce: tyre loads, and with them grip, grow with the square of speed."
     sentence = "the tyres carry {coefficient} times speed squared more than the car's weight"
-    refuted_if = "the fastest corner of a given radius is no faster than grip without downforce allows"
+    refuted_if = "the highest speed in a corner is not higher than grip without downforce allows"
     order = 10
     parameters = (EffectParameter("coefficient", "N s2/m2", 0.0, -10.0, 10.0, 0.3),)
 
@@ -47,9 +47,11 @@ class LoadTransfer(DynamicsEffect):
 
     id = "load_transfer"
     name = "load transfer between the axles"
-    summary = "Speeding up presses the rear wheels to the ground and braking the front wheels."
-    sentence = "speeding up and braking move load between the axles, as of a centre of mass {height} above the floor"
-    refuted_if = "braking and speeding up change the balance in the same direction (then they share the tyres' grip)"
+    summary = "Acceleration moves load to the rear axle, and braking moves load to the front axle."
+    sentence = "acceleration and braking move load between the axles, as with a centre of mass {height} above the floor"
+    refuted_if = (
+        "braking and acceleration change the handling balance in the same direction (then tyres share their grip)"
+    )
     parameters = (EffectParameter("height", "m", 0.0, 0.0, 1.0, 0.04),)
 
     def on_transfer(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -73,7 +75,9 @@ class RollDynamics(DynamicsEffect):
 
     id = "roll_dynamics"
     name = "roll of the body"
-    summary = "The body rolls and swings, which shifts grip between the sides later than the side force changes."
+    summary = (
+        "The body rolls and oscillates: load moves between the left and right wheels later than the side force changes."
+    )
     sentence = (
         "the body rolls at {frequency} with a damping ratio of {damping}, and load that changes sides costs grip, "
         "with a sensitivity of {sensitivity}"
@@ -92,7 +96,7 @@ class RollDynamics(DynamicsEffect):
         Confusable(
             "load_transfer",
             "steering_chirp",
-            "a rolling body answers late and most near its own frequency; load moves at once",
+            "a rolling body responds late, and most near its natural frequency; load transfer acts at once",
         ),
     )
 

@@ -23,7 +23,7 @@ class MarkerOffset(ObservationEffect):
         "motion capture tracks a point {ahead:size} {ahead:ahead of|behind} and {left:size} to the {left:left|right} "
         "of the centre of mass"
     )
-    refuted_if = "on a slow circle the tracked point shows the side velocity of the centre of mass"
+    refuted_if = "on a slow circle the tracked point has the side velocity of the centre of mass"
     parameters = (
         EffectParameter("ahead", "m", 0.0, -1.0, 1.0, 0.03),
         EffectParameter("left", "m", 0.0, -1.0, 1.0, 0.01),
@@ -73,8 +73,8 @@ class MocapYawMisalignment(ObservationEffect):
     id = "mocap_yaw_misalignment"
     fitted_with_curves = True
     name = "a yaw misalignment of motion capture"
-    summary = "Motion capture's forward axis of the car is not the car's."
-    sentence = "motion capture sees the car turned {angle:size} to the {angle:left|right} of where it points"
+    summary = "The forward axis of the rigid body in motion capture differs from the forward axis of the car."
+    sentence = "motion capture measures a heading {angle:size} to the {angle:left|right} of the true heading"
     refuted_if = "driving straight with the steering centred, the measured side velocity does not grow with speed"
     order = 60
     parameters = (EffectParameter("angle", "rad", 0.0, -3.2, 3.2, 0.03),)
@@ -96,10 +96,10 @@ class MocapLatency(ObservationEffect):
     """Every measured channel is ``latency`` old."""
 
     id = "mocap_latency"
-    name = "a motion-capture latency that is not the car file's"
+    name = "a motion-capture latency that differs from the car file"
     summary = "The latency of motion capture differs from the car file."
-    sentence = "all that motion capture measures is {latency} old"
-    refuted_if = "a latency measured against a known event, such as a tap on the car, equals the car file's"
+    sentence = "motion capture measures with a latency of {latency}"
+    refuted_if = "a latency measured against a known event, such as a tap on the car, equals that of the car file"
     lag_parameter = "latency"
     parameters = (EffectParameter("latency", "s", None, 0.0, 1.0, 0.03, same_as="mocap.latency"),)
     confusable = (
@@ -131,12 +131,12 @@ class VelocityFilterLag(ObservationEffect):
         Confusable(
             "motor_lag",
             "throttle_steps",
-            "compare velocity with the slope of the position: a filter delays the first against the second",
+            "compare velocity with the derivative of the position: a filter delays only the velocity",
         ),
         Confusable(
             "steering_lag",
             "steering_steps",
-            "compare yaw rate with the slope of the yaw: a filter delays the first against the second",
+            "compare yaw rate with the derivative of the yaw: a filter delays only the yaw rate",
         ),
     )
 

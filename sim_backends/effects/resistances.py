@@ -18,7 +18,7 @@ class RollingResistance(DynamicsEffect):
     name = "rolling resistance"
     summary = "Rolling resistance: a force against the motion that does not depend on speed."
     sentence = "a rolling resistance of {force} holds the car back at any speed"
-    refuted_if = "rolling out with no throttle, the car loses less speed each second the slower it gets"
+    refuted_if = "without throttle, the deceleration falls as the car becomes slower"
     parameters = (EffectParameter("force", "N", 0.0, 0.0, 50.0, 0.8),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
@@ -35,7 +35,7 @@ class AerodynamicDrag(DynamicsEffect):
     name = "a drag that grows with the square of speed"
     summary = "Aerodynamic drag: a force against the motion that grows with the square of speed."
     sentence = "a drag of {coefficient} times speed squared holds the car back"
-    refuted_if = "rolling out from high speed with no throttle shows no such drag (then the motor is at its limit)"
+    refuted_if = "without throttle, the car shows no such drag at high speed (then the motor is at its limit)"
     parameters = (EffectParameter("coefficient", "N s2/m2", 0.0, 0.0, 10.0, 0.1),)
     confusable = (
         Confusable(
@@ -58,7 +58,7 @@ class CorneringDrag(DynamicsEffect):
     name = "a drag of the steered wheels"
     summary = "Steered wheels slow the car down more than their side force does."
     sentence = "steered wheels hold the car back by {coefficient} of wheel angle"
-    refuted_if = "the loss of speed in corners depends on how fast they are driven rather than on the wheel angle"
+    refuted_if = "the loss of speed in corners depends on speed rather than on the wheel angle"
     parameters = (EffectParameter("coefficient", "N/rad", 0.0, 0.0, 100.0, 3.0),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:

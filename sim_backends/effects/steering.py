@@ -136,7 +136,7 @@ class SteeringAsymmetry(ActuatorEffect):
         Confusable(
             "steering_offset",
             "figure_eight",
-            "an offset tightens one circle and widens the other alike at any command; an asymmetry grows with it",
+            "the effect of an offset is equal at any command; the effect of an asymmetry grows with the command",
         ),
     )
 
@@ -152,7 +152,7 @@ class SteeringNonlinearity(ActuatorEffect):
     represented_by = "steering_curve"
     name = "a nonlinearity of the steering towards full lock"
     summary = "The wheel angle grows less than the command towards full lock."
-    sentence = "the wheel angle grows ever less than its command and would never exceed {saturation}"
+    sentence = "the wheel angle grows less than in proportion to its command and stays below {saturation}"
     refuted_if = "a slow circle at full lock, where tyres do not slip, has the radius of the linear steering"
     command = "steering"
     order = 60
@@ -161,7 +161,7 @@ class SteeringNonlinearity(ActuatorEffect):
         Confusable(
             "tyre_saturation",
             "slow_circle",
-            "at walking pace tyres do not slip, so a wide circle at full lock is the steering's",
+            "at walking pace tyres do not slip, so a circle that is too wide at full lock is caused by the steering",
         ),
     )
 
@@ -180,7 +180,7 @@ class SteeringOffset(ActuatorEffect):
     name = "an offset of the steering"
     summary = "The wheels are not straight when the steering command is zero."
     sentence = "with a steering command of zero the wheels point {angle:size} to the {angle:left|right}"
-    refuted_if = "the pull to one side fades as speed grows, or the heading is off without the path being curved"
+    refuted_if = "the pull to one side falls as speed grows, or the heading has an error although the path is straight"
     command = "steering"
     order = 70
     parameters = (EffectParameter("angle", "rad", 0.0, -1.0, 1.0, 0.05),)
@@ -188,13 +188,13 @@ class SteeringOffset(ActuatorEffect):
         Confusable(
             "lateral_bias",
             "throttle_ramp",
-            "the curvature from wheels off centre stays as speed grows; that from a side force fades",
+            "a steering offset curves the path alike at any speed; the curvature by a side force falls as speed grows",
         ),
         Confusable(
             "mocap_yaw_misalignment",
             "throttle_ramp",
             (
-                "wheels off centre curve the path; a yaw misalignment appears only as a side velocity proportional to "
+                "a steering offset curves the path; a yaw misalignment appears only as a side velocity proportional to "
                 "speed"
             ),
         ),

@@ -45,7 +45,7 @@ class ThrottleNonlinearity(ActuatorEffect):
     represented_by = "drive_map"
     name = "a curved throttle response"
     summary = "The motor's force is not proportional to the throttle command."
-    sentence = "the motor's force grows as the throttle to the power of {exponent}, not in proportion to it"
+    sentence = "the motor's force grows with the throttle to the power of {exponent}, not in proportion to it"
     refuted_if = "the curve has a sharp corner (a dead band or a limit) rather than a bend over the whole range"
     command = "throttle"
     order = 20

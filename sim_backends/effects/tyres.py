@@ -45,9 +45,9 @@ class TyreSaturation(DynamicsEffect):
 
     id = "tyre_saturation"
     name = "the limit of tyre grip"
-    summary = "The tyres' side force saturates: grip is limited."
+    summary = "The tyres' side force saturates at large slip angles."
     sentence = "the side force of the tyres saturates, at a friction of {mu_front} in front and {mu_rear} at the rear"
-    refuted_if = "turns tighten less than linearly even at walking pace (then it is the steering)"
+    refuted_if = "even at walking pace, turns tighten less than in proportion to the command (then it is the steering)"
     parameters = (
         EffectParameter("mu_front", "1", None, 0.0, 5.0, 0.43, same_as="tyre.front.mu"),
         EffectParameter("B_front", "1", None, 0.0, 100.0, 2.75, positive=True, same_as="tyre.front.B"),
@@ -112,7 +112,7 @@ class LowFrictionPatch(DynamicsEffect):
     name = "a low-friction patch"
     summary = "There is a place on the floor where grip is low."
     sentence = "grip falls by {loss:percent} within {radius} of the place x = {x}, y = {y}"
-    refuted_if = "the car slides alike elsewhere at the same speed and turn, or does not slide there on another lap"
+    refuted_if = "the car also slides elsewhere at the same speed and turn, or does not slide there on another lap"
     order = 20
     depends_on = frozenset({"place"})
     disc_parameters = ("x", "y", "radius")
@@ -151,7 +151,9 @@ class FrictionEllipse(DynamicsEffect):
     sentence = (
         "driving and braking take side force from rear tyres, as a friction circle at {scale} times the drive force"
     )
-    refuted_if = "driving and braking shift the balance in opposite directions (then load moves between the axles)"
+    refuted_if = (
+        "driving and braking change the handling balance in opposite directions (then load moves between axles)"
+    )
     order = 10
     parameters = (EffectParameter("scale", "1", 0.0, 0.0, 10.0, 0.6),)
     confusable = (
@@ -159,8 +161,8 @@ class FrictionEllipse(DynamicsEffect):
             "load_transfer",
             "throttle_steps",
             (
-                "shared grip is lost both in driving and in braking; moved load helps the rear in one and hurts in "
-                "the other"
+                "shared grip is lost both in driving and in braking; load transfer raises the grip of the rear axle in "
+                "one and lowers it in the other"
             ),
         ),
     )

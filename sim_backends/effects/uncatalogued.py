@@ -99,7 +99,7 @@ class FrontSideForce(_SideForce):
         Confusable("lateral_bias"),
     )
     summary = "Toe or camber of the front wheels pushes them to one side."
-    class_statement = "constant: a bias of the front wheels' side force, even in steering, as of toe or camber"
+    class_statement = "constant: a bias of the front wheels' side force, even in steering, as by toe or camber"
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Push the front."""
@@ -115,7 +115,7 @@ class RearSideForce(_SideForce):
         Confusable("lateral_bias"),
     )
     summary = "Toe or camber of the rear wheels pushes them to one side."
-    class_statement = "constant: a bias of the rear wheels' side force, even in steering, as of toe or camber"
+    class_statement = "constant: a bias of the rear wheels' side force, even in steering, as by toe or camber"
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Push the rear."""
@@ -132,7 +132,7 @@ class LockedAxle(DynamicsEffect):
     id = "locked_axle"
     catalogued = False
     summary = "Two driven wheels that turn as one scrub in turns."
-    class_statement = "odd in the yaw rate, by the path's curvature whatever the speed, as of a locked differential"
+    class_statement = "odd in the yaw rate, by the path's curvature whatever the speed, as with a locked differential"
     parameters = (EffectParameter("moment", "N m", 0.0, 0.0, 20.0, 0.1),)
     confusable = (Confusable("yaw_damping"),)
 
@@ -165,7 +165,7 @@ class CoastBrake(DynamicsEffect):
     represented_by = "drive_map"
     catalogued = False
     summary = "The motor brakes while the throttle is released."
-    class_statement = "odd in speed where there is no throttle, as of a motor that brakes while it coasts"
+    class_statement = "odd in speed where there is no throttle, as with a motor that brakes while the car coasts"
     parameters = (EffectParameter("coefficient", "N s/m", 0.0, 0.0, 50.0, 0.5),)
     confusable = (
         Confusable("rolling_resistance"),

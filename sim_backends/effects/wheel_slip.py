@@ -37,9 +37,9 @@ class LongitudinalSlip(DynamicsEffect):
     represented_by = "drive_map"
     command = "throttle"
     name = "slipping driven wheels"
-    summary = "The driven wheels slip: they spin up before the car does, and pass on no more than their grip."
-    sentence = "the driven wheels slip: their inertia is {inertia}, the tyres' stiffness along {stiffness}"
-    refuted_if = "the push of the motor is late by the same time at low and at high throttle (then the motor lags)"
+    summary = "The driven wheels slip: they accelerate before the car does, and transmit at most their grip."
+    sentence = "the driven wheels slip: their inertia is {inertia}, their longitudinal tyre stiffness {stiffness}"
+    refuted_if = "the drive force is late by the same time at low and at high throttle (then the motor lags)"
     order = 50
     states = ("slip_speed",)
     stiff = True
@@ -56,7 +56,7 @@ class LongitudinalSlip(DynamicsEffect):
         Confusable(
             "traction_limit",
             "throttle_steps",
-            "wheels that spin need time to spin up and to catch again; a plain limit acts at once",
+            "wheels that spin need time to accelerate and to grip again; a limit of traction acts at once",
         ),
     )
 

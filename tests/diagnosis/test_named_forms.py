@@ -184,7 +184,7 @@ def test_random_smooth_curves_are_not_named(curve_id):
     ]
     assert sum(form.is_within_band for form in forms) <= 1
     curve = replace(measured_curve(curve_id, random_smooth(curve_id, 0), 0, anchored=False)[0], form=forms[0])
-    assert form_sentence(curve).startswith(f"No named form fits the {curve.quantity} within its band. The closest, ")
+    assert form_sentence(curve).startswith(f"No named form fits the {curve.quantity} within its band. The closest ")
 
 
 def test_true_forms_have_the_nominal_level():
@@ -200,7 +200,7 @@ def test_forms_that_a_wide_band_does_not_distinguish_are_all_named():
     form = read_form(wide, 144.0 * covariance, DEFAULT.curves)
     assert form.is_within_band
     assert len(form.indistinguishable_from) >= 1
-    assert "As well within the band: a " in form_sentence(replace(wide, form=form))
+    assert "Also within the band: a " in form_sentence(replace(wide, form=form))
 
 
 def test_knots_without_data_are_not_compared_and_too_few_have_no_form():

@@ -35,9 +35,9 @@ def ceiling_sentence(diagnosis: Diagnosis) -> str:
         return ""
     return (
         f"Of the refit's squared excess the model explains {percent(ceiling.by_model)}; networks predict another "
-        f"{percent(ceiling.predictable)} from past commands and velocities; {percent(ceiling.unpredictable)} is "
-        f"predicted by neither. The model explains {percent(ceiling.explained_of_predictable)} of the predictable "
-        "part."
+        f"{percent(ceiling.predictable)} from past commands and velocities; neither predicts "
+        f"{percent(ceiling.unpredictable)}. The model explains {percent(ceiling.explained_of_predictable)} of the "
+        "predictable part."
     )
 
 
@@ -63,7 +63,7 @@ def form_sentence(curve: CurveFinding) -> str:
     misfit = f"chi² per knot {number(form.chi2_per_knot)} at {form.knots} knots"
     if not form.is_within_band:
         return (
-            f"No named form fits the {curve.quantity} within its band. The closest, {form.name}, differs by "
+            f"No named form fits the {curve.quantity} within its band. The closest form, {form.name}, differs by "
             f"{with_unit(form.rms_difference, curve.unit)} rms ({misfit}; at most {number(form.max_chi2_per_knot)} "
             "within the band)."
         )
@@ -71,7 +71,7 @@ def form_sentence(curve: CurveFinding) -> str:
         f"{name} {with_unit(e.value, e.unit)} ({number(e.low90)} to {number(e.high90)})"
         for name, e in form.parameters.items()
     ]
-    others = f" As well within the band: {listed(form.indistinguishable_from)}." * bool(form.indistinguishable_from)
+    others = f" Also within the band: {listed(form.indistinguishable_from)}." * bool(form.indistinguishable_from)
     text = f"The {curve.quantity} has the form of {form.name}"
     return f"{text}{': ' * bool(values)}{', '.join(values)} ({misfit}).{others}"
 
@@ -100,7 +100,7 @@ def readings_of_drive(curve: CurveFinding, settings: ReportSettings) -> list[str
     growth = (full - high)[driven]
     expected = (curve.car_file[-1] - curve.car_file[-2])[driven]
     if driven.sum() >= 2 and float(np.median(growth)) < settings.saturation_share * float(np.median(expected)):
-        found.append(f"Beyond a throttle of {number(float(throttle[-2]))} the drive force hardly grows: it saturates.")
+        found.append(f"Above a throttle of {number(float(throttle[-2]))} the drive force hardly grows: it saturates.")
     return found
 
 
@@ -114,7 +114,7 @@ def _zero(speed: FloatArray, row: FloatArray) -> float | None:
 
 
 def curve_charts(curve: CurveFinding) -> list[Figure]:
-    """The measured curve with its 90 % band beside that of the car file; a map as one panel for each first knot."""
+    """The measured curve with its 90 % band, and that of the car file; a map has one panel for each first knot."""
     size = (420, 260) if len(curve.axes) == 1 else (300, 220)
     rows = [()] if len(curve.axes) == 1 else [(k,) for k in range(len(curve.axes[0].knots))]
     spread = 1.645 * np.nan_to_num(curve.std)

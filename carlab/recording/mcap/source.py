@@ -190,7 +190,7 @@ class _Collector:
             )
         if not self._episode:
             raise DataError(
-                f"{path} holds no complete tick (its writer was stopped before the episode began); record it anew."
+                f"{path} holds no complete tick (its writer was stopped before the episode began); record it again."
             )
         try:
             documents = list(self._assemble())
