@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import functools
 import html
-import json
 import logging
 import math
 import os
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec
 
 from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.json_files import read_json
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -182,7 +182,7 @@ def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
 
     path = run.path / RESULT_FILE
     try:
-        before = list(json.loads(path.read_text(encoding="utf-8"))["episodes"])
+        before = [row for row in read_json(path)["episodes"] if isinstance(row, dict)]
     except (OSError, ValueError, KeyError, TypeError):
         before = []
     now = {result.episode for result in results}
@@ -191,7 +191,7 @@ def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:
             "episode": result.episode,
             "ticks": result.data.ticks,
             "return": result.total_reward,
-            **{name: None if math.isnan(value) else float(value) for name, value in result.summary.items()},
+            **{name: None if not math.isfinite(value) else value for name, value in result.summary.items()},
             "end_reason": result.reason.name,
             "end_detail": result.data.metadata["end_detail"],
         }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,6 +12,7 @@ from carlab.api.recordings import required_file
 from carlab.cli.bench_output import report, run_and_write
 from carlab.cli.console import console, progress
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.json_files import read_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,7 +68,7 @@ def check_unseen(model: Path, held_out: Path) -> None:
     if not report.is_file():
         return
     try:
-        known = {use["sha256"] for use in json.loads(report.read_text(encoding="utf-8"))["recordings"]}
+        known = {use["sha256"] for use in read_json(report)["recordings"]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{report} cannot be read ({error!r}); diagnose again.") from error
     if hashlib.sha256(held_out.read_bytes()).hexdigest() in known:

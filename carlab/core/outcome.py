@@ -26,6 +26,7 @@ class EndReason(enum.Enum):
     LATE_LOOP = "Too many ticks were late; close other programs or lengthen control_period."
     BAD_COMMAND = "The policy returned a command that is not a number; retrain it or use an earlier policy."
     POLICY_ERROR = "The policy raised an error; see the log."
+    TASK_ERROR = "The task raised an error or gave a reward that is not a number; correct its file."
     RECORDER_ERROR = "The recording could not be written; free some disk space and check the folder's permissions."
     LOOP_HUNG = "The control loop hung and the watchdog thread stopped the car; see the log."
     CRASHED = "The program ended during the episode; the recording is complete up to that point."

@@ -162,7 +162,7 @@ def _task_of_file(file: str, class_name: str, sha256: str) -> Task:
         )
     try:
         return kind()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigError(f"--task: {class_name}() fails: {type(error).__name__}: {error}.") from error
 
 

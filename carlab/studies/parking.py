@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.json_files import read_json
 from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.report import CURVE_FILE
@@ -107,7 +107,7 @@ def check_run(folder: Path, options: Mapping[str, tuple[str, int | str | None]])
 
 def _plan(folder: Path) -> dict[str, Any]:
     try:
-        plan: dict[str, Any] = json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]
+        plan: dict[str, Any] = read_json(folder / CAMPAIGN_FILE)["plan"]
         return plan
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{folder} is not a run of carlab learn ({error}); remove it.") from error
@@ -117,7 +117,7 @@ def read_curve(folder: Path) -> Curve:
     """Read the figures of a run. Raises DataError if the folder is not a run of carlab learn."""
     plan = _plan(folder)
     try:
-        rows = json.loads((folder / CURVE_FILE).read_text(encoding="utf-8"))["episodes"]
+        rows = read_json(folder / CURVE_FILE)["episodes"]
         episodes = sorted((EpisodeFigures.from_dict(row) for row in rows), key=lambda e: e.episode)
         return Curve(method_of(plan), int(plan["seed"]), int(plan["updates"]), tuple(episodes))
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
+import math
 import shlex
 import shutil
 import signal
@@ -175,6 +177,34 @@ def test_resume_refuses_folders_that_are_no_learning_run(carlab: Carlab, tmp_pat
     code, text = carlab("learn", "--resume", driven.path)
     assert code == 1
     assert "cannot be resumed" in text
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("episodes",), math.inf),
+        (("episodes",), -1),
+        (("ticks",), math.inf),
+        (("ticks",), 0),
+        (("place",), "no"),
+        (("plan",), "x"),
+        (("plan", "seed"), -1),
+        (("plan", "seed"), math.inf),
+        (("plan", "updates"), 10**400),
+    ],
+)
+def test_resume_refuses_an_edited_campaign(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, keys: tuple[str, ...], value: object
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(learned[2], folder, ignore=shutil.ignore_patterns("models"))
+    content = json.loads((folder / "campaign.json").read_text())
+    *parents, name = keys
+    functools.reduce(lambda table, key: table[key], parents, content)[name] = value
+    (folder / "campaign.json").write_text(json.dumps(content))
+    code, text = carlab("learn", "--resume", folder)
+    assert code == 1
+    assert "cannot be resumed (campaign.json: " in text
 
 
 def test_invalid_prior_file_is_refused_with_the_name_of_the_key(carlab: Carlab, tmp_path: Path) -> None:

@@ -1,7 +1,10 @@
 """The control loop of one episode: order of documents, alignment of rows and commands, end reasons, stopped car."""
 
+import itertools
 import math
+import sys
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -254,3 +257,34 @@ def test_steering_steps_and_coast_down_have_the_requested_levels() -> None:
     coast = coast_down(throttle=0.5, push_s=1.0, coast_s=2.0)
     assert coast.at(0.99).throttle == 0.5
     assert coast.at(1.01).throttle == 0.0
+
+
+class WrongAtTick(ParkingTask):
+    """A parking task whose reward calls a function at each tick."""
+
+    def __init__(self, reward: Callable[[int], object]) -> None:
+        super().__init__()
+        object.__setattr__(self, "rewards", map(reward, itertools.count()))
+
+    def reward(self, features: Any, action: Any, next_features: Any) -> Any:
+        return next(self.rewards)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("reward", "detail"),
+    [
+        (lambda k: 1.0 if k < 5 else 1 / 0, "ZeroDivisionError"),
+        (lambda k: 1.0 if k < 5 else math.nan, "The reward is nan"),
+        (lambda k: 1.0 if k < 5 else np.zeros(3), "TypeError"),
+        (lambda k: 1.0 if k < 5 else sys.exit(0), "SystemExit"),
+    ],
+)
+def test_error_of_a_task_while_driving_stops_the_car_and_keeps_the_ticks(
+    reward: Callable[[int], object], detail: str
+) -> None:
+    with StopCountingCar() as car:
+        data = run_episode(car, FunctionPolicy(sine_steering), WrongAtTick(reward), SafetyEnvelope(), period_s=PERIOD_S)
+        assert car.stops == [False]
+    assert data.metadata["end_reason"] == EndReason.TASK_ERROR.name
+    assert detail in data.metadata["end_detail"]
+    np.testing.assert_array_equal(data.rewards, np.ones(5))

@@ -1,6 +1,7 @@
 """The checker accepts all tasks of carlab and of the examples, and names each error of a wrong task."""
 
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def in_place(self: Task, features: Any, action: Any, next_features: Any) -> Any:
     return next_features[..., 0]
 
 
-def start(**state: float) -> Callable[[Task, np.random.Generator], CarState]:
+def start(**state: Any) -> Callable[[Task, np.random.Generator], CarState]:
     return lambda self, rng: CarState(**state)
 
 
@@ -89,7 +90,24 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"cost": lambda self, n: -1.0 + 0.0 * n[..., 0]}, "must not be below zero"),
     ({"terminated": lambda self, n: n[..., 0] * 0.0}, "terminated returns float64; return booleans"),
     ({"terminated": lambda self, n: n[..., 0] < 10.0}, "the episode would end at once"),
-    ({"summary": lambda self, t, s: {"distance_m": 1.0}}, "summary lacks 'success'"),
+    ({"max_ticks": 10**30}, "max_ticks is 1"),
+    ({"goal": 5.0}, "goal is 5.0; give a tuple"),
+    ({"goal": "abc"}, "goal is 'abc'; give a tuple"),
+    ({"cost_weight": math.nan}, "cost_weight is nan"),
+    ({"keep_out": None}, "keep_out must be a tuple"),
+    ({"arena_m": None}, "arena_m must be a tuple of points"),
+    ({"path_m": ((0.0, 0.0, 0.0),)}, "path_m must be a tuple of points"),
+    ({"outlines_m": ((0.0, 1.0),)}, "outlines_m must be a tuple of lines"),
+    ({"max_ticks": property(lambda self: 1 // 0)}, "max_ticks raises ZeroDivisionError"),
+    ({"sample_start": start(x_m="a")}, "sample_start returns .* give finite numbers"),
+    ({"sample_training_start": lambda self, rng: None}, "sample_training_start returns a NoneType"),
+    ({"reward": lambda self, f, a, n: sys.exit(0)}, "reward of a batch raises SystemExit: 0"),
+    ({"reward": lambda self, f, a, n: [[1.0], [1.0, 2.0]]}, "the value of reward as an array raises ValueError"),
+    ({"summary": lambda self, t, s: {"distance_m": 1.0}}, "summary needs 'success'"),
+    ({"summary": lambda self, t, s: {"success": math.nan}}, "summary needs 'success'"),
+    ({"summary": lambda self, t, s: {"success": 1.0, "return": 2.0}}, "summary has 'return', a figure"),
+    ({"summary": lambda self, t, s: {"success": 1.0, "n": 10**400}}, "summary 'n' raises OverflowError"),
+    ({"outcome": lambda self, s: None}, "outcome returns None"),
     ({"summary": lambda self, t, s: {"success": "yes"}}, "summary has 'yes' under success"),
     ({"summary": lambda self, t, s: 1.0 / 0.0}, "summary raises ZeroDivisionError"),
 ]
@@ -107,3 +125,12 @@ def test_each_error_is_named_in_one_sentence(members: dict[str, Any], message: s
 def test_path_outside_the_arena_of_the_car_is_refused() -> None:
     with pytest.raises(ConfigError, match="its path leaves the arena"):
         check_task(TASKS["laps"](), rectangle(-1.0, 1.0, -2.0, 2.0))
+
+
+def test_numbers_of_numpy_in_a_summary_and_tensors_with_gradient_are_accepted() -> None:
+    def reward(self: Task, features: Any, action: Any, next_features: Any) -> Any:
+        value = next_features[..., 0] - 0.01 * (action**2).sum(-1)
+        return value.requires_grad_() if hasattr(value, "requires_grad_") else value
+
+    summary = {"success": np.float32(1.0), "laps": np.int64(3), "inside": np.True_, "best_lap_s": math.nan}
+    check_task(changed(reward=reward, summary=lambda self, t, s: summary))

@@ -12,18 +12,18 @@ its next step.
 
 from __future__ import annotations
 
-import json
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from carlab.cars import CarChoice
 from carlab.core.documents import EpisodeEnded
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.json_files import read_json
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
@@ -40,6 +40,7 @@ from carlab.recording.run_folder import RunDirectory
 from learning.policy.sac_agent import SacAgent, SacSettings
 from sim_backends.car_parameters import SimulatorConfig
 
+T = TypeVar("T", int, bool)
 CAMPAIGN_FILE = "campaign.json"
 CONTINUE_REASONS = frozenset(
     {EndReason.COMPLETED, EndReason.GOAL_REACHED, EndReason.TASK_ENDED, EndReason.GEOFENCE, EndReason.OVERSPEED}
@@ -289,7 +290,7 @@ def check_same_car(run: RunDirectory, choice: CarChoice, car_options: str) -> No
         car_options: the command-line options that select the car.
     """
     try:
-        content = json.loads((run.path / CAMPAIGN_FILE).read_text(encoding="utf-8"))
+        content = read_json(run.path / CAMPAIGN_FILE)
         texts = (run.config_toml, choice.config_toml)
         tables = [{k: v for k, v in tomllib.loads(text).items() if k not in CONNECTION_TABLES} for text in texts]
         saved_options = str(content.get("car", car_options))
@@ -308,7 +309,8 @@ def check_same_car(run: RunDirectory, choice: CarChoice, car_options: str) -> No
 def saved_seed(folder: Path) -> int | None:
     """The seed of a run; None if the folder is not a campaign (``resumed_campaign`` raises then)."""
     try:
-        return int(json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"]["seed"])
+        seed = int(read_json(folder / CAMPAIGN_FILE)["plan"]["seed"])
+        return seed if seed >= 0 else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -316,7 +318,7 @@ def saved_seed(folder: Path) -> int | None:
 def saved_plan(folder: Path) -> TrainingPlan:
     """The plan of a run, without the file of a user's task. Raises DataError if the folder is not a campaign."""
     try:
-        plan = plan_from_json(json.loads((folder / CAMPAIGN_FILE).read_text(encoding="utf-8"))["plan"])
+        plan = plan_from_json(read_json(folder / CAMPAIGN_FILE)["plan"])
         SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
         return plan
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -327,15 +329,16 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
     """Resume a run with its saved settings, optionally on another device. Raises DataError if it is not a campaign."""
     path = run.path / CAMPAIGN_FILE
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         plan = plan_from_json(content["plan"])
         plan = plan if device is None else replace(plan, device=device)
         SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
-        ticks, tables = content["ticks"], content.get("questioned")
+        tables = content.get("questioned")
         checked_simulator = None if tables is None else SimulatorConfig.from_tables(tables)
         return Campaign(
-            choice, plan, int(content["episodes"]), run, hooks, None if ticks is None else int(ticks),
-            bool(content["place"]), bool(content["rerun"]), checked_simulator, str(content.get("car", "")),
+            choice, plan, _typed(content, "episodes", int), run, hooks,
+            None if content["ticks"] is None else _typed(content, "ticks", int), _typed(content, "place", bool),
+            _typed(content, "rerun", bool), checked_simulator, str(content.get("car", "")),
             bool(content.get("repairs_prior", False)),
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -343,6 +346,14 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
             f"{run.path} cannot be resumed ({CAMPAIGN_FILE}: {error}); name the folder of a run of carlab learn, or "
             "start a new run."
         ) from error
+
+
+def _typed(content: Mapping[str, Any], name: str, kind: type[T]) -> T:
+    """A value of a JSON object. Raises ValueError if it has another type or is below 1 (bool: no limit)."""
+    value = content[name]
+    if type(value) is not kind or (kind is int and value < 1):
+        raise ValueError(f"{name} is {value!r}")
+    return value
 
 
 __all__ = [

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from carlab.core.errors import CarlabError
+from carlab.core.json_files import read_json
 from carlab.experiment.campaign.child_process import child_context
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
@@ -79,7 +80,7 @@ def run_check_subprocess(
                 child.join()
                 return None
             child.join(POLL_S)
-        return QuickCheck.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        return QuickCheck.from_dict(read_json(path))
     except (OSError, ValueError, KeyError, TypeError) as error:
         code = f"exit code {child.exitcode}" if child.exitcode else str(error)
         log.warning("The quick check of episode %d failed: %s", number, error)

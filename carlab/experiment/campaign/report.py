@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
 
 from carlab.core.errors import DataError
+from carlab.core.json_files import read_json
 from carlab.core.task import Task
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.picture import draw
@@ -29,7 +29,7 @@ def learning_curve(run: RunDirectory) -> list[EpisodeFigures]:
     if not path.is_file():
         return []
     try:
-        return [EpisodeFigures.from_dict(row) for row in json.loads(path.read_text(encoding="utf-8"))["episodes"]]
+        return [EpisodeFigures.from_dict(row) for row in read_json(path)["episodes"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} cannot be read ({error}); remove it, and the next run restores it.") from error
 

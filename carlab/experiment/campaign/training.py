@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError, DivergedError
+from carlab.core.json_files import read_json
 from carlab.core.observation import episode_features, feature_size
 from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
@@ -66,7 +67,7 @@ def training_figures(run: RunDirectory, episode: int) -> dict[str, Any]:
     """
     path = model_folder(run.models, episode) / FIGURES_FILE
     try:
-        figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        figures: dict[str, Any] = read_json(path)
     except (OSError, ValueError) as error:
         raise DataError(f"{path} cannot be read ({error}); remove its folder to train again.") from error
     version = read_version(run, episode - 1)

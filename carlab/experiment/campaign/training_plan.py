@@ -80,6 +80,8 @@ def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:
     Raises:
         KeyError, TypeError, ValueError: wrong names, types or ranges.
     """
+    if not isinstance(content, Mapping):
+        raise TypeError("the plan is not an object")
     task_choice = TaskChoice.from_table(content["task_choice"]) if "task_choice" in content else PARKING
     method = method_of(content)
     if method != content.get("method", method):

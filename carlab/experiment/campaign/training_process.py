@@ -91,7 +91,7 @@ def _child(
         pipe.send(("failed", str(error)))
     except BrokenPipeError:
         pass
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         log.exception("Training failed")
         pipe.send(("failed", f"Training failed: {type(error).__name__}: {error}; the recordings are kept."))
     finally:

@@ -233,15 +233,14 @@ def _drive(
         timing = pacer.wait()
         now_s, observation = _observe(car, rows, hooks)
         next_features = encode(observation.state.to_array(), history.rows)
-        reward = float(task.reward(features, sent.to_array(), next_features))
-        terminated = bool(task.terminated(next_features))
+        reward, terminated, success = _judge(task, features, sent, next_features)
         rows.add_step(requested, sent, reward)
         rows.add_observation(now_s, observation)
         truncated = step + 1 == ticks and not terminated
         hooks.emit(Transition(step, now_s, features, sent, reward, next_features, terminated, truncated))
         features = next_features
         if terminated:
-            return EndReason.GOAL_REACHED if bool(task.success(next_features)) else EndReason.TASK_ENDED
+            return EndReason.GOAL_REACHED if success else EndReason.TASK_ENDED
         if late.add(timing):
             raise _End(EndReason.LATE_LOOP, f"{pacer.skipped} ticks were skipped.")
     return EndReason.COMPLETED
@@ -285,6 +284,20 @@ def _act(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeo
     if policy_s > timeout_s:
         raise _End(EndReason.LATE_LOOP, f"The policy '{policy.name}' took {policy_s:.1f} s for one tick.")
     return action, policy_s
+
+
+def _judge(task: Task, features: FloatArray, sent: Action, next_features: FloatArray) -> tuple[float, bool, bool]:
+    """Reward, end, and success at the end, of one transition. Raises _End for an error of the task."""
+    try:
+        reward = float(task.reward(features, sent.to_array(), next_features))
+        terminated = bool(task.terminated(next_features))
+        success = terminated and bool(task.success(next_features))
+    except (Exception, SystemExit) as error:
+        log.debug("The task '%s' raised an error", task.name, exc_info=True)
+        raise _End(EndReason.TASK_ERROR, f"{type(error).__name__}: {error}") from error
+    if not math.isfinite(reward):
+        raise _End(EndReason.TASK_ERROR, f"The reward is {reward:g}.")
+    return reward, terminated, success
 
 
 def _end_of(error: BaseException, state: SafetyState, *, driven: bool) -> tuple[EndReason, str, bool]:

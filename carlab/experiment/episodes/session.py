@@ -20,7 +20,7 @@ from carlab.core.car import Car
 from carlab.core.clock import wall_clock_ns
 from carlab.core.documents import Document, EpisodeEnded, Tick
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import PoseLostError
+from carlab.core.errors import ConfigError, PoseLostError
 from carlab.core.observation import episode_features
 from carlab.core.outcome import EndReason
 from carlab.core.policy import Policy
@@ -58,11 +58,17 @@ class EpisodeResult:
 
 
 def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
-    """Result of a recorded episode."""
-    summary = task.summary(data.times_s, data.states)
-    if task.has_constraint:
-        costs = np.asarray(task.cost(episode_features(data.states, data.sent, task.history_length)[1:]))
-        summary |= {"cost": float(costs.sum()), "violations": float((costs > 0.0).sum())}
+    """Result of a recorded episode. Raises ConfigError if the task cannot judge it."""
+    try:
+        summary = {name: float(value) for name, value in task.summary(data.times_s, data.states).items()}
+        if task.has_constraint:
+            costs = np.asarray(task.cost(episode_features(data.states, data.sent, task.history_length)[1:]))
+            summary |= {"cost": float(costs.sum()), "violations": float((costs > 0.0).sum())}
+    except (Exception, SystemExit) as error:
+        raise ConfigError(
+            f"The task {task.name} cannot judge {path} ({type(error).__name__}: {error}); correct its summary and "
+            "cost; the recording is complete."
+        ) from error
     return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], summary, path)
 
 

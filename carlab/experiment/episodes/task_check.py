@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import numbers
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +22,14 @@ MAX_REWARD, MAX_SPEED_MPS, MAX_POSITION_M = 100.0, 20.0, 1000.0
 """Largest plausible reward of a tick, speed and position; larger ones have the wrong unit."""
 TORCH_TOLERANCE = 1e-3
 """Relative difference of float32 from float64."""
+MAX_TICKS = 10**6
 _METRES = "positions are in metres"
+_ATTRIBUTES = (
+    *("name", "history_length", "max_ticks", "cost_weight"),
+    *("arena_m", "path_m", "outlines_m", "goal"),
+)
+_RESULT_NAMES = {"", "episode", "ticks", "return", "end_reason", "end_detail"}
+"""Names of the other figures of an episode in result.json."""
 
 
 def check_task(task: Task, arena_m: Corners = ()) -> None:
@@ -67,35 +76,54 @@ def _error(task: Task, text: str) -> ConfigError:
 def _call(task: Task, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return function(*arguments)
-    except Exception as error:
-        raise _error(task, f"{name} raises {type(error).__name__}: {error}".rstrip(".")) from error
+    except (Exception, SystemExit) as error:
+        raise _error(task, f"{name} raises {type(error).__name__}: {error}".rstrip(".: ")) from error
 
 
 def _check_attributes(task: Task) -> None:
-    if not isinstance(task.name, str) or not task.name:
-        raise _error(task, f"name is {task.name!r}; give a text")
-    for name, minimum in (("history_length", 0), ("max_ticks", 1)):
-        value = getattr(task, name)
-        if type(value) is not int or value < minimum:
-            raise _error(task, f"{name} is {value!r}; give a whole number of at least {minimum}")
-    if not all(isinstance(shape, KeepOut) for shape in _call(task, "keep_out", lambda: tuple(task.keep_out))):
+    shapes = _call(task, "keep_out", getattr, task, "keep_out")
+    if not isinstance(shapes, (tuple, list)) or not all(isinstance(shape, KeepOut) for shape in shapes):
         raise _error(task, "keep_out must be a tuple of Disc and Polygon (carlab.core.keep_out)")
-    for name in ("arena_m", "path_m", "outlines_m", "goal"):
-        _call(task, name, lambda name=name: getattr(task, name))
-    if len(task.arena_m):
-        as_polygon(task.arena_m, f"arena_m of the task {type(task).__name__}")
+    values = {name: _call(task, name, getattr, task, name) for name in _ATTRIBUTES}
+    if not isinstance(values["name"], str) or not values["name"]:
+        raise _error(task, f"name is {values['name']!r}; give a text")
+    for name, minimum in (("history_length", 0), ("max_ticks", 1)):
+        if type(values[name]) is not int or not minimum <= values[name] <= MAX_TICKS:
+            raise _error(task, f"{name} is {values[name]!r}; give a whole number from {minimum} to {MAX_TICKS}")
+    weight = values["cost_weight"]
+    if type(weight) not in (int, float) or not 0.0 <= weight < math.inf:
+        raise _error(task, f"cost_weight is {weight!r}; give a number of at least 0")
+    for name in ("arena_m", "path_m"):
+        if not _are_points(values[name]):
+            raise _error(task, f"{name} must be a tuple of points (x, y) in metres")
+    outlines = values["outlines_m"]
+    if not isinstance(outlines, (tuple, list)) or not all(map(_are_points, outlines)):
+        raise _error(task, "outlines_m must be a tuple of lines, each a tuple of points (x, y) in metres")
+    if values["arena_m"]:
+        as_polygon(values["arena_m"], f"arena_m of the task {type(task).__name__}")
+
+
+def _are_points(points: Any) -> bool:
+    """Whether a value is a tuple or list of points (x, y) of finite numbers, possibly empty."""
+    return isinstance(points, (tuple, list)) and all(_is_row(point, 2) for point in points)
+
+
+def _is_row(values: Any, length: int) -> bool:
+    """Whether a value is a tuple or list of ``length`` finite numbers."""
+    return (
+        isinstance(values, (tuple, list))
+        and len(values) == length
+        and all(isinstance(v, numbers.Real) and math.isfinite(v) for v in values)
+    )
 
 
 def _starts(task: Task, arena_m: Corners) -> FloatArray:
     """States of ``N_STARTS`` starts (N, 6)."""
     starts = []
     for seed in range(N_STARTS):
-        start, again = (_call(task, "sample_start", task.sample_start, np.random.default_rng(seed)) for _ in range(2))
-        if not isinstance(start, CarState):
-            raise _error(task, f"sample_start returns a {type(start).__name__}; return a carlab.CarState")
-        state = np.asarray(start.to_array(), dtype=np.float64)
-        if not np.isfinite(state).all() or np.abs(state[:2]).max() > MAX_POSITION_M:
-            raise _error(task, f"sample_start returns {start}; give finite numbers ({_METRES})")
+        start, again = (_drawn(task, "sample_start", seed) for _ in range(2))
+        _drawn(task, "sample_training_start", seed)
+        state = start.to_array()
         if not np.array_equal(state, again.to_array()):
             raise _error(task, "sample_start gives two starts for one seed; draw random numbers from its argument only")
         if abs(start.yaw_rad) > 2.0 * math.pi:
@@ -111,13 +139,23 @@ def _starts(task: Task, arena_m: Corners) -> FloatArray:
     return np.array(starts)
 
 
+def _drawn(task: Task, name: str, seed: int) -> CarState:
+    """A plausible state of ``sample_start`` or ``sample_training_start``."""
+    start = _call(task, name, getattr(task, name), np.random.default_rng(seed))
+    if not isinstance(start, CarState):
+        raise _error(task, f"{name} returns a {type(start).__name__}; return a carlab.CarState")
+    if not _is_row(dataclasses.astuple(start), 6) or max(abs(start.x_m), abs(start.y_m)) > MAX_POSITION_M:
+        raise _error(task, f"{name} returns {start}; give finite numbers ({_METRES})")
+    return start
+
+
 def _check_goal(task: Task, arena_m: Corners) -> None:
     goal = task.goal
     if goal is None:
         return
-    values = np.asarray(goal, dtype=np.float64) if len(goal) == 3 else np.full(3, np.nan)
-    if not np.isfinite(values).all():
-        raise _error(task, f"goal is {goal!r}; give x [m], y [m] and yaw [rad], or None")
+    if not _is_row(goal, 3):
+        raise _error(task, f"goal is {goal!r}; give a tuple of x [m], y [m] and yaw [rad], or None")
+    values = np.asarray(goal, dtype=np.float64)
     if abs(values[2]) > 2.0 * math.pi:
         raise _error(task, f"the goal has a yaw of {values[2]:.4g}; angles are in radians")
     if arena_m and not contains(arena_m, float(values[0]), float(values[1])):
@@ -155,7 +193,7 @@ def _check_function(task: Task, name: str, arguments: tuple[FloatArray, ...], *,
     in_torch = _call(task, f"{name} of torch tensors (use array_api_compat.array_namespace)", function, *tensors)
     if not isinstance(in_torch, torch.Tensor):
         raise _error(task, f"{name} of torch tensors returns a {type(in_torch).__name__}; return a tensor")
-    torch_values = _values(task, f"{name} of torch tensors", in_torch.numpy(), values.shape, bool_wanted)
+    torch_values = _values(task, f"{name} of torch tensors", in_torch.detach().numpy(), values.shape, bool_wanted)
     if not bool_wanted and not np.allclose(torch_values, values, rtol=TORCH_TOLERANCE, atol=TORCH_TOLERANCE):
         raise _error(task, f"{name} differs between NumPy and torch")
     return values
@@ -163,7 +201,7 @@ def _check_function(task: Task, name: str, arguments: tuple[FloatArray, ...], *,
 
 def _values(task: Task, name: str, result: Any, shape: tuple[int, ...], bool_wanted: bool) -> FloatArray:
     """A result of a function of features as an array of the wanted shape and kind."""
-    array = np.asarray(result)
+    array: np.ndarray = _call(task, f"the value of {name} as an array", np.asarray, result)
     if array.shape != shape:
         raise _error(task, f"{name} returns the shape {array.shape} for features of shape {(*shape, 'F')}; "
                            f"return one value per row, {shape}")  # fmt: skip
@@ -173,7 +211,8 @@ def _values(task: Task, name: str, result: Any, shape: tuple[int, ...], bool_wan
         raise _error(task, f"{name} returns {array.dtype}; return {wanted}")
     if not np.isfinite(array.astype(np.float64)).all():
         raise _error(task, f"{name} is not finite; avoid a division by zero or a root of a negative number")
-    return array.astype(np.float64)
+    values: FloatArray = array.astype(np.float64)
+    return values
 
 
 def _check_summary(task: Task, starts: FloatArray) -> None:
@@ -182,11 +221,17 @@ def _check_summary(task: Task, starts: FloatArray) -> None:
     if not isinstance(summary, dict) or not all(isinstance(k, str) for k in summary):
         raise _error(task, "summary must return a dictionary of numbers by name")
     for name, value in summary.items():
-        if not isinstance(value, (int, float, np.floating)):
-            raise _error(task, f"summary has {value!r} under {name}; give a number")
-    if "success" not in summary:
-        raise _error(task, "summary lacks 'success' (1.0 or 0.0)")
-    _call(task, "outcome", task.outcome, summary)
+        if not isinstance(value, (numbers.Real, np.bool_)) or math.isinf(
+            _call(task, f"summary '{name}'", float, value)
+        ):
+            raise _error(task, f"summary has {value!r} under {name}; give a number (NaN: unknown)")
+    if taken := sorted(_RESULT_NAMES & summary.keys()):
+        raise _error(task, f"summary has '{taken[0]}', a figure that every episode has; choose another name")
+    if summary.get("success") not in (0, 1):
+        raise _error(task, "summary needs 'success' (1.0 or 0.0)")
+    text = _call(task, "outcome", task.outcome, summary)
+    if not isinstance(text, str):
+        raise _error(task, f"outcome returns {text!r}; return a text")
 
 
 __all__ = ["check_task"]

@@ -1,0 +1,43 @@
+"""Read JSON files that a person may have edited."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+_INTEGER_LIMIT = 2**63
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object. NaN, Infinity and numbers beyond the range of a float become NaN.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is not UTF-8 or not JSON, is no object, is nested too deeply, or has an integer beyond 64 bits.
+    """
+    try:
+        content = json.loads(
+            path.read_text(encoding="utf-8"), parse_int=_integer, parse_float=_number, parse_constant=_number
+        )
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(content, dict):
+        raise ValueError("it is not a JSON object")
+    return content
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    return value if math.isfinite(value) else math.nan
+
+
+def _integer(text: str) -> int:
+    value = int(text)
+    if abs(value) >= _INTEGER_LIMIT:
+        raise ValueError("it has an integer beyond 64 bits")
+    return value
+
+
+__all__ = ["read_json"]
