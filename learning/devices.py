@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 
@@ -19,6 +19,8 @@ DeviceName = Literal["cpu", "cuda"]
 
 def available(name: str) -> str:
     """Check that a device is available; returns its name. Raises ConfigError if torch does not find it."""
+    if name not in get_args(DeviceName):
+        raise ConfigError(f"--device {name}: choose one of {', '.join(get_args(DeviceName))}.")
     if torch.device(name).type == "cuda" and not torch.cuda.is_available():
         built = f"for CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
         raise ConfigError(

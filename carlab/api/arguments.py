@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import math
+import numbers
+from typing import Any
+
 from carlab.core.errors import ConfigError
 
 
-def above_zero(**values: float | None) -> None:
+def above_zero(**values: Any) -> None:
     """Raise ConfigError for an argument that is not a finite number above zero; None is valid."""
     for name, value in values.items():
-        if value is not None and not 0.0 < value < float("inf"):
-            raise ConfigError(f"--{name.replace('_', '-')} {value:g}: give a number above zero.")
+        if value is not None and not (isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf):
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: give a number above zero.")
 
 
-def at_least(minimum: int, **values: int | None) -> None:
-    """Raise ConfigError for an argument below ``minimum``; None is valid."""
+def whole_number(**values: Any) -> None:
+    """Raise ConfigError for an argument that is no integer; None is valid."""
+    for name, value in values.items():
+        if value is not None and not isinstance(value, numbers.Integral):
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: give a whole number.")
+
+
+def at_least(minimum: int, **values: Any) -> None:
+    """Raise ConfigError for an argument that is no integer or below ``minimum``; None is valid."""
+    whole_number(**values)
     for name, value in values.items():
         if value is not None and value < minimum:
             raise ConfigError(f"--{name.replace('_', '-')} {value}: give at least {minimum}.")

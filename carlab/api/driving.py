@@ -265,6 +265,8 @@ def _check(
         raise ConfigError(
             f"--policy {policy}: choose one of {', '.join(_policy_names())}, or the folder of a run of carlab learn."
         )
+    if not isinstance(policy, (str, Path)) and not callable(getattr(policy, "act", None)):
+        raise ConfigError(f"--policy {policy!r}: give a name, the folder of a run, or an object with the method act.")
     if max_throttle is not None and not 0.0 < max_throttle <= 1.0:
         raise ConfigError(f"--max-throttle {max_throttle:g}: give a number above 0 and at most 1.")
     if policy == "keyboard" and not has_screen():

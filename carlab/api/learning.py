@@ -7,9 +7,9 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
-from carlab.api.arguments import above_zero, at_least
+from carlab.api.arguments import above_zero, at_least, whole_number
 from carlab.api.learn_request import AUTO, Device, LearnRequest, Method, checked_simulator, training_plan
 from carlab.api.runs import (
     RunHooks,
@@ -271,9 +271,13 @@ def _with_view(hooks: LearnHooks, view: LiveView) -> LearnHooks:
 def _check(request: LearnRequest) -> None:
     from learning.devices import available
 
-    above_zero(episodes=request.episodes, updates=request.updates, ticks=request.ticks, model_steps=request.model_steps)
+    counts = {name: getattr(request, name) for name in ("episodes", "updates", "ticks", "model_steps")}
+    above_zero(**counts)
+    whole_number(**counts)
     at_least(0, history=request.history, seed=request.seed)
     available(request.device or "cpu")
+    if request.method not in get_args(Method):
+        raise ConfigError(f"--method {request.method}: choose one of {', '.join(get_args(Method))}.")
     if request.prior == AUTO and request.method != "gp-sim-posterior":
         raise ConfigError(
             f"--prior auto: its repairs are for --method gp-sim-posterior; {request.method} needs another --prior."

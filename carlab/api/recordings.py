@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import types
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -207,6 +208,7 @@ def resolved_mapping(
     Raises:
         ConfigError: the mapping file or an option is invalid.
     """
+    from carlab.core.errors import ConfigError
     from carlab.recording.column_mapping import CHANNELS, ColumnMapping, load_mapping, recognise_layout
     from carlab.recording.csv.table import read_csv
 
@@ -222,8 +224,10 @@ def resolved_mapping(
             whole[RENAMED_OPTIONS.get(name, name)] = value
     if isinstance(mapping, (str, Path)):
         mapping = load_mapping(mapping)
+    if not isinstance(mapping, (ColumnMapping, types.NoneType)):
+        raise ConfigError(f"mapping is {mapping!r}; give a TOML file or a ColumnMapping.")
     if not columns and not whole:
         return mapping
-    if not isinstance(mapping, ColumnMapping):
+    if mapping is None:
         mapping = recognise_layout(read_csv(path).header, path.name)
     return mapping.with_options(columns=columns, **whole)

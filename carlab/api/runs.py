@@ -155,7 +155,7 @@ def viewer_connection(live: bool, viewer: str | None) -> Callable[[RecordingStre
     if viewer is not None:
         from carlab.recording.rerun.viewer import connect_to_viewer
 
-        if not re.fullmatch(r"rerun(\+https?)?://[^/]+/proxy", viewer):
+        if not isinstance(viewer, str) or not re.fullmatch(r"rerun(\+https?)?://[^/]+/proxy", viewer):
             raise ConfigError(f"--viewer {viewer}: give the address of a viewer, rerun+http://HOST:9876/proxy.")
         return functools.partial(connect_to_viewer, address=viewer)
     if not live:

@@ -15,9 +15,11 @@ from carlab.api.runs import viewer_program
 from carlab.cli.console import console
 from carlab.cli.options import new_file
 from carlab.cli.recordings import load_episodes
-from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.errors import ConfigError, DataError, NotReadyError
 
 REPORT_FILE = "report.rrd"
+RRD_MAGIC = b"RRF"
+"""First bytes of a rerun recording of any version."""
 
 
 @dataclass
@@ -70,6 +72,9 @@ class View:
                 )
             path /= REPORT_FILE
         if required_file(path).suffix == ".rrd":
+            with path.open("rb") as file:
+                if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
+                    raise DataError(f"{path} is not a rerun recording; name another file, or write it again.")
             return _Source(path.stem, lambda rrd: path, None)
         episodes = load_episodes(path)
         if len(episodes) > 1:

@@ -6,13 +6,14 @@ Faults of the recording are repaired; the initial states are estimated, and the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.events import EventUse, mark_events
@@ -116,8 +117,8 @@ def score_recording(
         ConfigError: the share is out of range.
     """
     checked_held_out_share(holdout_share, DEFAULT.windows)
-    if not (horizon_s > 0 and stride_s > 0):
-        raise DataError(f"Horizon {horizon_s:g} s and stride {stride_s:g} s must be positive.")
+    if not all(isinstance(v, (int, float)) and 0.0 < v < math.inf for v in (horizon_s, stride_s)):
+        raise ConfigError(f"Horizon {horizon_s} s and stride {stride_s} s must be finite numbers above zero.")
     if not any(episode.ticks for episode in episodes):
         raise DataError("The recording contains no command; give a recording of a drive.")
     repaired, _, faults = recording_faults.check(episodes, [], config)

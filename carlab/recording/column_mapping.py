@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -57,6 +58,8 @@ class ColumnSource:
     def factor(self, channel: str) -> float:
         """Factor from the column to the channel's SI unit. Raises ConfigError for an unknown unit."""
         units = UNITS[channel]
+        if not (math.isfinite(self.scale) and self.scale != 0.0):
+            raise ConfigError(f"The scale of {channel} is {self.scale:g}; give a finite number other than 0.")
         if self.unit is None:
             return self.sign * self.scale
         if self.unit not in units:
@@ -107,6 +110,8 @@ class ColumnMapping:
 
     def __post_init__(self) -> None:
         check_keys(self.columns, CHANNELS, f"the columns of mapping '{self.layout}'")
+        if self.rate_hz is not None and not 0.0 < self.rate_hz < math.inf:
+            raise ConfigError(f"The rate of the rows is {self.rate_hz:g} Hz; give a number above zero.")
         for channel, source in self.columns.items():
             source.factor(channel)
         check_keys(dict.fromkeys(self.references.values()), CHANNELS, f"the references of mapping '{self.layout}'")
@@ -118,12 +123,13 @@ class ColumnMapping:
         """
         known = [f.name for f in dataclasses.fields(self) if f.name != "columns"]
         check_keys(options, known, "the mapping's options")
+        checked = from_table(ColumnMapping, {"columns": {}, **options}, "the mapping's options")
         sources = dict(self.columns)
         for channel, changes in (columns or {}).items():
             check_keys({channel: None}, CHANNELS, "the mapping's columns")
-            check_keys(changes, [f.name for f in dataclasses.fields(ColumnSource)], f"the changes to {channel}")
-            sources[channel] = dataclasses.replace(sources.get(channel, ColumnSource(channel)), **changes)
-        return dataclasses.replace(self, columns=sources, **options)
+            source = dataclasses.asdict(sources.get(channel, ColumnSource(channel)))
+            sources[channel] = from_table(ColumnSource, {**source, **changes}, f"the changes to {channel}")
+        return dataclasses.replace(self, columns=sources, **{name: getattr(checked, name) for name in options})
 
 
 def load_mapping(path: Path | str) -> ColumnMapping:

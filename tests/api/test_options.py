@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,10 @@ from carlab.cli.import_ import Import
 from carlab.cli.learn import Learn
 from carlab.cli.options import CarOptions, TaskOptions
 from carlab.cli.replay import Replay
+from carlab.core.errors import ConfigError
+from carlab.diagnosis.score_recording import score_recording
 from carlab.recording.column_mapping import CHANNELS, ColumnMapping
+from sim_backends.car_parameters import SimulatorConfig
 
 CASES = [
     (Drive, carlab.drive, {"verbose"}),
@@ -101,3 +105,51 @@ def test_replay_of_recorded_actions_reaches_the_same_position(tmp_path: Path) ->
     assert replayed.folder.name.endswith("replay")
     assert replayed.episodes[0].data.ticks == 30
     assert replayed.episodes[0].data.states[-1, :2] == pytest.approx(episode.states[30, :2], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: carlab.drive("sim", episodes=1.5), "--episodes 1.5: give a whole number"),
+        (lambda: carlab.drive("sim", ticks=2.5), "--ticks 2.5: give a whole number"),
+        (lambda: carlab.drive("sim", seed="x"), "--seed x: give a whole number"),
+        (lambda: carlab.drive("sim", policy=5), "--policy 5: give a name"),
+        (lambda: carlab.drive("sim", viewer=5), "--viewer 5: give the address"),
+        (lambda: carlab.learn("sim", updates=1.5), "--updates 1.5: give a whole number"),
+        (lambda: carlab.learn("sim", episodes="a"), "--episodes a: give a number"),
+        (lambda: carlab.learn("sim", method="x"), "--method x: choose one of gp-sim-posterior"),
+        (lambda: carlab.learn("sim", device="tpu"), "--device tpu: choose one of cpu, cuda"),
+    ],
+)
+def test_argument_of_a_wrong_type_is_refused_before_a_run_folder_is_made(
+    call: Callable[[], object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=message):
+        call()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gaps": "zz"}, "'gaps' in the mapping's options is 'zz'"),
+        ({"rate": -5.0}, "The rate of the rows is -5 Hz"),
+        ({"vx_scale": 0.0}, "The scale of vx is 0"),
+        ({"vx_scale": math.inf}, "The scale of vx is inf"),
+        ({"vx_scale": "a"}, "'scale' in the changes to vx must be a number"),
+        ({"steering_sign": 3}, "'sign' in the changes to steering is 3"),
+        ({"mapping": 5}, "mapping is 5"),
+    ],
+)
+def test_invalid_options_of_a_csv_are_refused(options: dict[str, object], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "drive.csv"
+    path.write_text(",".join(CHANNELS) + "\n" + "".join(f"{k / 30},0,0,0,0,0,0,0,0\n" for k in range(5)))
+    with pytest.raises(ConfigError, match=message):
+        carlab.load(path, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("horizon_s", [0.0, -1.0, math.nan, math.inf, "1", None])
+def test_horizon_of_a_prediction_is_a_finite_number_above_zero(horizon_s: object) -> None:
+    with pytest.raises(ConfigError, match="must be finite numbers above zero"):
+        score_recording([], SimulatorConfig(), horizon_s=horizon_s)  # type: ignore[arg-type]

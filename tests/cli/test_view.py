@@ -36,6 +36,17 @@ def test_folder_of_a_diagnosis_opens_its_report_and_other_folders_are_refused(ca
     code, text = carlab("view", tmp_path, "--save", tmp_path / "x.rrd")
     assert code == 2
     assert "is not the folder of a run or of a diagnosis" in text
-    (tmp_path / "report.rrd").write_bytes(b"the report")
+    (tmp_path / "report.rrd").write_bytes(b"RRF2 the report")
     assert carlab("view", tmp_path, "--save", tmp_path / "x.rrd")[0] == 0
-    assert (tmp_path / "x.rrd").read_bytes() == b"the report"
+    assert (tmp_path / "x.rrd").read_bytes() == b"RRF2 the report"
+
+
+@pytest.mark.parametrize("content", [b"", b"RR", b"\x89MCAP0\r\n"])
+def test_file_that_is_no_rerun_recording_is_refused_and_not_copied(
+    carlab: Carlab, tmp_path: Path, content: bytes
+) -> None:
+    (tmp_path / "some.rrd").write_bytes(content)
+    code, text = carlab("view", tmp_path / "some.rrd", "--save", tmp_path / "copy.rrd")
+    assert code == 1
+    assert "some.rrd is not a rerun recording" in text
+    assert not (tmp_path / "copy.rrd").exists()
