@@ -51,6 +51,9 @@ class Import:
     velocities: Literal["columns", "pose"] | None = None
     """Take velocities from their columns, or estimate them from the pose."""
 
+    t_unit: str | None = None
+    """s, ms, us or ns."""
+
     x_unit: str | None = None
     """Unit of x: m, cm, mm."""
 

@@ -53,6 +53,14 @@ class TestConversion:
             import_csv(foreign.write(tmp_path / "commas.csv", clean)).episode.states,
         )
 
+    @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+    def test_stamps_in_another_unit_are_refused_until_it_is_declared(self, clean, tmp_path, unit, factor):
+        path = foreign.write(tmp_path / "run.csv", {**clean, "t": clean["t"] * factor})
+        with pytest.raises(DataError, match=f"looks like {unit}; say so with --t-unit {unit}"):
+            import_csv(path)
+        declared = CANONICAL.with_options(columns={"t": {"unit": unit}})
+        np.testing.assert_allclose(import_csv(path, mapping=declared).episode.times_s, EVEN, atol=1e-6)
+
     def test_mapping_file_converts_names_units_and_signs(self, clean, tmp_path):
         columns = {
             "stamp": clean["t"] * 1e3 + 5e6,

@@ -8,7 +8,7 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.report import Finding, Severity
-from carlab.recording.column_mapping import COMMAND_CHANNELS, POSE_CHANNELS, ColumnMapping
+from carlab.recording.column_mapping import COMMAND_CHANNELS, POSE_CHANNELS, UNITS, ColumnMapping
 from carlab.recording.faults.pose import frozen_rows, stale_rows
 from carlab.recording.faults.robust import LAGS_S, correlation, fit_column, wrapped
 from carlab.recording.faults.stamps import gap_rows
@@ -16,6 +16,8 @@ from carlab.recording.pose_velocity import BoolArray, IndexArray
 
 MAX_NUMBER = 1e12
 """Larger numbers in SI units are markers of missing values or corrupt data."""
+MAX_PERIOD_S = 2.0
+"""Longest plausible time between two rows; a longer one has another unit (milliseconds, nanoseconds)."""
 MAX_COMMAND = 1.05
 """A calibration overshoots by up to 5 %; a larger command has another unit (degrees, per cent, microseconds)."""
 
@@ -74,9 +76,29 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
 
 def check_stamps(t_s: FloatArray, mapping: ColumnMapping) -> list[Finding]:
     """Gaps, jitter and a clock that was constructed afterwards. ``t_s`` (N,) increases."""
+    if (unit := _check_time_unit(t_s, mapping)) is not None:
+        return [unit]
     gaps = gap_rows(t_s)
     findings = [_gap_finding(t_s, gaps, mapping)] if len(gaps) else []
     return findings + (_check_even_stamps(t_s) or _check_jitter(t_s, gaps))
+
+
+def _check_time_unit(t_s: FloatArray, mapping: ColumnMapping) -> Finding | None:
+    """Stamps that are too far apart to control a car but plausible in another unit, if no unit is declared."""
+    source = mapping.columns.get("t")
+    median_s = float(np.median(np.diff(t_s)))
+    if source is None or source.unit is not None or median_s <= MAX_PERIOD_S:
+        return None
+    unit = next((u for u, factor in UNITS["t"].items() if median_s * factor <= MAX_PERIOD_S), None)
+    if unit is None:
+        return None
+    sentence = (
+        f"Column '{source.name}': rows are {median_s:.4g} s apart; the unit looks like {unit}; say so with --t-unit "
+        f"{unit} (or --t-unit s)."
+    )
+    return Finding(
+        "wrong_unit", "t", Severity.ERROR, sentence, evidence={"median_s": median_s}, option=f"--t-unit {unit}"
+    )
 
 
 def _gap_finding(t_s: FloatArray, gaps: IndexArray, mapping: ColumnMapping) -> Finding:
