@@ -8,7 +8,6 @@ import html
 import logging
 import math
 import os
-import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -150,13 +149,12 @@ def viewer_connection(live: bool, viewer: str | None) -> Callable[[RecordingStre
 
     Raises:
         ConfigError: the address is invalid.
-        NotReadyError: no viewer can be opened here.
+        NotReadyError: no viewer can be opened here, or none listens at the address.
     """
     if viewer is not None:
-        from carlab.recording.rerun.viewer import connect_to_viewer
+        from carlab.recording.rerun.viewer import check_viewer, connect_to_viewer
 
-        if not isinstance(viewer, str) or not re.fullmatch(r"rerun(\+https?)?://[^/]+/proxy", viewer):
-            raise ConfigError(f"--viewer {viewer}: give the address of a viewer, rerun+http://HOST:9876/proxy.")
+        check_viewer(viewer)
         return functools.partial(connect_to_viewer, address=viewer)
     if not live:
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import queue
+import socket
 import threading
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from carlab.experiment.campaign import live_view
 from carlab.experiment.campaign.figures import predict_ahead
 from carlab.experiment.campaign.live_view import Activity, LiveSettings, LiveView, show
 from carlab.recording.mcap.source import read_documents, read_episode
+from carlab.recording.rerun.viewer import check_viewer
 from tests.helpers.rerun_files import cells, tabs
 
 
@@ -101,3 +103,22 @@ def test_predicted_path_follows_the_policy_with_the_spread_of_the_model() -> Non
         ahead.mean[:, :, 0], [steps, 2.0 + steps], atol=1e-5, err_msg="commands are clipped to 1"
     )
     np.testing.assert_allclose(ahead.across_std, [0.01 * np.sqrt(steps)] * 2, rtol=0.06, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "address", ["localhost:9876", "http://h:1/proxy", "rerun+http://h:99999/proxy", "rerun+http:///proxy"]
+)
+def test_text_that_is_no_address_of_a_viewer_is_refused(address: str) -> None:
+    with pytest.raises(ConfigError, match="give the address of a viewer"):
+        check_viewer(address)
+
+
+def test_address_where_no_viewer_listens_is_refused_before_the_drive(tmp_path: Path) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{unused.getsockname()[1]}"
+        with pytest.raises(NotReadyError, match=f"no viewer listens at {address}"):
+            carlab.drive(viewer=f"rerun+http://{address}/proxy", out=tmp_path)
+        unused.listen()
+        check_viewer(f"rerun+http://{address}/proxy")
+    assert list(tmp_path.iterdir()) == []

@@ -9,13 +9,16 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import rerun as rr
 
 from carlab.core.clock import monotonic_ns
-from carlab.core.errors import NotReadyError
+from carlab.core.errors import ConfigError, NotReadyError
 
 ADDRESS = "rerun+http://127.0.0.1:{port}/proxy"
+DEFAULT_PORT = 9876
+_CONNECT_TIMEOUT_S = 3.0
 _START_TIMEOUT_NS = 30 * 10**9
 
 
@@ -66,9 +69,39 @@ def open_viewer(stream: rr.RecordingStream, program: Path) -> None:
     connect_to_viewer(stream, ADDRESS.format(port=port))
 
 
+def check_viewer(address: str) -> None:
+    """Check that a viewer listens at an address such as rerun+http://HOST:9876/proxy.
+
+    Raises:
+        ConfigError: it is no address of a viewer.
+        NotReadyError: no program listens there.
+    """
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname, parts.port or DEFAULT_PORT
+        is_valid = parts.scheme in ("rerun", "rerun+http", "rerun+https") and parts.path == "/proxy"
+    except (ValueError, AttributeError, TypeError):
+        is_valid, host = False, None
+    if not is_valid or host is None:
+        raise ConfigError(f"--viewer {address}: give the address of a viewer, rerun+http://HOST:9876/proxy.")
+    try:
+        socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT_S).close()
+    except OSError as error:
+        reason = f"no viewer listens at {host}:{port} ({error}); open it there with 'rerun', or remove --viewer."
+        raise NotReadyError("The viewer", [reason]) from error
+
+
 def connect_to_viewer(stream: rr.RecordingStream, address: str) -> None:
     """Connect a stream to an open viewer."""
     stream.connect_grpc(address)
 
 
-__all__ = ["ADDRESS", "connect_to_viewer", "free_port", "open_viewer", "rerun_program", "wait_until_open"]
+__all__ = [
+    "ADDRESS",
+    "check_viewer",
+    "connect_to_viewer",
+    "free_port",
+    "open_viewer",
+    "rerun_program",
+    "wait_until_open",
+]
