@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from carlab.api.arguments import above_zero, at_least
 from carlab.cli.console import console, fail, progress, table
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
@@ -102,8 +103,9 @@ class Prove:
         from carlab.benchmark.proof.runner import Proof
         from carlab.experiment.episodes.interrupts import Interrupts
 
-        if self.jobs < 1 or self.timeout <= 0.0:
-            raise ConfigError("--jobs and --timeout: give numbers above zero.")
+        above_zero(jobs=self.jobs, timeout=self.timeout)
+        at_least(0, seed=self.seed)
+        at_least(1, limit=self.limit)
         if self.ray and (self.jobs > 1 or self.simulator != "own"):
             raise ConfigError("--ray replaces --jobs, and needs --simulator own; leave one of them out.")
         if self.set == "real":
@@ -131,7 +133,6 @@ class Prove:
         from carlab.cli.prove_real import car_path, require_tool, run_stages, score, tables_in
         from carlab.experiment.episodes.interrupts import Interrupts
 
-        self._check_limit()
         require_tool(self.tool)
         car, recordings = car_path(self.car, self.out), tables_in(self.data)
         specs, refused = drawn_specs(self.seed, self.limit, recordings)
@@ -157,10 +158,6 @@ class Prove:
         from carlab.benchmark.proof.ray_executor import RayExecutor
 
         return RayExecutor(self.ray)
-
-    def _check_limit(self) -> None:
-        if self.limit is not None and self.limit < 1:
-            raise ConfigError(f"--limit {self.limit}: give at least 1.")
 
     def _study(self) -> int:
         from carlab.benchmark.public_simulators.commonroad import require_public_simulator
@@ -211,7 +208,6 @@ class Prove:
         from carlab.benchmark.cases.hard_set import drawn_evenly, hard_set
         from carlab.benchmark.cases.proof_set import drawn, full_set, short_set
 
-        self._check_limit()
         if self.set == "short":
             specs = short_set("test", self.seed)
         elif self.set in ("hard", "hard-development"):

@@ -28,18 +28,19 @@ def require_tool(verb: str) -> None:
 
 def car_path(car: str, folder: Path) -> Path:
     """The car file, written to the folder if it is a preset."""
+    import tomli_w
+
     from carlab.api.cars import load_car
 
     if not car:
         raise ConfigError("--set real needs the car file of the recordings; add --car FILE.")
     if Path(car).is_file():
         return Path(car)
-    load_car(car)
-    from importlib import resources
-
+    file = load_car(car)
+    text = file.text or tomli_w.dumps(file.simulator.to_tables())
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{car}.toml"
-    path.write_text((resources.files("sim_backends") / "presets" / f"{car}.toml").read_text("utf-8"), "utf-8")
+    path.write_text(text, encoding="utf-8")
     return path
 
 

@@ -106,9 +106,9 @@ def test_other_cases_in_the_same_folder_are_refused(proof_dir: Path, carlab: Car
     assert "contains a proof of other cases" in text
 
 
-def test_options_of_zero_are_refused(tmp_path: Path, carlab: Carlab) -> None:
-    for option in ("--jobs", "--limit", "--timeout"):
-        code, text = carlab("prove", "--out", tmp_path / "proof", option, 0)
+def test_numbers_out_of_range_are_refused(tmp_path: Path, carlab: Carlab) -> None:
+    for option, value in (("--jobs", 0), ("--limit", 0), ("--timeout", 0), ("--timeout", "nan"), ("--seed", -1)):
+        code, text = carlab("prove", "--out", tmp_path / "proof", option, value)
         assert code == 2
         assert option in text
     assert not (tmp_path / "proof").exists()

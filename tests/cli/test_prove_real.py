@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 from recorded_drives import drive
 
+from carlab.api.cars import load_car
 from carlab.cli import prove
+from carlab.cli.prove_real import car_path
 from carlab.recording import write_csv
 from sim_backends import SimulatorConfig
 
@@ -51,3 +53,9 @@ def test_missing_data_and_car_are_refused(data: Path, tmp_path: Path, carlab: Ca
         assert code == 2
         assert words in text
     assert "Traceback" not in text
+
+
+@pytest.mark.parametrize("car", ["sim", "rc_car"])
+def test_named_car_becomes_a_file_with_its_parameters(car: str, tmp_path: Path) -> None:
+    path = car_path(car, tmp_path / "proof")
+    assert load_car(path).simulator == load_car(car).simulator
