@@ -7,6 +7,7 @@ import functools
 import html
 import logging
 import math
+import multiprocessing
 import os
 import shutil
 import sys
@@ -84,6 +85,7 @@ def new_run(
     """Create a run folder with the program's log; remove it finally if its subfolder ``keep`` is empty."""
     from carlab.recording.run_folder import RunDirectory
 
+    _refuse_second_execution()
     run = RunDirectory.create(out, name, config_toml=choice.config_toml)
     try:
         with _logged(run, choice, hooks):
@@ -98,9 +100,19 @@ def existing_run(path: Path | str, choice: CarChoice, hooks: RunHooks) -> Iterat
     """Open the folder of a resumed run; the program's log is appended."""
     from carlab.recording.run_folder import RunDirectory
 
+    _refuse_second_execution()
     run = RunDirectory.open_existing(path)
     with _logged(run, choice, hooks):
         yield run
+
+
+def _refuse_second_execution() -> None:
+    """Raise ConfigError in a child process that executes the program's script again: it would open the car twice."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise ConfigError(
+            "The processes of a run execute your script again; put its calls of carlab under "
+            "'if __name__ == \"__main__\":'."
+        )
 
 
 @contextmanager
