@@ -207,6 +207,20 @@ def test_resume_refuses_an_edited_campaign(
     assert "cannot be resumed (campaign.json: " in text
 
 
+@pytest.mark.parametrize("content", ["x = [", None])
+def test_run_whose_car_is_unknown_is_not_resumed(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path, content: str | None
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(learned[2], folder)
+    (folder / "config.toml").unlink()
+    if content is not None:
+        (folder / "config.toml").write_text(content)
+    code, text = carlab("learn", "--resume", folder, "--car", "eth_rc_car")
+    assert code == 1
+    assert "its car is unknown (config.toml: " in text
+
+
 def test_invalid_prior_file_is_refused_with_the_name_of_the_key(carlab: Carlab, tmp_path: Path) -> None:
     path = tmp_path / "model.toml"
     path.write_text("[vehicle]\nmas = 1.6\n", encoding="utf-8")

@@ -282,20 +282,29 @@ CONNECTION_TABLES = ("hardware", "mocap")
 
 
 def check_same_car(run: RunDirectory, choice: CarChoice, car_options: str) -> None:
-    """Raise ConfigError if a campaign was started with another car, other parameters or another ``--dry-run``.
+    """Check that a campaign was started with the same car, its parameters and the same ``--dry-run``.
 
     Args:
         run: folder of the campaign.
         choice: the car that resumes the campaign.
         car_options: the command-line options that select the car.
+
+    Raises:
+        ConfigError: it was started with another one.
+        DataError: the folder's config.toml cannot be read.
     """
     try:
-        content = read_json(run.path / CAMPAIGN_FILE)
+        saved_options = str(read_json(run.path / CAMPAIGN_FILE).get("car", car_options))
+    except (OSError, ValueError):
+        return  # No campaign: ``resumed_campaign`` raises.
+    try:
         texts = (run.config_toml, choice.config_toml)
         tables = [{k: v for k, v in tomllib.loads(text).items() if k not in CONNECTION_TABLES} for text in texts]
-        saved_options = str(content.get("car", car_options))
-    except (OSError, ValueError, AttributeError):
-        return  # No campaign: ``resumed_campaign`` raises.
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"{run.path} cannot be resumed, because its car is unknown (config.toml: {error}); restore the file, or "
+            "start a new run."
+        ) from error
     kinds = [text.partition("\n")[0] for text in texts]
     if kinds[0] == kinds[1] and tables[0] == tables[1] and (DRY_RUN in saved_options) == (DRY_RUN in car_options):
         return
