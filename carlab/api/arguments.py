@@ -12,8 +12,10 @@ from carlab.core.errors import ConfigError
 def above_zero(**values: Any) -> None:
     """Raise ConfigError for an argument that is not a finite number above zero; None is valid."""
     for name, value in values.items():
-        if value is not None and not (isinstance(value, numbers.Real) and 0.0 < float(value) < math.inf):
-            raise ConfigError(f"--{name.replace('_', '-')} {value}: give a number above zero.")
+        is_number = isinstance(value, numbers.Real)
+        if value is not None and not (is_number and 0.0 < float(value) < math.inf):
+            text = f"{float(value):g}" if is_number else value
+            raise ConfigError(f"--{name.replace('_', '-')} {text}: give a number above zero.")
 
 
 def whole_number(**values: Any) -> None:
