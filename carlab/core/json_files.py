@@ -10,16 +10,21 @@ from typing import Any
 _INTEGER_LIMIT = 2**63
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object. NaN, Infinity and numbers beyond the range of a float become NaN.
+def read_json(path: Path, *, keep_infinite: bool = False) -> dict[str, Any]:
+    """Read a JSON object. Infinity and numbers beyond the range of a float become NaN.
+
+    Args:
+        path: the file.
+        keep_infinite: keep them infinite: parameters of effects may be, for example a limit that is never reached.
 
     Raises:
         OSError: the file cannot be read.
         ValueError: it is not UTF-8 or not JSON, is no object, is nested too deeply, or has an integer beyond 64 bits.
     """
+    number = float if keep_infinite else _finite
     try:
         content = json.loads(
-            path.read_text(encoding="utf-8"), parse_int=_integer, parse_float=_number, parse_constant=_number
+            path.read_text(encoding="utf-8"), parse_int=_integer, parse_float=number, parse_constant=number
         )
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
@@ -28,7 +33,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _number(text: str) -> float:
+def _finite(text: str) -> float:
     value = float(text)
     return value if math.isfinite(value) else math.nan
 

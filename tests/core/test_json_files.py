@@ -26,3 +26,9 @@ def test_numbers_that_are_not_finite_become_nan(tmp_path: Path) -> None:
     values = read_json(path)["a"]
     assert all(math.isnan(v) for v in values[:4])
     assert values[4:] == [1.5, 3]
+
+
+def test_infinite_numbers_are_kept_on_request(tmp_path):
+    path = tmp_path / "limits.json"
+    path.write_text('{"force": Infinity, "other": -1e999}')
+    assert read_json(path, keep_infinite=True) == {"force": math.inf, "other": -math.inf}

@@ -77,7 +77,7 @@ def read_version(run: RunDirectory, episode: int) -> PriorVersion | None:
     if not path.is_file():
         return None
     try:
-        return PriorVersion.from_dict(read_json(path))
+        return PriorVersion.from_dict(read_json(path, keep_infinite=True))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path} cannot be read ({error}); remove it, and the run repeats the repair.") from error
 
@@ -117,7 +117,7 @@ def repair(request: RepairRequest) -> PriorVersion:
     car = SimulatorConfig.from_tables(tomllib.loads(request.car_toml))
     episodes = [read_episode(path) for path in request.recordings if has_ticks(path)]
     number = len(request.recordings)
-    check: dict[str, Any] = read_json(request.folder / CHECK_FILE)
+    check: dict[str, Any] = read_json(request.folder / CHECK_FILE, keep_infinite=True)
     newest = episodes[-1] if episodes and has_ticks(request.recordings[-1]) else None
     tested = [c for c in request.before.corrections if c.episodes < number]
     contradicted = contradicted_by(newest, car, request.before.corrections, tested) if newest is not None else ()
