@@ -94,9 +94,11 @@ def run_repair_subprocess(request: RepairRequest, stop: Callable[[], bool] = lam
     child.start()
     sender.close()
     try:
-        while not receiver.poll(POLL_S):
-            if stop():
-                return None
+        while not stop():
+            if receiver.poll(POLL_S):
+                break
+        else:
+            return None
         version: PriorVersion = receiver.recv()
     except EOFError:
         child.join()
