@@ -15,11 +15,9 @@ from carlab.api.runs import viewer_program
 from carlab.cli.console import console
 from carlab.cli.options import new_file
 from carlab.cli.recordings import load_episodes
-from carlab.core.errors import ConfigError, DataError, NotReadyError
+from carlab.core.errors import ConfigError, NotReadyError
 
 REPORT_FILE = "report.rrd"
-RRD_MAGIC = b"RRF"
-"""First bytes of a rerun recording of any version."""
 
 
 @dataclass
@@ -72,9 +70,9 @@ class View:
                 )
             path /= REPORT_FILE
         if required_file(path).suffix == ".rrd":
-            with path.open("rb") as file:
-                if file.read(len(RRD_MAGIC)) != RRD_MAGIC:
-                    raise DataError(f"{path} is not a rerun recording; name another file, or write it again.")
+            from carlab.recording.rerun.viewer import check_rerun_file
+
+            check_rerun_file(path)
             return _Source(path.stem, lambda rrd: path, None)
         episodes = load_episodes(path)
         if len(episodes) > 1:

@@ -11,11 +11,11 @@ _INTEGER_LIMIT = 2**63
 
 
 def read_json(path: Path, *, keep_infinite: bool = False) -> dict[str, Any]:
-    """Read a JSON object. Infinity and numbers beyond the range of a float become NaN.
+    """Read a JSON object. Infinite numbers become NaN, also those beyond the range of a float.
 
     Args:
         path: the file.
-        keep_infinite: keep them infinite: parameters of effects may be, for example a limit that is never reached.
+        keep_infinite: return infinite numbers as they are. The identity value of a limit is infinite.
 
     Raises:
         OSError: the file cannot be read.

@@ -130,12 +130,12 @@ def _drift_of(
         settings: conditions of a drift.
     """
     own = held_out.windows.recording == number
-    judge = replace(held_out, windows=held_out.windows.take(own))
+    held_out_part = replace(held_out, windows=held_out.windows.take(own))
     slow = slowly_adapted(EVERYTHING)
-    gains = [_gain_z(judge, errors[name][own], slow.errors[own], settings) for name in BASELINES]
+    gains = [_gain_z(held_out_part, errors[name][own], slow.errors[own], settings) for name in BASELINES]
     is_drift = min(gains) >= settings.gain_z_min
     changes: tuple[Change, ...] = ()
-    if is_drift and any(mask := _changed(judge, own, errors["model"], slowly_adapted, settings)):
+    if is_drift and any(mask := _changed(held_out_part, own, errors["model"], slowly_adapted, settings)):
         changes = _changes(slowly_adapted(mask).model.series(), number, mask, along_fitted(mask), settings)
     shown = np.flatnonzero(series.recording == number)
     shown = shown[:: max(1, -(-len(shown) // settings.series_points))]
@@ -156,16 +156,16 @@ def _drift_of(
     )
 
 
-def _gain_z(judge: HeldOut, before: FloatArray, after: FloatArray, settings: DriftSettings) -> float:
+def _gain_z(held_out_part: HeldOut, before: FloatArray, after: FloatArray, settings: DriftSettings) -> float:
     """Gain from errors ``before`` to ``after`` (S, 6) [clustered standard errors]; 0 with too few blocks."""
-    if len(np.unique(judge.windows.block)) < settings.min_blocks:
+    if len(np.unique(held_out_part.windows.block)) < settings.min_blocks:
         return 0.0
-    gain, error = judge.gain(before, after)
+    gain, error = held_out_part.gain(before, after)
     return gain / error
 
 
 def _changed(
-    judge: HeldOut,
+    held_out_part: HeldOut,
     own: NDArray[np.bool_],
     plain: FloatArray,
     slowly_adapted: Callable[[Mask], _SlowAdaptation],
@@ -176,7 +176,7 @@ def _changed(
     current = plain[own]
     while not all(mask):
         larger = [tuple(old or k == new for k, old in enumerate(mask)) for new in np.flatnonzero(~np.array(mask))]
-        gains = [judge.gain(current, slowly_adapted(each).errors[own]) for each in larger]
+        gains = [held_out_part.gain(current, slowly_adapted(each).errors[own]) for each in larger]
         best = int(np.argmax([gain for gain, _ in gains]))
         gain, error = gains[best]
         if gain < settings.gain_z_min * error:

@@ -5,8 +5,8 @@ Inputs of a network are pose and velocities in the world frame; it predicts thei
 of the yaw as independent outputs. Without a simulator the weight of the Gaussian-process prior is ``1 / (L (batch +
 points))``, because the authors average its score over particles and points and sum the likelihood; the repulsive term
 is weaker by ``1 / L``; and at their bandwidth the kernel matrix is the identity, so that particles do not interact.
-``mended`` fits have none of these slips; their bandwidth follows the median heuristic. Draws of the simulator are taken
-once.
+``mended`` fits have none of these errors; their bandwidth follows the median heuristic. Draws of the simulator are
+taken once.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ PATIENCE = 3
 
 
 def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, mended: bool = False) -> FsvgdSettings:
-    """The authors' settings; ``mended`` without the slips of their code."""
+    """The authors' settings; ``mended`` without the errors of their code."""
     noise = tuple(s / o for s, o in zip(NOISE_STD, CHANGE_STD, strict=True))
     settings = FsvgdSettings(
         particles=PARTICLES, steps=steps, batch=BATCH, measurement_points=POINTS, bandwidth=0.2, natural=False,
@@ -65,7 +65,7 @@ def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, men
     )  # fmt: skip
     if mended:
         return replace(settings, bandwidth=None)
-    return settings.with_published_slips(BATCH, with_simulator=with_simulator)
+    return settings.with_published_errors(BATCH, with_simulator=with_simulator)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +141,7 @@ def fit_authors_fsvgd(
         progress: called with the number of steps done.
         device: of the fit; random numbers are drawn on the CPU.
         simulator: prior of Sim-FSVGD; None: FSVGD.
-        mended: without the slips of the authors' code.
+        mended: without the errors of the authors' code.
 
     Raises:
         DataError: the episodes hold too few rows.

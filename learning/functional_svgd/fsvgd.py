@@ -129,8 +129,8 @@ class FsvgdSettings:
     patience: int = 0
     seed: int = 0
 
-    def with_published_slips(self, rows: int, *, with_simulator: bool) -> FsvgdSettings:
-        """Copy with the slips of the authors' code (lasgroup/simulation_transfer at 547fa14).
+    def with_published_errors(self, rows: int, *, with_simulator: bool) -> FsvgdSettings:
+        """Copy with the errors of the authors' code (lasgroup/simulation_transfer at 547fa14).
 
         Only the driving term is summed over the particles, so repulsion is weaker by 1 / L. Without a simulator, the
         prior's score is averaged over particles and measurement points, whereas the likelihood is summed.

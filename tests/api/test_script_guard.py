@@ -1,4 +1,4 @@
-"""A script without the guard of its main module learns that it needs one, and drives the car once only."""
+"""A script without a main guard: its child process ends with one sentence and opens no car."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ carlab.learn("sim", episodes=1, ticks=10, updates=10, model_steps=10, history=1,
 """
 
 
-def test_unguarded_script_is_told_to_add_the_guard(tmp_path: Path) -> None:
+def test_script_without_a_main_guard_ends_with_the_remedy(tmp_path: Path) -> None:
     path = tmp_path / "script.py"
     path.write_text(SCRIPT, encoding="utf-8")
     ended = subprocess.run([sys.executable, path], cwd=tmp_path, capture_output=True, text=True, check=False)

@@ -200,7 +200,7 @@ def test_hidden_effect_changes_the_rate_as_its_equation(name, acceleration):
     assert np.allclose((with_effect - without).numpy(), expected, atol=1e-9)
 
 
-def test_published_slips_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
+def test_published_errors_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
     """Authors' bnn_fsvgd.py: only the driving term is summed; the Gaussian process has weight 1 / (L (batch + k))."""
     received = {}
 

@@ -195,7 +195,8 @@ class TestOutliers:
     def error(self, mean):
         return np.sqrt(((np.asarray(mean) - truth(self.query)) ** 2).mean(axis=0))
 
-    @pytest.mark.parametrize(("model", "size"), [(None, 3.0), (Linear(), 3.0), (Linear(), 30.0)])
+    @pytest.mark.parametrize("model", [None, Linear()])
+    @pytest.mark.parametrize("size", [3.0, 30.0])
     def test_outliers_hardly_change_the_prediction(self, model, size):
         """A Gaussian process with the same covariance and Gaussian noise follows the outliers."""
         y = self.with_outliers(size)
@@ -266,9 +267,9 @@ class TestRestarts:
         ("model", "expected"), [(None, 0.01), (None, PRIOR_DISCREPANCY_STD), (Linear(), PRIOR_DISCREPANCY_STD)], ids=str
     )
     def test_restarts_raise_the_held_out_density(self, model, expected):
-        """The average gain over two data sets is clear and no data set loses."""
+        """The average gain over three data sets is clear and no data set loses."""
         gains = []
-        for seed in range(2):
+        for seed in range(3):
             query, y = rows(300, 100 + seed)
             single, restarted = (
                 infer(

@@ -28,7 +28,7 @@ def means(scores: Iterable[Score], figure: str = "nll") -> dict[tuple[str, int],
 
 def test_simulator_posterior_beats_baselines_on_ten_pendulum_rows() -> None:
     """Drag, friction and motor lag are not in the prior."""
-    nll = means(run_study("pendulum_motor", rows=(10,), seeds=1, methods=(OURS, *BASELINES), steps=500))
+    nll = means(run_study("pendulum_motor", rows=(10,), seeds=1, methods=(OURS, *BASELINES), steps=1000))
     assert nll[OURS, 10] < -5.7
     assert all(nll[OURS, 10] < nll[name, 10] - 1.0 for name in BASELINES), nll
 

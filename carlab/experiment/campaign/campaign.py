@@ -345,10 +345,10 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
         tables = content.get("questioned")
         checked_simulator = None if tables is None else SimulatorConfig.from_tables(tables)
         return Campaign(
-            choice, plan, _typed(content, "episodes", int), run, hooks,
-            None if content["ticks"] is None else _typed(content, "ticks", int), _typed(content, "place", bool),
-            _typed(content, "rerun", bool), checked_simulator, str(content.get("car", "")),
-            bool(content.get("repairs_prior", False)),
+            choice, plan, _checked_value(content, "episodes", int), run, hooks,
+            None if content["ticks"] is None else _checked_value(content, "ticks", int),
+            _checked_value(content, "place", bool), _checked_value(content, "rerun", bool),
+            checked_simulator, str(content.get("car", "")), bool(content.get("repairs_prior", False)),
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(
@@ -357,7 +357,7 @@ def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks,
         ) from error
 
 
-def _typed(content: Mapping[str, Any], name: str, kind: type[T]) -> T:
+def _checked_value(content: Mapping[str, Any], name: str, kind: type[T]) -> T:
     """A value of a JSON object. Raises ValueError if it has another type or is below 1 (bool: no limit)."""
     value = content[name]
     if type(value) is not kind or (kind is int and value < 1):

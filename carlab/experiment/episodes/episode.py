@@ -233,7 +233,7 @@ def _drive(
         timing = pacer.wait()
         now_s, observation = _observe(car, rows, hooks)
         next_features = encode(observation.state.to_array(), history.rows)
-        reward, terminated, success = _judge(task, features, sent, next_features)
+        reward, terminated, success = _evaluate_transition(task, features, sent, next_features)
         rows.add_step(requested, sent, reward)
         rows.add_observation(now_s, observation)
         truncated = step + 1 == ticks and not terminated
@@ -286,8 +286,10 @@ def _act(policy: Policy, view: PolicyInput, car: Car, hooks: EpisodeHooks, timeo
     return action, policy_s
 
 
-def _judge(task: Task, features: FloatArray, sent: Action, next_features: FloatArray) -> tuple[float, bool, bool]:
-    """Reward, end, and success at the end, of one transition. Raises _End for an error of the task."""
+def _evaluate_transition(
+    task: Task, features: FloatArray, sent: Action, next_features: FloatArray
+) -> tuple[float, bool, bool]:
+    """Reward, whether the episode ends, and whether it ends with success. Raises _End for an error of the task."""
     try:
         reward = float(task.reward(features, sent.to_array(), next_features))
         terminated = bool(task.terminated(next_features))

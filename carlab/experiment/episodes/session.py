@@ -58,7 +58,7 @@ class EpisodeResult:
 
 
 def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> EpisodeResult:
-    """Result of a recorded episode. Raises ConfigError if the task cannot judge it."""
+    """Result of a recorded episode. Raises ConfigError if the task cannot evaluate it."""
     try:
         summary = {name: float(value) for name, value in task.summary(data.times_s, data.states).items()}
         if task.has_constraint:
@@ -66,7 +66,7 @@ def result_of(number: int, data: EpisodeData, task: Task, path: Path) -> Episode
             summary |= {"cost": float(costs.sum()), "violations": float((costs > 0.0).sum())}
     except (Exception, SystemExit) as error:
         raise ConfigError(
-            f"The task {task.name} cannot judge {path} ({type(error).__name__}: {error}); correct its summary and "
+            f"The task {task.name} cannot evaluate {path} ({type(error).__name__}: {error}); correct its summary and "
             "cost; the recording is complete."
         ) from error
     return EpisodeResult(number, data, EndReason[data.metadata["end_reason"]], summary, path)

@@ -14,12 +14,14 @@ from urllib.parse import urlsplit
 import rerun as rr
 
 from carlab.core.clock import monotonic_ns
-from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.errors import ConfigError, DataError, NotReadyError
 
 ADDRESS = "rerun+http://127.0.0.1:{port}/proxy"
 DEFAULT_PORT = 9876
 _CONNECT_TIMEOUT_S = 3.0
 _START_TIMEOUT_NS = 30 * 10**9
+_FIRST_BYTES = b"RRF"
+"""First bytes of a rerun recording of any version."""
 
 
 def rerun_program() -> Path | None:
@@ -29,6 +31,13 @@ def rerun_program() -> Path | None:
         return beside
     found = shutil.which("rerun")
     return Path(found) if found else None
+
+
+def check_rerun_file(path: Path) -> None:
+    """Check that a file is a rerun recording. Raises DataError if it is none, and OSError if it cannot be read."""
+    with path.open("rb") as file:
+        if file.read(len(_FIRST_BYTES)) != _FIRST_BYTES:
+            raise DataError(f"{path} is not a rerun recording; name another file, or write it again.")
 
 
 def free_port() -> int:
@@ -98,6 +107,7 @@ def connect_to_viewer(stream: rr.RecordingStream, address: str) -> None:
 
 __all__ = [
     "ADDRESS",
+    "check_rerun_file",
     "check_viewer",
     "connect_to_viewer",
     "free_port",

@@ -3,7 +3,7 @@
 carlab's methods (``gp-...``) condition a Gaussian process (``learning.posterior``) around a simulator, around zero, or
 average several by held-out density. ``sim-fsvgd`` and ``fsvgd`` are the paper's (``functional_svgd.fsvgd``) with
 the steps, batches, points, bandwidth and starting noise of the authors' public code; prior moments come from a fixed
-set of draws. Their ``-mended`` forms correct two slips of that code: the repulsive term divided by the number of
+set of draws. Their ``-mended`` forms correct two errors of that code: the repulsive term divided by the number of
 particles, and the almost absent Gaussian-process prior of FSVGD.
 """
 
@@ -116,7 +116,7 @@ class FitTask:
                 steps=steps, batch=8, measurement_points=32, bandwidth=10.0 if case.name == "realcar" else 2.0,
                 natural=False, anneal_rate=False, noise_std=noise, noise_rate=1.0, seed=self.seed,
             )  # fmt: skip
-        return settings if mended else settings.with_published_slips(rows, with_simulator=with_simulator)
+        return settings if mended else settings.with_published_errors(rows, with_simulator=with_simulator)
 
     def pool(self) -> Tensor:
         """Inputs of the domain (M, D)."""
