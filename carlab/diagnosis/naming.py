@@ -2,7 +2,7 @@
 
 A spurious attribution gives a catalogue name to physics outside the catalogue. Effects are withdrawn if uncatalogued
 physics explains as much in their place, if unnamed terms explain much in addition to them or more than them, or if they
-increase the error on held-out recordings. Single effects are also withdrawn if they are negligible, or if they increase
+increase the error on held-out recordings or explain little of it. Single effects are also withdrawn if they are negligible, or if they increase
 that error when they are added last (``weak_effects``).
 """
 
@@ -69,6 +69,8 @@ def accept_names(
         found = found.without_effects()
     elif found.effects and _increases_held_out_error(found, held_out):
         log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
+        found = found.without_effects()
+    elif found.is_complete and found.effects and _explain_little(problem, found, held_out, control):
         found = found.without_effects()
     elif found.effects:
         standing = without_harmful_effects(problem, found, held_out, control)
@@ -143,6 +145,29 @@ def _increases_held_out_error(found: SearchResult, held_out: HeldOut) -> bool:
     """Whether held-out score and likelihood are both worse with the effects than with the refit alone."""
     without, with_names = held_out.final_error(found.base.config), held_out.final_error(found.best.config)
     return held_out.score(with_names) > held_out.score(without) and held_out.gain(without, with_names)[0] < 0.0
+
+
+def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl) -> bool:
+    """Whether one or two effects explain less than half of the held-out excess, with an uncertain gain.
+
+    The strongest part of physics outside the catalogue often resembles an effect; the rest of it remains.
+    """
+    settings = problem.settings.rivals
+    without, with_names = held_out.final_error(found.base.config), held_out.final_error(found.best.config)
+    excess = held_out.score(without) ** 2 - 1.0
+    if len(found.effects) >= settings.many_effects or excess <= settings.min_held_out_excess:
+        return False
+    explained = 1.0 - max(held_out.score(with_names) ** 2 - 1.0, 0.0) / excess
+    gain, error = held_out.gain(without, with_names)
+    alternatives = (
+        (Condition("rivals.min_explained_share", explained, settings.min_explained_share),),
+        (Condition("rivals.min_explained_z", gain / error, settings.min_explained_z),),
+    )
+    little = explained < settings.min_explained_share and gain < settings.min_explained_z * error
+    _record(control, found, alternatives, not little)
+    if little:
+        log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), explained)
+    return little
 
 
 @dataclass(frozen=True, slots=True)
