@@ -2,8 +2,8 @@
 
 A spurious attribution gives a catalogue name to physics outside the catalogue. Effects are withdrawn if uncatalogued
 physics explains as much in their place, if unnamed terms explain much in addition to them or more than them, or if they
-increase the error on held-out recordings or explain little of it. Single effects are also withdrawn if they are negligible, or if they increase
-that error when they are added last (``weak_effects``).
+increase the error on held-out recordings or explain little of it. Single effects are also withdrawn if they are
+negligible, or if they increase that error when they are added last (``weak_effects``).
 """
 
 from __future__ import annotations
