@@ -70,13 +70,13 @@ def accept_names(
     elif found.effects and _increases_held_out_error(found, held_out):
         log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
         found = found.without_effects()
-    elif found.is_complete and found.effects and _explain_little(problem, found, held_out, control):
-        found = found.without_effects()
     elif found.effects:
         standing = without_harmful_effects(problem, found, held_out, control)
         if standing.effects != found.effects:
             found, residual = standing, residual_of(problem, standing)
             rival = additional_physics(problem, found, control)
+        if found.is_complete and found.effects and _explain_little(problem, found, held_out, control):
+            found = found.without_effects()
     if names and not found.effects:
         log.info("%s: withdrawn as a spurious attribution", ", ".join(names))
         residual = residual_of(problem, found)

@@ -97,6 +97,17 @@ def test_effect_that_raises_the_held_out_error_is_withdrawn(drag: Case, tmp_path
     ]
 
 
+@pytest.mark.parametrize(
+    ("min_share", "min_z", "expected"), [(0.99, math.inf, []), (0.99, 1.0, [DRAG]), (0.5, math.inf, [DRAG])]
+)
+def test_effect_that_explains_little_is_not_named(
+    drag: Case, tmp_path: Path, min_share: float, min_z: float, expected: list[str]
+) -> None:
+    """The cameras see the car turned in the held-out recording only, so drag explains only a part of its errors."""
+    strict = replace(DEFAULT.rivals, min_explained_share=min_share, min_explained_z=min_z)
+    assert names(found(drag, tmp_path, (0.0, 0.01), replace(DEFAULT, rivals=strict))) == expected
+
+
 def test_time_limit_ends_the_search_with_a_valid_report(drag: Case, tmp_path: Path) -> None:
     outcome = found(drag, tmp_path, budget_s=1e-3)
     assert outcome.diagnosis.search == SearchExtent(False, "budget", 1e-3)
@@ -122,15 +133,19 @@ def test_stopped_search_keeps_the_effects_found_so_far(drag: Case, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("max_alternatives", "min_remaining", "expected"),
-    [(3, 0.1, {DRAG, MISALIGNMENT}), (0, 0.1, {MISALIGNMENT}), (3, 0.99, {MISALIGNMENT})],
+    ("limits", "expected"),
+    [
+        ({}, {DRAG, MISALIGNMENT}),
+        ({"max_alternatives": 0}, {MISALIGNMENT}),
+        ({"min_remaining_excess": 0.99}, {MISALIGNMENT}),
+        ({"min_effects_of_wrong_turn": 2}, {MISALIGNMENT}),
+    ],
 )
 def test_other_choice_repairs_a_wrong_turn(
     drag: Case,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    max_alternatives: int,
-    min_remaining: float,
+    limits: dict[str, Any],
     expected: set[str],
 ) -> None:
     """A greedy path that ends after its first effect leaves the drag, unless other choices are followed."""
@@ -140,8 +155,9 @@ def test_other_choice_repairs_a_wrong_turn(
         return extend(replace(problem, settings=one), start, control)
 
     monkeypatch.setattr("carlab.diagnosis.selection.search.extend", one_step)
-    selection = replace(DEFAULT.selection, max_alternatives=max_alternatives, min_remaining_excess=min_remaining)
-    outcome = found(drag, tmp_path, (0.02, 0.02), replace(DEFAULT, selection=selection))
+    selection = replace(DEFAULT.selection, **{"min_effects_of_wrong_turn": 1, **limits})
+    lenient = replace(DEFAULT.rivals, min_explained_share=0.0)
+    outcome = found(drag, tmp_path, (0.02, 0.02), replace(DEFAULT, selection=selection, rivals=lenient))
     assert set(names(outcome)) == expected
 
 

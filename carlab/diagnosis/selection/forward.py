@@ -1,8 +1,8 @@
 """Forward selection along several paths.
 
-A greedy search can take a wrong turn: its first effect may be a proxy of two others. Where the greedy path leaves a
-part of the excess, other choices are followed to their end, and unseen blocks choose between the paths (limited
-discrepancy search, Harvey and Ginsberg 1995, with one deviation from the greedy choices).
+A greedy search can take a wrong turn: its first effect may be a proxy of two others. Where the greedy path has several
+effects and leaves a part of the excess, other choices are followed to their end, and unseen blocks choose between the
+paths (limited discrepancy search, Harvey and Ginsberg 1995, with one deviation from the greedy choices).
 """
 
 from __future__ import annotations
@@ -73,6 +73,8 @@ def extend(
 def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunControl) -> Path:
     """The greedy path, or the path with one other choice that predicts unseen blocks significantly better."""
     settings = problem.settings.selection
+    if len(greedy.model.effects) < settings.min_effects_of_wrong_turn:
+        return greedy
     best, visited = greedy, {frozenset(greedy.model.effects)}
     choices = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.unseen_gain)[: settings.max_alternatives]
     for k, choice in enumerate(choices):
