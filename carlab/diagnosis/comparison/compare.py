@@ -7,8 +7,9 @@ to the second group. Physics that the simulator lacks is in the errors of both g
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -25,6 +26,7 @@ from carlab.diagnosis.comparison.candidates import (
 )
 from carlab.diagnosis.comparison.change_fit import ChangeFit, fit_change
 from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
+from carlab.diagnosis.comparison.drive_spread import longest_drive_blocks, part_blocks, parts_of, spread_prior
 from carlab.diagnosis.comparison.groups import ComparedGroups, compared_groups
 from carlab.diagnosis.comparison.result import Change, Comparison, Tested, verdict_sentence
 from carlab.diagnosis.findings import Estimate
@@ -32,6 +34,8 @@ from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.settings import DEFAULT, ComparisonSettings, DiagnosisSettings
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.registry import REGISTRY
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +75,9 @@ class _Linear:
         at = self.secants.at
         return np.asarray(at.z0 + self.difference.step * (at.points[self.point] - at.z0))
 
-    def p_value(self, groups: Sequence[GroupErrors]) -> float:
-        found = self.difference
-        blocks = min(group.blocks for group in groups)
-        return p_value(found.likelihood_ratio, found.design_effect, len(self.secants.at.z0), blocks)
+    @property
+    def p_value(self) -> float:
+        return p_value(self.difference, self.difference.likelihood_ratio, len(self.secants.at.z0))
 
     def tested(self) -> Tested:
         at = self.secants.at
@@ -160,43 +163,54 @@ def _select(
     stop: Callable[[], bool],
 ) -> tuple[tuple[Change, ...], tuple[Tested, ...]]:
     """Forward selection: the change with the largest likelihood ratio comes first."""
+    windows = [fitter.windows for fitter in material.fitters]
+    length = part_blocks(windows)
     first, second = (
-        GroupErrors(material.model.decorrelated(errors), fitter.windows.block)
-        for errors, fitter in zip(material.errors, material.fitters, strict=True)
+        GroupErrors(material.model.decorrelated(errors), w.block, parts_of(w, length))
+        for errors, w in zip(material.errors, windows, strict=True)
     )
+    length_ratio = longest_drive_blocks(windows[1]) / length
     found: list[_Refined] = []
     ties: list[tuple[str, ...]] = []
     tested: tuple[Tested, ...] = ()
     while len(found) < settings.max_changes and not stop():
         progress(f"change {len(found) + 1}", 0.7 + 0.1 * len(found))
-        groups = (first, GroupErrors(found[-1].fit.errors, second.block) if found else second)
+        groups = (first, replace(second, errors=found[-1].fit.errors) if found else second)
         known = list(found[-1].fit.jacobian) if found else []
         taken = {f.linear.secants.at.candidate.id for f in found}
         linear = [s.best(groups, material, settings, known) for s in screened if s.at.candidate.id not in taken]
-        usable = sorted((x for x in linear if x is not None), key=lambda x: -x.difference.likelihood_ratio)
+        usable = _moderated([x for x in linear if x is not None], length_ratio)
+        usable.sort(key=lambda x: -x.difference.likelihood_ratio)
         tested = tested or tuple(x.tested() for x in usable)
-        if not any(len(screened) * x.p_value(groups) < settings.p_max for x in usable):
+        if not any(len(screened) * x.p_value < settings.p_max for x in usable):
             break
-        refined = [_refine(x, found, material, groups, settings) for x in usable[: settings.max_refined]]
+        refined = [_refine(x, found, material, settings) for x in usable[: settings.max_refined]]
         significant = [r for r in refined if len(screened) * r.p_value < settings.p_max]
         best = max(significant, key=lambda r: r.likelihood_ratio, default=None)
         if best is None or (found and best.likelihood_ratio < settings.min_share_of_first * found[0].likelihood_ratio):
             break
         ties.append(_ties(best, refined, settings))
         found.append(best)
-    blocks = min(first.blocks, second.blocks)
     changes = [
-        _change(one, _joint(one, found[-1].fit), near, len(screened), blocks)
-        for one, near in zip(found, ties, strict=True)
+        _change(one, _joint(one, found[-1].fit), near, len(screened)) for one, near in zip(found, ties, strict=True)
     ]
     return tuple(changes), tested
+
+
+def _moderated(linear: Sequence[_Linear], length_ratio: float) -> list[_Linear]:
+    """The candidates with their spreads between drives moderated by those of all candidates."""
+    prior = spread_prior([x.difference.spread for x in linear])
+    log.info("spread between drives over that of blocks: %.2f (%.1f degrees of freedom)", prior.ratio, prior.dof)
+    return [
+        replace(x, difference=replace(x.difference, spread=prior.moderated(x.difference.spread, length_ratio)))
+        for x in linear
+    ]
 
 
 def _refine(
     linear: _Linear,
     found: Sequence[_Refined],
     material: ComparedGroups,
-    groups: Sequence[GroupErrors],
     settings: ComparisonSettings,
 ) -> _Refined:
     """Fit a candidate to the second group, together with the changes found before."""
@@ -212,8 +226,7 @@ def _refine(
     offset = offset + (before.offset if before else 0.0)
     fit = fit_change(material.fitters[1], config, free, starts, material.model, offset, settings)
     ratio = 2.0 * fit.gain / linear.difference.borrowed
-    blocks = min(group.blocks for group in groups)
-    p = p_value(ratio, linear.difference.design_effect, len(at.z0), blocks)
+    p = p_value(linear.difference, ratio, len(at.z0))
     return _Refined(linear, fit, ratio, p, offset)
 
 
@@ -240,12 +253,11 @@ def _change(
     joint: tuple[FloatArray, list[int], ChangeFit],
     ties: tuple[str, ...],
     candidates: int,
-    blocks: int,
 ) -> Change:
     z, index, last = joint
     at, found = one.linear.secants.at, one.linear.difference
     std = np.sqrt(np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed)
-    quantile = float(stats.t.ppf(0.95, max(blocks - len(index), 1)))
+    quantile = float(stats.t.ppf(0.95, max(min(found.dof - len(index), found.spread.dof), 1.0)))
     low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))
     parameters, reference = {}, {}
     for k, f in enumerate(at.candidate.free):

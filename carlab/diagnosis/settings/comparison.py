@@ -33,8 +33,6 @@ class ComparisonSettings:
     """Updates of the Student-t weights in a linear estimate."""
     max_start_step: float = 3.0
     """Maximum step along a secant at which a fit starts; a larger linear estimate is cut to it."""
-    part_prior_dof: float = 3.0
-    """Degrees of freedom of the prior that estimates spread over long parts as over blocks."""
     max_refined: int = 5
     """Maximum number of candidates that are fitted after the linear estimate."""
     iterations: int = 6
