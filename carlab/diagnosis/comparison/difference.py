@@ -42,7 +42,7 @@ class Difference:
     information    of the first and the second group
     block_effect   variance of the step for independent blocks over that for independent errors
     spread         variance of parts of a drive over that for independent blocks
-    dof            degrees of freedom of the variance: effective number of blocks of the group with fewer
+    dof            degrees of freedom of the variance: effective number of blocks of both groups
     """
 
     step: float
@@ -77,7 +77,7 @@ def difference(
     settings: ComparisonSettings,
     known: Sequence[FloatArray] = (),
 ) -> Difference | None:
-    """Difference along a secant; None if a group has no information about it.
+    """Difference along a secant; None if a group has too little information about it.
 
     Args:
         secants: decorrelated change of the errors of each group (S, D).
@@ -105,14 +105,21 @@ def difference(
     ratio = change**2 * first * second / (first + second)
     by_block = _block_effect(informations, residuals, groups)
     spread = spread_of_parts(informations, residuals, [group.part for group in groups], by_block)
-    dof = min(_effective_blocks(i, group) for i, group in zip(informations, groups, strict=True))
+    of_block = [_of_blocks(i, group) for i, group in zip(informations, groups, strict=True)]
+    if min(_effective_number(own) for own in of_block) < settings.min_effective_blocks:
+        return None
+    dof = _effective_number(np.concatenate(of_block)) - 2.0
     return Difference(change, steps[0], ratio, (first, second), by_block, spread, dof)
 
 
-def _effective_blocks(information: FloatArray, group: GroupErrors) -> float:
-    """Effective number of blocks that contribute (Carter, Schnepel and Steigerwald 2017)."""
-    of_block = np.bincount(np.unique(group.block, return_inverse=True)[1], weights=information)
-    return float(of_block.sum() ** 2 / (of_block**2).sum())
+def _of_blocks(values: FloatArray, group: GroupErrors) -> FloatArray:
+    """Sum of the values of windows (S,) in each block."""
+    return np.asarray(np.bincount(np.unique(group.block, return_inverse=True)[1], weights=values))
+
+
+def _effective_number(information: FloatArray) -> float:
+    """Effective number of blocks that contribute information (Carter, Schnepel and Steigerwald 2017)."""
+    return float(information.sum() ** 2 / (information**2).sum())
 
 
 def _block_effect(
@@ -121,7 +128,7 @@ def _block_effect(
     """Spread of the scores of blocks over the information, at least one."""
     squares = 0.0
     for score, group in zip(scores, groups, strict=True):
-        sums = np.bincount(np.unique(group.block, return_inverse=True)[1], weights=score)
+        sums = _of_blocks(score, group)
         squares += float((sums**2).sum()) * len(sums) / max(len(sums) - 1, 1)
     return max(squares / sum(float(i.sum()) for i in informations), 1.0)
 

@@ -13,6 +13,9 @@ class ComparisonSettings:
     """Length [s] of blocks that count as independent: errors of a wrong model depend on the place and the manoeuvre."""
     min_blocks: int = 10
     """Minimum number of blocks of a group; fewer give no usable standard error."""
+    min_effective_blocks: float = 5.0
+    """Minimum effective number of blocks of a group in which a candidate acts; the standard error of a candidate that
+    acts in fewer, such as a small patch of low friction, is unknown."""
     max_windows: tuple[int, int] = (300, 150)
     """Maximum number of windows of the first and the second group, thinned evenly; bounds the time."""
     max_point_windows: int = 80
