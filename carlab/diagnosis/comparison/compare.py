@@ -26,7 +26,7 @@ from carlab.diagnosis.comparison.candidates import (
 )
 from carlab.diagnosis.comparison.change_fit import ChangeFit, fit_change
 from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
-from carlab.diagnosis.comparison.drive_spread import longest_drive_blocks, part_blocks, parts_of, spread_prior
+from carlab.diagnosis.comparison.drive_spread import longest_drive_blocks, part_blocks, spread_prior
 from carlab.diagnosis.comparison.groups import ComparedGroups, compared_groups
 from carlab.diagnosis.comparison.result import Change, Comparison, Tested, verdict_sentence
 from carlab.diagnosis.findings import Estimate
@@ -147,11 +147,11 @@ def _screen(
             break
         progress(f"influence of {candidate.id}", 0.1 + 0.6 * k / len(candidates))
         at = candidate_points(few, material.config, candidate)
-        own = [
-            material.model.decorrelated(at.secants(fitter, errors, settings.max_secant))
+        secants = [
+            at.secants(fitter, errors, settings.max_secant)
             for fitter, errors in zip(material.fitters, material.errors, strict=True)
         ]
-        found.append(_Secants(at, (own[0], own[1])))
+        found.append(_Secants(at, material.decorrelated(secants)))
     return found
 
 
@@ -164,12 +164,11 @@ def _select(
 ) -> tuple[tuple[Change, ...], tuple[Tested, ...]]:
     """Forward selection: the change with the largest likelihood ratio comes first."""
     windows = [fitter.windows for fitter in material.fitters]
-    length = part_blocks(windows)
     first, second = (
-        GroupErrors(material.model.decorrelated(errors), w.block, parts_of(w, length))
-        for errors, w in zip(material.errors, windows, strict=True)
+        GroupErrors(errors, w.block, part)
+        for errors, w, part in zip(material.decorrelated(material.errors), windows, material.parts, strict=True)
     )
-    length_ratio = longest_drive_blocks(windows[1]) / length
+    length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows)
     found: list[_Refined] = []
     ties: list[tuple[str, ...]] = []
     tested: tuple[Tested, ...] = ()

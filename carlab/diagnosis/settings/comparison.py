@@ -30,8 +30,12 @@ class ComparisonSettings:
     """Changes of whitened errors are clipped here [standard deviations]."""
     student_dof: float = 5.0
     """Degrees of freedom of the errors' multivariate Student-t distribution."""
-    covariance_ridge: tuple[float, float] = (0.02, 0.01)
-    """Added to the diagonal of the errors' covariance: share of the diagonal, and variance [squared floors]."""
+    ridge_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+    """Shares of the diagonal that may be added to the errors' covariance; cross-validation chooses one."""
+    ridge_variance: float = 0.01
+    """Added to the diagonal of the errors' covariance [squared floors]."""
+    error_folds: int = 5
+    """Number of folds of whole parts whose errors are decorrelated by the covariance of the other folds."""
     weight_iterations: int = 3
     """Updates of the Student-t weights in a linear estimate."""
     max_start_step: float = 3.0
