@@ -48,6 +48,11 @@ class ComparisonSettings:
     """Relative fall of the loss at which a fit ends."""
     p_max: float = 0.05
     """Maximum p-value of a change, multiplied by the number of candidates (Bonferroni)."""
+    null_draws: int = 99
+    """Number of comparisons of parts within the first group."""
+    null_share_max: float = 0.01
+    """Maximum share of these comparisons with a p-value as small as that of a change. It is smaller than ``p_max``,
+    because the reference model is fitted to the first group and its errors there are smaller."""
     min_share_of_first: float = 0.15
     """Minimum likelihood ratio of a further change, as a share of that of the first: a weak one imitates the first."""
     max_changes: int = 3
