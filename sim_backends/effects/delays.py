@@ -18,7 +18,9 @@ class CommandDelay(DelayEffect):
         "steering and throttle have different delays, or a delay measured at the car equals that of the car file"
     )
     lag_parameter = "extra_delay"
-    parameters = (EffectParameter("extra_delay", "s", 0.0, -1.0, 1.0, 0.03, reduces="timing.command_delay"),)
+    parameters = (
+        EffectParameter("extra_delay", "s", 0.0, -1.0, 1.0, 0.03, reduces="timing.command_delay", is_delay=True),
+    )
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
         """Same for both."""
@@ -36,7 +38,7 @@ class SteeringDelay(DelayEffect):
         "the wheels start to move at once but reach their angle late, or fast steering has a weaker response than slow"
     )
     lag_parameter = "delay"
-    parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03),)
+    parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03, is_delay=True),)
     confusable = (
         Confusable(
             "steering_lag",
@@ -60,7 +62,7 @@ class ThrottleDelay(DelayEffect):
     sentence = "the throttle command acts {delay} later than the steering command"
     refuted_if = "the car accelerates at once after a step of throttle, but less at first"
     lag_parameter = "delay"
-    parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03),)
+    parameters = (EffectParameter("delay", "s", 0.0, 0.0, 1.0, 0.03, is_delay=True),)
     confusable = (
         Confusable(
             "motor_lag",

@@ -1,9 +1,14 @@
-"""Cases of a proof on real recordings: parts that are left out of a reference, and what is concealed in them."""
+"""Cases of a proof on real recordings: parts that are left out of a reference, and what is concealed in them.
+
+A car differs from drive to drive (battery, tyres), so a whole drive differs from others without anything concealed.
+Therefore a part consists of pieces of all drives, and a reference of the pieces between them (a randomised block
+design): both have the same share of each drive, and only what is concealed differs.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -16,14 +21,15 @@ from carlab.benchmark.real.kinds import FULL_LOCK, KINDS, MAX_INEXACT, Kind
 from carlab.benchmark.world.measurement import COLUMNS, write_csv
 from carlab.core.errors import DataError
 
-PART_S = 80.0
-"""Aimed length of a part that a reference leaves out [s]."""
+PIECE_S = 20.0
+"""Aimed length of a piece [s]."""
+MAX_PARTS = 4
 SHORTEST_S, LONGEST_S = 60.0, 100.0
-"""Length of the recording of a case [s]."""
+"""Length of the pieces of a case [s]."""
 GUARD_S = 1.0
-"""Time between a part and the recordings of its reference, and cut at both ends of a changed recording [s]."""
-SHORTEST_REFERENCE_S = 20.0
-"""Shorter pieces of a recording are left out of a reference [s]."""
+"""Time between a piece and the recordings of its reference, and cut at both ends of a changed piece [s]."""
+SHORTEST_REFERENCE_S = 10.0
+"""Shorter pieces are left out of a reference [s]."""
 MAX_GAP_PERIODS = 3.0
 MOVING_MPS = 0.2
 MIN_MOVING_SHARE = 0.5
@@ -49,12 +55,21 @@ class RealCaseSpec:
 
 
 @dataclass(frozen=True)
-class Part:
+class Piece:
     """A stretch of one recording between two stamps [s]."""
 
     recording: str
     begin_s: float
     end_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """Length [s]."""
+        return self.end_s - self.begin_s
+
+
+Part = tuple[Piece, ...]
+"""Pieces of recordings that a reference leaves out."""
 
 
 def case_specs(seed: int = 0) -> list[RealCaseSpec]:
@@ -78,41 +93,36 @@ def with_full_lock(table: Table) -> Table:
 
 
 def parts(recordings: Mapping[str, Table]) -> list[Part]:
-    """Cut recordings into parts of about ``PART_S`` that a reference can leave out.
+    """Cut recordings into pieces of about ``PIECE_S``, and deal them in turn to parts that a reference can leave out.
 
     Raises:
-        DataError: there is no part whose reference would keep ``SHORTEST_S`` of driving.
+        DataError: there are less than two parts of ``SHORTEST_S`` of driving.
     """
-    found, total_s = [], 0.0
-    for name, table in recordings.items():
-        for begin_s, end_s in _stretches(table["t"]):
-            total_s += end_s - begin_s
-            if end_s - begin_s >= SHORTEST_S:
-                edges = np.linspace(begin_s, end_s, max(1, round((end_s - begin_s) / PART_S)) + 1)
-                found += [Part(name, float(a), float(b)) for a, b in pairwise(edges)]
-    usable = [
-        part for part in found if total_s - (part.end_s - part.begin_s) >= SHORTEST_S and _is_driven(recordings, part)
-    ]
-    if not usable:
+    pieces = [piece for name, table in recordings.items() for piece in _pieces(name, table)]
+    driven = [piece for piece in pieces if _is_driven(recordings, piece)]
+    driven_s = sum(piece.duration_s for piece in driven)
+    count = min(MAX_PARTS, int(driven_s / (SHORTEST_S + PIECE_S)))
+    if count < 2:
         raise DataError(
-            f"The recordings have {total_s:.0f} s without gaps; a proof needs {2.0 * SHORTEST_S:.0f} s of driving "
-            f"with varying commands, {SHORTEST_S:.0f} s of them in one piece; add recordings."
+            f"The recordings have {driven_s:.0f} s of driving with varying commands in pieces of {PIECE_S:.0f} s; a "
+            f"proof needs {2.0 * (SHORTEST_S + PIECE_S):.0f} s; add recordings."
         )
-    return usable
+    return [tuple(driven[k::count]) for k in range(count)]
 
 
 def reference(recordings: Mapping[str, Table], left_out: Part) -> list[Table]:
-    """The untouched recordings of a reference: everything but the part and ``GUARD_S`` before and after it."""
+    """The untouched recordings of a reference: everything but the pieces and ``GUARD_S`` before and after each."""
     kept = []
     for name, table in recordings.items():
         for begin_s, end_s in _stretches(table["t"]):
-            pieces = [(begin_s, end_s)]
-            if name == left_out.recording:
-                pieces = [
-                    (begin_s, min(end_s, left_out.begin_s - GUARD_S)),
-                    (max(begin_s, left_out.end_s + GUARD_S), end_s),
-                ]
-            kept += [cut(table, a, b) for a, b in pieces if b - a >= SHORTEST_REFERENCE_S]
+            edges = [begin_s]
+            for piece in left_out:
+                if piece.recording == name and begin_s <= piece.begin_s < end_s:
+                    edges += [piece.begin_s - GUARD_S, piece.end_s + GUARD_S]
+            edges.append(end_s)
+            kept += [
+                cut(table, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= SHORTEST_REFERENCE_S
+            ]
     return kept
 
 
@@ -125,13 +135,13 @@ def cut(table: Table, begin_s: float, end_s: float) -> Table:
 
 def make_real_case(
     spec: RealCaseSpec, recordings: Mapping[str, Table], left_out: Sequence[Part]
-) -> tuple[int, Table, dict[str, Any]]:
-    """Draw the part and the recording of a case, and conceal its effects.
+) -> tuple[int, list[Table], dict[str, Any]]:
+    """Draw the part and the pieces of a case, and conceal its effects in all of them.
 
     A transformation that clips too many commands takes the next smaller size; if the smallest clips, the next part.
 
     Returns:
-        The number of the part, the recording, and the answer as JSON.
+        The number of the part, the recordings, and the answer as JSON.
 
     Raises:
         DataError: the commands of no part allow the effects.
@@ -139,39 +149,53 @@ def make_real_case(
     rng = np.random.default_rng((spec.seed, 1))
     draws = rng.random(2).tolist()
     for number in rng.permutation(len(left_out)):
-        part = left_out[number]
-        length_s = min(part.end_s - part.begin_s, rng.uniform(SHORTEST_S, LONGEST_S))
-        begin_s = rng.uniform(part.begin_s, part.end_s - length_s)
-        table = cut(recordings[part.recording], begin_s, begin_s + length_s)
-        made = _conceal(spec, table, draws)
+        pieces = _drawn_pieces(left_out[number], rng)
+        made = _conceal(spec, [cut(recordings[p.recording], p.begin_s, p.end_s) for p in pieces], draws)
         if made is None:
             continue
-        answer = {"kind": spec.kind, "seed": spec.seed, "effects": made[1], "part": asdict(part), "begin_s": begin_s}
-        end_s = float(made[0]["t"][-1])
-        return int(number), cut(made[0], GUARD_S, end_s - GUARD_S), answer
+        tables, effects = made
+        answer = {"kind": spec.kind, "seed": spec.seed, "effects": effects, "part": [asdict(p) for p in pieces]}
+        return int(number), [cut(t, GUARD_S, float(t["t"][-1]) - GUARD_S) for t in tables], answer
     raise DataError(f"The commands of no recording allow {' and '.join(spec.kinds)} without leaving [-1, 1].")
 
 
+def _drawn_pieces(part: Part, rng: np.random.Generator) -> list[Piece]:
+    """Random pieces of a part, in their order, whose total length is within ``SHORTEST_S`` and ``LONGEST_S``."""
+    aimed_s = rng.uniform(SHORTEST_S, LONGEST_S)
+    chosen: list[int] = []
+    total_s = 0.0
+    for k in rng.permutation(len(part)):
+        if total_s < SHORTEST_S or total_s + part[k].duration_s <= aimed_s:
+            chosen.append(int(k))
+            total_s += part[k].duration_s
+    return [part[k] for k in sorted(chosen)]
+
+
 def _conceal(
-    spec: RealCaseSpec, table: Table, draws: np.ndarray[Any, Any]
-) -> tuple[Table, list[dict[str, Any]]] | None:
+    spec: RealCaseSpec, tables: list[Table], draws: Sequence[float]
+) -> tuple[list[Table], list[dict[str, Any]]] | None:
     known = {kind.id: kind for kind in KINDS}
     concealed = []
     for name, largest, draw in zip(spec.kinds, spec.sizes, draws, strict=False):
-        change = _largest_exact(known[name], table, largest, draw)
+        change = _largest_exact(known[name], tables, largest, draw)
         if change is None:
             return None
-        table = change[0]
+        tables = change[0]
         concealed.append(change[1])
-    return table, concealed
+    return tables, concealed
 
 
-def _largest_exact(kind: Kind, table: Table, largest: int, draw: float) -> tuple[Table, dict[str, Any]] | None:
+def _largest_exact(
+    kind: Kind, tables: Sequence[Table], largest: int, draw: float
+) -> tuple[list[Table], dict[str, Any]] | None:
+    """The tables with the largest size that clips few commands in any of them, and the answer; None without one."""
     for index in range(largest, -1, -1):
-        change = kind.apply(table, kind.sizes[index], draw)
-        inside = all(np.abs(change.table[name]).max() <= 1.0 for name in ("steering", "throttle"))
-        if inside and change.inexact <= MAX_INEXACT:
-            return change.table, {**kind.as_dict(change, kind.sizes[index]), "size_index": index}
+        changes = [kind.apply(table, kind.sizes[index], draw) for table in tables]
+        commands = [change.table[name] for change in changes for name in ("steering", "throttle")]
+        inexact = max(change.inexact for change in changes)
+        if all(np.abs(command).max() <= 1.0 for command in commands) and inexact <= MAX_INEXACT:
+            answer = kind.as_dict(replace(changes[0], inexact=inexact), kind.sizes[index])
+            return [change.table for change in changes], {**answer, "size_index": index}
     return None
 
 
@@ -191,7 +215,18 @@ def _stretches(t_s: np.ndarray[Any, Any]) -> list[tuple[float, float]]:
     return [(float(t_s[a]), float(t_s[b])) for a, b in zip(first, last, strict=True) if b > a]
 
 
-def _is_driven(recordings: Mapping[str, Table], part: Part) -> bool:
-    table = cut(recordings[part.recording], part.begin_s, part.end_s)
+def _pieces(name: str, table: Table) -> list[Piece]:
+    """Pieces of equal length of each stretch that has at least two."""
+    found: list[Piece] = []
+    for begin_s, end_s in _stretches(table["t"]):
+        count = round((end_s - begin_s) / PIECE_S)
+        if count > 1:
+            edges = np.linspace(begin_s, end_s, count + 1).tolist()
+            found += [Piece(name, a, b) for a, b in pairwise(edges)]
+    return found
+
+
+def _is_driven(recordings: Mapping[str, Table], piece: Piece) -> bool:
+    table = cut(recordings[piece.recording], piece.begin_s, piece.end_s)
     moving = float(np.mean(np.hypot(table["vx"], table["vy"]) > MOVING_MPS))
     return moving >= MIN_MOVING_SHARE and all(np.ptp(table[name]) > 0.0 for name in ("steering", "throttle"))

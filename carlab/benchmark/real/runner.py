@@ -3,7 +3,7 @@
 Folder of a proof, in addition to that of ``SealedRun``:
 
     references/K/        untouched_1.csv ..., car.toml: input of the diagnosis of reference K; out/model.toml
-    handed/NAME/         other.csv: the recording of a case
+    handed/NAME/         other_1.csv ...: the recordings of a case
     answered/NAME/       the tool's report, run.json (exit status, seconds, peak memory)
 """
 
@@ -36,7 +36,7 @@ from carlab.benchmark.real.cases import (
 from carlab.benchmark.real.kinds import FULL_LOCK, KINDS
 from carlab.core.errors import ConfigError, DataError
 
-OTHER, CAR, MODEL = "other.csv", "car.toml", "model.toml"
+OTHER, CAR, MODEL = "other_{}.csv", "car.toml", "model.toml"
 CARLAB = (PYTHON, "-m", "carlab")
 REFERENCE_OPTIONS = ("--effects", "command_delay", "--curves")
 CONCEALABLE_EFFECTS = tuple(sorted({name for kind in KINDS for name in kind.names if "." not in name}))
@@ -46,8 +46,8 @@ CONCEALABLE_EFFECTS = tuple(sorted({name for kind in KINDS for name in kind.name
 class Tool:
     """A command that answers, and the file of its report.
 
-    ``compare`` gets the untouched recordings, ``--with other.csv``, the reference's model and a folder. ``diagnose``
-    gets the other recording alone, and searches only the effects of commands and sensors.
+    ``compare`` gets the untouched recordings, ``--with other_1.csv ...``, the reference's model and a folder.
+    ``diagnose`` gets the other recordings alone, and searches only the effects of commands and sensors.
     """
 
     verb: Literal["compare", "diagnose"]
@@ -58,9 +58,9 @@ class Tool:
         """Name of the report in the tool's folder."""
         return "compare.json" if self.verb == "compare" else "report.json"
 
-    def arguments(self, untouched: Sequence[str]) -> list[str]:
+    def arguments(self, untouched: Sequence[str], others: Sequence[str]) -> list[str]:
         """The command line of one case."""
-        recordings = [*untouched, "--with", OTHER] if self.verb == "compare" else [OTHER]
+        recordings = [*untouched, "--with", *others] if self.verb == "compare" else [*others]
         options = [] if self.verb == "compare" else ["--effects", *CONCEALABLE_EFFECTS]
         return [*self.command, self.verb, *recordings, "--car", MODEL, "--out", "out", *options]
 
@@ -106,8 +106,9 @@ class RealProof(SealedRun):
         for name, spec in zip(self.case_names(), self.specs, strict=True):
             path = self.answers_folder / f"{name}.json"
             if not path.exists():
-                number, table, answer = make_real_case(spec, self.recordings, self.parts)
-                files = write_tables(self.root / "handed" / name, {OTHER: table})
+                number, tables, answer = make_real_case(spec, self.recordings, self.parts)
+                folder = self.root / "handed" / name
+                files = write_tables(folder, {OTHER.format(k + 1): table for k, table in enumerate(tables)})
                 write_json(path, {**answer, "reference": number, "files": files})
         for number, part in enumerate(self.parts):
             folder = self.root / "references" / str(number)
@@ -165,9 +166,10 @@ class RealProof(SealedRun):
 
     def _answer_one(self, name: str) -> ChildEnd:
         untouched = sorted(self._model(name).parents[1].glob("untouched_*.csv"))
-        sources = (*untouched, self._model(name), self.root / "handed" / name / OTHER)
+        others = sorted((self.root / "handed" / name).glob(OTHER.format("*")))
+        sources = (*untouched, self._model(name), *others)
         job = ChildJob(
-            tuple(self.tool.arguments([path.name for path in untouched])), self.timeout_s,
+            tuple(self.tool.arguments([p.name for p in untouched], [p.name for p in others])), self.timeout_s,
             {path.name: path.read_bytes() for path in sources}, (f"out/{self.tool.report}",),
             environment=self.environment,
         )  # fmt: skip

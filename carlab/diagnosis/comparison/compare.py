@@ -3,12 +3,13 @@
 The simulator is fitted to the first group. The change of its errors by each candidate is computed once. A linear
 estimate in both groups then gives the likelihood ratio and the significance of each candidate. The best ones are fitted
 to the second group. Physics that the simulator lacks is in the errors of both groups, so it cancels in the difference.
+A change must also be more significant than any that comparisons within the first group show.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -16,16 +17,18 @@ from scipy import stats
 from carlab.core.clock import MonotonicClock
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.comparison.candidates import (
-    CandidatePoints,
-    candidate_points,
-    change_candidates,
-    size_of,
-    with_candidate,
-)
+from carlab.diagnosis.comparison.candidates import candidate_points, change_candidates, size_of, with_candidate
 from carlab.diagnosis.comparison.change_fit import ChangeFit, fit_change
-from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
+from carlab.diagnosis.comparison.difference import GroupErrors, p_value
+from carlab.diagnosis.comparison.drive_spread import longest_drive_blocks, part_blocks
 from carlab.diagnosis.comparison.groups import ComparedGroups, compared_groups
+from carlab.diagnosis.comparison.linear_change import (
+    LinearChange,
+    Secants,
+    linear_changes,
+    null_p_values,
+    short_name,
+)
 from carlab.diagnosis.comparison.result import Change, Comparison, Tested, verdict_sentence
 from carlab.diagnosis.findings import Estimate
 from carlab.diagnosis.identification.fit import Fitter
@@ -35,59 +38,10 @@ from sim_backends.registry import REGISTRY
 
 
 @dataclass(frozen=True, slots=True)
-class _Secants:
-    """A candidate with its decorrelated secants (P, S, D) in both groups."""
-
-    at: CandidatePoints
-    of_group: tuple[FloatArray, FloatArray]
-
-    def best(
-        self,
-        groups: Sequence[GroupErrors],
-        material: ComparedGroups,
-        settings: ComparisonSettings,
-        known: Sequence[FloatArray],
-    ) -> _Linear | None:
-        """The point with the largest likelihood ratio; None without a usable one."""
-        found = []
-        for k in range(len(self.at.points)):
-            own = [g[k] for g in self.of_group]
-            one = difference(own, groups, material.model, settings, known)
-            if one is not None and one.step > 0.0:
-                found.append(_Linear(self, k, one))
-        return max(found, key=lambda linear: linear.difference.likelihood_ratio, default=None)
-
-
-@dataclass(frozen=True, slots=True)
-class _Linear:
-    """The linear estimate of a candidate along the secant of one of its points."""
-
-    secants: _Secants
-    point: int
-    difference: Difference
-
-    @property
-    def z(self) -> FloatArray:
-        at = self.secants.at
-        return np.asarray(at.z0 + self.difference.step * (at.points[self.point] - at.z0))
-
-    def p_value(self, groups: Sequence[GroupErrors]) -> float:
-        found = self.difference
-        blocks = min(group.blocks for group in groups)
-        return p_value(found.likelihood_ratio, found.design_effect, len(self.secants.at.z0), blocks)
-
-    def tested(self) -> Tested:
-        at = self.secants.at
-        values = size_of(at.candidate, self.z, at.z0).tolist()
-        names = [_short(f.name) for f in at.candidate.free]
-        return Tested(at.candidate.id, dict(zip(names, values, strict=True)), self.difference.standard_errors)
-
-
-@dataclass(frozen=True, slots=True)
 class _Refined:
     """A candidate fitted to the second group with all changes before it."""
 
-    linear: _Linear
+    linear: LinearChange
     fit: ChangeFit
     likelihood_ratio: float
     p_value: float
@@ -133,7 +87,7 @@ def _screen(
     settings: ComparisonSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
-) -> list[_Secants]:
+) -> list[Secants]:
     """Secants of all candidates in both groups."""
     first = material.fitters[0]
     few = Fitter(first.windows.thinned(settings.max_point_windows), first.scale, first.settings)
@@ -144,59 +98,72 @@ def _screen(
             break
         progress(f"influence of {candidate.id}", 0.1 + 0.6 * k / len(candidates))
         at = candidate_points(few, material.config, candidate)
-        own = [
-            material.model.decorrelated(at.secants(fitter, errors, settings.max_secant))
+        secants = [
+            at.secants(fitter, errors, settings.max_secant)
             for fitter, errors in zip(material.fitters, material.errors, strict=True)
         ]
-        found.append(_Secants(at, (own[0], own[1])))
+        found.append(Secants(at, material.decorrelated(secants)))
     return found
 
 
 def _select(
     material: ComparedGroups,
-    screened: Sequence[_Secants],
+    screened: Sequence[Secants],
     settings: ComparisonSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
 ) -> tuple[tuple[Change, ...], tuple[Tested, ...]]:
     """Forward selection: the change with the largest likelihood ratio comes first."""
+    windows = [fitter.windows for fitter in material.fitters]
     first, second = (
-        GroupErrors(material.model.decorrelated(errors), fitter.windows.block)
-        for errors, fitter in zip(material.errors, material.fitters, strict=True)
+        GroupErrors(errors, w.block, part)
+        for errors, w, part in zip(material.decorrelated(material.errors), windows, material.parts, strict=True)
     )
+    length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows)
+    model = material.model
+    progress("comparing parts of the first group", 0.7)
+    null = null_p_values(screened, first, int(second.part.max()) + 1, model, settings)
+
+    def adjusted(p: float) -> float:
+        return _adjusted_p(p, len(screened), null, settings)
+
     found: list[_Refined] = []
     ties: list[tuple[str, ...]] = []
     tested: tuple[Tested, ...] = ()
     while len(found) < settings.max_changes and not stop():
-        progress(f"change {len(found) + 1}", 0.7 + 0.1 * len(found))
-        groups = (first, GroupErrors(found[-1].fit.errors, second.block) if found else second)
+        progress(f"change {len(found) + 1}", 0.75 + 0.08 * len(found))
+        groups = (first, replace(second, errors=found[-1].fit.errors) if found else second)
         known = list(found[-1].fit.jacobian) if found else []
         taken = {f.linear.secants.at.candidate.id for f in found}
-        linear = [s.best(groups, material, settings, known) for s in screened if s.at.candidate.id not in taken]
-        usable = sorted((x for x in linear if x is not None), key=lambda x: -x.difference.likelihood_ratio)
-        tested = tested or tuple(x.tested() for x in usable)
-        if not any(len(screened) * x.p_value(groups) < settings.p_max for x in usable):
+        others = [s for s in screened if s.at.candidate.id not in taken]
+        linear = linear_changes(others, groups, model, settings, length_ratio=length_ratio, known=known)
+        tested = tested or tuple(x.tested() for x in linear)
+        if not any(adjusted(x.p_value) < settings.p_max for x in linear):
             break
-        refined = [_refine(x, found, material, groups, settings) for x in usable[: settings.max_refined]]
-        significant = [r for r in refined if len(screened) * r.p_value < settings.p_max]
+        refined = [_refine(x, found, material, settings) for x in linear[: settings.max_refined]]
+        significant = [r for r in refined if adjusted(r.p_value) < settings.p_max]
         best = max(significant, key=lambda r: r.likelihood_ratio, default=None)
         if best is None or (found and best.likelihood_ratio < settings.min_share_of_first * found[0].likelihood_ratio):
             break
         ties.append(_ties(best, refined, settings))
         found.append(best)
-    blocks = min(first.blocks, second.blocks)
     changes = [
-        _change(one, _joint(one, found[-1].fit), near, len(screened), blocks)
+        _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value))
         for one, near in zip(found, ties, strict=True)
     ]
     return tuple(changes), tested
 
 
+def _adjusted_p(p: float, candidates: int, null: FloatArray, settings: ComparisonSettings) -> float:
+    """P-value for many candidates: by Bonferroni, and 1 if too many comparisons within the first group are as small."""
+    as_small = int(np.searchsorted(null, p, side="right"))
+    return min(1.0, candidates * p) if as_small <= settings.null_share_max * len(null) else 1.0
+
+
 def _refine(
-    linear: _Linear,
+    linear: LinearChange,
     found: Sequence[_Refined],
     material: ComparedGroups,
-    groups: Sequence[GroupErrors],
     settings: ComparisonSettings,
 ) -> _Refined:
     """Fit a candidate to the second group, together with the changes found before."""
@@ -212,8 +179,7 @@ def _refine(
     offset = offset + (before.offset if before else 0.0)
     fit = fit_change(material.fitters[1], config, free, starts, material.model, offset, settings)
     ratio = 2.0 * fit.gain / linear.difference.borrowed
-    blocks = min(group.blocks for group in groups)
-    p = p_value(ratio, linear.difference.design_effect, len(at.z0), blocks)
+    p = p_value(linear.difference, ratio, len(at.z0))
     return _Refined(linear, fit, ratio, p, offset)
 
 
@@ -239,31 +205,25 @@ def _change(
     one: _Refined,
     joint: tuple[FloatArray, list[int], ChangeFit],
     ties: tuple[str, ...],
-    candidates: int,
-    blocks: int,
+    p: float,
 ) -> Change:
     z, index, last = joint
     at, found = one.linear.secants.at, one.linear.difference
     std = np.sqrt(np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed)
-    quantile = float(stats.t.ppf(0.95, max(blocks - len(index), 1)))
+    quantile = float(stats.t.ppf(0.95, max(min(found.dof - len(index), found.spread.dof), 1.0)))
     low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))
     parameters, reference = {}, {}
     for k, f in enumerate(at.candidate.free):
-        name = _short(f.name)
+        name = short_name(f.name)
         limits = sorted((float(low[k]), float(high[k])))
         spread = (limits[1] - limits[0]) / (2.0 * quantile)
         parameters[name] = Estimate(float(value[k]), spread, limits[0], limits[1], REGISTRY[f.name].unit)
         reference[name] = float(f.value(np.asarray(at.z0[k])))
     standard_errors = float(np.sqrt(max(one.likelihood_ratio, 0.0) / found.design_effect))
     return Change(
-        at.candidate.id, parameters, reference, min(1.0, one.p_value * candidates), one.fit.loss_share,
+        at.candidate.id, parameters, reference, p, one.fit.loss_share,
         standard_errors, ties,
     )  # fmt: skip
-
-
-def _short(name: str) -> str:
-    """Name of an effect's parameter without the effect; a base parameter keeps its dotted name."""
-    return name.rpartition(".")[2] if name.startswith("effects.") else name
 
 
 __all__ = ["Comparison", "compare"]

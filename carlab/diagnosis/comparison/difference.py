@@ -2,8 +2,8 @@
 
 Along a secant g of the errors e, the generalised least-squares step of a group is ``-sum(w g'e) / sum(w g'g)``. The
 difference of the steps of both groups is the change: an error that the model has in both cancels. Its variance is that
-of independent errors times a design effect: the spread of the scores of blocks (Liang and Zeger 1986), and of parts of
-the first group as long as the second, over that of independent errors.
+of independent errors times a design effect: the spread of the scores of blocks over that of independent errors (Liang
+and Zeger 1986), times the spread of drives over that of blocks (``drive_spread``).
 """
 
 from __future__ import annotations
@@ -15,26 +15,21 @@ import numpy as np
 from scipy import stats
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.comparison.drive_spread import DriveSpread, spread_of_parts
 from carlab.diagnosis.comparison.error_model import ErrorModel
 from carlab.diagnosis.settings import ComparisonSettings
 from carlab.prediction.windows import IndexArray
 
 MIN_INFORMATION = 1.0
-MIN_PART_SHARE = 0.02
-"""Minimum share of the information that a part of the first group must have."""
 
 
 @dataclass(frozen=True, slots=True)
 class GroupErrors:
-    """Decorrelated errors (S, D) of a group and the block of each window (S,)."""
+    """Decorrelated errors (S, D) of a group, and the block and the part of each window (S,)."""
 
     errors: FloatArray
     block: IndexArray
-
-    @property
-    def blocks(self) -> int:
-        """Number of blocks."""
-        return len(np.unique(self.block))
+    part: IndexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,14 +40,23 @@ class Difference:
     common         step of the first group
     likelihood_ratio  twice the gain in log-likelihood by the change
     information    of the first and the second group
-    design_effect  variance of the step over that for independent errors
+    block_effect   variance of the step for independent blocks over that for independent errors
+    spread         variance of parts of a drive over that for independent blocks
+    dof            degrees of freedom of the variance: effective number of blocks of both groups
     """
 
     step: float
     common: float
     likelihood_ratio: float
     information: tuple[float, float]
-    design_effect: float
+    block_effect: float
+    spread: DriveSpread
+    dof: float
+
+    @property
+    def design_effect(self) -> float:
+        """Variance of the step over that for independent errors."""
+        return self.block_effect * self.spread.ratio
 
     @property
     def standard_errors(self) -> float:
@@ -73,7 +77,7 @@ def difference(
     settings: ComparisonSettings,
     known: Sequence[FloatArray] = (),
 ) -> Difference | None:
-    """Difference along a secant; None if a group has no information about it.
+    """Difference along a secant; None if a group has too little information about it.
 
     Args:
         secants: decorrelated change of the errors of each group (S, D).
@@ -99,40 +103,40 @@ def difference(
     first, second = (float(i.sum()) for i in informations)
     change = steps[1] - steps[0]
     ratio = change**2 * first * second / (first + second)
-    effect = _design_effect(informations, residuals, groups, settings)
-    return Difference(change, steps[0], ratio, (first, second), effect)
+    by_block = _block_effect(informations, residuals, groups)
+    spread = spread_of_parts(informations, residuals, [group.part for group in groups], by_block)
+    of_block = [_of_blocks(i, group) for i, group in zip(informations, groups, strict=True)]
+    if min(_effective_number(own) for own in of_block) < settings.min_effective_blocks:
+        return None
+    dof = _effective_number(np.concatenate(of_block)) - 2.0
+    return Difference(change, steps[0], ratio, (first, second), by_block, spread, dof)
 
 
-def _design_effect(
-    informations: Sequence[FloatArray],
-    scores: Sequence[FloatArray],
-    groups: Sequence[GroupErrors],
-    settings: ComparisonSettings,
+def _of_blocks(values: FloatArray, group: GroupErrors) -> FloatArray:
+    """Sum of the values of windows (S,) in each block."""
+    return np.asarray(np.bincount(np.unique(group.block, return_inverse=True)[1], weights=values))
+
+
+def _effective_number(information: FloatArray) -> float:
+    """Effective number of blocks that contribute information (Carter, Schnepel and Steigerwald 2017)."""
+    return float(information.sum() ** 2 / (information**2).sum())
+
+
+def _block_effect(
+    informations: Sequence[FloatArray], scores: Sequence[FloatArray], groups: Sequence[GroupErrors]
 ) -> float:
-    """Spread of the scores of blocks and of long parts over the information, at least one."""
+    """Spread of the scores of blocks over the information, at least one."""
     squares = 0.0
     for score, group in zip(scores, groups, strict=True):
-        sums = np.bincount(np.unique(group.block, return_inverse=True)[1], weights=score)
+        sums = _of_blocks(score, group)
         squares += float((sums**2).sum()) * len(sums) / max(len(sums) - 1, 1)
-    by_block = max(squares / sum(float(i.sum()) for i in informations), 1.0)
-    parts = max(round(groups[0].blocks / groups[1].blocks), 1)
-    if parts < 2:
-        return by_block
-    index = np.unique(groups[0].block, return_inverse=True)[1]
-    part = index * parts // (int(index.max()) + 1)
-    information = np.bincount(part, weights=informations[0])
-    share = information / information.sum()
-    usable = share > MIN_PART_SHARE
-    expected = by_block * information * (1.0 - share)
-    spread = float(np.mean((np.bincount(part, weights=scores[0]) ** 2 / np.maximum(expected, 1e-12))[usable]))
-    prior, dof = settings.part_prior_dof, parts - 1
-    return by_block * max((prior + dof * spread) / (prior + dof), 1.0)
+    return max(squares / sum(float(i.sum()) for i in informations), 1.0)
 
 
-def p_value(likelihood_ratio: float, design_effect: float, parameters: int, blocks: int) -> float:
-    """P-value of no change by an F-test whose degrees of freedom are the blocks of the smaller group."""
-    dof = max(blocks - parameters, 1)
-    return float(stats.f.sf(max(likelihood_ratio, 0.0) / (design_effect * parameters), parameters, dof))
+def p_value(difference: Difference, likelihood_ratio: float, parameters: int) -> float:
+    """P-value of no change by an F-test with the design effect and the degrees of freedom of a difference."""
+    dof = max(min(difference.dof - parameters, difference.spread.dof), 1.0)
+    return float(stats.f.sf(max(likelihood_ratio, 0.0) / (difference.design_effect * parameters), parameters, dof))
 
 
 def _without(secant: FloatArray, known: Sequence[FloatArray], weight: FloatArray) -> FloatArray:

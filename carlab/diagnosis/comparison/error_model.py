@@ -2,6 +2,10 @@
 
 The errors of a window, by step and channel, have a multivariate Student-t distribution with the covariance that the
 first group shows. It contains the error of the model. Directions in which the model errs count little.
+
+The covariance fits the windows that it is estimated from better than others. So the errors of the first group are
+decorrelated by covariances of other folds (cross-fitting, Chernozhukov et al. 2018, "Double/debiased machine learning
+for treatment and structural parameters"), and the ridge has the largest likelihood on the folds that are left out.
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ from scipy import stats
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.settings import ComparisonSettings
+from carlab.prediction.windows import IndexArray
 
 SCATTER_ITERATIONS = 20
 
@@ -26,16 +31,21 @@ class ErrorModel:
     dof: float
 
     @classmethod
-    def of(cls, errors: FloatArray, settings: ComparisonSettings) -> Self:
-        """Scatter of errors (S, D) by expectation maximisation (Liu and Rubin 1995), with a ridge."""
+    def of(cls, errors: FloatArray, ridge_share: float, settings: ComparisonSettings) -> Self:
+        """Scatter of errors (S, D) by expectation maximisation (Liu and Rubin 1995), with a ridge.
+
+        Args:
+            errors: of the reference model.
+            ridge_share: added to the diagonal of the scatter, as a share of it.
+            settings: settings of the comparison.
+        """
         count, size = errors.shape
         scatter = errors.T @ errors / count
         for _ in range(SCATTER_ITERATIONS):
             distance_sq = _distance_sq(errors, scatter + 1e-6 * np.eye(size))
             weighted = errors * ((settings.student_dof + size) / (settings.student_dof + distance_sq))[:, None]
             scatter = weighted.T @ errors / count
-        share, variance = settings.covariance_ridge
-        scatter = scatter + share * np.diag(np.diag(scatter)) + variance * np.eye(size)
+        scatter = scatter + ridge_share * np.diag(np.diag(scatter)) + settings.ridge_variance * np.eye(size)
         scatter = scatter * np.median(_distance_sq(errors, scatter)) / stats.chi2.median(size)
         return cls(np.asarray(np.linalg.cholesky(np.linalg.inv(scatter))), settings.student_dof)
 
@@ -49,13 +59,65 @@ class ErrorModel:
         return np.asarray((self.dof + decorrelated.shape[-1]) / (self.dof + distance_sq))
 
     def loss(self, decorrelated: FloatArray) -> FloatArray:
-        """Negative log-likelihood (...) of windows, without its constant."""
+        """Negative log-likelihood (...) of windows, without the constant of this model."""
         distance_sq = (decorrelated**2).sum(axis=-1)
         return np.asarray(0.5 * (self.dof + decorrelated.shape[-1]) * np.log1p(distance_sq / self.dof))
+
+    def log_determinant(self) -> float:
+        """Logarithm of the determinant of ``root``."""
+        return float(np.linalg.slogdet(self.root)[1])
+
+
+@dataclass(frozen=True, slots=True)
+class CrossFittedErrors:
+    """Error models of the windows of the first group.
+
+    Attributes:
+        whole: from all windows; for the second group.
+        without: from the windows outside each fold.
+        fold: (S,) fold of each window of the first group.
+    """
+
+    whole: ErrorModel
+    without: tuple[ErrorModel, ...]
+    fold: IndexArray
+
+    @classmethod
+    def of(cls, errors: FloatArray, fold: IndexArray, settings: ComparisonSettings) -> Self:
+        """Error models with the ridge that has the largest likelihood on the folds that are left out.
+
+        Args:
+            errors: (S, D) of the reference model on the first group.
+            fold: (S,) fold of each window, from 0 on.
+            settings: settings of the comparison.
+        """
+        folds = range(int(fold.max()) + 1)
+
+        def without_each(share: float) -> tuple[ErrorModel, ...]:
+            return tuple(ErrorModel.of(errors[fold != k], share, settings) for k in folds)
+
+        def loss_left_out(models: tuple[ErrorModel, ...]) -> float:
+            left_out = [errors[fold == k] for k in folds]
+            return sum(
+                float(m.loss(m.decorrelated(e)).sum()) - len(e) * m.log_determinant()
+                for m, e in zip(models, left_out, strict=True)
+            )
+
+        tried = [(share, without_each(share)) for share in settings.ridge_shares]
+        share, models = min(tried, key=lambda one: loss_left_out(one[1]))
+        return cls(ErrorModel.of(errors, share, settings), models, fold)
+
+    def decorrelated(self, errors: FloatArray) -> FloatArray:
+        """Errors (..., S, D) of the first group, each by the model without its fold."""
+        found = np.empty_like(errors)
+        for k, model in enumerate(self.without):
+            own = self.fold == k
+            found[..., own, :] = model.decorrelated(errors[..., own, :])
+        return found
 
 
 def _distance_sq(errors: FloatArray, scatter: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("si,ij,sj->s", errors, np.linalg.inv(scatter), errors))
 
 
-__all__ = ["ErrorModel"]
+__all__ = ["CrossFittedErrors", "ErrorModel"]

@@ -10,7 +10,8 @@ import numpy as np
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.comparison.error_model import ErrorModel
+from carlab.diagnosis.comparison.drive_spread import part_blocks, parts_of
+from carlab.diagnosis.comparison.error_model import CrossFittedErrors, ErrorModel
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
@@ -22,7 +23,7 @@ from carlab.diagnosis.selection.refit import fit_with_scale
 from carlab.diagnosis.settings import DiagnosisSettings
 from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.prediction.initial_states import without_curvature_bias
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows, tracks_of
+from carlab.prediction.windows import IndexArray, PredictionWindows, Track, cut_windows, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CURVES, confusable_effects
 
@@ -34,13 +35,25 @@ class ComparedGroups:
     config   simulator fitted to the first group
     fitters  windows and error scale of each group
     errors   (S, D) whitened errors of the reference model in each group
-    model    distribution of these errors, from the first group
+    parts    (S,) part of each window, in each group
+    error_models  distributions of the errors of the first group
     """
 
     config: SimulatorConfig
     fitters: tuple[Fitter, Fitter]
     errors: tuple[FloatArray, FloatArray]
-    model: ErrorModel
+    parts: tuple[IndexArray, IndexArray]
+    error_models: CrossFittedErrors
+
+    @property
+    def model(self) -> ErrorModel:
+        """Distribution of the errors of the second group."""
+        return self.error_models.whole
+
+    def decorrelated(self, of_groups: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Errors (..., S, D) of each group in standard deviations along independent directions."""
+        first, second = of_groups
+        return self.error_models.decorrelated(first), self.model.decorrelated(second)
 
 
 def compared_groups(
@@ -80,7 +93,11 @@ def compared_groups(
     )
     config = fitted.fit.config
     errors = (_errors(one, config), _errors(two, config))
-    return ComparedGroups(config, (one, two), errors, ErrorModel.of(errors[0], settings.comparison))
+    length = part_blocks((one.windows, two.windows))
+    parts = (parts_of(one.windows, length), parts_of(two.windows, length))
+    fold = parts[0] % min(settings.comparison.error_folds, int(parts[0].max()) + 1)
+    models = CrossFittedErrors.of(errors[0], fold, settings.comparison)
+    return ComparedGroups(config, (one, two), errors, parts, models)
 
 
 def _errors(fitter: Fitter, config: SimulatorConfig) -> FloatArray:

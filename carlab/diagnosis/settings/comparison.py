@@ -13,6 +13,9 @@ class ComparisonSettings:
     """Length [s] of blocks that count as independent: errors of a wrong model depend on the place and the manoeuvre."""
     min_blocks: int = 10
     """Minimum number of blocks of a group; fewer give no usable standard error."""
+    min_effective_blocks: float = 5.0
+    """Minimum effective number of blocks of a group in which a candidate acts; the standard error of a candidate that
+    acts in fewer, such as a small patch of low friction, is unknown."""
     max_windows: tuple[int, int] = (300, 150)
     """Maximum number of windows of the first and the second group, thinned evenly; bounds the time."""
     max_point_windows: int = 80
@@ -27,14 +30,16 @@ class ComparisonSettings:
     """Changes of whitened errors are clipped here [standard deviations]."""
     student_dof: float = 5.0
     """Degrees of freedom of the errors' multivariate Student-t distribution."""
-    covariance_ridge: tuple[float, float] = (0.02, 0.01)
-    """Added to the diagonal of the errors' covariance: share of the diagonal, and variance [squared floors]."""
+    ridge_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+    """Shares of the diagonal that may be added to the errors' covariance; cross-validation chooses one."""
+    ridge_variance: float = 0.01
+    """Added to the diagonal of the errors' covariance [squared floors]."""
+    error_folds: int = 5
+    """Number of folds of whole parts whose errors are decorrelated by the covariance of the other folds."""
     weight_iterations: int = 3
     """Updates of the Student-t weights in a linear estimate."""
     max_start_step: float = 3.0
     """Maximum step along a secant at which a fit starts; a larger linear estimate is cut to it."""
-    part_prior_dof: float = 3.0
-    """Degrees of freedom of the prior that estimates spread over long parts as over blocks."""
     max_refined: int = 5
     """Maximum number of candidates that are fitted after the linear estimate."""
     iterations: int = 6
@@ -43,6 +48,11 @@ class ComparisonSettings:
     """Relative fall of the loss at which a fit ends."""
     p_max: float = 0.05
     """Maximum p-value of a change, multiplied by the number of candidates (Bonferroni)."""
+    null_draws: int = 99
+    """Number of comparisons of parts within the first group."""
+    null_share_max: float = 0.01
+    """Maximum share of these comparisons with a p-value as small as that of a change. It is smaller than ``p_max``,
+    because the reference model is fitted to the first group and its errors there are smaller."""
     min_share_of_first: float = 0.15
     """Minimum likelihood ratio of a further change, as a share of that of the first: a weak one imitates the first."""
     max_changes: int = 3

@@ -1,0 +1,156 @@
+"""Linear estimates of all candidates, from the errors of one model and their secants."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.comparison.candidates import CandidatePoints, size_of
+from carlab.diagnosis.comparison.difference import Difference, GroupErrors, difference, p_value
+from carlab.diagnosis.comparison.drive_spread import spread_prior
+from carlab.diagnosis.comparison.error_model import ErrorModel
+from carlab.diagnosis.comparison.result import Tested
+from carlab.diagnosis.settings import ComparisonSettings
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Secants:
+    """A candidate with its decorrelated secants (P, S, D) in both groups."""
+
+    at: CandidatePoints
+    of_group: tuple[FloatArray, FloatArray]
+
+    def split(self, is_second: NDArray[np.bool_]) -> Secants:
+        """The first group's secants as those of two groups; ``is_second`` (S,) are the windows of the second one."""
+        return Secants(self.at, (self.of_group[0][:, ~is_second], self.of_group[0][:, is_second]))
+
+    def best(
+        self,
+        groups: Sequence[GroupErrors],
+        model: ErrorModel,
+        settings: ComparisonSettings,
+        known: Sequence[FloatArray],
+    ) -> LinearChange | None:
+        """The point with the largest likelihood ratio; None without a usable one."""
+        found = []
+        for k in range(len(self.at.points)):
+            own = [g[k] for g in self.of_group]
+            one = difference(own, groups, model, settings, known)
+            if one is not None and one.step > 0.0:
+                found.append(LinearChange(self, k, one))
+        return max(found, key=lambda linear: linear.difference.likelihood_ratio, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class LinearChange:
+    """The linear estimate of a candidate along the secant of one of its points."""
+
+    secants: Secants
+    point: int
+    difference: Difference
+
+    @property
+    def z(self) -> FloatArray:
+        """Estimated coordinates of the second group."""
+        at = self.secants.at
+        return np.asarray(at.z0 + self.difference.step * (at.points[self.point] - at.z0))
+
+    @property
+    def p_value(self) -> float:
+        """P-value of no change, for this candidate alone."""
+        return p_value(self.difference, self.difference.likelihood_ratio, len(self.secants.at.z0))
+
+    def tested(self) -> Tested:
+        """For the report."""
+        at = self.secants.at
+        values = size_of(at.candidate, self.z, at.z0).tolist()
+        names = [short_name(f.name) for f in at.candidate.free]
+        return Tested(at.candidate.id, dict(zip(names, values, strict=True)), self.difference.standard_errors)
+
+
+def linear_changes(
+    screened: Sequence[Secants],
+    groups: Sequence[GroupErrors],
+    model: ErrorModel,
+    settings: ComparisonSettings,
+    *,
+    length_ratio: float = 1.0,
+    known: Sequence[FloatArray] = (),
+) -> list[LinearChange]:
+    """Linear estimates of the candidates, the most likely first; those without information are left out.
+
+    Args:
+        screened: candidates with their secants.
+        groups: errors of both groups.
+        model: distribution of the errors.
+        settings: settings of the comparison.
+        length_ratio: length of a drive of the second group over that of a part.
+        known: decorrelated Jacobians (S, D) of changes of the second group that are already known.
+    """
+    found = [linear for s in screened if (linear := s.best(groups, model, settings, known)) is not None]
+    prior = spread_prior([x.difference.spread for x in found])
+    log.debug("spread between drives over that of blocks: %.2f (%.1f degrees of freedom)", prior.ratio, prior.dof)
+    moderated = [
+        replace(x, difference=replace(x.difference, spread=prior.moderated(x.difference.spread, length_ratio)))
+        for x in found
+    ]
+    return sorted(moderated, key=lambda x: -x.difference.likelihood_ratio)
+
+
+def null_p_values(
+    screened: Sequence[Secants],
+    first: GroupErrors,
+    parts: int,
+    model: ErrorModel,
+    settings: ComparisonSettings,
+) -> FloatArray:
+    """Smallest p-values of comparisons within the first group.
+
+    Random parts of the first group take the place of the second group, and all candidates are tested (Westfall and
+    Young 1993, "Resampling-based multiple testing"). This accounts for the number of candidates, their correlation, and
+    drives that differ more than the p-values assume.
+
+    Args:
+        screened: candidates with their secants.
+        first: errors of the first group.
+        parts: number of parts of the second group; at most half of the first group's are drawn.
+        model: distribution of the errors.
+        settings: settings of the comparison.
+
+    Returns:
+        (n,) sorted; n is at most ``settings.null_draws``.
+    """
+    count = int(first.part.max()) + 1
+    rng = np.random.default_rng(0)
+    chosen = min(parts, count // 2)
+    if chosen < 1:
+        return np.zeros(0)
+    draws = {tuple(sorted(rng.choice(count, chosen, replace=False).tolist())) for _ in range(settings.null_draws)}
+    smallest = []
+    for draw in sorted(draws):
+        is_second = np.isin(first.part, draw)
+        groups = [_subset(first, ~is_second), _subset(first, is_second)]
+        found = linear_changes([s.split(is_second) for s in screened], groups, model, settings)
+        smallest.append(min((x.p_value for x in found), default=1.0))
+    return np.sort(smallest)
+
+
+def _subset(group: GroupErrors, rows: NDArray[np.bool_]) -> GroupErrors:
+    part: NDArray[Any] = np.unique(group.part[rows], return_inverse=True)[1]
+    return GroupErrors(group.errors[rows], group.block[rows], part)
+
+
+def short_name(name: str) -> str:
+    """Name of an effect's parameter without the effect; a base parameter keeps its dotted name."""
+    return name.rpartition(".")[2] if name.startswith("effects.") else name
+
+
+__all__ = ["LinearChange", "Secants", "linear_changes", "null_p_values", "short_name"]
