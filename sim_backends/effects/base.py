@@ -46,7 +46,7 @@ class EffectParameter:
         same_as: Dotted name of the car file's number that replaces a missing value.
         choices: Words of a choice; its number is the position, 0.0 for the first; car files have the word.
         reduces: Dotted name of the car file's number that a negative value reduces, at most to 0.
-        is_delay: Whether it delays samples, so that predictions jump where it moves one to another step.
+        is_delay: Whether it delays commands or measurements.
     """
 
     name: str

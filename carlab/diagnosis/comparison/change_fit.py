@@ -15,8 +15,8 @@ from sim_backends.car_parameters import SimulatorConfig
 
 DAMPINGS = (0.0, 0.1, 1.0, 10.0, 100.0)
 DIFFERENCE_STEP = 0.3
-"""Step of the Jacobian, in coordinates. The errors jump where a delay moves a command to another step of the
-integrator; steps below 0.2 give a delay four to ten times its information (ETH RC car)."""
+"""Step of the Jacobian, in coordinates. Predictions from rest jump (``identification.fit.DELAY_DIFFERENCE_STEP``);
+steps below 0.2 give a delay four to ten times its information (ETH RC car)."""
 MAX_STEP = 8.0
 
 
