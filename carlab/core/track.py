@@ -20,6 +20,8 @@ from carlab.core.tables import check_keys, number
 
 MIN_WIDTH_M, MAX_LENGTH_M, MAX_POINTS = 0.25, 2000.0, 2000
 """Limits of a plausible track; a file in millimetres or centimetres exceeds one of them."""
+MAX_CLOSING_RATIO = 5.0
+"""Maximum distance from the last point to the first, over that of other neighbours; a longer one is a missing part."""
 COLUMNS = ("x", "y", "width")
 _AMBIGUITY_COST_M = 1e3
 
@@ -198,6 +200,11 @@ def _checked(rows: list[list[float]], where: str) -> Track:
         raise ConfigError(
             f"{where} is {steps.sum():.4g} m long and {values[:, 2].min():.3g} to {values[:, 2].max():.3g} m wide, "
             f"which no car drives; give x, y and width in metres (width at least {MIN_WIDTH_M:g})."
+        )
+    if steps[-1] > MAX_CLOSING_RATIO * steps[:-1].max():
+        raise ConfigError(
+            f"{where} is open: its last point is {steps[-1]:.3g} m from the first, other points at most "
+            f"{steps[:-1].max():.3g} m apart; add the points between, because a track is closed."
         )
     return Track(tuple((float(x), float(y)) for x, y in values[:, :2]), tuple(float(w) for w in values[:, 2]))
 

@@ -215,7 +215,7 @@ def _draw_velocities(velocity_axis: Any, yaw_rate_axis: Any, episodes: Sequence[
 
 
 def _draw_latencies_or_rewards(axis: Any, episodes: Sequence[EpisodeData]) -> None:
-    """Draw the latencies of one episode or the rewards of several; the speed if these were not recorded."""
+    """Draw the latencies of one episode or the rewards of several; the speed if these were not recorded or all 0."""
     first = episodes[0]
     columns = ((POSE_AGE, "age of the pose"), (LATE, "lateness of the tick"), (POLICY_TIME, "time of the policy"))
     latencies = [(first.extra[name], label) for name, label in columns if name in first.extra]
@@ -225,7 +225,7 @@ def _draw_latencies_or_rewards(axis: Any, episodes: Sequence[EpisodeData]) -> No
             axis.plot(t_s, 1e3 * values_s, color=color, linewidth=1.3, label=label)
         axis.set_ylabel("latency [ms]")
         return
-    has_rewards = any(np.isfinite(episode.rewards).any() for episode in episodes)
+    has_rewards = any((np.isfinite(episode.rewards) & (episode.rewards != 0.0)).any() for episode in episodes)
     for k, episode in enumerate(episodes):
         t_s = episode.times_s - episode.times_s[0]
         values = episode.rewards if has_rewards else np.hypot(episode.states[1:, 3], episode.states[1:, 4])

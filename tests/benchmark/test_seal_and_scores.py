@@ -237,6 +237,13 @@ def test_proof_is_sealed_resumed_diagnosed_and_scored(tmp_path: Path) -> None:
         resumed.open_seal()
 
 
+def test_folder_with_other_files_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(DataError, match=r"contains other files \(thesis.tex\); name a new folder"):
+        Proof(tmp_path, SPECS, command=FAKE_DIAGNOSIS).make()
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
+
+
 def test_failed_or_hung_diagnosis_is_recorded(tmp_path: Path) -> None:
     root = tmp_path / "proof"
     proof = Proof(root, SPECS[1:], command=(sys.executable, "-c", "import sys; sys.exit('no such verb')"))

@@ -134,6 +134,10 @@ def test_track_of_a_csv_file_and_of_a_table_are_equal(tmp_path: Path) -> None:
         ("x,y,width\n0,0,1\n1,0,1\n", "2 points"),
         ("x,y,width\n0,0,1\n1,0,1\n1,0,1\n0,1,1\n", "two equal points"),
         ("x,y,width\n0,0,nan\n1,0,1\n0,1,1\n", "not finite"),
+        (
+            "x,y,width\n0,0,1\n1,0,1\n2,0,1\n3,0,1\n4,0,1\n5,0,1\n6,0,1\n",
+            "is open: its last point is 6 m from",
+        ),
         ("x,y,width\n0,0,800\n3000,0,800\n3000,3000,800\n", "in metres"),
         ("x,y,width\n0,0,0.01\n2,0,1\n0,2,1\n", "in metres"),
     ],

@@ -44,8 +44,9 @@ class TestConversion:
         assert "canonical" in imported.announcement
         assert "recognised" in imported.announcement
 
-    def test_gzip_semicolons_and_byte_order_mark_are_accepted(self, clean, tmp_path):
-        plain = foreign.write(tmp_path / "run.csv", clean, delimiter=";")
+    @pytest.mark.parametrize("delimiter", [";", "\t"])
+    def test_gzip_delimiters_and_byte_order_mark_are_accepted(self, clean, tmp_path, delimiter):
+        plain = foreign.write(tmp_path / "run.csv", clean, delimiter=delimiter)
         packed = tmp_path / "run.csv.gz"
         packed.write_bytes(gzip.compress(b"\xef\xbb\xbf" + plain.read_bytes()))
         np.testing.assert_array_equal(

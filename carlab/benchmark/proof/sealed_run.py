@@ -63,6 +63,9 @@ class SealedRun:
         """Random names of the cases, in the order of the plan. Raises DataError if the folder has another plan."""
         path = self.answers_folder / "plan.json"
         if not path.exists():
+            foreign = [p.name for p in self.root.iterdir() if p.suffix != ".toml"] if self.root.is_dir() else []
+            if foreign:
+                raise DataError(f"{self.root} contains other files ({foreign[0]}); name a new folder for the proof.")
             write_json(path, {"plan": self._plan, "names": [new_name() for _ in self._plan]})
         kept = read_json(path)
         if kept["plan"] != self._plan:

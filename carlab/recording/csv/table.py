@@ -46,7 +46,7 @@ class CsvTable:
 
 
 def read_csv(path: Path | str) -> CsvTable:
-    """Read a comma- or semicolon-separated file with one header line; ``.gz`` is decompressed.
+    """Read a file with one header line, separated by commas, semicolons or tabs; ``.gz`` is decompressed.
 
     Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Raises DataError if the file is missing, empty,
     truncated or not text, or if a row has another number of cells than the header.
@@ -54,7 +54,7 @@ def read_csv(path: Path | str) -> CsvTable:
     path = Path(path)
     text = _read_text(path)
     first = text.split("\n", 1)[0]
-    delimiter = ";" if first.count(";") > first.count(",") else ","
+    delimiter = max(",;\t", key=first.count)
     try:
         lines = [row for row in csv.reader(io.StringIO(text, newline=""), delimiter=delimiter) if row]
     except csv.Error as error:
