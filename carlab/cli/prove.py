@@ -53,7 +53,7 @@ class Prove:
     in recordings of a real car."""
 
     data: Path | None = None
-    """Only --set real: folder with recordings of one car, at least 120 s."""
+    """Only --set real: folder with recordings of one car, at least 160 s."""
 
     car: str = ""
     """Only --set real: car file or preset of that car."""

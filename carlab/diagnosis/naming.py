@@ -148,7 +148,7 @@ def _increases_held_out_error(found: SearchResult, held_out: HeldOut) -> bool:
 
 
 def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl) -> bool:
-    """Whether one or two effects explain less than half of the held-out excess, with an uncertain gain.
+    """Whether one or two effects explain little of the held-out excess, with a gain of few standard errors.
 
     The strongest part of physics outside the catalogue often resembles an effect; the rest of it remains.
     """

@@ -32,16 +32,12 @@ def windows(recording: list[int], block: list[int]) -> PredictionWindows:
     )  # fmt: skip
 
 
-def groups(rng: np.random.Generator, deviation: float, secant: FloatArray) -> list[GroupErrors]:
-    """Two groups of independent errors in which each part has its own parameter along the secant."""
-    block = np.repeat(np.arange(PARTS * BLOCKS), WINDOWS)
+def group(rng: np.random.Generator, deviation: float, secant: FloatArray, windows_per_block: int) -> GroupErrors:
+    """Independent errors in which each part has its own parameter along the secant."""
+    block = np.repeat(np.arange(len(secant) // windows_per_block), windows_per_block)
     part = block // BLOCKS
-    return [
-        GroupErrors(
-            rng.standard_normal(secant.shape) - deviation * rng.standard_normal(PARTS)[part, None] * secant, block, part
-        )
-        for _ in range(2)
-    ]
+    of_part = deviation * rng.standard_normal(int(part.max()) + 1)
+    return GroupErrors(rng.standard_normal(secant.shape) - of_part[part, None] * secant, block, part)
 
 
 def p_values(deviation: float, *, with_spread: bool, count: int = 300) -> FloatArray:
@@ -50,7 +46,8 @@ def p_values(deviation: float, *, with_spread: bool, count: int = 300) -> FloatA
     found = []
     for _ in range(count):
         secant = rng.standard_normal((PARTS * BLOCKS * WINDOWS, SIZE))
-        one = difference([secant, secant], groups(rng, deviation, secant), UNIT, SETTINGS)
+        both = [group(rng, deviation, secant, WINDOWS) for _ in range(2)]
+        one = difference([secant, secant], both, UNIT, SETTINGS)
         assert isinstance(one, Difference)
         used = one if with_spread else replace(one, spread=DriveSpread(1.0, 1e6))
         found.append(p_value(used, one.likelihood_ratio, 1))
@@ -64,14 +61,31 @@ def test_p_value_of_independent_errors_is_uniform() -> None:
 def test_spread_of_parts_keeps_the_rate_of_false_changes() -> None:
     """Each part has another true value, with three times the standard error of a part."""
     deviation = 3.0 / np.sqrt(BLOCKS * WINDOWS * SIZE)
-    assert np.mean(p_values(deviation, with_spread=False) < 0.05) > 0.25
+    assert np.mean(p_values(deviation, with_spread=False) < 0.05) > 0.2
     assert np.mean(p_values(deviation, with_spread=True) < 0.05) == pytest.approx(0.05, abs=0.03)
+
+
+def test_shorter_group_with_more_windows_per_block_keeps_the_rate_of_false_changes() -> None:
+    """A parameter that differs from block to block: 60 blocks of 5 windows against 12 blocks of 12 windows."""
+    rng = np.random.default_rng(6)
+    found = []
+    for _ in range(500):
+        secants = [rng.standard_normal((blocks * windows, SIZE)) for blocks, windows in ((60, 5), (12, 12))]
+        both = []
+        for secant, windows in zip(secants, (5, 12), strict=True):
+            one = group(rng, 0.0, secant, windows)
+            of_block = 0.3 * rng.standard_normal(int(one.block.max()) + 1)
+            both.append(replace(one, errors=one.errors - of_block[one.block, None] * secant))
+        change = difference(secants, both, UNIT, SETTINGS)
+        assert change is not None
+        found.append(p_value(replace(change, spread=DriveSpread(1.0, 1e6)), change.likelihood_ratio, 1))
+    assert np.mean(np.array(found) < 0.05) == pytest.approx(0.05, abs=0.025)
 
 
 def test_candidate_that_acts_in_few_blocks_is_left_out() -> None:
     rng = np.random.default_rng(2)
     secant = rng.standard_normal((PARTS * BLOCKS * WINDOWS, SIZE))
-    both = groups(rng, 0.0, secant)
+    both = [group(rng, 0.0, secant, WINDOWS) for _ in range(2)]
     few = np.where(both[0].block[:, None] < 3, secant, 0.0)
     assert difference([few, secant], both, UNIT, SETTINGS) is None
 

@@ -138,7 +138,7 @@ def test_stopped_search_keeps_the_effects_found_so_far(drag: Case, tmp_path: Pat
         ({}, {DRAG, MISALIGNMENT}),
         ({"max_alternatives": 0}, {MISALIGNMENT}),
         ({"min_remaining_excess": 0.99}, {MISALIGNMENT}),
-        ({"min_effects_of_wrong_turn": 2}, {MISALIGNMENT}),
+        ({"min_effects_for_alternatives": 2}, {MISALIGNMENT}),
     ],
 )
 def test_other_choice_repairs_a_wrong_turn(
@@ -155,7 +155,7 @@ def test_other_choice_repairs_a_wrong_turn(
         return extend(replace(problem, settings=one), start, control)
 
     monkeypatch.setattr("carlab.diagnosis.selection.search.extend", one_step)
-    selection = replace(DEFAULT.selection, **{"min_effects_of_wrong_turn": 1, **limits})
+    selection = replace(DEFAULT.selection, **{"min_effects_for_alternatives": 1, **limits})
     lenient = replace(DEFAULT.rivals, min_explained_share=0.0)
     outcome = found(drag, tmp_path, (0.02, 0.02), replace(DEFAULT, selection=selection, rivals=lenient))
     assert set(names(outcome)) == expected

@@ -1,8 +1,7 @@
 """Cases of a proof on real recordings: parts that are left out of a reference, and what is concealed in them.
 
 A car differs from drive to drive (battery, tyres), so a whole drive differs from others without anything concealed.
-Therefore a part consists of pieces of all drives, and a reference of the pieces between them (a randomised block
-design): both have the same share of each drive, and only what is concealed differs.
+Therefore a part consists of short pieces of many drives, and a reference of the pieces between them.
 """
 
 from __future__ import annotations
@@ -24,12 +23,13 @@ from carlab.core.errors import DataError
 PIECE_S = 20.0
 """Aimed length of a piece [s]."""
 MAX_PARTS = 4
+"""Maximum number of parts, each with its own reference."""
 SHORTEST_S, LONGEST_S = 60.0, 100.0
-"""Length of the pieces of a case [s]."""
+"""Minimum and maximum total length of the pieces of a case, before the guards are cut [s]."""
 GUARD_S = 1.0
 """Time between a piece and the recordings of its reference, and cut at both ends of a changed piece [s]."""
 SHORTEST_REFERENCE_S = 10.0
-"""Shorter pieces are left out of a reference [s]."""
+"""Shorter stretches are not used in a reference [s]."""
 MAX_GAP_PERIODS = 3.0
 MOVING_MPS = 0.2
 MIN_MOVING_SHARE = 0.5
@@ -93,10 +93,10 @@ def with_full_lock(table: Table) -> Table:
 
 
 def parts(recordings: Mapping[str, Table]) -> list[Part]:
-    """Cut recordings into pieces of about ``PIECE_S``, and deal them in turn to parts that a reference can leave out.
+    """Cut recordings into pieces of about ``PIECE_S``, and assign them in turn to parts that a reference can leave out.
 
     Raises:
-        DataError: there are less than two parts of ``SHORTEST_S`` of driving.
+        DataError: there are fewer than two parts of ``SHORTEST_S`` of driving.
     """
     pieces = [piece for name, table in recordings.items() for piece in _pieces(name, table)]
     driven = [piece for piece in pieces if _is_driven(recordings, piece)]
@@ -188,9 +188,11 @@ def _conceal(
 def _largest_exact(
     kind: Kind, tables: Sequence[Table], largest: int, draw: float
 ) -> tuple[list[Table], dict[str, Any]] | None:
-    """The tables with the largest size that clips few commands in any of them, and the answer; None without one."""
+    """The tables with the largest size that clips few commands in each of them, and the answer; None without one."""
     for index in range(largest, -1, -1):
         changes = [kind.apply(table, kind.sizes[index], draw) for table in tables]
+        if any(change.truth != changes[0].truth for change in changes):
+            raise DataError("The recordings have different periods; use recordings of one period.")
         commands = [change.table[name] for change in changes for name in ("steering", "throttle")]
         inexact = max(change.inexact for change in changes)
         if all(np.abs(command).max() <= 1.0 for command in commands) and inexact <= MAX_INEXACT:

@@ -25,6 +25,8 @@ from carlab.benchmark.proof.child_processes import ChildEnd
 from carlab.benchmark.proof.sealed_run import SealedRun
 from carlab.benchmark.proof.worker import read_json, write_json
 from carlab.benchmark.real.cases import (
+    MAX_PARTS,
+    PIECE_S,
     RealCaseSpec,
     case_specs,
     make_real_case,
@@ -213,4 +215,5 @@ def drawn_specs(seed: int, limit: int | None, recordings: Mapping[str, Table]) -
 
 
 def _plan(specs: Sequence[RealCaseSpec], recordings: Mapping[str, Table], tool: Tool) -> list[dict[str, Any]]:
-    return [*(spec.as_dict() for spec in specs), {"recordings": sorted(recordings), "tool": tool.verb}]
+    rules = {"recordings": sorted(recordings), "tool": tool.verb, "piece_s": PIECE_S, "max_parts": MAX_PARTS}
+    return [*(spec.as_dict() for spec in specs), rules]

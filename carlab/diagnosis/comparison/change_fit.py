@@ -14,9 +14,8 @@ from carlab.diagnosis.settings import ComparisonSettings
 from sim_backends.car_parameters import SimulatorConfig
 
 DAMPINGS = (0.0, 0.1, 1.0, 10.0, 100.0)
-DIFFERENCE_STEP = 0.3
-"""Step of the Jacobian, in coordinates. Predictions from rest jump (``identification.fit.DELAY_DIFFERENCE_STEP``);
-steps below 0.2 give a delay four to ten times its information (ETH RC car)."""
+CHANGE_DIFFERENCE_STEP = 0.3
+"""Step of the Jacobian, in coordinates; for the reason see ``identification.fit.DELAY_DIFFERENCE_STEP``."""
 MAX_STEP = 8.0
 
 
@@ -78,7 +77,7 @@ def fit_change(
     losses = model.loss(first).sum(axis=1)
     best = int(np.argmin(losses))
     z, errors, loss, before = starts[best], first[best], float(losses[best]), float(losses[0])
-    jacobian = _jacobian(errors_at, z, errors)
+    jacobian = _jacobian(errors_at, free, z)
     for _ in range(settings.iterations):
         weight = model.weights(errors)[:, None]
         normal = np.einsum("nsd,msd->nm", jacobian * weight, jacobian)
@@ -94,7 +93,7 @@ def fit_change(
         if gain <= 0.0:
             break
         z, errors, loss = _within(free, tried)[best], whole[best], float(losses[best])
-        jacobian = _jacobian(errors_at, z, errors)
+        jacobian = _jacobian(errors_at, free, z)
         if gain < settings.tolerance * loss:
             break
     weighted = jacobian * model.weights(errors)[None, :, None]
@@ -107,13 +106,14 @@ def _within(free: tuple[FitParameter, ...], z: FloatArray) -> FloatArray:
     return np.array([[f.coordinate(float(f.value(np.array(v)))) for f, v in zip(free, row, strict=True)] for row in z])
 
 
-def _jacobian(errors_at: Callable[[FloatArray], FloatArray], z: FloatArray, errors: FloatArray) -> FloatArray:
-    """Jacobian (n, S, D) by central differences; by a step to one side where the other side has a bound."""
-    step = DIFFERENCE_STEP * np.eye(len(z))
-    ahead, behind = errors_at(z + step) - errors, errors - errors_at(z - step)
-    is_free = [np.abs(side).max(axis=(1, 2)) > 0.0 for side in (ahead, behind)]
-    sides = is_free[0].astype(float) + is_free[1]
-    return np.asarray((ahead + behind) / (np.maximum(sides, 1.0) * DIFFERENCE_STEP)[:, None, None])
+def _jacobian(
+    errors_at: Callable[[FloatArray], FloatArray], free: tuple[FitParameter, ...], z: FloatArray
+) -> FloatArray:
+    """Jacobian (n, S, D) by differences over ``CHANGE_DIFFERENCE_STEP`` to both sides, less at a bound."""
+    step = CHANGE_DIFFERENCE_STEP * np.eye(len(z))
+    ahead, behind = _within(free, z + step), _within(free, z - step)
+    width = np.diag(ahead - behind)
+    return np.asarray((errors_at(ahead) - errors_at(behind)) / np.where(width > 0.0, width, 1.0)[:, None, None])
 
 
 __all__ = ["ChangeFit", "fit_change"]

@@ -8,6 +8,7 @@ A change must also be more significant than any that comparisons within the firs
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,9 +30,9 @@ from carlab.diagnosis.comparison.linear_change import (
     null_p_values,
     short_name,
 )
-from carlab.diagnosis.comparison.result import Change, Comparison, Tested, verdict_sentence
+from carlab.diagnosis.comparison.result import Change, Comparison, ComparisonVerdict, Tested, verdict_sentence
 from carlab.diagnosis.findings import Estimate
-from carlab.diagnosis.identification.fit import Fitter
+from carlab.diagnosis.identification.fit import Fitter, clustered_gain
 from carlab.diagnosis.settings import DEFAULT, ComparisonSettings, DiagnosisSettings
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.registry import REGISTRY
@@ -77,8 +78,9 @@ def compare(
     material = compared_groups(reference, changed, nominal, settings)
     screened = _screen(material, candidates, settings.comparison, progress, stop)
     changes, tested = _select(material, screened, settings.comparison, progress, stop)
+    verdict: ComparisonVerdict = "changed" if changes else "inconclusive" if stop() else "nothing"
     seconds = MonotonicClock().now_s() - began_s
-    return Comparison("changed" if changes else "nothing", verdict_sentence(changes), changes, seconds, tested)
+    return Comparison(verdict, verdict_sentence(verdict, changes), changes, seconds, tested)
 
 
 def _screen(
@@ -122,10 +124,10 @@ def _select(
     length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows)
     model = material.model
     progress("comparing parts of the first group", 0.7)
-    null = null_p_values(screened, first, int(second.part.max()) + 1, model, settings)
+    null = null_p_values(screened, first, int(second.part.max()) + 1, model, settings, stop)
 
     def adjusted(p: float) -> float:
-        return _adjusted_p(p, len(screened), null, settings)
+        return 1.0 if len(null) and p >= null[0] else min(1.0, len(screened) * p)
 
     found: list[_Refined] = []
     ties: list[tuple[str, ...]] = []
@@ -141,23 +143,17 @@ def _select(
         if not any(adjusted(x.p_value) < settings.p_max for x in linear):
             break
         refined = [_refine(x, found, material, settings) for x in linear[: settings.max_refined]]
-        significant = [r for r in refined if adjusted(r.p_value) < settings.p_max]
+        significant = [r for r in refined if adjusted(max(r.p_value, r.linear.p_value)) < settings.p_max]
         best = max(significant, key=lambda r: r.likelihood_ratio, default=None)
         if best is None or (found and best.likelihood_ratio < settings.min_share_of_first * found[0].likelihood_ratio):
             break
-        ties.append(_ties(best, refined, settings))
+        ties.append(_ties(best, refined, material, settings.tie_z))
         found.append(best)
     changes = [
         _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value))
         for one, near in zip(found, ties, strict=True)
     ]
     return tuple(changes), tested
-
-
-def _adjusted_p(p: float, candidates: int, null: FloatArray, settings: ComparisonSettings) -> float:
-    """P-value for many candidates: by Bonferroni, and 1 if too many comparisons within the first group are as small."""
-    as_small = int(np.searchsorted(null, p, side="right"))
-    return min(1.0, candidates * p) if as_small <= settings.null_share_max * len(null) else 1.0
 
 
 def _refine(
@@ -183,14 +179,21 @@ def _refine(
     return _Refined(linear, fit, ratio, p, offset)
 
 
-def _ties(best: _Refined, refined: Sequence[_Refined], settings: ComparisonSettings) -> tuple[str, ...]:
-    """Candidates whose likelihood ratio is not clearly smaller, the closest first, at most two."""
-    limit = settings.tie_chi2 * best.linear.difference.design_effect
-    near = [
-        (best.likelihood_ratio - other.likelihood_ratio, other.linear.secants.at.candidate.id)
-        for other in refined
-        if other is not best and best.likelihood_ratio - other.likelihood_ratio < limit
-    ]
+def _ties(best: _Refined, refined: Sequence[_Refined], material: ComparedGroups, tie_z: float) -> tuple[str, ...]:
+    """Candidates whose loss on the second group is not significantly larger, the closest first, at most two.
+
+    The comparison is that of non-nested models (Vuong 1989), with a standard error clustered by block and multiplied by
+    the spread between drives.
+    """
+    windows, model = material.fitters[1].windows, material.model
+    loss = model.loss(best.fit.errors)
+    near = []
+    for other in refined:
+        if other is best:
+            continue
+        difference, error = clustered_gain(model.loss(other.fit.errors), loss, windows)
+        if difference < tie_z * error * math.sqrt(best.linear.difference.spread.ratio):
+            near.append((difference, other.linear.secants.at.candidate.id))
     return tuple(name for _, name in sorted(near)[:2])
 
 
@@ -210,7 +213,7 @@ def _change(
     z, index, last = joint
     at, found = one.linear.secants.at, one.linear.difference
     std = np.sqrt(np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed)
-    quantile = float(stats.t.ppf(0.95, max(min(found.dof - len(index), found.spread.dof), 1.0)))
+    quantile = float(stats.t.ppf(0.95, max(min(found.dof - (len(index) - 1), found.spread.dof), 1.0)))
     low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))
     parameters, reference = {}, {}
     for k, f in enumerate(at.candidate.free):

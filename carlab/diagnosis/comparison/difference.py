@@ -42,7 +42,7 @@ class Difference:
     information    of the first and the second group
     block_effect   variance of the step for independent blocks over that for independent errors
     spread         variance of parts of a drive over that for independent blocks
-    dof            degrees of freedom of the variance: effective number of blocks of both groups
+    dof            degrees of freedom of the variance for independent blocks (Welch 1947)
     """
 
     step: float
@@ -103,13 +103,16 @@ def difference(
     first, second = (float(i.sum()) for i in informations)
     change = steps[1] - steps[0]
     ratio = change**2 * first * second / (first + second)
-    by_block = _block_effect(informations, residuals, groups)
-    spread = spread_of_parts(informations, residuals, [group.part for group in groups], by_block)
     of_block = [_of_blocks(i, group) for i, group in zip(informations, groups, strict=True)]
-    if min(_effective_number(own) for own in of_block) < settings.min_effective_blocks:
+    numbers = [_effective_number(own) for own in of_block]
+    if min(numbers) < settings.min_effective_blocks:
         return None
-    dof = _effective_number(np.concatenate(of_block)) - 2.0
-    return Difference(change, steps[0], ratio, (first, second), by_block, spread, dof)
+    effects = [_block_effect(i, score, group) for i, score, group in zip(informations, residuals, groups, strict=True)]
+    variances = [effect / information for effect, information in zip(effects, (first, second), strict=True)]
+    by_block = sum(variances) / (1.0 / first + 1.0 / second)
+    dof = sum(variances) ** 2 / sum(v**2 / (number - 1.0) for v, number in zip(variances, numbers, strict=True))
+    spread = spread_of_parts(informations, residuals, [group.part for group in groups], effects)
+    return None if spread is None else Difference(change, steps[0], ratio, (first, second), by_block, spread, dof)
 
 
 def _of_blocks(values: FloatArray, group: GroupErrors) -> FloatArray:
@@ -122,20 +125,15 @@ def _effective_number(information: FloatArray) -> float:
     return float(information.sum() ** 2 / (information**2).sum())
 
 
-def _block_effect(
-    informations: Sequence[FloatArray], scores: Sequence[FloatArray], groups: Sequence[GroupErrors]
-) -> float:
-    """Spread of the scores of blocks over the information, at least one."""
-    squares = 0.0
-    for score, group in zip(scores, groups, strict=True):
-        sums = _of_blocks(score, group)
-        squares += float((sums**2).sum()) * len(sums) / max(len(sums) - 1, 1)
-    return max(squares / sum(float(i.sum()) for i in informations), 1.0)
+def _block_effect(information: FloatArray, score: FloatArray, group: GroupErrors) -> float:
+    """Spread of the scores of a group's blocks over its information, at least one."""
+    sums = _of_blocks(score, group)
+    return max(float((sums**2).sum()) * len(sums) / max(len(sums) - 1, 1) / float(information.sum()), 1.0)
 
 
 def p_value(difference: Difference, likelihood_ratio: float, parameters: int) -> float:
     """P-value of no change by an F-test with the design effect and the degrees of freedom of a difference."""
-    dof = max(min(difference.dof - parameters, difference.spread.dof), 1.0)
+    dof = max(min(difference.dof - (parameters - 1), difference.spread.dof), 1.0)
     return float(stats.f.sf(max(likelihood_ratio, 0.0) / (difference.design_effect * parameters), parameters, dof))
 
 

@@ -3,8 +3,9 @@
 A car and its floor change from drive to drive, and a wrong model needs other parameters for another drive. So the
 variance of a parameter between drives exceeds that of independent blocks. Each group is cut into parts as long as a
 drive of the second group. The ratio of both variances is estimated for each candidate, and moderated by the estimates
-of all candidates (Smyth 2004, "Linear models and empirical Bayes methods for assessing differential expression", eqs.
-3 and 6), because a few parts give an uncertain estimate.
+of all candidates, because there are few parts (Smyth 2004, "Linear models and empirical Bayes methods for assessing
+differential expression"). Candidates of one car are correlated, so the prior has at most ``MAX_PRIOR_RATIO`` times the
+degrees of freedom of a candidate.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ from carlab.prediction.windows import IndexArray, PredictionWindows
 MIN_PART_SHARE = 0.02
 """Minimum share of the information of a group that a part must have."""
 MIN_PARTS = 4
-"""Aimed number of parts of the first group; a part of a short group is shorter than a drive of the second group."""
+"""Minimum number of parts of the first group, if they have ``MIN_PART_BLOCKS`` blocks."""
 MIN_PART_BLOCKS = 4
 """Minimum length of a part, in blocks."""
+MAX_PRIOR_RATIO = 3.0
+"""Maximum ratio of the prior's degrees of freedom to those of a candidate."""
 MAX_PRIOR_DOF = 1e4
 MIN_SPREAD = 1e-3
 
@@ -46,10 +49,11 @@ class SpreadPrior:
     dof: float
 
     def moderated(self, spread: DriveSpread, length_ratio: float) -> DriveSpread:
-        """Posterior mean of the precision, for drives ``length_ratio`` times as long as the parts; at least one."""
-        dof = self.dof + spread.dof
-        ratio = (self.dof * self.ratio + spread.dof * spread.ratio) / dof if dof > 0.0 else 1.0
-        return DriveSpread(1.0 + max(ratio - 1.0, 0.0) * max(length_ratio, 1.0), dof if dof > 0.0 else math.inf)
+        """Reciprocal of the posterior mean precision for drives ``length_ratio`` times as long as parts; at least 1."""
+        prior_dof = min(self.dof, MAX_PRIOR_RATIO * spread.dof)
+        dof = prior_dof + spread.dof
+        ratio = (prior_dof * self.ratio + spread.dof * spread.ratio) / dof
+        return DriveSpread(1.0 + max(ratio - 1.0, 0.0) * max(length_ratio, 1.0), dof)
 
 
 def part_blocks(groups: Sequence[PredictionWindows]) -> int:
@@ -76,36 +80,38 @@ def parts_of(windows: PredictionWindows, length_blocks: int) -> IndexArray:
 
 
 def spread_of_parts(
-    informations: Sequence[FloatArray], scores: Sequence[FloatArray], parts: Sequence[IndexArray], block_effect: float
-) -> DriveSpread:
-    """Spread of the scores of parts over that expected of independent blocks.
+    informations: Sequence[FloatArray],
+    scores: Sequence[FloatArray],
+    parts: Sequence[IndexArray],
+    block_effects: Sequence[float],
+) -> DriveSpread | None:
+    """Spread of the scores of parts over that expected of independent blocks; None without two parts in any group.
 
     Args:
         informations: of each window (S,) of each group.
         scores: derivatives of the loss of each window (S,) at the step of its group.
         parts: index of the part of each window (S,).
-        block_effect: variance for independent blocks over that for independent errors.
+        block_effects: variance for independent blocks over that for independent errors, of each group.
     """
     ratios, dof = [], 0
-    for information, score, part in zip(informations, scores, parts, strict=True):
+    for information, score, part, effect in zip(informations, scores, parts, block_effects, strict=True):
         of_part = np.bincount(part, weights=information)
         share = of_part / of_part.sum()
         usable = share > MIN_PART_SHARE
         if usable.sum() > 1:
-            expected = block_effect * of_part * (1.0 - share)
+            expected = effect * of_part * (1.0 - share)
             ratios += list((np.bincount(part, weights=score) ** 2 / np.maximum(expected, 1e-12))[usable])
             dof += int(usable.sum()) - 1
-    return DriveSpread(float(np.mean(ratios)) if ratios else 1.0, float(dof))
+    return DriveSpread(float(np.mean(ratios)), float(dof)) if dof else None
 
 
 def spread_prior(spreads: Sequence[DriveSpread]) -> SpreadPrior:
     """Prior of the ratio from the estimates of all candidates, by the moments of their logarithms."""
-    usable = [s for s in spreads if s.dof > 0.0]
-    if len(usable) < 3:
+    if len(spreads) < 3:
         return SpreadPrior(1.0, 0.0)
-    dof = float(np.median([s.dof for s in usable]))
-    logs = np.log([max(s.ratio, MIN_SPREAD) for s in usable]) - digamma(dof / 2.0) + math.log(dof / 2.0)
-    prior_dof = 2.0 * _inverse_trigamma(float(np.var(logs, ddof=1)) - float(polygamma(1, dof / 2.0)))
+    dof = np.array([s.dof for s in spreads])
+    logs = np.log([max(s.ratio, MIN_SPREAD) for s in spreads]) - digamma(dof / 2.0) + np.log(dof / 2.0)
+    prior_dof = 2.0 * _inverse_trigamma(float(np.var(logs, ddof=1) - np.mean(polygamma(1, dof / 2.0))))
     ratio = math.exp(float(np.mean(logs)) + float(digamma(prior_dof / 2.0)) - math.log(prior_dof / 2.0))
     return SpreadPrior(max(ratio, 1.0), prior_dof)
 

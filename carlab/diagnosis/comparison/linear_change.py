@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -85,7 +87,7 @@ def linear_changes(
     length_ratio: float = 1.0,
     known: Sequence[FloatArray] = (),
 ) -> list[LinearChange]:
-    """Linear estimates of the candidates, the most likely first; those without information are left out.
+    """Linear estimates sorted by likelihood ratio; candidates without enough information are omitted.
 
     Args:
         screened: candidates with their secants.
@@ -111,8 +113,9 @@ def null_p_values(
     parts: int,
     model: ErrorModel,
     settings: ComparisonSettings,
+    stop: Callable[[], bool] = lambda: False,
 ) -> FloatArray:
-    """Smallest p-values of comparisons within the first group.
+    """Smallest p-values of linear estimates in comparisons within the first group.
 
     Random parts of the first group take the place of the second group, and all candidates are tested (Westfall and
     Young 1993, "Resampling-based multiple testing"). This accounts for the number of candidates, their correlation, and
@@ -124,23 +127,35 @@ def null_p_values(
         parts: number of parts of the second group; at most half of the first group's are drawn.
         model: distribution of the errors.
         settings: settings of the comparison.
+        stop: callback; if it returns true, the comparisons so far are the result.
 
     Returns:
-        (n,) sorted; n is at most ``settings.null_draws``.
+        (n,) sorted; n is at most ``settings.null_draws``. Comparisons without a usable candidate do not count.
     """
-    count = int(first.part.max()) + 1
-    rng = np.random.default_rng(0)
-    chosen = min(parts, count // 2)
-    if chosen < 1:
-        return np.zeros(0)
-    draws = {tuple(sorted(rng.choice(count, chosen, replace=False).tolist())) for _ in range(settings.null_draws)}
     smallest = []
-    for draw in sorted(draws):
+    for draw in _draws(int(first.part.max()) + 1, parts, settings.null_draws):
+        if stop():
+            break
         is_second = np.isin(first.part, draw)
         groups = [_subset(first, ~is_second), _subset(first, is_second)]
         found = linear_changes([s.split(is_second) for s in screened], groups, model, settings)
-        smallest.append(min((x.p_value for x in found), default=1.0))
+        if found:
+            smallest.append(min(x.p_value for x in found))
     return np.sort(smallest)
+
+
+def _draws(count: int, parts: int, most: int) -> list[tuple[int, ...]]:
+    """Different sets of ``parts`` of ``count`` parts, at most half of them: all, or ``most`` random ones."""
+    chosen = min(parts, count // 2)
+    if chosen < 1:
+        return []
+    if math.comb(count, chosen) <= most:
+        return list(itertools.combinations(range(count), chosen))
+    rng = np.random.default_rng(0)
+    drawn: set[tuple[int, ...]] = set()
+    while len(drawn) < most:
+        drawn.add(tuple(sorted(rng.choice(count, chosen, replace=False).tolist())))
+    return sorted(drawn)
 
 
 def _subset(group: GroupErrors, rows: NDArray[np.bool_]) -> GroupErrors:

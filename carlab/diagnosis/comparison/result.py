@@ -24,7 +24,7 @@ class Change:
         reference: value of each parameter in the first group.
         p_value: of no change, multiplied by the number of candidates.
         loss_share: fall of the negative log-likelihood of the second group, as a share of it.
-        standard_errors: size of the change in standard errors of independent blocks.
+        standard_errors: size of the change in standard errors, with the spread between blocks and between drives.
         indistinguishable_from: candidates that explain the second group as well.
     """
 
@@ -68,7 +68,7 @@ class Comparison:
     """The smallest set of changes that explains the difference between two groups of recordings.
 
     Attributes:
-        verdict: "changed", "nothing" or "inconclusive".
+        verdict: "changed", "nothing", or "inconclusive" if it was stopped before it found a change.
         sentence: the verdict.
         changes: the changes, the strongest first.
         seconds: run time [s].
@@ -86,8 +86,10 @@ class Comparison:
         return {"schema": SCHEMA, **asdict(self)}
 
 
-def verdict_sentence(changes: Sequence[Change]) -> str:
+def verdict_sentence(verdict: ComparisonVerdict, changes: Sequence[Change]) -> str:
     """The verdict of a comparison that has enough data."""
+    if verdict == "inconclusive":
+        return "The comparison was stopped before all candidates were tested."
     if not changes:
         return "These recordings show no change of the car between the two groups."
     falls = percent(1.0 - _product([1.0 - c.loss_share for c in changes]))

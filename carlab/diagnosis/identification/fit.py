@@ -41,9 +41,9 @@ MIN_POSITIVE_SHARE = 1e-3
 DIFFERENCE_STEP = 0.02
 """Step of a coordinate for finite differences."""
 DELAY_DIFFERENCE_STEP = 0.3
-"""The same for delays. With measured maps, predictions from rest jump with a delay: of 150 windows of the
-ETH RC car, eight from rest gave 94 % of a delay's information with a step of 0.02, so its interval was too narrow by a
-factor of about two. With steps of 0.3 to 1 the information is that of the other windows."""
+"""The same for delays. With measured maps, the prediction of a window that starts at rest is discontinuous in a delay:
+of 150 windows of the ETH RC car, eight from rest gave 94 % of its information with a step of 0.02, so its interval
+was too narrow by a factor of about two. With steps of 0.3 to 1 the information is that of the other windows."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,7 +73,7 @@ def extend(
 def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunControl) -> Path:
     """The greedy path, or the path with one other choice that predicts unseen blocks significantly better."""
     settings = problem.settings.selection
-    if len(greedy.model.effects) < settings.min_effects_of_wrong_turn:
+    if len(greedy.model.effects) < settings.min_effects_for_alternatives:
         return greedy
     best, visited = greedy, {frozenset(greedy.model.effects)}
     choices = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.unseen_gain)[: settings.max_alternatives]

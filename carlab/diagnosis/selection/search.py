@@ -1,7 +1,7 @@
 """Forward selection of missing effects.
 
 Each step screens all candidates, refits the best of them together with the base parameters, tests them on unseen
-blocks, accepts one, and applies moves. Where the result leaves a part of the excess, other choices are followed.
+blocks, accepts one, and applies moves. Where several effects leave a part of the excess, other choices are followed.
 Elimination and pairwise comparison come last. The stages exchange fitted models (``selection.problem``); no stage
 calls a later stage.
 """

@@ -49,15 +49,12 @@ class ComparisonSettings:
     p_max: float = 0.05
     """Maximum p-value of a change, multiplied by the number of candidates (Bonferroni)."""
     null_draws: int = 99
-    """Number of comparisons of parts within the first group."""
-    null_share_max: float = 0.01
-    """Maximum share of these comparisons with a p-value as small as that of a change. It is smaller than ``p_max``,
-    because the reference model is fitted to the first group and its errors there are smaller."""
+    """Maximum number of comparisons within the first group; a change must have a smaller p-value than each of them."""
     min_share_of_first: float = 0.15
     """Minimum likelihood ratio of a further change, as a share of that of the first: a weak one imitates the first."""
     max_changes: int = 3
     """Maximum number of changes."""
-    tie_chi2: float = 4.0
-    """Two candidates are indistinguishable if their likelihood ratios, over the design effect, differ by less."""
+    tie_z: float = 2.0
+    """Two candidates are indistinguishable if their losses on the second group differ by less [standard errors]."""
     period_ratio_max: float = 1.2
     """Maximum ratio of the recording periods of one car."""

@@ -74,7 +74,7 @@ class SelectionSettings:
     """Maximum number of effects."""
     min_remaining_excess: float = 0.1
     """Other choices are followed if the effects of the greedy path leave this share of the refit's squared excess."""
-    min_effects_of_wrong_turn: int = 3
+    min_effects_for_alternatives: int = 3
     """Minimum number of effects of the greedy path, so that other choices are followed. With one or two effects, they
     changed no name in 70 development cases, and took a fifth of the time."""
     max_alternatives: int = 3
@@ -128,7 +128,7 @@ class RivalSettings:
     spurious_share_many: float = 0.3
     """The same for ``many_effects`` effects or more: such a car may also have physics outside the catalogue."""
     many_effects: int = 3
-    """Number of effects from which ``spurious_share_many`` applies."""
+    """Number of effects from which ``spurious_share_many`` applies, and limits for one or two effects do not."""
     min_unnamed_share: float = 0.04
     """Minimum gain of unnamed physics that makes effects spurious, as a share of a perfect simulator's loss."""
     unnamed_ratio: float = 1.15
@@ -137,8 +137,8 @@ class RivalSettings:
     """Minimum share of the held-out squared excess of the refit that one or two effects explain. On 47 development
     cases, concealed effects explain 0.61 or more, and two of three spurious names 0.20 and 0.29."""
     min_explained_z: float = 3.0
-    """Alternative: minimum fall of the held-out loss with the effects [standard errors]; a certain effect of a car that
-    also lacks other physics stays."""
+    """Alternative: minimum fall of the held-out loss with the effects [standard errors]. It keeps a significant effect
+    of a car that also lacks other physics."""
     min_held_out_excess: float = 0.1
     """Minimum squared excess of the refit for this share; a smaller one is as uncertain as the noise floor."""
     weak_term_chi2: float = 14.0
