@@ -127,6 +127,21 @@ def test_reference_leaves_out_the_pieces_of_the_case(recordings: dict[str, dict[
         assert len(kept) > 80.0 / PERIOD_S
 
 
+@pytest.mark.parametrize(("ratio", "message"), [(1.0 + 1e-5, None), (1.5, "different periods")])
+def test_size_is_that_of_all_pieces(
+    recordings: dict[str, dict[str, np.ndarray]], ratio: float, message: str | None
+) -> None:
+    """A delay of whole rows has the same size in all pieces if their periods are equal up to the jitter of stamps."""
+    tables = {name: with_full_lock(table) for name, table in recordings.items()}
+    tables["b"] = {**tables["b"], "t": ratio * tables["b"]["t"]}
+    spec = RealCaseSpec("single", 3, ("steering_delay",), (2,))
+    if message is None:
+        assert len(make_real_case(spec, tables, parts(tables))[1]) > 1
+    else:
+        with pytest.raises(DataError, match=message):
+            make_real_case(spec, tables, parts(tables))
+
+
 def poses(table: dict[str, np.ndarray]) -> set[tuple[float, float]]:
     return set(zip(table["x"].tolist(), table["y"].tolist(), strict=True))
 

@@ -6,6 +6,7 @@ Therefore a part consists of short pieces of many drives, and a reference of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -16,7 +17,7 @@ import numpy as np
 
 from carlab.benchmark.cases.seal import file_digest
 from carlab.benchmark.effects.data_faults import Table
-from carlab.benchmark.real.kinds import FULL_LOCK, KINDS, MAX_INEXACT, Kind
+from carlab.benchmark.real.kinds import FULL_LOCK, KINDS, MAX_INEXACT, Kind, Truth
 from carlab.benchmark.world.measurement import COLUMNS, write_csv
 from carlab.core.errors import DataError
 
@@ -31,6 +32,8 @@ GUARD_S = 1.0
 SHORTEST_REFERENCE_S = 10.0
 """Shorter stretches are not used in a reference [s]."""
 MAX_GAP_PERIODS = 3.0
+MAX_SIZE_RATIO = 0.02
+"""Maximum relative difference of an effect's size between the pieces of a case."""
 MOVING_MPS = 0.2
 MIN_MOVING_SHARE = 0.5
 SEED_BASE = 3_000_000
@@ -191,7 +194,7 @@ def _largest_exact(
     """The tables with the largest size that clips few commands in each of them, and the answer; None without one."""
     for index in range(largest, -1, -1):
         changes = [kind.apply(table, kind.sizes[index], draw) for table in tables]
-        if any(change.truth != changes[0].truth for change in changes):
+        if not all(_are_close(change.truth, changes[0].truth) for change in changes):
             raise DataError("The recordings have different periods; use recordings of one period.")
         commands = [change.table[name] for change in changes for name in ("steering", "throttle")]
         inexact = max(change.inexact for change in changes)
@@ -199,6 +202,11 @@ def _largest_exact(
             answer = kind.as_dict(replace(changes[0], inexact=inexact), kind.sizes[index])
             return [change.table for change in changes], {**answer, "size_index": index}
     return None
+
+
+def _are_close(truth: Sequence[Truth], other: Sequence[Truth]) -> bool:
+    """Whether the sizes are equal up to the jitter of the stamps."""
+    return all(math.isclose(a.size, b.size, rel_tol=MAX_SIZE_RATIO) for a, b in zip(truth, other, strict=True))
 
 
 def write_tables(folder: Path, tables: Mapping[str, Table]) -> dict[str, str]:
