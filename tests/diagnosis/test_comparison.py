@@ -71,8 +71,10 @@ def test_same_car_has_no_change(first, seed):
     assert compare([first], [second(CAR, seed)], CAR, candidates=CANDIDATES).verdict == "nothing"
 
 
-def test_stop_ends_with_the_changes_so_far(first):
-    assert compare([first], [first], CAR, stop=lambda: True).changes == ()
+def test_stop_without_a_change_is_inconclusive(first):
+    stopped = compare([first], [first], CAR, stop=lambda: True)
+    assert (stopped.verdict, stopped.changes) == ("inconclusive", ())
+    assert stopped.sentence == "The comparison was stopped before all candidates were tested."
 
 
 def test_unusable_groups_are_refused_with_one_sentence(first):
