@@ -153,7 +153,7 @@ class SerialFirmware:
     def _step(self, now_s: float) -> float:
         """Process received and outgoing bytes that are due; return the time to wait [s]."""
         if self._master is not None and not self.faults.stops_reading:
-            self._read(self._master, now_s)
+            self._read(self._master)
         while self._received and self._received[0][0] <= now_s:
             t_s, data = self._received.popleft()
             for payload in self.decoder.feed(data, t_s):
@@ -164,7 +164,7 @@ class SerialFirmware:
         due = [queue[0][0] - now_s for queue in (self._received, self._outgoing) if queue]
         return max(0.0, min([POLL_S, *due]))
 
-    def _read(self, master: int, now_s: float) -> None:
+    def _read(self, master: int) -> None:
         try:
             data = os.read(master, 4096)
         except BlockingIOError:
@@ -175,9 +175,10 @@ class SerialFirmware:
                 raise
             if self._has_host:
                 self._has_host = False
-                self.log.add(now_s, "hang_up")
+                self.log.add(time.monotonic(), "hang_up")
                 self.decoder.clear()
             return
+        now_s = time.monotonic()  # after the read: bytes never arrive before they were written
         self._has_host = True
         if data and not self._has_received:
             self._has_received = True

@@ -21,7 +21,7 @@ FAKE = Path(__file__).resolve().parents[1] / "benchmark" / "fake_comparison.py"
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
     for seed in (1, 2):
-        write_csv(drive(SimulatorConfig(), 75.0, seed), folder / f"{seed}.csv")
+        write_csv(drive(SimulatorConfig(), 85.0, seed), folder / f"{seed}.csv")
     return folder
 
 

@@ -10,7 +10,7 @@ import carlab
 from carlab.cli import run
 from carlab.core.errors import ConfigError, DataError
 from carlab.diagnosis.comparison.compare import compare
-from carlab.diagnosis.identification.fit import with_effect
+from carlab.diagnosis.identification.fit_parameters import with_effect
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 

@@ -14,7 +14,8 @@ from carlab.cars import load_car_file
 from carlab.core.episode_data import EpisodeData
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.evidence import Texts
-from carlab.diagnosis.identification.fit import Fit, Fitter, Scale, base_parameters, effect_parameters, with_effect
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.fit_parameters import base_parameters, effect_parameters, with_effect
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.selection.elimination import eliminate

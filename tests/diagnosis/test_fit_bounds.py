@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from carlab.diagnosis.identification.fit import effect_parameters, with_effect
+from carlab.diagnosis.identification.fit_parameters import effect_parameters, with_effect
 from sim_backends import SimulatorConfig
 from sim_backends.effects import EFFECTS
 

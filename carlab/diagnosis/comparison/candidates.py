@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import (
-    Fit,
+from carlab.diagnosis.identification.fit import Fit, Fitter
+from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
-    Fitter,
     base_parameters,
     effect_parameters,
     with_effect,

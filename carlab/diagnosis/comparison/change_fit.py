@@ -9,7 +9,8 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.error_model import ErrorModel
-from carlab.diagnosis.identification.fit import FitParameter, Fitter
+from carlab.diagnosis.identification.fit import Fitter
+from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.settings import ComparisonSettings
 from sim_backends.car_parameters import SimulatorConfig
 

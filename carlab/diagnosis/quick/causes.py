@@ -14,13 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import (
-    Fit,
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale, clustered_gain
+from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
-    Fitter,
-    Scale,
     base_parameters,
-    clustered_gain,
     effect_parameters,
     with_effect,
 )

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 
-from carlab.diagnosis.identification.fit import design_effect_of, effect_parameters
+from carlab.diagnosis.identification.fit import design_effect_of
+from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import fit_with_scale, refit, refit_candidate
 from carlab.diagnosis.selection.screening import Screen

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import clustered_gain, design_effect_of, effect_parameters
+from carlab.diagnosis.identification.fit import clustered_gain, design_effect_of
+from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.selection.elimination import EliminationResult
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit_candidate

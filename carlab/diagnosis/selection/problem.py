@@ -10,11 +10,9 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Decision
-from carlab.diagnosis.identification.fit import (
-    Fit,
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.fit_parameters import (
     FitParameter,
-    Fitter,
-    Scale,
     base_parameters,
     effect_parameters,
     with_effect,

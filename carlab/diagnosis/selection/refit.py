@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, FitParameter, Fitter, Scale
+from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
+from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.selection.problem import Candidate, Model, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult
 from carlab.prediction.errors import prediction_errors

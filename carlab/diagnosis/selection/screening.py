@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, FitParameter, Fitter, effect_parameters, with_effect
+from carlab.diagnosis.identification.fit import Fit, Fitter
+from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
 from carlab.diagnosis.selection.problem import Model, SearchProblem
 from carlab.diagnosis.settings import DEFAULT, ScreeningSettings
 from sim_backends.car_parameters import SimulatorConfig
