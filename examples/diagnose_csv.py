@@ -27,7 +27,7 @@ def example_csv(folder: Path) -> Path:
         "sim",
         reality=CarFile("reality", "", simulator, None),
         policy=ManoeuvrePolicy(Manoeuvre("steps", 40.0, steps)),
-        task=RecordedTask(carlab.CarState(), max_ticks=1200, arena_m=rectangle(-20.0, 20.0, -20.0, 20.0)),
+        task=RecordedTask(carlab.CarState(), max_ticks=1200, arena_m=rectangle(-60.0, 60.0, -60.0, 60.0)),
         out=folder,
     )
     return carlab.load(run.recordings[0]).save(run.folder / "drive.csv")
