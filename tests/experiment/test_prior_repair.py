@@ -153,7 +153,11 @@ def test_version_is_read_as_it_was_written(tmp_path: Path) -> None:
     version = PriorVersion((MOTOR_LAG, Correction("motor_saturation", saturation, {}, 1, "diagnosis")), 5, "Why.", 1)
     path.write_text(json.dumps(version.to_dict()))
     assert read_version(run, 1) == version
-    for content in ("{", "[]", '{"corrections": [1], "history": 4, "sentence": "", "diagnosed": 0}'):
+    rest = '"sentence": "", "diagnosed": 0}'
+    for content in (
+        *("{", "[]", '{"corrections": [1], "history": 4, ' + rest),
+        *('{"corrections": [], "history": ' + history + ", " + rest for history in ("-1", "1e9", "NaN")),
+    ):
         path.write_text(content)
         with pytest.raises(DataError, match=r"remove it, and the run repeats the repair\.$"):
             read_version(run, 1)

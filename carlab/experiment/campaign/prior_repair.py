@@ -24,6 +24,8 @@ PARAMETERS = "parameters"
 MAX_SHOWN = 4
 """Maximum number of numbers in a message."""
 MIN_HISTORY, MAX_HISTORY = 3, 8
+LARGEST_GIVEN_HISTORY = 100
+"""Largest number of past commands of a file; a user may ask for more than ``MAX_HISTORY``."""
 MIN_ENTRY_SHARE = 0.3
 """Minimum share of the error that a cause of the quick check explains on windows that were not fitted."""
 MIN_STD_SHARE = 0.2
@@ -93,7 +95,10 @@ class PriorVersion:
             )
             for c in content["corrections"]
         )  # fmt: skip
-        return cls(corrections, int(content["history"]), str(content["sentence"]), int(content["diagnosed"]))
+        history = int(content["history"])
+        if not 0 <= history <= LARGEST_GIVEN_HISTORY:
+            raise ValueError(f"history is {history}")
+        return cls(corrections, history, str(content["sentence"]), int(content["diagnosed"]))
 
 
 @dataclass(frozen=True, slots=True)
