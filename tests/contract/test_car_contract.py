@@ -43,7 +43,15 @@ def car(closed_car: Car) -> Iterator[Car]:
     with closed_car:
         yield closed_car
         if closed_car.reality is Reality.REAL:
-            assert closed_car.health().ready
+            assert problems_after_waiting(closed_car) == ()
+
+
+def problems_after_waiting(car: Car) -> tuple[str, ...]:
+    """Problems that do not end within five seconds; on a busy machine the newest pose is late now and then."""
+    end_s = car.clock.now_s() + 5.0
+    while (problems := car.health().problems) and car.clock.now_s() < end_s:
+        wait(car, 0.05)
+    return problems
 
 
 def arm(car: Car) -> None:
@@ -83,7 +91,7 @@ def test_constructing_does_nothing_and_a_closed_car_raises(closed_car: Car) -> N
 def test_open_and_close_are_idempotent(closed_car: Car) -> None:
     closed_car.open()
     closed_car.open()
-    assert closed_car.health().ready, closed_car.health().problems
+    assert problems_after_waiting(closed_car) == ()
     closed_car.close()
     closed_car.close()
     with pytest.raises(NotOpenError):
