@@ -102,10 +102,10 @@ def test_prior_of_the_spread_is_that_of_its_sample(ratio: float, dof: float) -> 
 
 def test_moderated_spread_lies_between_prior_and_estimate() -> None:
     prior = spread_prior([DriveSpread(float(s), 3.0) for s in stats.f.rvs(3, 5, size=2000, random_state=4)])
-    assert prior.ratio < prior.moderated(DriveSpread(9.0, 3.0), 1.0).ratio < 9.0
-    assert prior.moderated(DriveSpread(0.1, 3.0), 1.0).ratio == 1.0
-    long_drive = prior.moderated(DriveSpread(9.0, 3.0), 2.0).ratio
-    assert long_drive - 1.0 == pytest.approx(2.0 * (prior.moderated(DriveSpread(9.0, 3.0), 1.0).ratio - 1.0))
+    assert prior.ratio < prior.moderated(DriveSpread(9.0, 3.0), 1.0, SETTINGS).ratio < 9.0
+    assert prior.moderated(DriveSpread(0.1, 3.0), 1.0, SETTINGS).ratio == 1.0
+    long_drive = prior.moderated(DriveSpread(9.0, 3.0), 2.0, SETTINGS).ratio
+    assert long_drive - 1.0 == pytest.approx(2.0 * (prior.moderated(DriveSpread(9.0, 3.0), 1.0, SETTINGS).ratio - 1.0))
 
 
 def test_part_lies_in_one_drive() -> None:

@@ -18,7 +18,7 @@ from carlab.diagnosis.identification.fit_parameters import (
 )
 from carlab.diagnosis.selection.problem import is_applicable
 from carlab.diagnosis.selection.screening import Screen
-from carlab.diagnosis.settings import DEFAULT
+from carlab.diagnosis.settings import DiagnosisSettings
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
 
@@ -69,9 +69,10 @@ def with_candidate(config: SimulatorConfig, candidate: ChangeCandidate) -> Simul
     return with_effect(config, candidate.id) if is_new else config
 
 
-def candidate_points(fitter: Fitter, config: SimulatorConfig, candidate: ChangeCandidate) -> CandidatePoints:
+def candidate_points(
+    fitter: Fitter, config: SimulatorConfig, candidate: ChangeCandidate, settings: DiagnosisSettings
+) -> CandidatePoints:
     """Points of a candidate: of an absent effect as in a screening, of a known parameter one step to both sides."""
-    settings = DEFAULT.comparison
     whole = with_candidate(config, candidate)
     values = whole.values()
     z0 = np.array([f.coordinate(values[f.name]) for f in candidate.free])
@@ -79,13 +80,13 @@ def candidate_points(fitter: Fitter, config: SimulatorConfig, candidate: ChangeC
         steps = np.vstack([np.eye(len(z0)), -np.eye(len(z0))])
         return CandidatePoints(candidate, whole, z0, z0 + steps)
     screening = replace(
-        DEFAULT.screening,
-        error_rms_changes=settings.error_rms_changes,
-        typical_size_ratios=settings.typical_size_ratios,
+        settings.screening,
+        error_rms_changes=settings.comparison.error_rms_changes,
+        typical_size_ratios=settings.comparison.typical_size_ratios,
     )
     screen = Screen(fitter, config, Fit(config, (), np.zeros(0), 0.0, np.zeros(0)), settings=screening)
     points = screen.points(candidate.id, candidate.free)
-    chosen = np.unique(np.linspace(0, len(points) - 1, settings.max_points).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(points) - 1, settings.comparison.max_points).round().astype(int))
     return CandidatePoints(candidate, whole, z0, points[chosen])
 
 

@@ -77,7 +77,7 @@ def compare(
     began_s = MonotonicClock().now_s()
     progress("fitting the simulator to the first group", 0.0)
     material = compared_groups(reference, changed, nominal, settings)
-    screened = _screen(material, candidates, settings.comparison, progress, stop)
+    screened = _screen(material, candidates, settings, progress, stop)
     changes, tested = _select(material, screened, settings.comparison, progress, stop)
     verdict: ComparisonVerdict = "changed" if changes else "inconclusive" if stop() else "nothing"
     seconds = MonotonicClock().now_s() - began_s
@@ -87,22 +87,22 @@ def compare(
 def _screen(
     material: ComparedGroups,
     only: Sequence[str] | None,
-    settings: ComparisonSettings,
+    settings: DiagnosisSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
 ) -> list[Secants]:
     """Secants of all candidates in both groups."""
     first = material.fitters[0]
-    few = Fitter(first.windows.thinned(settings.max_point_windows), first.scale, first.settings)
+    few = Fitter(first.windows.thinned(settings.comparison.max_point_windows), first.scale, first.settings)
     candidates = change_candidates(material.config, only)
     found = []
     for k, candidate in enumerate(candidates):
         if stop():
             break
         progress(f"influence of {candidate.id}", 0.1 + 0.6 * k / len(candidates))
-        at = candidate_points(few, material.config, candidate)
+        at = candidate_points(few, material.config, candidate, settings)
         secants = [
-            at.secants(fitter, errors, settings.max_secant)
+            at.secants(fitter, errors, settings.comparison.max_secant)
             for fitter, errors in zip(material.fitters, material.errors, strict=True)
         ]
         found.append(Secants(at, material.decorrelated(secants)))
@@ -122,7 +122,7 @@ def _select(
         GroupErrors(errors, w.block, part)
         for errors, w, part in zip(material.decorrelated(material.errors), windows, material.parts, strict=True)
     )
-    length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows)
+    length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows, settings)
     model = material.model
     progress("comparing parts of the first group", 0.7)
     null = null_p_values(screened, first, int(second.part.max()) + 1, model, settings, stop)

@@ -4,7 +4,7 @@ A car and its floor change from drive to drive, and a wrong model needs other pa
 variance of a parameter between drives exceeds that of independent blocks. Each group is cut into parts as long as a
 drive of the second group. The ratio of both variances is estimated for each candidate, and moderated by the estimates
 of all candidates, because there are few parts (Smyth 2004, "Linear models and empirical Bayes methods for assessing
-differential expression"). Candidates of one car are correlated, so the prior has at most ``MAX_PRIOR_RATIO`` times the
+differential expression"). Candidates of one car are correlated, so the prior has at most ``max_prior_ratio`` times the
 degrees of freedom of a candidate.
 """
 
@@ -19,16 +19,9 @@ from scipy.optimize import brentq
 from scipy.special import digamma, polygamma
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.settings import ComparisonSettings
 from carlab.prediction.windows import IndexArray, PredictionWindows
 
-MIN_PART_SHARE = 0.02
-"""Minimum share of the information of a group that a part must have."""
-MIN_PARTS = 4
-"""Minimum number of parts of the first group, if they have ``MIN_PART_BLOCKS`` blocks."""
-MIN_PART_BLOCKS = 4
-"""Minimum length of a part, in blocks."""
-MAX_PRIOR_RATIO = 3.0
-"""Maximum ratio of the prior's degrees of freedom to those of a candidate."""
 MAX_PRIOR_DOF = 1e4
 MIN_SPREAD = 1e-3
 
@@ -48,18 +41,19 @@ class SpreadPrior:
     ratio: float
     dof: float
 
-    def moderated(self, spread: DriveSpread, length_ratio: float) -> DriveSpread:
+    def moderated(self, spread: DriveSpread, length_ratio: float, settings: ComparisonSettings) -> DriveSpread:
         """Reciprocal of the posterior mean precision for drives ``length_ratio`` times as long as parts; at least 1."""
-        prior_dof = min(self.dof, MAX_PRIOR_RATIO * spread.dof)
+        prior_dof = min(self.dof, settings.max_prior_ratio * spread.dof)
         dof = prior_dof + spread.dof
         ratio = (prior_dof * self.ratio + spread.dof * spread.ratio) / dof
         return DriveSpread(1.0 + max(ratio - 1.0, 0.0) * max(length_ratio, 1.0), dof)
 
 
-def part_blocks(groups: Sequence[PredictionWindows]) -> int:
+def part_blocks(groups: Sequence[PredictionWindows], settings: ComparisonSettings) -> int:
     """Length of a part in blocks: the longest drive of the second group, or less if the first group is short."""
     first, second = groups
-    return max(min(longest_drive_blocks(second), len(np.unique(first.block)) // MIN_PARTS), MIN_PART_BLOCKS)
+    most = len(np.unique(first.block)) // settings.min_parts
+    return max(min(longest_drive_blocks(second), most), settings.min_part_blocks)
 
 
 def longest_drive_blocks(windows: PredictionWindows) -> int:
@@ -84,6 +78,7 @@ def spread_of_parts(
     scores: Sequence[FloatArray],
     parts: Sequence[IndexArray],
     block_effects: Sequence[float],
+    min_part_share: float,
 ) -> DriveSpread | None:
     """Spread of the scores of parts over that expected of independent blocks; None without two parts in any group.
 
@@ -92,12 +87,13 @@ def spread_of_parts(
         scores: derivatives of the loss of each window (S,) at the step of its group.
         parts: index of the part of each window (S,).
         block_effects: variance for independent blocks over that for independent errors, of each group.
+        min_part_share: minimum share of the information of a group that a part must have.
     """
     ratios, dof = [], 0
     for information, score, part, effect in zip(informations, scores, parts, block_effects, strict=True):
         of_part = np.bincount(part, weights=information)
         share = of_part / of_part.sum()
-        usable = share > MIN_PART_SHARE
+        usable = share > min_part_share
         if usable.sum() > 1:
             expected = effect * of_part * (1.0 - share)
             ratios += list((np.bincount(part, weights=score) ** 2 / np.maximum(expected, 1e-12))[usable])

@@ -93,7 +93,7 @@ def compared_groups(
     )
     config = fitted.fit.config
     errors = (_errors(one, config), _errors(two, config))
-    length = part_blocks((one.windows, two.windows))
+    length = part_blocks((one.windows, two.windows), settings.comparison)
     parts = (parts_of(one.windows, length), parts_of(two.windows, length))
     fold = parts[0] % min(settings.comparison.error_folds, int(parts[0].max()) + 1)
     models = CrossFittedErrors.of(errors[0], fold, settings.comparison)

@@ -100,9 +100,9 @@ def linear_changes(
     found = [linear for s in screened if (linear := s.best(groups, model, settings, known)) is not None]
     prior = spread_prior([x.difference.spread for x in found])
     log.debug("spread between drives over that of blocks: %.2f (%.1f degrees of freedom)", prior.ratio, prior.dof)
+    spreads = [prior.moderated(x.difference.spread, length_ratio, settings) for x in found]
     moderated = [
-        replace(x, difference=replace(x.difference, spread=prior.moderated(x.difference.spread, length_ratio)))
-        for x in found
+        replace(x, difference=replace(x.difference, spread=spread)) for x, spread in zip(found, spreads, strict=True)
     ]
     return sorted(moderated, key=lambda x: -x.difference.likelihood_ratio)
 

@@ -34,6 +34,14 @@ class ComparisonSettings:
     """Shares of the diagonal that may be added to the errors' covariance; cross-validation chooses one."""
     ridge_variance: float = 0.01
     """Added to the diagonal of the errors' covariance [squared floors]."""
+    min_parts: int = 4
+    """Minimum number of parts of the first group, if they have ``min_part_blocks`` blocks."""
+    min_part_blocks: int = 4
+    """Minimum length of a part of a drive, in blocks."""
+    min_part_share: float = 0.02
+    """Minimum share of the information of a group that a part must have to count in the spread between parts."""
+    max_prior_ratio: float = 3.0
+    """Maximum ratio of the degrees of freedom of the spread of all candidates to those of one candidate."""
     error_folds: int = 5
     """Number of folds of whole parts whose errors are decorrelated by the covariance of the other folds."""
     weight_iterations: int = 3
