@@ -51,7 +51,6 @@ def test_change_is_named_with_its_size_although_the_simulator_lacks_physics(slow
     assert found.changes[0].parameters["time_constant"].value == pytest.approx(LAG_S, rel=0.1)
 
 
-@pytest.mark.xfail(strict=True, reason="intervals of a comparison are too narrow")
 def test_interval_of_a_large_change_contains_it(slower_servo):
     estimate = slower_servo.changes[0].parameters["time_constant"]
     assert estimate.low90 <= LAG_S <= estimate.high90

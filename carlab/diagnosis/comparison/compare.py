@@ -152,7 +152,7 @@ def _select(
         ties.append(_ties(best, refined, material, settings.tie_z))
         found.append(best)
     changes = [
-        _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value))
+        _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value), settings.model_error_share)
         for one, near in zip(found, ties, strict=True)
     ]
     return tuple(changes), tested
@@ -211,10 +211,12 @@ def _change(
     joint: tuple[FloatArray, list[int], ChangeFit],
     ties: tuple[str, ...],
     p: float,
+    model_error_share: float,
 ) -> Change:
     z, index, last = joint
     at, found = one.linear.secants.at, one.linear.difference
-    std = np.sqrt(np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed)
+    variance = np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed
+    std = np.sqrt(variance + (model_error_share * (z - at.z0)) ** 2)
     quantile = float(stats.t.ppf(0.95, max(min(found.dof - (len(index) - 1), found.spread.dof), 1.0)))
     low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))
     parameters, reference = {}, {}
