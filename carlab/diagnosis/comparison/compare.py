@@ -3,7 +3,7 @@
 The simulator is fitted to the first group. The change of its errors by each candidate is computed once. A linear
 estimate in both groups then gives the likelihood ratio and the significance of each candidate. The best ones are fitted
 to the second group. Physics that the simulator lacks is in the errors of both groups, so it cancels in the difference.
-A change must also be more significant than nearly all that comparisons within the first group show.
+A change must also be more significant than any that comparisons within the first group show.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from carlab.diagnosis.comparison.groups import ComparedGroups, compared_groups
 from carlab.diagnosis.comparison.linear_change import (
     LinearChange,
     Secants,
-    is_smaller_than_null,
     linear_changes,
     null_p_values,
     short_name,
@@ -128,7 +127,7 @@ def _select(
     null = null_p_values(screened, first, int(second.part.max()) + 1, model, settings, stop)
 
     def adjusted(p: float) -> float:
-        return min(1.0, len(screened) * p)
+        return 1.0 if len(null) and p >= null[0] else min(1.0, len(screened) * p)
 
     found: list[_Refined] = []
     ties: list[tuple[str, ...]] = []
@@ -141,8 +140,7 @@ def _select(
         others = [s for s in screened if s.at.candidate.id not in taken]
         linear = linear_changes(others, groups, model, settings, length_ratio=length_ratio, known=known)
         tested = tested or tuple(x.tested() for x in linear)
-        smallest = min((x.p_value for x in linear), default=1.0)
-        if adjusted(smallest) >= settings.p_max or not is_smaller_than_null(smallest, null, settings.p_max):
+        if not any(adjusted(x.p_value) < settings.p_max for x in linear):
             break
         refined = [_refine(x, found, material, settings) for x in linear[: settings.max_refined]]
         significant = [r for r in refined if adjusted(max(r.p_value, r.linear.p_value)) < settings.p_max]

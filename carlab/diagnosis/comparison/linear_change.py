@@ -144,16 +144,6 @@ def null_p_values(
     return np.sort(smallest)
 
 
-def is_smaller_than_null(p: float, null: FloatArray, level: float) -> bool:
-    """Whether a p-value is smaller than those of comparisons within the first group, with this error rate.
-
-    The Monte Carlo p-value (1 + number of null p-values up to ``p``) / (1 + n) may be at most ``level`` (Phipson and
-    Smyth 2010). Too few comparisons for that level must all have larger p-values.
-    """
-    allowed = max(int(level * (len(null) + 1)) - 1, 0)
-    return int((null <= p).sum()) <= allowed
-
-
 def _draws(count: int, parts: int, most: int) -> list[tuple[int, ...]]:
     """Different sets of ``parts`` of ``count`` parts, at most half of them: all, or ``most`` random ones."""
     chosen = min(parts, count // 2)
@@ -178,4 +168,4 @@ def short_name(name: str) -> str:
     return name.rpartition(".")[2] if name.startswith("effects.") else name
 
 
-__all__ = ["LinearChange", "Secants", "is_smaller_than_null", "linear_changes", "null_p_values", "short_name"]
+__all__ = ["LinearChange", "Secants", "linear_changes", "null_p_values", "short_name"]

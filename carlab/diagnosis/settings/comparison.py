@@ -57,8 +57,7 @@ class ComparisonSettings:
     p_max: float = 0.05
     """Maximum p-value of a change, multiplied by the number of candidates (Bonferroni)."""
     null_draws: int = 99
-    """Maximum number of comparisons within the first group. At most a share ``p_max`` of them may be as significant as
-    a change."""
+    """Maximum number of comparisons within the first group; a change must have a smaller p-value than each of them."""
     min_share_of_first: float = 0.15
     """Minimum likelihood ratio of a further change, as a share of that of the first: a weak one imitates the first."""
     max_changes: int = 3
