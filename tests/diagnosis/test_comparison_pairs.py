@@ -1,6 +1,6 @@
 """Study of comparisons on pairs of groups of drives from an independent generator, with one concealed change or none.
 
-Run it with ``pytest -m slow tests/diagnosis/test_comparison_pairs.py -s``; it takes about an hour on one core.
+Run it with ``pytest -m slow tests/diagnosis/test_comparison_pairs.py -s``; it takes half an hour on one core.
 """
 
 from collections.abc import Sequence
@@ -69,7 +69,7 @@ def test_concealed_change_is_named_first(tmp_path: Path) -> None:
         changes = [(c.id, c.indistinguishable_from, round(c.standard_errors, 1)) for c in found.changes]
         print(f"{name} ({excess:g}): {changes}", flush=True)
     print(f"named first: {hits} of {count} with sets, {strict} of {count} itself or a confusable effect")
-    assert hits >= 0.6 * count
+    assert hits >= 0.8 * count
 
 
 @pytest.mark.slow
