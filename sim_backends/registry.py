@@ -99,12 +99,15 @@ def register(effect: Effect) -> None:
     """Add an effect to car files, all engines, the diagnosis, its reports, and the prior of learning.
 
     Raises:
-        ConfigError: its id exists, or it has no parameters.
+        ConfigError: its id exists, or it has no parameters or lacks a method.
     """
     if effect.id in EFFECTS:
         raise ConfigError(f"There is an effect '{effect.id}' already; choose another id for the new effect.")
     if not effect.parameters:
         raise ConfigError(f"Effect '{effect.id}' has no parameters; give it at least one EffectParameter.")
+    method = effect.required_method()
+    if method and getattr(type(effect), method).__module__ == Effect.__module__:
+        raise ConfigError(f"Effect '{effect.id}' has no method '{method}'; define it in the class of the effect.")
     EFFECTS[effect.id] = effect
     if effect.catalogued:
         CATALOGUE[effect.id] = effect

@@ -178,7 +178,7 @@ class SerialFirmware:
                 self.log.add(time.monotonic(), "hang_up")
                 self.decoder.clear()
             return
-        now_s = time.monotonic()  # after the read: bytes never arrive before they were written
+        now_s = time.monotonic()  # read after the data, so that it is later than their write
         self._has_host = True
         if data and not self._has_received:
             self._has_received = True

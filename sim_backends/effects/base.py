@@ -150,6 +150,10 @@ class Effect:
         """
         return None
 
+    def required_method(self) -> str:
+        """Name of the method that a subclass has to define; "" without one. ``register`` refuses an effect without."""
+        return ""
+
     def numbers(self, values: Mapping[str, Value]) -> dict[str, Value]:
         """The effect's parameters by name, from numbers by dotted name."""
         return {p.name: values[f"effects.{self.id}.{p.name}"] for p in self.parameters}
@@ -159,6 +163,10 @@ class DelayEffect(Effect):
     """A delay of commands."""
 
     kind: ClassVar[Kind] = "input"
+
+    def required_method(self) -> str:
+        """See ``Effect``."""
+        return "extra_delays_s"
 
     def extra_delays_s(self, values: Parameters) -> tuple[Value, Value]:
         """Seconds added to the delay of steering and of throttle."""
@@ -170,6 +178,10 @@ class ActuatorEffect(Effect):
 
     kind: ClassVar[Kind] = "input"
     has_state: ClassVar[bool] = False
+
+    def required_method(self) -> str:
+        """See ``Effect``."""
+        return "step" if self.has_state else "apply"
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
         """Output of an effect without memory."""
@@ -275,6 +287,10 @@ class DynamicsEffect(Effect):
     ) -> tuple[ModelKind, Mapping[str, Value]]:
         """Change the form of the base model and its tyre numbers (``front.mu``, ``rear.B`` ...)."""
         return kind, tyre
+
+    def required_method(self) -> str:
+        """See ``Effect``."""
+        return "stiff_step" if self.stiff else ""
 
     def stiff_step(self, ops: Ops, start: StepStart, values: Parameters) -> StiffStep:
         """Begin a step of the stiff states."""

@@ -37,6 +37,7 @@ from sim_backends.effects import (
     CATALOGUE,
     ActuatorEffect,
     Confusable,
+    DelayEffect,
     DynamicsEffect,
     Effect,
     EffectParameter,
@@ -337,3 +338,25 @@ def test_compiled_step_is_not_reused_for_a_new_class_with_the_same_id() -> None:
 
     assert yaw_after(1.0) == pytest.approx(-yaw_after(-1.0))
     assert yaw_after(1.0) > 0.01
+
+
+@pytest.mark.parametrize(
+    ("kind", "method", "settings"),
+    [
+        (DelayEffect, "extra_delays_s", {}),
+        (ActuatorEffect, "apply", {}),
+        (ActuatorEffect, "step", {"has_state": True}),
+        (DynamicsEffect, "stiff_step", {"stiff": True}),
+    ],
+)
+def test_effect_without_a_required_method_is_refused(
+    kind: type[Effect], method: str, settings: dict[str, bool]
+) -> None:
+    content = {"id": "incomplete", "parameters": CubicSteering.parameters, **settings}
+    incomplete = type("Incomplete", (kind,), content)
+    with pytest.raises(ConfigError, match=f"has no method '{method}'"), registered(incomplete()):
+        pass
+    assert "incomplete" not in EFFECTS
+    complete = type("Complete", (kind,), {**content, method: lambda *arguments: None})
+    with registered(complete()):
+        assert "incomplete" in EFFECTS
