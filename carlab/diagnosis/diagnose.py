@@ -190,7 +190,8 @@ def _search_effects(
     identification = request.settings.identification
     floor: FloatArray = np.sqrt(np.mean(noise_floor(windows, noise, nominal, identification)[1:] ** 2, axis=0))
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
-    problem = SearchProblem(nominal, windows, floor, request.texts.look_alikes, candidates, request.settings)
+    confusable = request.texts.look_alikes
+    problem = SearchProblem(nominal, windows, floor, noise.measured, confusable, candidates, request.settings)
     start, search_share = SEARCH_PROGRESS
 
     def search_progress(activity: str, share: float) -> None:

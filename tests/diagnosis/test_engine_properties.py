@@ -160,7 +160,7 @@ def test_effect_without_gain_on_unseen_blocks_is_eliminated(
 ) -> None:
     car = load_car_file(drag[0] / "car.toml").simulator
     floor = np.array([0.006, 0.006, 0.005, 0.015, 0.015, 0.04])
-    problem = SearchProblem(car, windows, floor, confusable_effects())
+    problem = SearchProblem(car, windows, floor, floor, confusable_effects())
     scale = Scale.of(prediction_errors(simulate_windows(windows, car), windows)[0], floor, 0.2)
     named = ("aerodynamic_drag", "steering_asymmetry", "torque_steer")
     base = refit(problem, (), Fit(car, (), np.zeros(0), 0.0, np.zeros(0)), scale)

@@ -125,7 +125,7 @@ def test_car_without_missing_physics_has_no_measured_curves():
     fit = drive(CAR, 40.0, 5)
     windows = cut_windows(tracks_of([fit]), 0.8, 0.3).thinned(30)
     settings = replace(SETTINGS, curves=replace(SETTINGS.curves, first_iterations=3, last_iterations=1))
-    problem = SearchProblem(CAR, windows, np.full(6, 2e-3), {}, (), settings)
+    problem = SearchProblem(CAR, windows, np.full(6, 2e-3), np.full(6, 2e-3), {}, (), settings)
     from carlab.diagnosis.selection.search import search
 
     assert fit_curves(problem, search(problem, RunControl()), RunControl()) is None
@@ -133,7 +133,7 @@ def test_car_without_missing_physics_has_no_measured_curves():
 
 def test_penalty_of_a_curve_is_that_of_its_roughness():
     windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
-    problem = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ())
+    problem = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ())
     free = problem.free_parameters(("front_tyre_map",))
     fitter = Fitter(windows, Scale(np.array([1]), np.ones((1, 6))))
     z = np.zeros((1, len(free)))
@@ -194,7 +194,7 @@ def test_curve_findings_of_the_car_file_equal_its_curve(curve):
 
     config = replace(CAR, effects={curve.id: {}})
     windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
-    free = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ()).free_parameters((curve.id,))
+    free = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ()).free_parameters((curve.id,))
     fit = Fit(config, free, np.zeros(len(free)), 0.0, np.zeros(1), np.eye(len(free)))
     found = curve_findings(
         CurveFit((curve.id,), (), fit, 5.0), CAR, tuple(tracks_of([drive(CAR, 30.0, 7)])), DEFAULT.curves
@@ -211,7 +211,7 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
 
     config = replace(CAR, effects={"drive_map": {}})
     windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
-    free = SearchProblem(CAR, windows, np.full(6, 1e-2), {}, ()).free_parameters(("drive_map",))
+    free = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ()).free_parameters(("drive_map",))
     names = [f.name for f in free]
     gain, knot = names.index("motor.drive_gain"), names.index("effects.drive_map.value_12_6")  # throttle 1
     covariance = np.zeros((len(free), len(free)))

@@ -82,7 +82,8 @@ def compared_groups(
     )
     noise = estimate_noise(tracks[0], first.curvature_bias, settings=settings.identification)
     per_step = noise_floor(first, noise, nominal, settings.identification)[1:]
-    problem = SearchProblem(nominal, first, np.sqrt(np.mean(per_step**2, axis=0)), confusable_effects(), (), settings)
+    floor = np.sqrt(np.mean(per_step**2, axis=0))
+    problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), (), settings)
     curves = tuple(f"effects.{curve.id}." for curve in CURVES)
     free = tuple(f for f in problem.free_parameters(()) if not f.name.startswith(curves))  # measured curves stay
     fitted = fit_with_scale(problem, (), nominal, free, problem.nominal_coordinates(free))

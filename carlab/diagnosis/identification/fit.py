@@ -7,10 +7,11 @@ outliers. Base parameters have weak priors; parameters of effects have only boun
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
@@ -218,9 +219,6 @@ class Fitter:
     def leave_fold_out_loss(self, fit: Fit, folds: IndexArray, max_error: float) -> FloatArray:
         """Loss of every window (S,) by a fit without its fold, whitened errors clipped at ``max_error``.
 
-        Each fold is removed from ``fit`` by one Gauss-Newton step (Beirami et al. 2017, approximate leave-k-out), at
-        the cost of a few predictions; a refit costs a hundred.
-
         Args:
             fit: fit to all windows.
             folds: index of each window's fold (S,).
@@ -228,10 +226,30 @@ class Fitter:
         """
         if not fit.free:
             return self.loss(fit.config, max_error=max_error)
+        loss = np.zeros(len(self.windows))
+        for own, _, white in self._without_each_fold(fit, folds):
+            loss[own] = self.huber(white.clip(-max_error, max_error)).sum(axis=(1, 2))
+        return loss
+
+    def leave_fold_out_coordinates(self, fit: Fit, folds: IndexArray) -> FloatArray:
+        """Coordinates (S, n) for every window by a fit without its fold (S,)."""
+        z = np.tile(fit.z, (len(self.windows), 1))
+        if fit.free:
+            for own, without, _ in self._without_each_fold(fit, folds):
+                z[own] = without
+        return z
+
+    def _without_each_fold(
+        self, fit: Fit, folds: IndexArray
+    ) -> Iterator[tuple[NDArray[np.bool_], FloatArray, FloatArray]]:
+        """For each fold: its windows (S,), coordinates (n,) of a fit without it, and its whitened errors.
+
+        Each fold is removed from ``fit`` by one Gauss-Newton step (Beirami et al. 2017, approximate leave-k-out), at
+        the cost of a few predictions; a refit costs a hundred.
+        """
         jacobian, white = self.linearised(fit)
         weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(white), 1e-12))
         normal, score = self._normal(fit, jacobian, white)
-        loss = np.zeros(len(self.windows))
         for name in np.unique(folds):
             own = folds == name
             part = jacobian[:, own].reshape(len(fit.free), -1)
@@ -242,8 +260,8 @@ class Fitter:
             trials = fit.z + np.array(self.settings.fold_step_shares)[:, None] * step
             whites = self.white(fit.config, fit.free, trials)
             seen = self.huber(whites[:, ~own]).sum(axis=(1, 2, 3)) + self.prior(fit.free, trials)
-            loss[own] = self.huber(whites[int(np.argmin(seen)), own].clip(-max_error, max_error)).sum(axis=(1, 2))
-        return loss
+            best = int(np.argmin(seen))
+            yield own, trials[best], whites[best, own]
 
     def linearised(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
         """Jacobian (n, S, U, 6) of the whitened errors (S, U, 6) at a fit."""

@@ -1,7 +1,8 @@
 """Pairwise comparison of each accepted effect with its confusable effects on unseen blocks.
 
 The comparison is that of non-nested models (Vuong 1989), with losses on blocks that are not fitted and standard errors
-clustered by block.
+clustered by block. Confusable effects differ little, so the initial states of the windows are free
+(``free_initial_states``).
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import clustered_gain, design_effect_of
+from carlab.diagnosis.identification.fit import Fit, clustered_gain, design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
-from carlab.diagnosis.selection.elimination import EliminationResult
-from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.refit import refit_candidate
+from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
+from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.refit import refit, refit_candidate
 from carlab.diagnosis.selection.screening import Screen
 
 log = logging.getLogger(__name__)
@@ -27,40 +29,66 @@ class PairwiseResult:
 
     chi2     twice the gain of the effect over its design effect
     rivals   effects that unseen blocks do not distinguish from it, the nearest first
+    better   the confusable effect that predicts unseen blocks best, if it does so better than the effect
     """
 
     chi2: Mapping[str, float] = field(default_factory=dict)
     rivals: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    better: Mapping[str, Candidate] = field(default_factory=dict)
+
+
+def choose_confusable(
+    problem: SearchProblem, eliminated: EliminationResult, control: RunControl
+) -> tuple[Model, PairwiseResult]:
+    """Replace effects of a model by confusable effects that predict unseen blocks better."""
+    pairs = compare_pairs(problem, eliminated, control)
+    for _ in eliminated.model.effects:
+        if not pairs.better or control.stop():
+            break
+        name, rival = next(iter(pairs.better.items()))
+        log.info("%s replaces %s", rival.effect, name)
+        before = eliminated.model
+        effects = tuple(rival.effect if e == name else e for e in before.effects)
+        model = refit(problem, effects, rival.fit, before.scale)
+        eliminated = EliminationResult(model, delete_each(problem, model, control))
+        pairs = compare_pairs(problem, eliminated, control)
+    return eliminated.model, pairs
 
 
 def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control: RunControl) -> PairwiseResult:
     """Compare each effect of a model with its confusable effects."""
-    model = eliminated.model
+    model, settings = eliminated.model, problem.settings.selection
     if not model.effects:
         return PairwiseResult()
-    fitter = problem.fitter(model.scale)
-    with_covariance = fitter.with_covariance(model.fit)
-    own_loss = fitter.leave_fold_out_loss(model.fit, problem.folds(), problem.settings.selection.max_unseen_error)
-    chi2, rivals = {}, {}
+    with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
+    own_loss = _unseen_loss(problem, model, model.fit)
+    chi2, rivals, better = {}, {}, {}
     for name in model.effects:
         others = tuple(e for e in model.effects if e != name)
         reduced = Model(others, eliminated.deletions[name].without, model.scale)
         gain = reduced.fit.cost - model.fit.cost
         chi2[name] = 2.0 * gain / design_effect_of(with_covariance, name)
-        rivals[name] = _rivals_of(problem, model, reduced, name, own_loss, control)
-    return PairwiseResult(chi2, rivals)
+        compared = []
+        for rival in _fitted_rivals(problem, model, reduced, name, control):
+            difference, error = clustered_gain(_unseen_loss(problem, model, rival.fit), own_loss, problem.windows)
+            log.info("%s against %s: %.1f (%.1f standard errors)", name, rival.effect, difference, difference / error)
+            compared.append((difference, error, rival))
+        compared.sort(key=lambda each: each[0])
+        rivals[name] = tuple(r.effect for d, e, r in compared if d < settings.rival_z * e)[: settings.max_set_rivals]
+        if compared and compared[0][0] < -settings.better_rival_z * compared[0][1]:
+            better[name] = compared[0][2]
+    return PairwiseResult(chi2, rivals, better)
 
 
-def _rivals_of(
-    problem: SearchProblem, model: Model, reduced: Model, name: str, own_loss: FloatArray, control: RunControl
-) -> tuple[str, ...]:
-    """Effects that predict unseen blocks as well as ``name`` when they replace it in ``model``."""
-    settings = problem.settings.selection
-    fitter = problem.fitter(model.scale)
+def _fitted_rivals(
+    problem: SearchProblem, model: Model, reduced: Model, name: str, control: RunControl
+) -> list[Candidate]:
+    """Confusable effects of ``name`` that explain a similar part when they replace it in ``model``."""
     screening = problem.settings.screening
+    fitter = problem.fitter(model.scale)
     screen = Screen(fitter, problem.config_with(reduced.effects), reduced.fit, screening.max_windows, screening)
-    gain = reduced.fit.cost - model.fit.cost
-    ties = []
+    min_gain = problem.settings.selection.min_gain_share * (reduced.fit.cost - model.fit.cost)
+    found = []
     for other in problem.confusable.get(name, ()):
         if other in model.effects or not problem.is_candidate(other):
             continue
@@ -68,14 +96,24 @@ def _rivals_of(
             break
         control.progress(f"{name} or {other}?", 0.95)
         rival = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
-        if rival.gain < settings.min_gain_share * gain:
-            continue
-        loss = fitter.leave_fold_out_loss(rival.fit, problem.folds(), settings.max_unseen_error)
-        difference, error = clustered_gain(loss, own_loss, problem.windows)
-        log.info("%s against %s: %.1f (%.1f standard errors)", name, other, difference, difference / error)
-        if difference < settings.tie_z * error:
-            ties.append((difference, other))
-    return tuple(other for _, other in sorted(ties)[: settings.max_set_rivals])
+        if rival.gain >= min_gain:
+            found.append(rival)
+    return found
 
 
-__all__ = ["PairwiseResult", "compare_pairs"]
+def _unseen_loss(problem: SearchProblem, model: Model, fit: Fit) -> FloatArray:
+    """Loss of each window (S,) by a fit without its fold, with free initial states."""
+    identification = problem.settings.identification
+    z = problem.fitter(model.scale).leave_fold_out_coordinates(fit, problem.folds())
+    return loss_of_free_initial_states(
+        problem.windows,
+        fit.config,
+        fit.free,
+        z,
+        problem.measured_std,
+        max_error=problem.settings.selection.max_unseen_error,
+        settings=identification,
+    )
+
+
+__all__ = ["PairwiseResult", "choose_confusable", "compare_pairs"]

@@ -30,6 +30,7 @@ class SearchProblem:
     nominal       simulator of the car file; its effects stay, and their parameters are fitted
     windows       windows of the recordings to fit
     floor   (6,)  standard deviation of each channel's error of a perfect simulator
+    measured_std  standard deviations (6,) of the noise of the measured channels
     confusable    confusable effects by effect id
     candidates    effects that may be accepted
     """
@@ -37,6 +38,7 @@ class SearchProblem:
     nominal: SimulatorConfig
     windows: PredictionWindows
     floor: FloatArray
+    measured_std: FloatArray
     confusable: Mapping[str, Sequence[str]]
     candidates: tuple[str, ...] = field(default_factory=lambda: tuple(CATALOGUE))
     settings: DiagnosisSettings = DEFAULT

@@ -2,8 +2,8 @@
 
 Each step screens all candidates, refits the best of them together with the base parameters, tests them on unseen
 blocks, accepts one, and applies moves. Where several effects leave a part of the excess, other choices are followed.
-Elimination and pairwise comparison come last. The stages exchange fitted models (``selection.problem``); no stage
-calls a later stage.
+Elimination and the choice between confusable effects come last. The stages exchange fitted models
+(``selection.problem``); no stage calls a later stage.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each, eliminate
 from carlab.diagnosis.selection.forward import Path, best_path, extend
-from carlab.diagnosis.selection.pairwise_tests import compare_pairs
+from carlab.diagnosis.selection.pairwise_tests import choose_confusable, compare_pairs
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import fit_base, refit
 
@@ -25,8 +25,7 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
     is_complete = not control.ends_search()
     path = best_path(problem, base, greedy, control)
     eliminated = eliminate(problem, path.model, control)
-    pairs = compare_pairs(problem, eliminated, control)
-    model = eliminated.model
+    model, pairs = choose_confusable(problem, eliminated, control)
     ordered = tuple(sorted(model.effects, key=lambda e: -pairs.chi2[e]))
     return SearchResult(
         base.fit, model.fit, ordered, pairs.chi2, pairs.rivals, path.history, greedy.tried, model.scale, is_complete

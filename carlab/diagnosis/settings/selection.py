@@ -103,7 +103,13 @@ class SelectionSettings:
     concealed friction ellipse of a development case is withdrawn: its removal lowers the score by 13 %, but raises
     the likelihood by 0.6 standard errors only."""
     tie_z: float = 2.0
-    """Two effects are indistinguishable if their losses on unseen blocks differ by less [standard errors]."""
+    """Another path replaces the greedy path if its loss on unseen blocks is lower by this [standard errors]."""
+    rival_z: float = 3.0
+    """Two confusable effects are indistinguishable if their losses on unseen blocks, with free initial states, differ
+    by less [standard errors]."""
+    better_rival_z: float = 1.0
+    """A confusable effect replaces an effect if its loss on unseen blocks, with free initial states, is lower by this
+    [standard errors]."""
     max_set_rivals: int = 2
     """Maximum number of effects in ``indistinguishable_from`` of report.json."""
 

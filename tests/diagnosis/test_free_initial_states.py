@@ -1,0 +1,83 @@
+"""Test the loss with free initial states, and confusable effects that only this loss distinguishes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import carlab
+from carlab.benchmark import make_case
+from carlab.benchmark.world.measurement import write_csv
+from carlab.cars import load_car_file
+from carlab.diagnosis.identification.fit import huber
+from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.recording.csv.foreign import import_csv
+from sim_backends.car_parameters import SimulatorConfig
+
+STD = np.array([1e-3, 1e-3, 2e-3, 0.01, 0.01, 0.03])
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatorConfig, PredictionWindows]:
+    """Return a car, and 60 windows of its motion with white noise, their initial states wrong by three deviations."""
+    folder = tmp_path_factory.mktemp("drive")
+    case = make_case("null", 5, fit_s=40, hold_s=30)
+    write_csv(folder / "fit.csv", case.fit)
+    case.nominal.write(folder / "car.toml")
+    car = load_car_file(folder / "car.toml").simulator
+    windows = cut_windows(tracks_of(list(import_csv(folder / "fit.csv").episodes)), 0.8, 0.5).thinned(60)
+    rng = np.random.default_rng(0)
+    motion = simulate_windows(windows, car)[0]
+    wrong = windows.initial_states + 3.0 * STD * rng.standard_normal((len(windows), 6))
+    return car, replace(windows, measured=motion + STD * rng.standard_normal(motion.shape), initial_states=wrong)
+
+
+def test_loss_of_the_true_car_follows_the_chi_square_law(
+    simulated: tuple[SimulatorConfig, PredictionWindows],
+) -> None:
+    """Each window has 6 K errors and 6 free numbers. With fixed initial states the loss is many times larger."""
+    car, windows = simulated
+    loss = loss_of_free_initial_states(windows, car, (), np.zeros((len(windows), 0)), STD, max_error=1e4)
+    freedom = len(windows) * (6 * windows.steps - 6)
+    assert 2.0 * loss.sum() == pytest.approx(freedom, abs=4.0 * np.sqrt(2.0 * freedom))
+    fixed = prediction_errors(simulate_windows(windows, car), windows)[0, :, 1:] / STD
+    assert huber(fixed).sum() > 10.0 * loss.sum()
+
+
+def test_loss_is_the_minimum_over_initial_states(simulated: tuple[SimulatorConfig, PredictionWindows]) -> None:
+    """The reference is a minimisation of the simulated loss by scipy, for a car with a wrong drive gain."""
+    car, windows = simulated
+    wrong = car.with_values({"motor.drive_gain": 0.8 * car.parameters.drive_gain_n})
+    for k in (3, 30):
+        window = windows.take(np.array([k]))
+
+        def loss_at(shift: np.ndarray, window: PredictionWindows = window) -> float:
+            moved = replace(window, initial_states=window.initial_states + shift * STD)
+            error = simulate_windows(moved, wrong)[0] - window.measured
+            rotated = prediction_errors(error[None] + window.measured, window)[0, 0, 1:]
+            return float(huber(rotated / STD).sum())
+
+        loss = loss_of_free_initial_states(window, wrong, (), np.zeros((1, 0)), STD, max_error=1e4)[0]
+        best = minimize(loss_at, np.zeros(6), method="Powell", options={"xtol": 1e-3, "ftol": 1e-6})
+        assert loss == pytest.approx(best.fun, rel=0.02)
+
+
+def test_delay_of_the_throttle_is_no_lag_of_the_motor(tmp_path: Path) -> None:
+    """With fixed initial states, a bias of these in hard braking makes a lag as likely as the concealed delay."""
+    case = make_case("single", 10, effects=("throttle_delay",), excess=3.0, fit_s=60, hold_s=30)
+    write_csv(tmp_path / "fit.csv", case.fit)
+    write_csv(tmp_path / "hold.csv", case.hold)
+    case.nominal.write(tmp_path / "car.toml")
+    report = carlab.diagnose(
+        str(tmp_path / "fit.csv"),
+        str(tmp_path / "car.toml"),
+        held_out=str(tmp_path / "hold.csv"),
+        effects=("throttle_delay", "motor_lag"),
+    )
+    found = report.diagnosis.effects[0]
+    assert (found.id, found.indistinguishable_from) == ("throttle_delay", ())
