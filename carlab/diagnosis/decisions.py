@@ -22,6 +22,11 @@ class Condition:
     threshold: float
     above: bool = True
 
+    @property
+    def holds(self) -> bool:
+        """Whether the statistic is on the required side of the threshold."""
+        return self.statistic > self.threshold if self.above else self.statistic <= self.threshold
+
 
 @dataclass(frozen=True, slots=True)
 class Decision:

@@ -16,6 +16,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.findings import Unexplained
+from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.rival_physics import RivalPhysics, additional_physics, replacing_physics
@@ -65,7 +66,7 @@ def accept_names(
     residual = residual_of(problem, found)
     if rival is None:
         rival = additional_physics(problem, found, control)
-    if found.is_complete and found.effects and _are_spurious(problem, found, residual, rival, control):
+    if found.is_complete and found.effects and _are_spurious(problem, found, residual, rival, held_out, control):
         found = found.without_effects()
     elif found.effects and _increases_held_out_error(found, held_out):
         log.info("%s: withdrawn, because the held-out error is larger with it", ", ".join(found.effects))
@@ -96,6 +97,7 @@ def _are_spurious(
     found: SearchResult,
     residual: ResidualModel,
     rival: RivalPhysics | None,
+    held_out: HeldOut,
     control: RunControl,
 ) -> bool:
     """Whether unnamed physics explains so much that the accepted effects are spurious.
@@ -110,15 +112,20 @@ def _are_spurious(
     min_gain = settings.min_unnamed_share * 0.5 * scale.sigma.size * len(windows)
     is_additional = rival is not None and rival.names == found.effects
     unnamed = max(residual.gain, rival.gain if rival is not None and is_additional else 0.0)
-    share = settings.spurious_share if is_small_set else settings.spurious_share_many
-    setting = "rivals.spurious_share" if is_small_set else "rivals.spurious_share_many"
     unnamed_share = unnamed / (unnamed + named) if unnamed + named > 0.0 else 0.0
     relevant = unnamed / (0.5 * scale.sigma.size * len(windows))
-    alternatives = (
-        (Condition(setting, unnamed_share, share, above=False),),
-        (Condition("rivals.min_unnamed_share", relevant, settings.min_unnamed_share, above=False),),
-    )
-    spurious = unnamed > max(share * (unnamed + named), min_gain)
+    is_irrelevant = Condition("rivals.min_unnamed_share", relevant, settings.min_unnamed_share, above=False)
+
+    def is_below(setting: str) -> Condition:
+        return Condition(f"rivals.{setting}", unnamed_share, float(getattr(settings, setting)), above=False)
+
+    alternatives: tuple[tuple[Condition, ...], ...] = ((is_irrelevant,), (is_below("spurious_share_many"),))
+    if is_small_set:
+        explained = explained_share(problem, found, held_out)
+        explain_most = Condition("rivals.min_explained_share", explained, settings.min_explained_share)
+        of_most = (is_below("spurious_share_of_most"), explain_most)
+        alternatives = ((is_irrelevant,), (is_below("spurious_share"),), of_most)
+    spurious = not any(all(c.holds for c in conditions) for conditions in alternatives)
     _record(control, found, alternatives, not spurious)
     if spurious or not is_small_set:
         return spurious
@@ -148,26 +155,48 @@ def _increases_held_out_error(found: SearchResult, held_out: HeldOut) -> bool:
 
 
 def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl) -> bool:
-    """Whether one or two effects explain little of the held-out excess, with a gain of few standard errors.
+    """Whether one or two effects explain little of the excess.
 
     The strongest part of physics outside the catalogue often resembles an effect; the rest of it remains.
     """
     settings = problem.settings.rivals
-    without, with_names = held_out.final_error(found.base.config), held_out.final_error(found.best.config)
-    excess = held_out.score(without) ** 2 - 1.0
+    before, after = (held_out.score(held_out.final_error(fit.config)) for fit in (found.base, found.best))
+    excess = before**2 - 1.0
     if len(found.effects) >= settings.many_effects or excess <= settings.min_held_out_excess:
         return False
-    explained = 1.0 - max(held_out.score(with_names) ** 2 - 1.0, 0.0) / excess
-    gain, error = held_out.gain(without, with_names)
-    alternatives = (
-        (Condition("rivals.min_explained_share", explained, settings.min_explained_share),),
-        (Condition("rivals.min_explained_z", gain / error, settings.min_explained_z),),
+    shares = explained_share(problem, found, held_out), 1.0 - max(after**2 - 1.0, 0.0) / excess
+    alternatives = tuple(
+        (Condition("rivals.min_explained_share", share, settings.min_explained_share),) for share in shares
     )
-    little = explained < settings.min_explained_share and gain < settings.min_explained_z * error
+    little = max(shares) < settings.min_explained_share
     _record(control, found, alternatives, not little)
     if little:
-        log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), explained)
+        log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), max(shares))
     return little
+
+
+def explained_share(problem: SearchProblem, found: SearchResult, held_out: HeldOut) -> float:
+    """Share of the refit's excess that the effects explain, over the fitted and the held-out windows.
+
+    The excess is the loss with free initial states minus that of a perfect simulator. Errors of initial states, which
+    hide most of a weak effect at the end of a window, do not enter it.
+    """
+    excess = []
+    for config in (found.base.config, found.best.config):
+        total = 0.0
+        for windows in (problem.windows, held_out.windows):
+            loss = loss_of_free_initial_states(
+                windows,
+                config,
+                (),
+                np.zeros((len(windows), 0)),
+                held_out.noise.measured,
+                max_error=problem.settings.selection.max_unseen_error,
+                settings=problem.settings.identification,
+            )
+            total += float(loss.sum()) - 3.0 * (windows.steps - 1) * len(windows)
+        excess.append(max(total, 0.0))
+    return 1.0 - excess[1] / excess[0] if excess[0] > 0.0 else 1.0
 
 
 @dataclass(frozen=True, slots=True)

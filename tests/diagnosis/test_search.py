@@ -97,14 +97,12 @@ def test_effect_that_raises_the_held_out_error_is_withdrawn(drag: Case, tmp_path
     ]
 
 
-@pytest.mark.parametrize(
-    ("min_share", "min_z", "expected"), [(0.99, math.inf, []), (0.99, 1.0, [DRAG]), (0.5, math.inf, [DRAG])]
-)
+@pytest.mark.parametrize(("min_share", "expected"), [(0.99, []), (0.5, [DRAG])])
 def test_effect_that_explains_little_is_not_named(
-    drag: Case, tmp_path: Path, min_share: float, min_z: float, expected: list[str]
+    drag: Case, tmp_path: Path, min_share: float, expected: list[str]
 ) -> None:
     """The cameras see the car turned in the held-out recording only, so drag explains only a part of its errors."""
-    strict = replace(DEFAULT.rivals, min_explained_share=min_share, min_explained_z=min_z)
+    strict = replace(DEFAULT.rivals, min_explained_share=min_share)
     assert names(found(drag, tmp_path, (0.0, 0.01), replace(DEFAULT, rivals=strict))) == expected
 
 
