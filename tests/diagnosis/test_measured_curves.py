@@ -28,8 +28,8 @@ CAR = SimulatorConfig(control_period_s=PERIOD_S)
 GAIN, TOP_SPEED, LIMIT = 4.0, 3.0, 4.0
 SETTINGS = replace(
     DEFAULT,
-    curves=CurveSettings(max_windows=50, first_iterations=6, iterations=2, last_iterations=2),
-    windows=replace(DEFAULT.windows, max_fit_windows=60),
+    curves=CurveSettings(max_windows=36, first_iterations=5, iterations=2, last_iterations=1),
+    windows=replace(DEFAULT.windows, max_fit_windows=40),
 )
 
 
