@@ -11,8 +11,12 @@ import carlab
 from carlab.benchmark import make_case
 from carlab.benchmark.world.measurement import write_csv
 from carlab.cars import load_car_file
-from carlab.diagnosis.identification.fit import huber
+from carlab.diagnosis.identification.fit import Fit, Scale, huber
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
+from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.identification.measurement_noise import Noise
+from carlab.diagnosis.naming import explained_share
+from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
@@ -65,6 +69,23 @@ def test_loss_is_the_minimum_over_initial_states(simulated: tuple[SimulatorConfi
         loss = loss_of_free_initial_states(window, wrong, (), np.zeros((1, 0)), STD, max_error=1e4)[0]
         best = minimize(loss_at, np.zeros(6), method="Powell", options={"xtol": 1e-3, "ftol": 1e-6})
         assert loss == pytest.approx(best.fun, rel=0.02)
+
+
+def test_explained_share_is_the_excess_that_the_effects_remove(
+    simulated: tuple[SimulatorConfig, PredictionWindows],
+) -> None:
+    """The refit has a wrong drive gain. Half-way between both gains a quarter of the squared error is left."""
+    car, windows = simulated
+    held_out = HeldOut(windows, STD, Noise(STD, STD))
+    problem = SearchProblem(car, windows, STD, STD, {})
+
+    def fitted(share: float) -> Fit:
+        gain = (1.0 - 0.04 * share) * car.parameters.drive_gain_n
+        return Fit(car.with_values({"motor.drive_gain": gain}), (), np.zeros(0), 0.0, np.zeros(0))
+
+    for share, expected in ((1.0, 0.0), (0.5, 0.75), (0.0, 1.0)):
+        found = SearchResult(fitted(1.0), fitted(share), ("motor_lag",), {}, {}, (), (), Scale(np.ones(1), STD[None]))
+        assert explained_share(problem, found, held_out) == pytest.approx(expected, abs=0.03)
 
 
 def test_delay_of_the_throttle_is_no_lag_of_the_motor(tmp_path: Path) -> None:
