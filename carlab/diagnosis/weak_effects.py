@@ -40,15 +40,10 @@ def without_negligible_effects(problem: SearchProblem, found: SearchResult, cont
 def without_harmful_effects(
     problem: SearchProblem, found: SearchResult, held_out: HeldOut, control: RunControl
 ) -> SearchResult:
-    """Remove effects one by one that raise the held-out error when they are added last, the most harmful first.
-
-    An effect that unseen blocks do not distinguish from others stays: another member of its set may be the right one.
-    """
+    """Remove effects one by one that raise the held-out error when they are added last, the most harmful first."""
     settings = problem.settings.selection
 
     def conditions(name: str, model: Model, without: Fit) -> Alternatives:
-        if found.rivals.get(name):
-            return ()
         before, after = held_out.final_error(without.config), held_out.final_error(model.fit.config)
         gain, error = held_out.gain(before, after)
         rise = held_out.score(before) / max(held_out.score(after), 1e-12) - 1.0
@@ -95,11 +90,8 @@ def _with_standing_effects(
             others = tuple(e for e in model.effects if e != name)
             without = refit(problem, others, model.fit, model.scale)
             conditions = conditions_of(name, model, without.fit)
-            if conditions:
-                removed[name] = (without, conditions, _margin(conditions))
-        weakest = min(removed, key=lambda name: removed[name][2], default=None)
-        if weakest is None:
-            break
+            removed[name] = (without, conditions, _margin(conditions))
+        weakest = min(removed, key=lambda name: removed[name][2])
         stands = removed[weakest][2] > 0.0
         for name in removed if stands else (weakest,):
             control.record(Decision("stand", name, removed[name][1], stands, len(model.effects)))
