@@ -1,6 +1,6 @@
 """``carlab VERB``: one file per verb; the help texts are the docstrings.
 
-Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 130 interrupted.
+Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 130 interrupted, 141 the reader of a pipe ended.
 """
 
 from __future__ import annotations
@@ -10,12 +10,20 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from carlab.cli.exit_codes import EXIT_INTERRUPTED
+from carlab.cli.exit_codes import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of the ``carlab`` command."""
-    sys.exit(run(sys.argv[1:] if argv is None else argv))
+    try:
+        try:
+            code = run(sys.argv[1:] if argv is None else argv)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # The reader of a pipe, such as ``head``, has ended.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = EXIT_BROKEN_PIPE
+    sys.exit(code)
 
 
 def run(argv: Sequence[str]) -> int:

@@ -3,3 +3,5 @@
 EXIT_FAILED = 1
 EXIT_SAFETY_STOP = 4
 EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+"""As a shell reports the signal SIGPIPE (128 + 13)."""

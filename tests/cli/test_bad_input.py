@@ -1,13 +1,16 @@
 """Invalid input is refused with one sentence, the next step and a non-zero exit code; never with a traceback."""
 
 import math
+import os
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from carlab import cli
 from carlab.cars.emulated_world import World, WorldConfig
 from carlab.core.clock import MonotonicClock
 from mocap.emulators.faults import ServerFaults
@@ -210,6 +213,16 @@ def test_import_does_not_overwrite_a_recording(carlab: Carlab, tmp_path: Path) -
     assert code == 1
     assert "already" in text
     assert out.read_bytes() == before
+
+
+def test_closed_pipe_ends_the_program_without_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as closed_pipe:
+        monkeypatch.setattr(sys, "stdout", closed_pipe)
+        with pytest.raises(SystemExit) as end:
+            cli.main(["--help"])
+    assert end.value.code == 141
 
 
 def test_misspelt_option_is_refused_with_a_suggestion(carlab: Carlab) -> None:
