@@ -38,6 +38,10 @@ class Concealed:
     resemblance: Resemblance | None = None
 
 
+Driven = tuple[Refit, tuple[Recording, ...], Windows]
+"""Refit, recordings and held-out windows of one set of concealed effects."""
+
+
 class Scene:
     """Random draws of a case that do not depend on the strength; it can be driven with any effects.
 
@@ -62,14 +66,23 @@ class Scene:
         self.noise = Noise(self.nominal.position_std, self.nominal.yaw_std, float(draws.choice((0.06, 0.075, 0.09))))
         self.seed, self.lengths_s, self.true_starts = seed, lengths_s, true_starts
         self.draws, self.feedback_only = draws, feedback_only
+        self._last: tuple[tuple[Concealed, ...], Driven] | None = None
 
     def human(self, part: int) -> HumanDriver:
         """The driver of a recording (0: to fit, 1: held out)."""
         rng = np.random.default_rng((self.seed, 2, part))
         return HumanDriver(self.car, self.track, rng, feedback_only=self.feedback_only)
 
-    def drive(self, concealed: Sequence[Concealed]) -> tuple[Refit, tuple[Recording, ...], Windows]:
-        """Drive both recordings with the effects; returns the refit, the recordings and the held-out windows."""
+    def drive(self, concealed: Sequence[Concealed]) -> Driven:
+        """Drive both recordings with the effects; returns the refit, the recordings and the held-out windows.
+
+        The last result is kept, because a case of one effect is driven again with the size that was found last.
+        """
+        if self._last is None or self._last[0] != tuple(concealed):
+            self._last = tuple(concealed), self._drive(concealed)
+        return self._last[1]
+
+    def _drive(self, concealed: Sequence[Concealed]) -> Driven:
         recordings: list[Recording] = []
         windows: list[Windows] = []
         for part, length_s in enumerate(self.lengths_s):
