@@ -10,6 +10,7 @@ with the states.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeAlias
@@ -17,7 +18,7 @@ from typing import TypeAlias
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects import EFFECTS, DelayEffect, ObservationEffect
 from sim_backends.effects.base import Parameters
-from sim_backends.effects.first_order import lag_weights
+from sim_backends.effects.first_order import LagWeights, lag_weights
 
 State: TypeAlias = tuple[Value, ...]
 """x, y [m], yaw [rad], vx, vy [m/s], yaw rate [rad/s]."""
@@ -103,6 +104,7 @@ class MeasurementModel:
         window_s2: float = 0.0,
         velocities_before: Sequence[State] = (),
         filtered: State | None = None,
+        ticks: Sequence[int] | None = None,
     ) -> list[State]:
         """Measured states of a trajectory at even ticks, in the recording's own time (latency is not applied).
 
@@ -113,15 +115,22 @@ class MeasurementModel:
             velocities_before: Unfiltered measured velocities (vx, vy, yaw rate) at the ticks before the trajectory,
                 from the first of which the filter starts settled.
             filtered: Output of the filter at the first tick, instead.
+            ticks: Indices of the ticks to return; all by default.
         """
-        shown = [self.observe(state) for state in trajectory]
-        if window_s2 > 0.0:
-            shown = windowed(self._ops, shown, period_s, window_s2)
+        wanted = range(len(trajectory)) if ticks is None else ticks
+        observed = functools.cache(lambda k: self.observe(trajectory[k]))
+
+        def shown(k: int) -> State:
+            if window_s2 <= 0.0 or k in (0, len(trajectory) - 1):
+                return observed(k)
+            return windowed(self._ops, (observed(k - 1), observed(k), observed(k + 1)), period_s, window_s2)
+
         if self.velocity_time_constant_s is None:
-            return shown
-        inputs = [*velocities_before, *(state[3:6] for state in shown)]
+            return [shown(k) for k in wanted]
+        every = [shown(k) for k in range(len(trajectory))]
+        inputs = [*velocities_before, *(state[3:6] for state in every)]
         outputs = filter_velocities(self._ops, inputs, period_s, self.velocity_time_constant_s, filtered)
-        return [(*s[:3], *v) for s, v in zip(shown, outputs[len(velocities_before) :], strict=True)]
+        return [(*every[k][:3], *outputs[len(velocities_before) + k]) for k in wanted]
 
 
 def filter_step(ops: Ops, output: State, first: State, last: State, step_s: Value, lag_s: Value) -> State:
@@ -129,7 +138,10 @@ def filter_step(ops: Ops, output: State, first: State, last: State, step_s: Valu
 
     ``lag_s dy/dt = u - y``; with a time constant of 0 the output is the input.
     """
-    weights = lag_weights(ops, lag_s, 2.0 * step_s)
+    return _filtered(lag_weights(ops, lag_s, 2.0 * step_s), output, first, last)
+
+
+def _filtered(weights: LagWeights, output: State, first: State, last: State) -> State:
     return tuple(weights.after_half(y, u0, u1) for y, u0, u1 in zip(output, first, last, strict=True))
 
 
@@ -138,22 +150,20 @@ def filter_velocities(
 ) -> list[State]:
     """Outputs of the first-order filter at even ticks; it starts at ``begin``, by default at the first input."""
     outputs = [inputs[0] if begin is None else begin]
+    weights = lag_weights(ops, lag_s, 2.0 * period_s)
     for first, last in itertools.pairwise(inputs):
-        outputs.append(filter_step(ops, outputs[-1], first, last, period_s, lag_s))
+        outputs.append(_filtered(weights, outputs[-1], first, last))
     return outputs
 
 
-def windowed(ops: Ops, states: Sequence[State], period_s: Value, variance_s2: float) -> list[State]:
-    """Velocities averaged over a symmetric window with a variance [s2]: ``v + variance / 2 d2v/dt2``, to fourth order.
+def windowed(ops: Ops, around: tuple[State, State, State], period_s: Value, variance_s2: float) -> State:
+    """The middle one of three states, its velocities averaged over a symmetric window with a variance [s2].
 
-    The first and the last state are unchanged.
+    The average is ``v + variance / 2 d2v/dt2``, to fourth order.
     """
-    found = [states[0]]
-    for before, now, after in zip(states[:-2], states[1:-1], states[2:], strict=True):
-        curvature = velocity_curvature(ops, before, now, after, period_s)
-        velocities = (v + 0.5 * variance_s2 * c for v, c in zip(now[3:6], curvature, strict=True))
-        found.append((*now[:3], *velocities))
-    return [*found, states[-1]] if len(states) > 1 else found
+    now = around[1]
+    curvature = velocity_curvature(ops, *around, period_s)
+    return (*now[:3], *(v + 0.5 * variance_s2 * c for v, c in zip(now[3:6], curvature, strict=True)))
 
 
 def velocity_curvature(ops: Ops, before: State, now: State, after: State, period_s: Value) -> State:

@@ -8,7 +8,7 @@ import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.prediction.predict import PredictiveModel
-from carlab.prediction.windows import PredictionWindows
+from carlab.prediction.windows import IndexArray, PredictionWindows
 
 MAX_ERROR = 1e3
 """Bound of a final error; it also replaces non-finite errors of a diverged simulator."""
@@ -29,17 +29,18 @@ class ChannelError:
     bias: float
 
 
-def prediction_errors(predicted: FloatArray, windows: PredictionWindows) -> FloatArray:
+def prediction_errors(predicted: FloatArray, windows: PredictionWindows, ticks: IndexArray | None = None) -> FloatArray:
     """Predicted minus measured (..., S, K + 1, 6).
 
     Args:
-        predicted: measurements (..., S, K + 1, 6).
+        predicted: measurements (..., S, K + 1, 6), or (..., S, U, 6) at ``ticks``.
         windows: the predicted windows.
+        ticks: indices (U,) of the predicted ticks; all K + 1 by default.
 
     Returns:
         x and y in the body frame of each window's initial state (ahead, left), the other channels unchanged.
     """
-    error = predicted - windows.measured
+    error = predicted - (windows.measured if ticks is None else windows.measured[:, ticks])
     yaw = windows.initial_states[:, 2, None]
     sin, cos = np.sin(yaw), np.cos(yaw)
     dx, dy = error[..., 0].copy(), error[..., 1].copy()

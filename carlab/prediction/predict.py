@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from carlab.core.quantities import FloatArray
-from carlab.prediction.windows import PredictionWindows
+from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.array_ops import ARRAYS
 from sim_backends.batch.inputs import with_effects_of_values
 from sim_backends.batch.rollout import rollout
@@ -100,6 +100,7 @@ def simulate_windows(
     values: Mapping[str, FloatArray] | None = None,
     *,
     max_step_s: float = MAX_STEP_S,
+    ticks: IndexArray | None = None,
 ) -> FloatArray:
     """Predict windows by a simulator with P parameter sets.
 
@@ -109,9 +110,10 @@ def simulate_windows(
         values: parameters by dotted name, each (P,), or (P, S) for a value of each window; default: those of
             ``config``.
         max_step_s: maximum integration step.
+        ticks: indices (U,) of the ticks to return; all K + 1 by default.
 
     Returns:
-        Predicted measurements (P, S, K + 1, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate.
+        Predicted measurements (P, S, K + 1 or U, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate.
     """
     given = {name: np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in (values or {}).items()}
     sets = max((len(v) for v in given.values()), default=1)
@@ -140,12 +142,13 @@ def simulate_windows(
         t0_s=tensor(np.tile(windows.t0_s, sets)),
         max_step_s=max_step_s,
     ).states
-    out = states.numpy().astype(np.float64).reshape(sets, count, windows.steps + 1, 6)
+    rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
     measured = measurement.measure(
-        [tuple(out[:, :, k, i] for i in range(6)) for k in range(windows.steps + 1)],
+        [tuple(tick) for tick in rows.reshape(windows.steps + 1, 6, sets, count)],
         windows.period_s,
         window_s2=windows.velocity_window_s2,
         velocities_before=[tuple(windows.past_states[:, k, 3:].T) for k in range(windows.past_states.shape[1])],
+        ticks=None if ticks is None else ticks.tolist(),
     )
     return _stacked(measured, sets)
 

@@ -123,7 +123,12 @@ def _joined(parts: Sequence[Rollout]) -> Rollout:
     if len(parts) == 1:
         return parts[0]
     measured = [part.measured for part in parts if part.measured is not None]
-    return Rollout(torch.cat([part.states for part in parts]), torch.cat(measured) if measured else None)
+    return Rollout(_concatenated([part.states for part in parts]), _concatenated(measured) if measured else None)
+
+
+def _concatenated(parts: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Parts (N, T + 1, 6) one after the other, in the order of memory of each part: ticks, rows, cars."""
+    return torch.cat([part.permute(1, 2, 0) for part in parts], dim=2).permute(2, 0, 1)
 
 
 class _Segment(NamedTuple):

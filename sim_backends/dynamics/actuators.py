@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects import EFFECTS, ActuatorEffect
 from sim_backends.effects.base import Parameters, Triple
 
+MAX_STORED_LENGTHS = 8
+"""Number of step lengths whose numbers are stored; a rollout has at most three pieces a period."""
 ActuatorState = tuple[Value, ...]
 """One value per effect with memory, steering's first."""
 
@@ -28,6 +31,7 @@ class ActuatorChain:
         chosen.sort(key=lambda e: (e.command != "steering", e.order, e.id))
         self._links: list[tuple[ActuatorEffect, Parameters]] = [(e, e.numbers(values)) for e in chosen]
         self.has_memory = any(e.has_state for e in chosen)
+        self._by_length: dict[Any, tuple[Value, list[Parameters]]] = {}
 
     def settled(self, commands: tuple[Value, Value]) -> ActuatorState:
         """Steady state of the actuators for constant ``commands``."""
@@ -64,7 +68,7 @@ class ActuatorChain:
         signals: dict[str, Triple] = {"steering": (angle, angle, angle), "throttle": (commands[1],) * 3}
         left = iter(memory)
         after: list[Value] = []
-        for effect, values in self._links:
+        for (effect, _), values in zip(self._links, self._step_numbers(step_s), strict=True):
             start, middle, end = signals[effect.command]
             if effect.has_state:
                 out, state = effect.step(self._ops, (start, middle, end), next(left), step_s, values)
@@ -79,3 +83,13 @@ class ActuatorChain:
                 )
             signals[effect.command] = out
         return (signals["steering"], signals["throttle"]), tuple(after)
+
+    def _step_numbers(self, step_s: Value) -> list[Parameters]:
+        """Numbers of each effect for steps of ``step_s``, computed once for each of the last lengths."""
+        key = step_s if isinstance(step_s, float) else id(step_s)  # the stored length keeps its id
+        if key not in self._by_length:
+            if len(self._by_length) == MAX_STORED_LENGTHS:
+                self._by_length.clear()
+            own = [e.step_numbers(self._ops, step_s, values) if e.has_state else values for e, values in self._links]
+            self._by_length[key] = step_s, own
+        return self._by_length[key][1]

@@ -187,12 +187,20 @@ class ActuatorEffect(Effect):
         """Output of an effect without memory."""
         raise NotImplementedError
 
+    def step_numbers(self, ops: Ops, duration_s: Value, values: Parameters) -> Parameters:
+        """The numbers that ``step`` gets for steps of ``duration_s``, computed once for each length: its parameters.
+
+        Override it to add what depends on parameters and length alone.
+        """
+        return values
+
     def step(
         self, ops: Ops, command: Triple, state: Value, duration_s: Value, values: Parameters
     ) -> tuple[Triple, Value]:
         """Output over a step of ``duration_s`` and the state at its end, for an effect with memory.
 
-        ``command[0]`` is the value just after the start. A held command has the same object three times.
+        ``values`` are those of ``step_numbers``. ``command[0]`` is the value just after the start. A held command has
+        the same object three times.
         """
         raise NotImplementedError
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import ActuatorEffect, Confusable, EffectParameter, Parameters, Triple
-from sim_backends.effects.first_order import lag_weights
+from sim_backends.effects.first_order import LagWeights, lag_weights
 
 
 class FirstOrderLag(ActuatorEffect):
@@ -14,12 +14,16 @@ class FirstOrderLag(ActuatorEffect):
     lag_parameter = "time_constant"
     parameters = (EffectParameter("time_constant", "s", 0.0, 0.0, 5.0, 0.08),)
 
+    def step_numbers(self, ops: Ops, duration_s: Value, values: Parameters) -> Parameters:
+        """Weights of the closed form."""
+        return lag_weights(ops, values["time_constant"], duration_s)._asdict()
+
     def step(
         self, ops: Ops, command: Triple, state: Value, duration_s: Value, values: Parameters
     ) -> tuple[Triple, Value]:
         """Exponential approach; with a time constant of zero the output is the command."""
         start, middle, end = command
-        weights = lag_weights(ops, values["time_constant"], duration_s)
+        weights = LagWeights(**values)
         first = start + (state - start) * weights.start
         if start is middle and middle is end:
             central = start + (state - start) * weights.decay

@@ -16,7 +16,6 @@ from sim_backends.measurement import (
     filter_velocities,
     filters_velocities,
     is_measured,
-    windowed,
 )
 
 OBSERVATIONS = [e.id for e in EFFECTS.values() if e.kind == "observation"]
@@ -75,6 +74,16 @@ def test_floats_arrays_and_tensors_give_equal_measurements():
         assert np.allclose(np.asarray(inverted[0]), model_of(config).invert(expected[0])[0], rtol=1e-12)
 
 
+@pytest.mark.parametrize("effects", [{}, ALL])
+def test_measurements_at_some_ticks_are_those_of_all_ticks(effects):
+    model = model_of(SimulatorConfig(effects=effects))
+    trajectory = [tuple(v + 0.1 * k**2 * (i + 1) for i, v in enumerate(STATE)) for k in range(6)]
+    settings = {"window_s2": 3e-4, "velocities_before": [(1.0, 0.0, 0.5), (1.2, 0.1, 0.6)]}
+    every = model.measure(trajectory, 0.03, **settings)
+    assert model.measure(trajectory, 0.03, ticks=[0, 2, 5], **settings) == [every[k] for k in (0, 2, 5)]
+    assert every[2] != model.observe(trajectory[2])
+
+
 def test_filter_solves_its_differential_equation():
     """The ramp response is ``t - T (1 - exp(-t / T))``; a time constant of 0 changes nothing."""
     period, lag = 0.02, 0.07
@@ -104,7 +113,7 @@ def test_window_is_the_mean_of_world_velocities_over_a_box():
     yaw = pose(t)[2]
     mean = (pose(t + half) - pose(t - half)) / (2.0 * half)
     states = [tuple(row) for row in np.column_stack([*pose(t), *body(world(t), yaw)])]
-    found = windowed(FLOATS, states, period, (2.0 * half) ** 2 / 12.0)
+    found = model_of(SimulatorConfig()).measure(states, period, window_s2=(2.0 * half) ** 2 / 12.0)
     expected = np.column_stack(body(mean, yaw))
     assert np.allclose([s[3:] for s in found[1:-1]], expected[1:-1], atol=2e-8)
     assert np.abs(expected - [s[3:] for s in states]).max() > 5e-5

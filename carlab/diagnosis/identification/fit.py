@@ -110,8 +110,8 @@ class Fitter:
             return np.concatenate([self.white(config, free, part) for part in parts])
         values = {f.name: f.value(z[:, k]) for k, f in enumerate(free)}
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
-            predicted = simulate_windows(self.windows, config, values)
-            white = self.scale.white(prediction_errors(predicted, self.windows))
+            predicted = simulate_windows(self.windows, config, values, ticks=self.scale.steps)
+            white = prediction_errors(predicted, self.windows, self.scale.steps) / self.scale.sigma
         return np.asarray(np.nan_to_num(white, nan=1e4, posinf=1e4, neginf=-1e4).clip(-1e4, 1e4))
 
     def precision(self, free: Sequence[FitParameter]) -> FloatArray:
