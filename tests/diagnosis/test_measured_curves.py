@@ -28,7 +28,7 @@ CAR = SimulatorConfig(control_period_s=PERIOD_S)
 GAIN, TOP_SPEED, LIMIT = 4.0, 3.0, 4.0
 SETTINGS = replace(
     DEFAULT,
-    curves=CurveSettings(max_windows=36, first_iterations=5, iterations=2, last_iterations=1),
+    curves=CurveSettings(max_windows=36, first_iterations=2, iterations=1, last_iterations=1),
     windows=replace(DEFAULT.windows, max_fit_windows=40),
 )
 
