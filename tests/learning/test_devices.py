@@ -57,11 +57,11 @@ RANGES = {"motor.drive_gain": (6.0, 10.0), "steering.max_angle": (0.3, 0.7)}
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the numbers of steps, because operations on the stand-in are slow."""
-    monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 10)
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 10)
+    monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 4)
+    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 4)
     monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
     monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)
-    monkeypatch.setattr("learning.posterior.parameter_posterior.MAX_TEMPERING_STEPS", 3)
+    monkeypatch.setattr("learning.posterior.parameter_posterior.MAX_TEMPERING_STEPS", 2)
     monkeypatch.setattr("learning.posterior.parameter_posterior.RANDOM_WALK_STEPS", 2)
 
 
@@ -342,18 +342,18 @@ def test_sac_gradient_steps_are_equal_on_the_device(device: str) -> None:
 
 def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name, value in (
-        (system_identification, "STEPS", 5),
-        (system_identification, "REFINEMENT_STEPS", 5),
-        (system_identification, "N_RESTARTS", 4),
+        (system_identification, "STEPS", 2),
+        (system_identification, "REFINEMENT_STEPS", 2),
+        (system_identification, "N_RESTARTS", 2),
         (averaging, "MAX_FOLDS", 2),
-        (discrepancy, "STEPS", 5),
+        (discrepancy, "STEPS", 2),
         (parameter_posterior, "RANDOM_WALK_STEPS", 1),
         (parameter_posterior, "MAX_TEMPERING_STEPS", 2),
     ):
         monkeypatch.setattr(module, name, value)
     on_device = None
     for on_device, on_cpu in zip(
-        *(run_study("pendulum", rows=(5,), seeds=1, steps=10, device=at) for at in (device, "cpu")),
+        *(run_study("pendulum", rows=(5,), seeds=1, steps=4, device=at) for at in (device, "cpu")),
         strict=True,
     ):
         assert on_device.method == on_cpu.method
@@ -369,7 +369,7 @@ def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(speed, "STEPS", 400)
     monkeypatch.setattr(speed, "FITTED_ROWS", 12)
     monkeypatch.setattr(speed, "SIZES", {"small": (4, 2, 9)})
-    monkeypatch.setattr(speed, "CAR_FIT", CarFitSettings(steps=20))
+    monkeypatch.setattr(speed, "CAR_FIT", CarFitSettings(steps=5))
     synchronise(device)
     training = speed.training_speed(device)
     assert training["small"]["steps_per_s"] > 0.0
