@@ -31,6 +31,10 @@ FINAL_RATE_SHARE = 0.001
 """Share of the learning rate at the end of its half cosine."""
 SQUARE_DECAY = 0.99
 """Adam's decay of the mean square of a gradient."""
+MAX_DOMAIN_POINTS = 8192
+"""Number of measurement points of a fit; 48 000 change no likelihood (docs/decisions/0010-distilled-posterior.md)."""
+MIN_DOMAIN_POINTS = 1024
+"""Minimum number of measurement points, for the linear trend and the units of the inputs."""
 MIN_ROWS_FOR_NEIGHBOURS = 20
 """Minimum number of rows for half of the measurement points to be neighbours of rows."""
 MIN_ROWS_FOR_NOISE = 40
@@ -68,6 +72,11 @@ class DistillationSettings:
     learning_rate: float = 1.5e-2
     activation: Activation = "silu"
     seed: int = 0
+
+    @property
+    def domain_points(self) -> int:
+        """Number of measurement points to draw: as many as the steps use, within the limits."""
+        return min(max(self.steps * self.sets * self.points, MIN_DOMAIN_POINTS), MAX_DOMAIN_POINTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +187,7 @@ def measurement_points(
     inputs: Tensor,
     normaliser: Normaliser,
     generator: torch.Generator,
-    count: int = 8192,
+    count: int = MAX_DOMAIN_POINTS,
     domain: Tensor | None = None,
 ) -> Tensor:
     """Raw inputs (count, D) at which particles are fitted to a posterior.

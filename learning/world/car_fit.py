@@ -123,10 +123,10 @@ def fit_car(
         model if with_simulator else None, inputs, outputs, units, torch.tensor(NOISE_STD).to(device),
         discrepancy_std=discrepancy_std, restart_scales=(1.0,), seed=settings.seed,
     )  # fmt: skip
-    points = measurement_points(model, inputs, units, generator)
     particles = DistillationSettings(
         particles=settings.particles, steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
     )
+    points = measurement_points(model, inputs, units, generator, particles.domain_points)
     start = None if before is None else before.posterior.to(device).parameters_for(target.normaliser)
     return CarDynamics(distil(target, points, particles, progress, start), model.history)
 

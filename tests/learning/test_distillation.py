@@ -32,6 +32,11 @@ def normal(*shape, seed=0):
     return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
 
 
+@pytest.mark.parametrize(("steps", "count"), [(3000, 8192), (40, 40 * 16 * 4), (1, 1024)])
+def test_no_more_measurement_points_are_drawn_than_the_steps_use(steps, count):
+    assert DistillationSettings(steps=steps).domain_points == count
+
+
 @dataclass(frozen=True)
 class FixedLine:
     """Simulator ``0.7 x - 1.2``; its parameter has no effect."""

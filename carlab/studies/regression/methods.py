@@ -149,8 +149,10 @@ class FitTask:
         """Particles distilled from the posterior over functions at the rows; arguments as for ``posterior``."""
         generator = torch.Generator().manual_seed(30_000 + self.seed)
         posterior = self.posterior(simulator, self.data.inputs, outputs, size)
-        points = measurement_points(simulator or self.case.prior, self.data.inputs, self.normaliser, generator)
         settings = DistillationSettings(hidden=HIDDEN, steps=self.steps or STEPS, seed=self.seed)
+        points = measurement_points(
+            simulator or self.case.prior, self.data.inputs, self.normaliser, generator, settings.domain_points
+        )
         return SmoothedParticles(distil(posterior, points, settings))
 
     @property
