@@ -18,9 +18,9 @@ from carlab.cli import run
 
 @pytest.fixture(scope="module")
 def concealed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """Write 60 s to fit and 30 s held out with a concealed servo lag and base parameters wrong by up to 10 %."""
+    """Write 45 s to fit and 20 s held out with a concealed servo lag and base parameters wrong by up to 10 %."""
     folder = tmp_path_factory.mktemp("concealed")
-    case = make_case("single", 11, effects=("steering_lag",), excess=4.0, fit_s=60, hold_s=30)
+    case = make_case("single", 11, effects=("steering_lag",), excess=4.0, fit_s=45, hold_s=20)
     write_csv(folder / "fit.csv", case.fit)
     write_csv(folder / "hold.csv", case.hold)
     case.nominal.write(folder / "car.toml")

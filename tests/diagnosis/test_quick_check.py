@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from carlab.core.episode_data import EpisodeData
 from carlab.core.state_estimator import fit_velocity
 from carlab.diagnosis.quick.conditions import find_conditions
-from carlab.diagnosis.quick.quick_check import quick_check
+from carlab.diagnosis.quick.quick_check import QuickCheck, quick_check
 from carlab.diagnosis.quick.sentences import sentences, short
 from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.state_alignment import align_states, window_variance_s2
@@ -40,12 +41,18 @@ def test_true_simulator_explains_its_recordings(tmp_path: Path, seed: int) -> No
     assert "explains" in sentences(check)[0]
 
 
+@functools.cache
+def checked(effect: str, size: float) -> tuple[drives.Concealed, QuickCheck]:
+    """Return drives with a concealed effect and their check."""
+    case = drives.concealed_drives(effect, size, seed=23)
+    return case, quick_check(case.episodes, case.simulator)
+
+
 @pytest.mark.parametrize(
     ("effect", "size"), [("motor_lag", 1.0), ("marker_offset", 1.0), ("road_slope", 2.0)]
 )  # fmt: skip
 def test_concealed_effect_of_an_independent_generator_is_located_and_named(effect: str, size: float) -> None:
-    case = drives.concealed_drives(effect, size, seed=23)
-    check = quick_check(case.episodes, case.simulator)
+    case, check = checked(effect, size)
     assert check.verdict == "left"
     assert check.channels[0].channel in case.main_channels
     first = check.causes[0]
@@ -85,10 +92,8 @@ def test_wrong_parameter_and_a_changed_effect_are_distinguished_from_new_effects
 
 
 def test_check_is_deterministic() -> None:
-    case = drives.concealed_drives("rolling_resistance", 3.0, seed=27, episodes=2)
-    first, second = (quick_check(case.episodes, case.simulator).to_dict() for _ in range(2))
-    assert first == second
-    assert first["verdict"] == "left"
+    case, first = checked("motor_lag", 1.0)
+    assert quick_check(case.episodes, case.simulator).to_dict() == first.to_dict()
 
 
 def test_insufficient_recordings_are_undecided_with_a_reason() -> None:
