@@ -51,8 +51,8 @@ def outcome(folder: Path, change: Callable[[Table], Table] = dict, effects: tupl
 
 @pytest.fixture(scope="module")
 def drag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """Aerodynamic drag concealed in 60 s of driving with wrong base parameters."""
-    case = make_case("single", 21, effects=("aerodynamic_drag",), excess=2.0, fit_s=60, hold_s=30)
+    """Aerodynamic drag concealed in 45 s of driving with wrong base parameters."""
+    case = make_case("single", 21, effects=("aerodynamic_drag",), excess=2.0, fit_s=45, hold_s=20)
     folder = write(tmp_path_factory.mktemp("drag"), case)
     return folder, case.answer()["effects"][0]["parameters"]["coefficient"]
 
@@ -111,7 +111,7 @@ def test_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -
 
 
 def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path) -> None:
-    found = outcome(write(tmp_path, make_case("parameters", 31, fit_s=60, hold_s=30))).diagnosis
+    found = outcome(write(tmp_path, make_case("parameters", 31, fit_s=45, hold_s=20))).diagnosis
     assert found.verdict == "parameters"
     assert found.effects == ()
     assert found.held_out["refit"].score < 0.5 * found.held_out["nominal"].score
@@ -122,7 +122,7 @@ def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path) -> None:
 )
 def test_uncatalogued_physics_is_described_without_a_name(tmp_path: Path, candidates: tuple[str, ...] | None) -> None:
     """A cable that pulls the rear of the car towards a point resembles no effect of the catalogue."""
-    case = make_case("outside", 41, effects=("cable_pull",), excess=4.0, fit_s=60, hold_s=30)
+    case = make_case("outside", 41, effects=("cable_pull",), excess=4.0, fit_s=45, hold_s=20)
     found = outcome(write(tmp_path, case), effects=candidates).diagnosis
     assert found.verdict == "unexplained"
     assert found.effects == ()
