@@ -70,9 +70,9 @@ class _Knots:
 
     def difference(self, form: Form, values: FloatArray) -> FloatArray:
         """Piecewise linear approximation of a form minus the curve, over the band, at the knots."""
-        grid = form.value(values, self.inputs)
-        for axis, projection in enumerate(self.projections):
-            grid = np.moveaxis(np.tensordot(projection, grid, axes=(1, axis)), 0, axis)
+        grid = self.projections[0] @ form.value(values, self.inputs)  # curves have one or two axes
+        if len(self.projections) == 2:
+            grid = grid @ self.projections[1].T
         return np.asarray((grid.ravel()[self.used] - self.measured) / self.std)
 
 
