@@ -156,8 +156,8 @@ def test_other_choice_repairs_a_wrong_turn(
 
     monkeypatch.setattr("carlab.diagnosis.selection.search.extend", one_step)
     selection = replace(DEFAULT.selection, **{"min_effects_for_alternatives": 1, **limits})
-    lenient = replace(DEFAULT.rivals, min_explained_share=0.0)
-    outcome = found(drag, tmp_path, (0.02, 0.02), replace(FEWER, selection=selection, rivals=lenient))
+    settings = replace(FEWER, selection=selection)
+    outcome = found(drag, tmp_path, (0.02, 0.02), settings, effects=(DRAG, MISALIGNMENT))  # named as the search ends
     assert set(names(outcome)) == expected
 
 
