@@ -179,3 +179,11 @@ def test_mirrored_commands_and_effects_give_mirrored_angles(name):
     commands = rng.uniform(-1, 1, 60)
     right = angles({name: other}, -commands)
     assert angles({name: typical}, commands) == pytest.approx([-a for a in right], abs=1e-14)
+
+
+def test_steps_of_many_lengths_in_turn_equal_those_of_a_new_chain():
+    effects = {"steering_lag": {"time_constant": 0.05}, "motor_lag": {"time_constant": 0.2}}
+    used = chain(effects)
+    memory = used.settled((0.1, -0.2))
+    for step_s in [0.001 * k for k in range(1, 13)] * 2:
+        assert used.step((0.7, 0.4), memory, step_s) == chain(effects).step((0.7, 0.4), memory, step_s)
