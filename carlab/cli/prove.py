@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from carlab.benchmark.cases.proof_set import CaseSpec
-    from carlab.benchmark.proof.child_jobs import Executor
     from carlab.benchmark.proof.runner import Proof
     from carlab.experiment.episodes.interrupts import Interrupts
+    from carlab.jobs.child_jobs import Executor
 
 STAGES = {
     "make": "cases made",
@@ -106,8 +106,8 @@ class Prove:
         above_zero(jobs=self.jobs, timeout=self.timeout)
         at_least(0, seed=self.seed)
         at_least(1, limit=self.limit)
-        if self.ray and (self.jobs > 1 or self.simulator != "own"):
-            raise ConfigError("--ray replaces --jobs, and needs --simulator own; leave one of them out.")
+        if self.ray and self.simulator != "own":
+            raise ConfigError("--ray needs --simulator own; leave one of them out.")
         if self.set == "real":
             return self._real()
         specs = self._specs()
@@ -151,13 +151,9 @@ class Prove:
         return score(proof, self.out, lambda runs: self._facts([spec.seed for spec in specs], runs))
 
     def _executor(self) -> AbstractContextManager[Executor]:
-        from carlab.benchmark.proof.child_jobs import LocalExecutor
+        from carlab.jobs.choice import chosen_executor
 
-        if not self.ray:
-            return nullcontext(LocalExecutor(self.jobs))
-        from carlab.benchmark.proof.ray_executor import RayExecutor
-
-        return RayExecutor(self.ray)
+        return chosen_executor(self.ray, self.jobs)
 
     def _study(self) -> int:
         from carlab.benchmark.public_simulators.commonroad import require_public_simulator

@@ -88,12 +88,22 @@ def prior_models(case: RecordedCase, car: SimulatorConfig, diagnosed: SimulatorC
     return priors
 
 
+def checked_counts(case: RecordedCase, rows: Sequence[int]) -> tuple[int, ...]:
+    """Numbers of rows, by default those of the case. Raises DataError if the recordings have fewer rows."""
+    assert case.rows is not None
+    counts = tuple(rows) or case.counts
+    if max(counts) > len(case.rows):
+        raise DataError(f"The recordings have {len(case.rows)} rows, not {max(counts)}; give fewer with --rows.")
+    return counts
+
+
 def run_prior_study(
     case: RecordedCase,
     priors: Mapping[str, DomainModel | None],
     *,
     rows: Sequence[int] = (),
     seeds: int = 3,
+    first_seed: int = 0,
     steps: int | None = None,
     device: str = "cpu",
     progress: Progress = lambda what, done, total: None,
@@ -107,6 +117,7 @@ def run_prior_study(
         priors: by name, from ``prior_models``.
         rows: numbers of rows; by default those of the case.
         seeds: number of seeds; rows and fit have the same seed.
+        first_seed: the smallest seed.
         steps: of the particles' optimiser; by default those of the method.
         device: of fits and predictions.
         progress: called before each fit and at the end.
@@ -115,11 +126,9 @@ def run_prior_study(
         DataError: the recordings have too few rows.
     """
     assert case.rows is not None
-    counts = tuple(rows) or case.counts
-    if max(counts) > len(case.rows):
-        raise DataError(f"The recordings have {len(case.rows)} rows, not {max(counts)}; give fewer with --rows.")
+    counts = checked_counts(case, rows)
     domain = priors.get(NOMINAL) or case.prior
-    plan = list(itertools.product(counts, range(seeds), priors))
+    plan = list(itertools.product(counts, range(first_seed, first_seed + seeds), priors))
     for done, (count, seed, name) in enumerate(plan):
         progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
         data = case.recorded(Path(), count, seed).to(device)
@@ -132,4 +141,14 @@ def run_prior_study(
     progress("", len(plan), len(plan))
 
 
-__all__ = ["DIAGNOSED", "KINEMATIC", "NOMINAL", "NONE", "InDomain", "check_periods", "prior_models", "run_prior_study"]
+__all__ = [
+    "DIAGNOSED",
+    "KINEMATIC",
+    "NOMINAL",
+    "NONE",
+    "InDomain",
+    "check_periods",
+    "checked_counts",
+    "prior_models",
+    "run_prior_study",
+]

@@ -87,8 +87,8 @@ def test_proof_is_sealed_scored_and_not_repeated(proof_dir: Path, carlab: Carlab
 
 
 def test_cases_do_not_depend_on_the_number_of_jobs(proof_dir: Path, tmp_path: Path) -> None:
-    from carlab.benchmark.proof.child_jobs import LocalExecutor
     from carlab.benchmark.proof.runner import Proof
+    from carlab.jobs.child_jobs import LocalExecutor
 
     files = []
     for jobs in (1, 2):

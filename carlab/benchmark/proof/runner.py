@@ -22,13 +22,13 @@ import numpy as np
 
 from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.cases.set_check import CHEAP, indistinguishable
-from carlab.benchmark.proof.child_jobs import PYTHON, ChildJob, Executor, JobEnd
-from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd
 from carlab.benchmark.proof.sealed_run import LOCAL, Progress, SealedRun, silent
 from carlab.benchmark.proof.worker import FILES, read_json, write_json
 from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import DataError
+from carlab.jobs.child_jobs import PYTHON, ChildJob, Executor, JobEnd
+from carlab.jobs.child_processes import ONE_THREAD, ChildEnd
 
 DIAGNOSE = (PYTHON, "-m", "carlab", "diagnose", "--decisions")
 COMPARED = ("single", "multiple", "null", "parameters", "outside")

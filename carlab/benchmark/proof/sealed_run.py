@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from carlab.benchmark.cases.seal import check, digest, file_digest, new_name, new_nonce
-from carlab.benchmark.proof.child_jobs import Executor, LocalExecutor
-from carlab.benchmark.proof.child_processes import ONE_THREAD, ChildEnd, side_by_side
 from carlab.benchmark.proof.worker import read_json, write_json
 from carlab.core.errors import DataError
+from carlab.jobs.child_jobs import Executor, LocalExecutor
+from carlab.jobs.child_processes import ONE_THREAD, ChildEnd, side_by_side
 
 Progress = Callable[[str, int, int, str], None]
 LOCAL = LocalExecutor()

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from carlab.benchmark.proof.child_processes import run_child
 from carlab.benchmark.proof.runner import DIAGNOSE
 from carlab.benchmark.proof.worker import FILES, read_json, write_json
 from carlab.benchmark.public_simulators.commonroad import (
@@ -26,6 +25,7 @@ from carlab.benchmark.public_simulators.commonroad_effects import physics_of, tr
 from carlab.benchmark.public_simulators.study_page import ASKED_RATIO, study_page
 from carlab.benchmark.world.measurement import as_table, write_csv
 from carlab.core.errors import DataError
+from carlab.jobs.child_processes import run_child
 
 PACKAGE = "commonroad-vehicle-models"
 KEPT = ("report.json", "report.html", "model.toml")

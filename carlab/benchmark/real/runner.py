@@ -20,8 +20,6 @@ import tomli_w
 
 from carlab.benchmark.cases.proof_set import drawn
 from carlab.benchmark.effects.data_faults import Table
-from carlab.benchmark.proof.child_jobs import PYTHON, ChildJob
-from carlab.benchmark.proof.child_processes import ChildEnd
 from carlab.benchmark.proof.sealed_run import SealedRun
 from carlab.benchmark.proof.worker import read_json, write_json
 from carlab.benchmark.real.cases import (
@@ -37,6 +35,8 @@ from carlab.benchmark.real.cases import (
 )
 from carlab.benchmark.real.kinds import FULL_LOCK, KINDS
 from carlab.core.errors import ConfigError, DataError
+from carlab.jobs.child_jobs import PYTHON, ChildJob
+from carlab.jobs.child_processes import ChildEnd
 
 OTHER, CAR, MODEL = "other_{}.csv", "car.toml", "model.toml"
 CARLAB = (PYTHON, "-m", "carlab")

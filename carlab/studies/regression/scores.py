@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,6 +39,11 @@ class Score:
     seconds: float
     nll_in_world: float | None = None
     failed: str | None = None
+
+
+def failed_score(case: str, method: str, rows: int, seed: int, reason: str) -> Score:
+    """The score of a failed fit."""
+    return Score(case, method, rows, seed, *(math.nan,) * 4, failed=reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,4 +106,10 @@ def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[
     }
 
 
-__all__ = ["FIGURES", "Row", "Score", "as_json", "summarised"]
+def scores_from_json(content: Mapping[str, Any]) -> list[Score]:
+    """Read the scores of ``as_json``. Raises KeyError, TypeError or ValueError for other content."""
+    rows = [{k: math.nan if v is None and k in FIGURES else v for k, v in row.items()} for row in content["scores"]]
+    return [Score(**row) for row in rows]
+
+
+__all__ = ["FIGURES", "Row", "Score", "as_json", "failed_score", "scores_from_json", "summarised"]

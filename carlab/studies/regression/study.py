@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError, DataError
 from carlab.studies.regression.cases import CASES, Case, Data
 from carlab.studies.regression.methods import METHODS, PAPER_METHODS, FitTask
-from carlab.studies.regression.scores import Score
+from carlab.studies.regression.scores import Score, failed_score
 from learning.evaluation import (
     Mixture,
     Prediction,
@@ -31,36 +32,58 @@ _LINEAR_ALGEBRA = ("linalg", "lapack", "cusolver", "magma")
 """Words that identify RuntimeErrors of torch's linear algebra and its libraries."""
 
 
-def run_study(
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """One fit of a study: number of rows, seed, and method."""
+
+    rows: int
+    seed: int
+    method: str
+
+
+@dataclass(frozen=True, slots=True)
+class StudyPlan:
+    """The fits of a study with their data.
+
+    Attributes:
+        fits: in the order of the study.
+        variants: case of each method: in the world frame for the paper's methods, else in the body frame.
+        data: by frame (``in_body_frame``), number of rows and seed.
+    """
+
+    fits: tuple[Fit, ...]
+    variants: Mapping[str, Case]
+    data: Mapping[tuple[bool, int, int], Data]
+
+    def scored(self, fit: Fit, steps: int | None = None, device: str = "cpu") -> Score:
+        """Run one fit and score it."""
+        variant = self.variants[fit.method]
+        data = self.data[variant.in_body_frame, fit.rows, fit.seed].to(device)
+        return scored(variant, data, fit.rows, fit.seed, fit.method, steps=steps)
+
+
+def plan_study(
     case: str | Case,
     *,
     rows: Sequence[int] = (),
-    seeds: int = 3,
+    seeds: Sequence[int] = range(3),
     methods: Sequence[str] = (),
     structure: bool = False,
     data: Path | None = None,
-    steps: int | None = None,
-    device: str = "cpu",
-    progress: Progress = lambda what, done, total: None,
-) -> Iterator[Score]:
-    """Fit every method to every number of rows with every seed; yield each score after its fit.
-
-    The score of a failed fit has the reason; the study continues.
+) -> StudyPlan:
+    """The fits of every method to every number of rows with every seed, and their data.
 
     Args:
         case: name in ``CASES``, or a case.
         rows: numbers of rows; by default those of the case.
-        seeds: number of seeds; data and fit have the same seed.
+        seeds: data and fit have the same seed.
         methods: names in ``METHODS``; by default all.
         structure: every method knows the structured simulator of the case.
         data: folder of the authors' arrays; None: the study generates the data.
-        steps: of the optimiser; by default those of the method.
-        device: of fits and predictions; random numbers are drawn on the CPU. Ridge runs in NumPy.
-        progress: called before each fit and at the end.
 
     Raises:
         ConfigError: an unknown case or method, no structured simulator, or too few rows for all methods.
-        DataError: arrays are missing or have fewer rows (raised before the first fit).
+        DataError: arrays are missing or have fewer rows.
     """
     if isinstance(case, str) and case not in CASES:
         raise ConfigError(f"There is no case '{case}'; choose {', '.join(CASES)}.")
@@ -71,23 +94,59 @@ def run_study(
         chosen = chosen.structured()
     counts = tuple(rows) or chosen.counts
     names = tuple(methods) or tuple(METHODS)
-    all_fits = itertools.product(counts, range(seeds), names)
-    plan = [fit for fit in all_fits if not (fit[2] == "ridge" and fit[0] < MIN_RIDGE_ROWS)]
-    if not plan:
+    all_fits = itertools.starmap(Fit, itertools.product(counts, seeds, names))
+    fits = tuple(fit for fit in all_fits if not (fit.method == "ridge" and fit.rows < MIN_RIDGE_ROWS))
+    if not fits:
         raise ConfigError(f"Ridge regression needs {MIN_RIDGE_ROWS} rows or more; give --rows, or other methods.")
-    # All data is read before the first fit, so that the study fails early if data is missing.
     variants = {name: chosen if name in PAPER_METHODS else chosen.body_frame or chosen for name in names}
     frames = {variant.in_body_frame: variant for variant in variants.values()}
     drawn = {
         (frame, count, seed): variant.data(count, seed) if data is None else variant.recorded(data, count, seed)
-        for (frame, variant), count, seed in itertools.product(frames.items(), counts, range(seeds))
+        for (frame, variant), count, seed in itertools.product(frames.items(), counts, seeds)
     }
-    for done, (count, seed, name) in enumerate(plan):
-        progress(f"{name}, {count} rows, seed {seed}", done, len(plan))
-        variant = variants[name]
-        rows_of_fit = drawn[variant.in_body_frame, count, seed].to(device)
-        yield scored(variant, rows_of_fit, count, seed, name, steps=steps)
-    progress("", len(plan), len(plan))
+    return StudyPlan(fits, variants, drawn)
+
+
+def run_study(
+    case: str | Case,
+    *,
+    rows: Sequence[int] = (),
+    seeds: int = 3,
+    first_seed: int = 0,
+    methods: Sequence[str] = (),
+    structure: bool = False,
+    data: Path | None = None,
+    steps: int | None = None,
+    device: str = "cpu",
+    progress: Progress = lambda what, done, total: None,
+) -> Iterator[Score]:
+    """Fit every method to every number of rows with every seed; yield each score after its fit.
+
+    The score of a failed fit has the reason; the study continues. All data is read before the first fit, so that the
+    study fails early if data is missing.
+
+    Args:
+        case: as for ``plan_study``.
+        rows: as for ``plan_study``.
+        seeds: number of seeds.
+        first_seed: the smallest seed.
+        methods: as for ``plan_study``.
+        structure: as for ``plan_study``.
+        data: as for ``plan_study``.
+        steps: of the optimiser; by default those of the method.
+        device: of fits and predictions; random numbers are drawn on the CPU. Ridge runs in NumPy.
+        progress: called before each fit and at the end.
+
+    Raises:
+        ConfigError, DataError: as for ``plan_study``.
+    """
+    plan = plan_study(
+        case, rows=rows, seeds=range(first_seed, first_seed + seeds), methods=methods, structure=structure, data=data
+    )
+    for done, fit in enumerate(plan.fits):
+        progress(f"{fit.method}, {fit.rows} rows, seed {fit.seed}", done, len(plan.fits))
+        yield plan.scored(fit, steps, device)
+    progress("", len(plan.fits), len(plan.fits))
 
 
 def scored(case: Case, data: Data, count: int, seed: int, method: str, *, steps: int | None = None) -> Score:
@@ -107,14 +166,10 @@ def scored(case: Case, data: Data, count: int, seed: int, method: str, *, steps:
     except (DataError, RuntimeError, np.linalg.LinAlgError) as error:
         if (reason := _failure_reason(error)) is None:
             raise
-        return _failed(case, method, count, seed, reason)
+        return failed_score(case.name, method, count, seed, reason)
     if not all(map(math.isfinite, figures)):
-        return _failed(case, method, count, seed, "The prediction is not finite.")
+        return failed_score(case.name, method, count, seed, "The prediction is not finite.")
     return Score(case.name, method, count, seed, *figures, seconds, in_world)
-
-
-def _failed(case: Case, method: str, count: int, seed: int, reason: str) -> Score:
-    return Score(case.name, method, count, seed, *(math.nan,) * 4, failed=reason)
 
 
 def _failure_reason(error: Exception) -> str | None:
@@ -140,4 +195,4 @@ def _nll_in_world(prediction: Prediction, data: Data) -> float | None:
     return negative_log_likelihood(in_world(prediction), measured)
 
 
-__all__ = ["Progress", "run_study", "scored"]
+__all__ = ["Fit", "Progress", "StudyPlan", "plan_study", "run_study", "scored"]

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from carlab.benchmark.cases.proof_set import CaseSpec
-from carlab.benchmark.proof.child_jobs import PYTHON, ChildJob, Executor, LocalExecutor
-from carlab.benchmark.proof.ray_executor import RayExecutor
 from carlab.benchmark.proof.runner import Proof
 from carlab.core.errors import ConfigError
+from carlab.jobs.child_jobs import PYTHON, ChildJob, Executor, LocalExecutor
+from carlab.jobs.ray_executor import RayExecutor
 
 FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).with_name("fake_diagnosis.py")))
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from carlab.benchmark.proof.child_processes import ChildEnd, run_child
+from carlab.core.errors import DataError
+from carlab.jobs.child_processes import ChildEnd, run_child
 
 PYTHON = "python"
 """Program of a job that stands for the Python interpreter of the machine that runs it."""
@@ -25,8 +26,9 @@ class ChildJob:
     Attributes:
         command: program and arguments; the program ``PYTHON`` is the interpreter that runs the job.
         timeout_s: time after which it is killed.
-        inputs: contents of files in the folder, by name.
-        outputs: files that are read afterwards, relative to the folder; missing ones are left out.
+        inputs: contents of files in the folder, by relative path.
+        outputs: files that are read afterwards, relative to the folder, or folders, of which all files are read;
+            missing ones are left out.
         words_in: standard input.
         environment: changes to the environment.
     """
@@ -41,7 +43,7 @@ class ChildJob:
 
 @dataclass(frozen=True, slots=True)
 class JobEnd:
-    """End of a job: that of its process, and its output files by name."""
+    """End of a job: that of its process, and its output files by relative path."""
 
     end: ChildEnd
     outputs: Mapping[str, bytes] = field(default_factory=dict)
@@ -51,6 +53,13 @@ class JobEnd:
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in self.outputs.items():
             (folder / Path(name).name).write_bytes(content)
+
+    @property
+    def failure(self) -> str:
+        """Reason of a failed job: the last printed line, or the exit status; empty for a job that succeeded."""
+        if self.end.exit_status == 0:
+            return ""
+        return (self.end.words.strip().splitlines() or [f"exit status {self.end.exit_status}"])[-1]
 
 
 class Executor(Protocol):
@@ -83,14 +92,39 @@ def run_job(job: ChildJob, abandon: Callable[[], bool] = lambda: False) -> JobEn
     command = [sys.executable if program == PYTHON else program, *arguments]
     with tempfile.TemporaryDirectory(prefix="job-") as fresh:
         folder = Path(fresh)
-        for name, content in job.inputs.items():
-            (folder / name).write_bytes(content)
+        write_files(folder, job.inputs)
         end = run_child(
             command, folder, timeout_s=job.timeout_s, words_in=job.words_in, environment=job.environment,
             abandon=abandon,
         )  # fmt: skip
-        written = [name for name in job.outputs if (folder / name).is_file()]
-        return JobEnd(end, {name: (folder / name).read_bytes() for name in written})
+        return JobEnd(end, {k: v for name in job.outputs for k, v in read_files(folder, name).items()})
 
 
-__all__ = ["PYTHON", "ChildJob", "Executor", "JobEnd", "LocalExecutor", "run_job"]
+def read_files(folder: Path, name: str) -> dict[str, bytes]:
+    """Contents of a file, or of all files below a folder, by path relative to ``folder``; empty if it is missing."""
+    path = folder / name
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files if file.is_file()}
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files by relative path. Raises DataError if a path leads out of the folder; no file is written then."""
+    root = folder.resolve()
+    for name in files:
+        if Path(name).is_absolute() or not (root / name).resolve().is_relative_to(root):
+            raise DataError(f"'{name}' is not a path within the folder of a job; nothing was written.")
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+
+
+__all__ = [
+    "PYTHON",
+    "ChildJob",
+    "Executor",
+    "JobEnd",
+    "LocalExecutor",
+    "read_files",
+    "run_job",
+    "write_files",
+]
