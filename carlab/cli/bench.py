@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from carlab.api.arguments import above_zero
+from carlab.api.arguments import above_zero, at_least
 from carlab.cli.bench_options import BenchOptions, check_options
 from carlab.cli.bench_output import write_figures
 from carlab.cli.console import console, table
@@ -19,16 +19,18 @@ class Bench(BenchOptions):
         """Measure and print."""
         from learning.devices import available
 
-        available(self.device)
+        if not self.ray:
+            available(self.device)
         if self.out is not None:
             json_file(self.out, "--out")
         check_options(self)
         if self.what == "speed":
             return self._speed()
         above_zero(
-            seeds=self.seeds, steps=self.steps, episodes=self.episodes, updates=self.updates,
+            seeds=self.seeds, jobs=self.jobs, steps=self.steps, episodes=self.episodes, updates=self.updates,
             **{"rows": min(self.rows)} if self.rows else {},
         )  # fmt: skip
+        at_least(0, first_seed=self.first_seed)
         if self.what == "realcars":
             from carlab.cli.bench_realcars import run_realcars
 

@@ -51,6 +51,17 @@ class BenchOptions:
     seeds: int = 3
     """Repetitions of each fit: with other true systems, other rows of a recording, or (parking) other runs."""
 
+    first_seed: int = 0
+    """Smallest seed of the repetitions."""
+
+    jobs: int = 1
+    """Number of parallel parts of the study (a number of rows, seed and method, or a run); with more than one, each has
+    one thread. ^C ends the study after the running parts, a second ^C at once."""
+
+    ray: str = ""
+    """Run the parts on Ray in place of --jobs: local for the cores of this machine, or the address of a cluster with
+    the same version of carlab. A part whose worker dies runs again, or fails alone. Needs pip install 'carlab[ray]'."""
+
     methods: tuple[str, ...] = ()
     """regression: some of gp-sim-average, gp-sim-posterior, sim-posterior, gp-posterior (carlab's: a Gaussian process
     with a simulator, averaged, alone, or without one), sim-fsvgd, fsvgd (the paper's, as published), sim-fsvgd-mended,
@@ -113,7 +124,8 @@ class BenchOptions:
     of the authors' code."""
 
     device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the models. speed: of the learning benchmarks only; the others run on the CPU."""
+    """Device of the models; with --ray, each part on cuda has one GPU of the cluster. speed: of the learning benchmarks
+    only; the others run on the CPU."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -151,6 +163,9 @@ PLACES = {
     "case": (REGRESSION,),
     "rows": (REGRESSION, PRIORS, ROLLOUTS),
     "seeds": (REGRESSION, PRIORS, PARKING, ROLLOUTS),
+    "first_seed": (REGRESSION, PRIORS, PARKING, ROLLOUTS),
+    "jobs": (REGRESSION, PRIORS, PARKING, ROLLOUTS),
+    "ray": (REGRESSION, PRIORS, PARKING, ROLLOUTS),
     "methods": (REGRESSION, PARKING),
     "structure": (PENDULUM,),
     "data": (REGRESSION, PRIORS, REALCARS, ROLLOUTS),

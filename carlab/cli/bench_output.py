@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from carlab.cli.bench_jobs import StudyJob, read_figures, run_jobs
 from carlab.cli.console import console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
+    from carlab.jobs.child_jobs import ChildJob
     from carlab.studies.regression.scores import Row, Score
     from carlab.studies.regression.study import Progress
 
@@ -35,7 +37,7 @@ def write_figures(path: Path, figures: Mapping[str, Any]) -> None:
 def run_and_write(
     study: Callable[[Progress], Iterator[Score]], options: BenchOptions, name: str
 ) -> tuple[list[Score], bool]:
-    """Run a study, write the figures after each score, and print each failure.
+    """Run a study in this process, write the figures after each score, and print each failure.
 
     Args:
         study: function that starts the study with a progress callback.
@@ -46,20 +48,46 @@ def run_and_write(
         The scores, and whether ^C ended the study.
     """
     from carlab.experiment.episodes.interrupts import Interrupts
-    from carlab.studies.regression.scores import as_json
 
     scores: list[Score] = []
     with Interrupts() as interrupts, progress(speed_estimate_period_s=SPEED_PERIOD_S) as bar:
         task = bar.add_task(name, total=None, note="")
         for score in study(lambda note, done, total: bar.update(task, completed=done, total=total, note=note)):
             scores.append(score)
-            if options.out is not None:
-                write_figures(options.out, as_json(scores, command(), options.device))
-            if score.failed is not None:
-                fail(f"{score.method}, {score.rows} rows, seed {score.seed} failed: {score.failed}")
+            _write_scores([score], scores, options)
             if interrupts.requested.is_set():
                 break
         return scores, interrupts.requested.is_set()
+
+
+def run_jobs_and_write(jobs: Sequence[StudyJob[Score]], options: BenchOptions, name: str) -> tuple[list[Score], bool]:
+    """As ``run_and_write``, with the parts of the study as parallel jobs."""
+    return run_jobs(jobs, options, name, lambda new, scores: _write_scores(new, scores, options))
+
+
+def score_job(job: ChildJob, case: str, rows: int, seed: int, methods: Sequence[str]) -> StudyJob[Score]:
+    """A job that writes the scores of methods; if it fails, each method has a failed score."""
+    from carlab.studies.regression.scores import failed_score, scores_from_json
+
+    return StudyJob(
+        f"{', '.join(methods)}, {rows} rows, seed {seed}",
+        job,
+        lambda end: scores_from_json(read_figures(end)),
+        lambda reason: [failed_score(case, method, rows, seed, reason) for method in methods],
+    )
+
+
+def _write_scores(new: Sequence[Score], scores: Sequence[Score], options: BenchOptions) -> None:
+    """Write all scores, and print the failures among the new ones."""
+    from carlab.studies.regression.scores import as_json
+    from learning.devices import device_name
+
+    if options.out is not None:
+        device = f"{options.device} of Ray {options.ray}" if options.ray else device_name(options.device)
+        write_figures(options.out, as_json(scores, command(), device))
+    for score in new:
+        if score.failed is not None:
+            fail(f"{score.method}, {score.rows} rows, seed {score.seed} failed: {score.failed}")
 
 
 def report(scores: Sequence[Score], stopped: bool, options: BenchOptions, title: str, first: str, *others: Path) -> int:

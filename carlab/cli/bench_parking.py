@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import itertools
+import math
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+from carlab.cli.bench_jobs import CARLAB, StudyJob, run_jobs, uses_jobs
 from carlab.cli.bench_output import command, write_figures
-from carlab.cli.console import console, table
+from carlab.cli.console import console, fail, table
+from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.core.errors import ConfigError
+from carlab.jobs.child_jobs import ChildJob, JobEnd, read_files, write_files
+from carlab.jobs.child_processes import ONE_THREAD
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
     from carlab.studies.parking import Curve, MethodFigures
     from carlab.studies.parking_realities import ArmFigures
+
+RUNS = "runs"
+"""Folder of the runs in the folder of a job."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,43 +41,131 @@ class _Run:
         """Method and reality."""
         return f"{self.method}-{self.reality}" if self.reality else self.method
 
+    @property
+    def name(self) -> str:
+        """Last part of the name of its folder."""
+        from carlab.studies.parking import run_name
+
+        return run_name(self.label, self.seed)
+
 
 def run_parking(options: BenchOptions) -> int:
     """Drive the missing runs of the study, and print the figures of all runs."""
-    from carlab.cli.learn import Learn
-    from carlab.cli.options import CarOptions
-    from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
-    from carlab.studies.parking import check_run, read_curve, run_folder, run_name
-    from carlab.studies.parking_realities import write_reality
-
     runs = _runs(options)
+    begun = _begun(runs, options)
+    code = _drive_as_jobs(runs, begun, options) if uses_jobs(options) else _drive_here(runs, begun, options)
+    if code in (0, EXIT_FAILED) and (curves := _curves(runs, options)):
+        _report(curves, options)
+    return code
+
+
+def _begun(runs: Sequence[_Run], options: BenchOptions) -> dict[str, Path]:
+    """Folders of the runs that exist, by name. Raises ConfigError if one was started with other options."""
+    from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
+    from carlab.studies.parking import check_run, run_folder
+
     begun = {}
     for run in runs:
-        done = run_folder(options.runs, run.label, run.seed)
-        if done is not None and (done / CAMPAIGN_FILE).is_file():
+        folder = run_folder(options.runs, run.label, run.seed)
+        if folder is not None and (folder / CAMPAIGN_FILE).is_file():
             expected = {"updates": ("--updates", options.updates), "model_steps": ("--steps", options.steps)}
             if "method" in run.options:
                 expected["method"] = ("--methods", run.options["method"])
-            check_run(done, expected)
-            begun[run.label, run.seed] = done
-    curves = []
+            check_run(folder, expected)
+            begun[run.name] = folder
+    return begun
+
+
+def _drive_here(runs: Sequence[_Run], begun: Mapping[str, Path], options: BenchOptions) -> int:
+    """Start or resume the runs in this process; returns the exit code of the first that fails, or 0."""
+    from carlab.cli.learn import Learn
+    from carlab.cli.options import CarOptions
+    from carlab.studies.parking_realities import write_reality
+
     for run in runs:
         console.print(f"{run.label}, seed {run.seed}")
         reality = write_reality(run.reality, options.runs / "realities") if run.reality else None
         code = Learn(
             CarOptions("sim", reality=reality), episodes=options.episodes, updates=options.updates,
-            model_steps=options.steps, seed=run.seed, device=options.device,
-            resume=begun.get((run.label, run.seed)), out=options.runs,
-            name=run_name(run.label, run.seed), rerun=False, **run.options,
+            model_steps=options.steps, seed=run.seed, device=options.device, resume=begun.get(run.name),
+            out=options.runs, name=run.name, rerun=False, **run.options,
         ).run()  # fmt: skip
         if code != 0:
             return code
-        folder = run_folder(options.runs, run.label, run.seed)
-        assert folder is not None
-        curves.append(replace(read_curve(folder), method=run.method, reality=run.reality))
-    names = list(dict.fromkeys(run.method for run in runs))
-    _report(sorted(curves, key=lambda c: names.index(c.method)), options)
     return 0
+
+
+def _drive_as_jobs(runs: Sequence[_Run], begun: Mapping[str, Path], options: BenchOptions) -> int:
+    """Start or resume the incomplete runs as parallel jobs; returns the exit code."""
+    from carlab.recording.run_folder import RunDirectory
+
+    failures: list[str] = []
+
+    def study_job(run: _Run) -> StudyJob[Path]:
+        def failed(reason: str) -> list[Path]:
+            failures.append(f"{run.label}, seed {run.seed} failed: {reason}")
+            fail(failures[-1])
+            return []
+
+        job = _job(run, begun.get(run.name), options)
+        return StudyJob(f"{run.label}, seed {run.seed}", job, lambda end: [_moved(end, options.runs)], failed)
+
+    def is_complete(run: _Run) -> bool:
+        return run.name in begun and len(RunDirectory(begun[run.name]).recordings()) >= options.episodes
+
+    jobs = [study_job(run) for run in runs if not is_complete(run)]
+    _, stopped = run_jobs(jobs, options, "runs", lambda new, done: None)
+    if stopped:
+        fail("Stopped; run the same command to continue.")
+        return EXIT_INTERRUPTED
+    return EXIT_FAILED if failures else 0
+
+
+def _job(run: _Run, begun: Path | None, options: BenchOptions) -> ChildJob:
+    """A run as a job: ``carlab learn``, with a copy of the run's folder if it exists."""
+    from carlab.studies.parking_realities import write_reality
+
+    command = [*CARLAB, "learn", "--car", "sim", "--no-rerun", "--device", options.device]
+    files: dict[str, bytes] = {}
+    if run.reality:
+        reality = write_reality(run.reality, options.runs / "realities")
+        files[reality.name] = reality.read_bytes()
+        command += ["--reality", reality.name]
+    if begun is not None:
+        files |= {f"{RUNS}/{name}": content for name, content in read_files(begun.parent, begun.name).items()}
+        command += ["--resume", f"{RUNS}/{begun.name}"]
+    given = {"episodes": options.episodes, "updates": options.updates, "seed": run.seed, "out": RUNS, "name": run.name}
+    given |= run.options | ({} if options.steps is None else {"model-steps": options.steps})
+    command += [word for name, value in given.items() for word in (f"--{name}", str(value))]
+    return ChildJob(tuple(command), math.inf, files, (RUNS,), environment=ONE_THREAD)
+
+
+def _moved(end: JobEnd, runs: Path) -> Path:
+    """Write the run folder of an ended job to the runs of the study. Raises ValueError if the run is incomplete."""
+    names = {Path(name).parts[1] for name in end.outputs}
+    if end.end.exit_status != 0 or len(names) != 1:
+        raise ValueError("the run is incomplete")
+    folder = runs / names.pop()
+    unfinished = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    write_files(unfinished, {str(Path(k).relative_to(RUNS, folder.name)): v for k, v in end.outputs.items()})
+    shutil.rmtree(folder, ignore_errors=True)
+    unfinished.replace(folder)
+    return folder
+
+
+def _curves(runs: Sequence[_Run], options: BenchOptions) -> list[Curve]:
+    """Curves of the runs that exist, method by method."""
+    from carlab.studies.parking import read_curve, run_folder
+
+    names = list(dict.fromkeys(run.method for run in runs))
+    folders = [(run, run_folder(options.runs, run.label, run.seed)) for run in runs]
+    curves = [
+        replace(read_curve(folder), method=run.method, reality=run.reality)
+        for run, folder in folders
+        if folder is not None
+    ]
+    return sorted(curves, key=lambda c: names.index(c.method))
 
 
 def _runs(options: BenchOptions) -> list[_Run]:
@@ -75,7 +173,7 @@ def _runs(options: BenchOptions) -> list[_Run]:
     from carlab.studies.parking_realities import ARMS, REALITIES, arm_of
     from learning.world.car_fit import Method
 
-    seeds = range(options.seeds)
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
     if options.realities is not None:
         if not 0 < options.realities <= len(REALITIES):
             raise ConfigError(f"--realities {options.realities}: give a number from 1 to {len(REALITIES)}.")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.api.recordings import required_file
-from carlab.cli.bench_output import report, run_and_write
+from carlab.cli.bench_jobs import StudyJob, bench_job, recorded_files, uses_jobs
+from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
 from carlab.cli.console import console, progress
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import read_json
@@ -18,7 +20,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from carlab.cli.bench_options import BenchOptions
+    from carlab.studies.regression.recordings import RecordedCase
+    from carlab.studies.regression.scores import Score
 
+MODEL = "model.toml"
 HOLDOUT_SHARE = 0.1
 """Share of each diagnosed recording in the validation split of the diagnosis (docs/decisions/0014)."""
 
@@ -45,15 +50,37 @@ def run_priors(options: BenchOptions) -> int:
         case = recorded_case([load_episodes(path) for path in files], car, options.history)
         console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
         priors = prior_models(case, simulator, diagnosed)
+        if uses_jobs(options):
+            scores, stopped = run_jobs_and_write(
+                _jobs(options, case, list(priors), files, car, model), options, "priors"
+            )
+            return report(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
         scores, stopped = run_and_write(
             lambda progress: run_prior_study(
-                case, priors, rows=options.rows, seeds=options.seeds, steps=options.steps, device=options.device,
-                progress=progress,
+                case, priors, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,
+                steps=options.steps, device=options.device, progress=progress,
             ),
             options,
             "priors",
         )  # fmt: skip
         return report(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
+
+
+def _jobs(
+    options: BenchOptions, case: RecordedCase, priors: Sequence[str], files: Sequence[Path], car: Path, model: Path
+) -> list[StudyJob[Score]]:
+    """One job for each number of rows and seed, with all priors."""
+    from carlab.studies.priors import checked_counts
+
+    assert case.rows is not None
+    recorded, contents = recorded_files(files, car, case.rows.history)
+    contents[MODEL] = model.read_bytes()
+    jobs = []
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    for rows, seed in itertools.product(checked_counts(case, options.rows), seeds):
+        job = bench_job(options, rows, seed, [*recorded, "--diagnosed", MODEL], contents)
+        jobs.append(score_job(job, case.name, rows, seed, priors))
+    return jobs
 
 
 def check_unseen(model: Path, held_out: Path) -> None:

@@ -2,42 +2,86 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from carlab.cli.bench_output import report, run_and_write
+from carlab.cli.bench_jobs import DATA, StudyJob, bench_job, recorded_files, uses_jobs
+from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
 from carlab.cli.console import console
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
     from carlab.studies.regression.recordings import RecordedCase
+    from carlab.studies.regression.scores import Score
 
 
 def run_regression(options: BenchOptions) -> int:
     """Fit every method to few rows, and print; the figures are written after each fit."""
+    case = _recorded(options) if options.case == "realcar" else options.case
+    if uses_jobs(options):
+        scores, stopped = run_jobs_and_write(_jobs(options, case), options, options.case)
+    else:
+        scores, stopped = _run_here(options, case)
+    structure = ", structured simulator for all methods" if options.structure else ""
+    return report(scores, stopped, options, f"{options.case}, {options.seeds} seeds{structure}", "method")
+
+
+def _run_here(options: BenchOptions, case: str | RecordedCase) -> tuple[list[Score], bool]:
     from carlab.studies.regression.study import run_study
 
-    case = _recorded(options) if options.case == "realcar" else options.case
-    scores, stopped = run_and_write(
+    return run_and_write(
         lambda progress: run_study(
-            case, rows=options.rows, seeds=options.seeds, methods=options.methods, structure=options.structure,
-            data=options.data, steps=options.steps, device=options.device, progress=progress,
+            case, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed, methods=options.methods,
+            structure=options.structure, data=options.data, steps=options.steps, device=options.device,
+            progress=progress,
         ),
         options,
         options.case,
     )  # fmt: skip
-    structure = ", structured simulator for all methods" if options.structure else ""
-    return report(scores, stopped, options, f"{options.case}, {options.seeds} seeds{structure}", "method")
+
+
+def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Score]]:
+    """One job for each fit."""
+    from carlab.studies.regression.cases import CASES
+    from carlab.studies.regression.study import plan_study
+
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    plan = plan_study(
+        case, rows=options.rows, seeds=seeds, methods=options.methods, structure=options.structure, data=options.data
+    )
+    given = ["--case", options.case, *(["--structure"] if options.structure else [])]
+    files: dict[str, bytes] = {}
+    if not isinstance(case, str):
+        assert case.rows is not None
+        recorded, files = recorded_files(_recordings(options), options.car, case.rows.history)
+        given += recorded
+    elif options.data is not None:
+        given += ["--data", DATA]
+    jobs = []
+    for fit in plan.fits:
+        more = dict(files)
+        if isinstance(case, str) and options.data is not None:
+            arrays = CASES[case].arrays_file(fit.rows, fit.seed)
+            more[f"{DATA}/{arrays}"] = (options.data / arrays).read_bytes()
+        job = bench_job(options, fit.rows, fit.seed, [*given, "--methods", fit.method], more)
+        jobs.append(score_job(job, options.case, fit.rows, fit.seed, [fit.method]))
+    return jobs
 
 
 def _recorded(options: BenchOptions) -> RecordedCase:
     from carlab.cli.recordings import load_episodes
     from carlab.studies.regression.recordings import recorded_case
 
-    if options.data is None or not options.data.is_dir():
-        given = "" if options.data is None else f" ('{options.data}' is not a folder)"
-        raise ConfigError(f"--case realcar needs --data FOLDER{given}, with at least two recordings (MCAP or CSV).")
-    files = sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
+    files = _recordings(options)
     case = recorded_case([load_episodes(path) for path in files], options.car, options.history)
     console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
     return case
+
+
+def _recordings(options: BenchOptions) -> list[Path]:
+    """Recordings of --case realcar, the last one held out."""
+    if options.data is None or not options.data.is_dir():
+        given = "" if options.data is None else f" ('{options.data}' is not a folder)"
+        raise ConfigError(f"--case realcar needs --data FOLDER{given}, with at least two recordings (MCAP or CSV).")
+    return sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from carlab.cli.bench_jobs import StudyJob, bench_job, read_figures, recorded_files, run_jobs, uses_jobs
 from carlab.cli.bench_output import command, write_figures
 from carlab.cli.bench_priors import recordings_in
-from carlab.cli.console import console, progress, table
-from carlab.cli.exit_codes import EXIT_INTERRUPTED
+from carlab.cli.console import console, fail, progress, table
+from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
+    from carlab.core.episode_data import EpisodeData
+    from carlab.studies.regression.recordings import RecordedCase
+    from carlab.studies.rollouts import RolloutScore
+
+    Recordings = Sequence[Sequence[EpisodeData]]
 
 
 def run_rollouts(options: BenchOptions) -> int:
     """Fit learned cars and their disturbances, and print coverage and error of their rollouts."""
     from carlab.cli.recordings import load_episodes
-    from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.studies.regression.recordings import recorded_case
-    from carlab.studies.rollouts import RolloutScore, as_json, run_rollout_study
 
     if options.data is None:
         raise ConfigError("bench rollouts needs --data FOLDER with recordings of one car; add it.")
@@ -27,20 +34,75 @@ def run_rollouts(options: BenchOptions) -> int:
     recordings = [load_episodes(path) for path in files]
     case = recorded_case(recordings, options.car, options.history)
     console.print(f"{case.history_message} Held out: {files[-1].name}.", soft_wrap=True)
+    failures: list[str] = []
+    if uses_jobs(options):
+        jobs = _jobs(options, case, recordings, files, failures)
+        scores, stopped = run_jobs(jobs, options, "rollouts", lambda new, scores: _write(scores, options))
+    else:
+        scores, stopped = _run_here(options, case, recordings)
+    _print(scores, files[-1].name)
+    if options.out is not None:
+        console.print(f"{options.out}")
+    if stopped:
+        return EXIT_INTERRUPTED
+    return EXIT_FAILED if failures else 0
+
+
+def _run_here(options: BenchOptions, case: RecordedCase, recordings: Recordings) -> tuple[list[RolloutScore], bool]:
+    from carlab.experiment.episodes.interrupts import Interrupts
+    from carlab.studies.rollouts import run_rollout_study
+
     scores: list[RolloutScore] = []
     with Interrupts() as interrupts, progress() as bar:
         row = bar.add_task("rollouts", total=None, note="")
         study = run_rollout_study(
-            case, recordings, rows=options.rows, seeds=options.seeds, steps=options.steps,
-            device=options.device,
+            case, recordings, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,
+            steps=options.steps, device=options.device,
             progress=lambda note, done, total: bar.update(row, completed=done, total=total, note=note),
             stop=interrupts.requested.is_set,
         )  # fmt: skip
         for score in study:
             scores.append(score)
-            if options.out is not None:
-                write_figures(options.out, as_json(scores, command()))
-        stopped = interrupts.requested.is_set()
+            _write(scores, options)
+        return scores, interrupts.requested.is_set()
+
+
+def _jobs(
+    options: BenchOptions, case: RecordedCase, recordings: Recordings, files: Sequence[Path], failures: list[str]
+) -> list[StudyJob[RolloutScore]]:
+    """One job for each number of rows and seed; ``failures`` receives the messages of failed ones."""
+    from carlab.studies.rollouts import checked_counts, scores_from_json
+
+    assert case.rows is not None
+    more, contents = recorded_files(files, options.car, case.rows.history)
+
+    def job(rows: int, seed: int) -> StudyJob[RolloutScore]:
+        label = f"{rows} rows, seed {seed}"
+
+        def failed(reason: str) -> list[RolloutScore]:
+            failures.append(f"{label} failed: {reason}")
+            fail(failures[-1])
+            return []
+
+        return StudyJob(
+            label,
+            bench_job(options, rows, seed, more, contents),
+            lambda end: scores_from_json(read_figures(end)),
+            failed,
+        )
+
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    return list(itertools.starmap(job, itertools.product(checked_counts(case, recordings, options.rows), seeds)))
+
+
+def _write(scores: Sequence[RolloutScore], options: BenchOptions) -> None:
+    from carlab.studies.rollouts import as_json
+
+    if options.out is not None:
+        write_figures(options.out, as_json(scores, command()))
+
+
+def _print(scores: Sequence[RolloutScore], held_out: str) -> None:
     columns = ["rows", "seed", "rollouts", "after [s]", "position rms [m]", "yaw rms [rad]", "energy score [m]",
                "ahead", "left", "yaw", "vx", "vy", "yaw rate", "one-step nll"]  # fmt: skip
     rows = [
@@ -48,7 +110,4 @@ def run_rollouts(options: BenchOptions) -> int:
          f"{s.energy_m:.4f}", *(f"{c:.2f}" for c in s.coverage), f"{s.nll:.2f}"]
         for s in scores
     ]  # fmt: skip
-    table(f"Coverage of 90 % bands and errors on {files[-1].name}", columns, rows)
-    if options.out is not None:
-        console.print(f"{options.out}")
-    return EXIT_INTERRUPTED if stopped else 0
+    table(f"Coverage of 90 % bands and errors on {held_out}", columns, rows)

@@ -6,6 +6,7 @@ Each job is a Ray task of one core. If its worker dies, Ray starts the task agai
 from __future__ import annotations
 
 import importlib.util
+import logging
 import os
 import platform
 from collections.abc import Callable
@@ -99,7 +100,7 @@ def connect(address: str) -> Any:
 
     quiet: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
     try:
-        ray.init(address=address, log_to_driver=False, logging_level="error", **quiet)
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **quiet)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         raise ConfigError(
             f"--ray {address}: no Ray cluster answers ({first_line(error)}); start one with 'ray start --head', or use "

@@ -8,7 +8,7 @@ independent particles and noise, and one particle with a disturbance for each ro
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -79,6 +79,7 @@ def run_rollout_study(
     *,
     rows: Sequence[int] = (),
     seeds: int = 3,
+    first_seed: int = 0,
     steps: int | None = None,
     device: str = "cpu",
     progress: Progress = lambda what, done, total: None,
@@ -91,6 +92,7 @@ def run_rollout_study(
         recordings: the recordings of the case.
         rows: numbers of rows of a fit; by default ``COUNTS``.
         seeds: number of repetitions.
+        first_seed: the smallest seed.
         steps: of the particles' optimiser; by default those of the regression study.
         device: of the fits; rollouts are sampled on the CPU.
         progress: called before each fit.
@@ -101,15 +103,12 @@ def run_rollout_study(
     """
     assert case.rows is not None
     assert case.held_out is not None
-    counts = tuple(rows) or COUNTS
-    fold_of_row = folds(case.rows.episode, case.rows.tick * _period_s(recordings))
-    smallest = min(int((fold_of_row != fold).sum()) for fold in range(N_FOLDS))
-    if max(counts) > smallest:
-        raise DataError(f"The folds have {smallest} rows, not {max(counts)}; give fewer with --rows.")
+    counts = checked_counts(case, recordings, rows)
+    fold_of_row = _folds_of_rows(case, recordings)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
     fit_windows, held_out = recorded_windows(fitted), recorded_windows(recordings[-1])
     total = len(counts) * seeds * (N_FOLDS + 1)
-    for done, (count, seed) in enumerate(itertools.product(counts, range(seeds))):
+    for done, (count, seed) in enumerate(itertools.product(counts, range(first_seed, first_seed + seeds))):
         errors: list[RolloutErrors] = []
         for fold in range(N_FOLDS):
             if stop():
@@ -125,6 +124,23 @@ def run_rollout_study(
         for name, model in models.items():
             yield from scores_of(name, model, held_out, count, seed, nll)
     progress("", total, total)
+
+
+def checked_counts(
+    case: RecordedCase, recordings: Sequence[Sequence[EpisodeData]], rows: Sequence[int]
+) -> tuple[int, ...]:
+    """Numbers of rows, by default ``COUNTS``. Raises DataError if a fold has fewer rows."""
+    counts = tuple(rows) or COUNTS
+    fold_of_row = _folds_of_rows(case, recordings)
+    smallest = min(int((fold_of_row != fold).sum()) for fold in range(N_FOLDS))
+    if max(counts) > smallest:
+        raise DataError(f"The folds have {smallest} rows, not {max(counts)}; give fewer with --rows.")
+    return counts
+
+
+def _folds_of_rows(case: RecordedCase, recordings: Sequence[Sequence[EpisodeData]]) -> np.ndarray:
+    assert case.rows is not None
+    return folds(case.rows.episode, case.rows.tick * _period_s(recordings))
 
 
 def fit_rows(
@@ -190,6 +206,15 @@ def as_json(scores: Sequence[RolloutScore], command: str) -> dict[str, Any]:
     return {"schema": "carlab.rollouts/1", "command": command, "level": LEVEL, "scores": [asdict(s) for s in scores]}
 
 
+def scores_from_json(content: Mapping[str, Any]) -> list[RolloutScore]:
+    """Read the scores of ``as_json``. Raises KeyError, TypeError or ValueError for other content."""
+    pairs = ("coverage", "band")
+    rows: list[dict[str, Any]] = [
+        {k: tuple(v) if k in pairs else v for k, v in row.items()} for row in content["scores"]
+    ]
+    return [RolloutScore(**row) for row in rows]
+
+
 def _one_step_nll(car: CarDynamics, rows: Transitions) -> float:
     inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
     return negative_log_likelihood(car.predict(inputs).smoothed(), outputs)
@@ -204,11 +229,13 @@ __all__ = [
     "INDEPENDENT",
     "RolloutScore",
     "as_json",
+    "checked_counts",
     "energy_score",
     "fit_rows",
     "fold_errors",
     "folds",
     "recorded_windows",
     "run_rollout_study",
+    "scores_from_json",
     "scores_of",
 ]

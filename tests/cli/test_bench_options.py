@@ -20,17 +20,19 @@ GIVEN = {
     "seconds": 1.0, "case": "car", "rows": (5,), "seeds": 1, "methods": ("ridge",), "structure": True,
     "data": Path("folder"), "car": Path("mine.toml"), "history": 0, "diagnosed": Path("model.toml"), "pair": 2,
     "recorded_s": (40.0, 20.0), "runs": Path("others"), "episodes": 3, "updates": 50, "steps": 70,
+    "first_seed": 4, "jobs": 2, "ray": "local",
 }  # fmt: skip
+REPEATED = {"seeds", "first_seed", "jobs", "ray"}
 ACCEPTED = {
     ("speed", ()): {"seconds"},
-    ("regression", ()): {"case", "rows", "seeds", "methods", "data", "steps"},
-    ("regression", (("case", "pendulum"),)): {"case", "rows", "seeds", "methods", "structure", "data", "steps"},
+    ("regression", ()): {"case", "rows", *REPEATED, "methods", "data", "steps"},
+    ("regression", (("case", "pendulum"),)): {"case", "rows", *REPEATED, "methods", "structure", "data", "steps"},
     ("regression", (("case", "realcar"),)): {
-        "case", "rows", "seeds", "methods", "data", "steps", "car", "history",
+        "case", "rows", *REPEATED, "methods", "data", "steps", "car", "history",
     },
-    ("priors", ()): {"rows", "seeds", "data", "history", "diagnosed", "pair", "recorded_s", "steps"},
-    ("priors", (("data", Path("folder")),)): {"rows", "seeds", "data", "car", "history", "diagnosed", "steps"},
-    ("parking", ()): {"seeds", "methods", "runs", "episodes", "updates", "steps"},
+    ("priors", ()): {"rows", *REPEATED, "data", "history", "diagnosed", "pair", "recorded_s", "steps"},
+    ("priors", (("data", Path("folder")),)): {"rows", *REPEATED, "data", "car", "history", "diagnosed", "steps"},
+    ("parking", ()): {*REPEATED, "methods", "runs", "episodes", "updates", "steps"},
 }  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -12,11 +13,11 @@ import pytest
 
 from carlab.benchmark.cases.proof_set import CaseSpec
 from carlab.benchmark.proof.runner import Proof
-from carlab.core.errors import ConfigError
-from carlab.jobs.child_jobs import PYTHON, ChildJob, Executor, LocalExecutor
+from carlab.core.errors import ConfigError, DataError
+from carlab.jobs.child_jobs import PYTHON, ChildJob, Executor, LocalExecutor, write_files
 from carlab.jobs.ray_executor import RayExecutor
 
-FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).with_name("fake_diagnosis.py")))
+FAKE_DIAGNOSIS = (sys.executable, str(Path(__file__).parents[1] / "benchmark" / "fake_diagnosis.py"))
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +45,26 @@ def test_job_reads_its_input_files_and_returns_its_output_files(executor: Execut
     done = executor.run(job, never)
     assert (done.end.exit_status, done.end.words.strip()) == (0, "printed")
     assert done.outputs == {"out/sum.txt": b"abc"}
+
+
+def test_job_returns_all_files_of_a_folder(executor: Executor) -> None:
+    program = "import pathlib; p = pathlib.Path('runs/a'); p.mkdir(parents=True); (p / 'b').write_text('c')"
+    done = executor.run(ChildJob((PYTHON, "-c", program), 60.0, {"runs/d/e": b"f"}, ("runs",)), never)
+    assert done.outputs == {"runs/a/b": b"c", "runs/d/e": b"f"}
+
+
+def test_failed_job_states_its_last_line(executor: Executor) -> None:
+    program = "import sys; print('first'); print('last'); sys.exit(3)"
+    done = executor.run(ChildJob((PYTHON, "-c", program), 60.0), never)
+    assert (done.end.exit_status, done.failure) == (3, "last")
+
+
+@pytest.mark.parametrize("name", ["../outside", "/tmp/outside", "a/../../outside"])
+def test_file_outside_its_folder_is_not_written(tmp_path: Path, name: str) -> None:
+    (tmp_path / "job").mkdir()
+    with pytest.raises(DataError, match="is not a path within the folder"):
+        write_files(tmp_path / "job", {"inside": b"1", name: b"2"})
+    assert [p.name for p in tmp_path.rglob("*")] == ["job"]
 
 
 def test_job_that_takes_too_long_has_no_exit_status(executor: Executor) -> None:
@@ -94,6 +115,22 @@ def test_unreachable_cluster_is_refused_with_the_remedy() -> None:
     pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
     with pytest.raises(ConfigError, match=r"no Ray cluster answers .* use --ray local"), RayExecutor("localhost:1"):
         pass
+
+
+def test_machine_with_another_version_is_refused(cluster: RayExecutor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sender states another version than the worker has."""
+    monkeypatch.setattr("carlab.jobs.ray_executor.VERSION", "99.0")
+    with pytest.raises(ConfigError, match=r"cluster has carlab .*, this one 99\.0; install the same version on both"):
+        cluster.run(ChildJob((PYTHON, "-c", ""), 60.0), never)
+
+
+def test_cluster_without_a_gpu_is_refused() -> None:
+    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    program = "from carlab.jobs.ray_executor import RayExecutor\nRayExecutor('local', gpu=True).__enter__()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        pytest.skip("this machine has a GPU")
+    assert "ConfigError: --ray local: the cluster has no GPU; add a machine, or" in done.stderr
 
 
 def test_missing_ray_is_refused_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:

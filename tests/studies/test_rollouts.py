@@ -8,33 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from linear_cars import linear_car
 
 import carlab.studies.rollouts as study
 from carlab.cli import run
 from carlab.core.episode_data import EpisodeData
 from carlab.studies.rollouts import DISTURBED, INDEPENDENT, energy_score, folds
-from learning.networks.normaliser import Normaliser
-from learning.networks.particles import Network
-from learning.posterior.particle_posterior import ParticlePosterior
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import drive
-
-
-def linear_car(case: object, rows: Transitions, count: int, seed: int, *others: object) -> CarDynamics:
-    """Fit two equal particles, linear in the inputs, by least squares; it cannot describe a car with tyres."""
-    design = np.hstack([np.ones((len(rows), 1)), rows.inputs])
-    weights = np.linalg.lstsq(design, rows.targets, rcond=None)[0]
-    noise = (rows.targets - design @ weights).std(axis=0)
-    width = rows.inputs.shape[1]
-    network = Network(width, 6, (2,))
-    units = Normaliser(torch.zeros(width), torch.ones(width), torch.zeros(6), torch.ones(6))
-    trend, noise_std = (torch.from_numpy(v).float() for v in (weights, noise))
-    zeros = torch.zeros(2, network.parameters)
-    clip = torch.full((width,), 100.0)
-    return CarDynamics(ParticlePosterior(network, zeros, noise_std, units, math.inf, trend, None, clip), rows.history)
 
 
 def write_drive(path: Path, episode: EpisodeData) -> None:

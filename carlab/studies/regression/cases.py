@@ -150,10 +150,13 @@ class Case:
         outputs = outputs + torch.tensor(self.noise_std) * torch.randn(outputs.shape, generator=generator)
         return Data(inputs[:count], outputs[:count], inputs[count:], outputs[count:])
 
+    def arrays_file(self, count: int, seed: int) -> str:
+        """Name of the file of the authors' arrays."""
+        return "sinusoid_n2.npz" if self.name == "1d" else f"{self.name}_seed{seed}_n{count}.npz"
+
     def recorded(self, folder: Path, count: int, seed: int) -> Data:
         """Read the authors' arrays of this case. Raises DataError if the file is missing or damaged."""
-        name = "sinusoid_n2" if self.name == "1d" else f"{self.name}_seed{seed}_n{count}"
-        path = folder / f"{name}.npz"
+        path = folder / self.arrays_file(count, seed)
         if not path.is_file():
             raise DataError(
                 f"{path} does not exist; leave out --data to draw the data here, or choose other --rows or fewer "

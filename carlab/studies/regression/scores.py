@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from learning.devices import device_name
-
 FIGURES = ("nll", "rmse", "calibration", "seconds")
 
 
@@ -91,7 +89,7 @@ def summarised(scores: Sequence[Score]) -> list[Row]:
 
 
 def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[str, object]:
-    """All scores, their summary and the command of the study; numbers that are not finite become null."""
+    """All scores, their summary, the command of the study and the name of the device; null for a non-finite number."""
 
     def plain(row: Row | Score) -> dict[str, object]:
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(row).items()}
@@ -99,7 +97,7 @@ def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[
     return {
         "schema": "carlab.regression/1",
         "command": command,
-        "device": device_name(device),
+        "device": device,
         "torch_threads": torch.get_num_threads(),
         "rows": [plain(row) for row in summarised(scores)],
         "scores": [plain(score) for score in scores],
@@ -108,7 +106,9 @@ def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[
 
 def scores_from_json(content: Mapping[str, Any]) -> list[Score]:
     """Read the scores of ``as_json``. Raises KeyError, TypeError or ValueError for other content."""
-    rows = [{k: math.nan if v is None and k in FIGURES else v for k, v in row.items()} for row in content["scores"]]
+    rows: list[dict[str, Any]] = [
+        {k: math.nan if v is None and k in FIGURES else v for k, v in row.items()} for row in content["scores"]
+    ]
     return [Score(**row) for row in rows]
 
 

@@ -1,0 +1,145 @@
+"""Parts of a study of ``carlab bench`` as jobs, on this machine (``--jobs``) or on Ray (``--ray``).
+
+A job is the same command for one number of rows, one seed or one method, with copies of the files that it reads.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from carlab.cli.console import progress
+from carlab.jobs.child_jobs import PYTHON, ChildJob, JobEnd
+from carlab.jobs.child_processes import ONE_THREAD, side_by_side
+
+if TYPE_CHECKING:
+    from carlab.cli.bench_options import BenchOptions
+
+Result = TypeVar("Result")
+CARLAB = (PYTHON, "-m", "carlab")
+DATA, CAR, FIGURES = "data", "car.toml", "figures.json"
+"""Names in the folder of a job: recordings, car file, and the figures that it writes."""
+SPEED_PERIOD_S = 86400.0
+"""Window over which the progress bar estimates its speed."""
+
+
+@dataclass(frozen=True, slots=True)
+class StudyJob(Generic[Result]):
+    """A part of a study.
+
+    Attributes:
+        label: for the progress bar and messages.
+        job: command and files.
+        read: results of an ended job. Raises KeyError, TypeError or ValueError if it left none.
+        failed: results that stand for a job that left none, from the reason.
+    """
+
+    label: str
+    job: ChildJob
+    read: Callable[[JobEnd], list[Result]]
+    failed: Callable[[str], list[Result]]
+
+    def results(self, end: JobEnd) -> list[Result]:
+        """Results of an ended job, or those that stand for a failed one."""
+        try:
+            return self.read(end)
+        except (KeyError, TypeError, ValueError) as error:
+            return self.failed(end.failure or f"its result cannot be read ({error!r})")
+
+
+def uses_jobs(options: BenchOptions) -> bool:
+    """Whether the options ask for parallel jobs."""
+    return bool(options.ray) or options.jobs > 1
+
+
+def run_jobs(
+    jobs: Sequence[StudyJob[Result]],
+    options: BenchOptions,
+    name: str,
+    finished: Callable[[list[Result], list[Result]], None],
+) -> tuple[list[Result], bool]:
+    """Run jobs in parallel. ^C ends the study after the running jobs, a second ^C at once.
+
+    Args:
+        jobs: in the order of the study.
+        options: with the executor.
+        name: of the progress bar.
+        finished: called after each job with its results and all results so far, in the order of the study.
+
+    Returns:
+        All results in the order of the study, and whether ^C ended it.
+    """
+    from carlab.experiment.episodes.interrupts import Interrupts
+    from carlab.jobs.choice import chosen_executor
+
+    found: dict[int, list[Result]] = {}
+    executor_of_options = chosen_executor(options.ray, options.jobs, gpu=options.device == "cuda")
+    with Interrupts() as interrupts, executor_of_options as executor, progress(SPEED_PERIOD_S) as bar:
+        row = bar.add_task(name, total=len(jobs), note="")
+
+        def on_end(number: int, end: JobEnd) -> None:
+            if end.end.abandoned:
+                return
+            found[number] = jobs[number].results(end)
+            bar.update(row, completed=len(found), note=jobs[number].label)
+            finished(found[number], in_order())
+
+        def in_order() -> list[Result]:
+            return [result for number in sorted(found) for result in found[number]]
+
+        side_by_side(
+            executor.jobs,
+            range(len(jobs)),
+            lambda number: executor.run(jobs[number].job, interrupts.urgent.is_set),
+            stop_requested=interrupts.requested.is_set,
+            finished=on_end,
+        )
+        return in_order(), len(found) < len(jobs)
+
+
+def bench_job(options: BenchOptions, rows: int, seed: int, more: Sequence[str], files: Mapping[str, bytes]) -> ChildJob:
+    """The command of one number of rows and one seed; its figures are in the output ``FIGURES``.
+
+    Args:
+        options: of the study.
+        rows: number of rows.
+        seed: of data and fit.
+        more: further options.
+        files: contents of the files that it reads.
+    """
+    command = [*CARLAB, "bench", options.what, "--out", FIGURES, "--rows", str(rows), "--seeds", "1"]
+    command += ["--first-seed", str(seed), "--device", options.device, *more]
+    if options.steps is not None:
+        command += ["--steps", str(options.steps)]
+    return ChildJob(tuple(command), math.inf, files, (FIGURES,), environment=ONE_THREAD)
+
+
+def recorded_files(recordings: Sequence[Path], car: Path, history: int) -> tuple[list[str], dict[str, bytes]]:
+    """Options and files of a job that reads recordings: copies of recordings and car file, and the number of commands.
+
+    Args:
+        recordings: the last one is held out.
+        car: car file, or the name of a preset.
+        history: number of past commands, so that no job estimates it again.
+    """
+    from carlab.cars import is_preset
+
+    files = {f"{DATA}/{path.name}": path.read_bytes() for path in recordings}
+    given = ["--data", DATA, "--history", str(history), "--car", str(car)]
+    if not is_preset(car):
+        files[CAR] = car.read_bytes()
+        given[-1] = CAR
+    return given, files
+
+
+def read_figures(end: JobEnd) -> dict[str, object]:
+    """The figures of a job. Raises KeyError or ValueError if it left none."""
+    content: dict[str, object] = json.loads(end.outputs[FIGURES])
+    return content
+
+
+__all__ = ["CARLAB", "DATA", "StudyJob", "bench_job", "read_figures", "recorded_files", "run_jobs", "uses_jobs"]
