@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from carlab.api.cars import car_options_text
 from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ConfigError
+from carlab.experiment.cluster.settings import LinkSettings
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from sim_backends.car_parameters import SimulatorConfig
 
 AUTO = "auto"
+RAY_WAIT_S = LinkSettings().wait_s
 BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
 Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
 Device = Literal["cpu", "cuda"]
@@ -48,6 +50,8 @@ class LearnRequest:
     dry_run: bool
     task: str | Task | None
     track: Path | str | None
+    ray: str
+    ray_wait_s: float
 
     @property
     def car_options(self) -> str:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import inspect
+import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from carlab.api.arguments import above_zero, at_least, whole_number
-from carlab.api.learn_request import AUTO, Device, LearnRequest, Method, checked_simulator, training_plan
+from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
 from carlab.api.runs import (
     RunHooks,
     existing_run,
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from carlab.experiment.campaign.live_view import LiveView
     from carlab.experiment.campaign.prior_repair import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
+    from carlab.experiment.cluster.trainer import ClusterTrainer
     from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.experiment.episodes.session import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
@@ -54,6 +57,7 @@ class LearnHooks(RunHooks):
         on_check: receives the result of the quick check.
         on_repairing: called before the repair of the prior (``prior="auto"``).
         on_prior: receives the version of the prior after the repair, with the sentence that states what changed.
+        on_link: receives a sentence when the cluster does not answer, is replaced by this computer, or answers again.
     """
 
     on_training: Callable[[str, int, int], None] = lambda activity, done, total: None
@@ -63,6 +67,7 @@ class LearnHooks(RunHooks):
     on_check: Callable[[QuickCheck], None] = lambda check: None
     on_repairing: Callable[[], None] = lambda: None
     on_prior: Callable[[PriorVersion], None] = lambda version: None
+    on_link: Callable[[str], None] = lambda sentence: None
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,8 @@ def learn(
     updates: int = 30000, seed: int = 0, device: Device | None = None, place: bool = True,
     resume: Path | str | None = None, out: Path | str = "runs", name: str = "learn", rerun: bool = True,
     live: bool = False, viewer: str | None = None, vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None, dry_run: bool = False, hooks: LearnHooks | None = None,
+    reality: Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait_s: float = RAY_WAIT_S,
+    hooks: LearnHooks | None = None,
 ) -> LearnRun:  # fmt: skip
     """Fit the car to all recordings, train a policy of a task in the learned car, drive an episode, and repeat.
 
@@ -161,6 +167,8 @@ def learn(
         vehicle: as for ``carlab.drive``.
         reality: as for ``carlab.drive``.
         dry_run: real inputs, but no command is sent.
+        ray: train on Ray: ``local``, or the address of a cluster; empty: a child process. The car stays here.
+        ray_wait_s: time without an answer of the cluster after which a training runs on this computer [s].
         hooks: callbacks.
 
     Returns:
@@ -173,7 +181,7 @@ def learn(
     return _learn(LearnRequest(
         car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
         None if resume is None else Path(resume), Path(out), name, rerun, live, viewer, vehicle, reality, dry_run,
-        task, track,
+        task, track, ray, ray_wait_s,
     ), hooks or LearnHooks())  # fmt: skip
 
 
@@ -240,6 +248,8 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
         if connect is not None:
             settings = LiveSettings(campaign.run.path, request.episodes or campaign.episodes, True, connect)
             hooks = _with_view(hooks, stack.enter_context(LiveView(settings)))
+        if request.ray:
+            campaign.trainer = stack.enter_context(_cluster_trainer(request, campaign, hooks))
         progress = _Progress(campaign.run, hooks)
         stack.enter_context(choice.car)
         campaign.hooks = progress.campaign_hooks(stack.enter_context(Interrupts()))
@@ -255,6 +265,23 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
     if results and campaign.run.path.is_dir():
         write_result(campaign.run, results)
     return LearnRun(campaign.run.path, campaign.episodes, tuple(progress.rows), tuple(results))
+
+
+def _cluster_trainer(request: LearnRequest, campaign: Campaign, hooks: LearnHooks) -> ClusterTrainer:
+    """The trainer of ``ray``. Raises ConfigError if Ray is not installed, or the task cannot be sent."""
+    from carlab.core.version import VERSION
+    from carlab.experiment.cluster.link_process import LinkProcess
+    from carlab.experiment.cluster.order import check_task
+    from carlab.experiment.cluster.settings import LinkSettings
+    from carlab.experiment.cluster.trainer import ClusterTrainer
+    from carlab.jobs.ray_executor import require_ray
+
+    require_ray()
+    check_task(campaign.plan)
+    settings = LinkSettings(wait_s=request.ray_wait_s)
+    run = hashlib.sha256(f"{platform.node()} {campaign.run.path.absolute()}".encode()).hexdigest()[:16]
+    link = LinkProcess(request.ray, f"training {VERSION} {run}", campaign.plan.device)
+    return ClusterTrainer(request.ray, link, hooks.on_link, settings)
 
 
 def _with_view(hooks: LearnHooks, view: LiveView) -> LearnHooks:
@@ -275,7 +302,9 @@ def _check(request: LearnRequest) -> None:
     above_zero(**counts)
     whole_number(**counts)
     at_least(0, history=request.history, seed=request.seed)
-    available(request.device or "cpu")
+    above_zero(ray_wait=request.ray_wait_s)
+    if not request.ray:
+        available(request.device or "cpu")
     if request.method not in get_args(Method):
         raise ConfigError(f"--method {request.method}: choose one of {', '.join(get_args(Method))}.")
     if request.prior == AUTO and request.method != "gp-sim-posterior":
@@ -307,7 +336,8 @@ def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack:
     task_choice = campaign.plan.task_choice.named_again(given_task(request.task, request.track, choice.track))
     campaign.plan = replace(campaign.plan, task_choice=task_choice)
     load_checked(task_choice, choice.envelope.arena_m)
-    available(campaign.plan.device)
+    if not request.ray:
+        available(campaign.plan.device)
     _check_as_before(request, campaign, choice)
     campaign.move_stopped_episode()
     restore_missing_rows(run, campaign.plan.task)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import Progress, TaskID
 from tyro.conf import OmitArgPrefixes
 
-from carlab.api.learn_request import Device, Method
+from carlab.api.learn_request import RAY_WAIT_S, Device, Method
 from carlab.cli.console import banner, console, fail, progress, table
 from carlab.cli.exit_codes import EXIT_INTERRUPTED, EXIT_SAFETY_STOP
 from carlab.cli.options import CarOptions, TaskOptions
@@ -103,6 +103,15 @@ class Learn:
     device: Device | None = None
     """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""
 
+    ray: str = ""
+    """Train on Ray while the car stays with this computer: local, or the address of a cluster (ray://HOST:10001) with
+    the same version of carlab, for example a computer with a GPU (--device cuda). While the cluster does not answer,
+    the car stays in neutral and the run waits; then it trains on this computer, and tries the cluster again before the
+    next episode. Needs pip install 'carlab[ray]'."""
+
+    ray_wait: float = RAY_WAIT_S
+    """Time without an answer of the cluster after which a training runs on this computer [s]."""
+
     place: bool = True
     """Start each episode at the task's start pose, at which a person places a real car; off: at the car's current
     pose."""
@@ -148,6 +157,8 @@ class Learn:
                 seed=self.seed,
                 device=self.device,
                 place=self.place,
+                ray=self.ray,
+                ray_wait_s=self.ray_wait,
                 resume=self.resume,
                 out=self.out,
                 name=self.name,
@@ -211,6 +222,7 @@ class Learn:
             on_check=on_check,
             on_repairing=functools.partial(show_progress, "repair of the prior", 0, 1),
             on_prior=on_prior,
+            on_link=lambda sentence: bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False),
         )
 
     def _report(self, run: LearnRun) -> int:
@@ -229,7 +241,7 @@ class Learn:
             console.print(
                 f"{done} of {run.wanted} episodes; resume with: "
                 f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}"
-                f"{self.which_task.to_text()}",
+                f"{self.which_task.to_text()}{self._ray_text()}",
                 soft_wrap=True,
             )
             last = run.end
@@ -239,6 +251,10 @@ class Learn:
                 else EXIT_INTERRUPTED
             )
         return 0
+
+    def _ray_text(self) -> str:
+        wait = "" if self.ray_wait == RAY_WAIT_S else f" --ray-wait {self.ray_wait:g}"
+        return f" --ray {shlex.quote(self.ray)}{wait}" if self.ray else ""
 
     def _print_episodes(self, run: LearnRun) -> None:
         """Table of the episodes, and the number of successes."""

@@ -33,7 +33,7 @@ from carlab.experiment.campaign.prior_repair import PriorVersion, corrected, wit
 from carlab.experiment.campaign.quick_check import QuickCheck, check_path, run_check_subprocess
 from carlab.experiment.campaign.training import Progress, model_folder, training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
-from carlab.experiment.campaign.training_process import train_in_subprocess
+from carlab.experiment.campaign.training_process import Trainer, train_in_subprocess
 from carlab.experiment.episodes.session import EpisodeResult, Session, SessionHooks
 from carlab.recording.mcap.source import read_documents
 from carlab.recording.run_folder import RunDirectory
@@ -117,6 +117,7 @@ class Campaign:
     ``checked_simulator`` is the simulator of the quick check after each episode; by default that of the car file.
     ``car`` holds the command-line options that select the car. With ``repairs_prior`` the prior is the car file's
     simulator with the corrections that ``repair`` finds between episodes, and the quick check tests this prior.
+    ``trainer`` trains model and policy; by default a child process.
     """
 
     choice: CarChoice
@@ -131,6 +132,7 @@ class Campaign:
     car: str = ""
     repairs_prior: bool = False
     repair: Callable[[RepairRequest, Callable[[], bool]], PriorVersion | None] = run_repair_subprocess
+    trainer: Trainer | None = None
 
     def write_plan(self) -> None:
         """Write the settings that resuming the run needs."""
@@ -156,7 +158,7 @@ class Campaign:
             if not folder.is_dir():
                 if not self._repair_prior():
                     return
-                trained = train_in_subprocess(
+                trained = (self.trainer or train_in_subprocess)(
                     self.current_plan(done),
                     self.run.models,
                     self.run.recordings(),

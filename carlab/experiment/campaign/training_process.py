@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.safety import SafetyEnvelope
@@ -18,6 +18,26 @@ from carlab.experiment.campaign.training_plan import TrainingPlan
 log = logging.getLogger(__name__)
 
 POLL_S = 0.1
+
+
+class TrainingDiedError(DataError):
+    """The process of a training died."""
+
+
+class Trainer(Protocol):
+    """Trains like ``train_in_subprocess``, here or elsewhere; a car may be open meanwhile, and stays in neutral."""
+
+    def __call__(
+        self,
+        plan: TrainingPlan,
+        models: Path,
+        recordings: list[Path],
+        envelope: SafetyEnvelope,
+        progress: Progress,
+        stop: Callable[[], bool],
+    ) -> dict[str, Any] | None:
+        """Arguments, result and errors of ``train_in_subprocess``."""
+        ...
 
 
 def train_in_subprocess(
@@ -42,7 +62,8 @@ def train_in_subprocess(
         The figures; None if ``stop`` ended it.
 
     Raises:
-        DataError: ``train`` raised an error, or its process died.
+        DataError: ``train`` raised an error.
+        TrainingDiedError: its process died.
     """
     context = child_context()
     receiver, sender = context.Pipe(duplex=False)
@@ -60,7 +81,7 @@ def train_in_subprocess(
                     kind, content = receiver.recv()
                 except EOFError:
                     child.join()
-                    raise DataError(
+                    raise TrainingDiedError(
                         f"The training process died (exit code {child.exitcode}; -9 often means too little memory); "
                         "the recordings are kept. Resume the run with --resume."
                     ) from None
@@ -98,4 +119,4 @@ def _child(
         pipe.close()
 
 
-__all__ = ["train_in_subprocess"]
+__all__ = ["Trainer", "TrainingDiedError", "train_in_subprocess"]

@@ -1,0 +1,1 @@
+"""Training of a run on a Ray cluster, while the car stays with this computer."""

@@ -1,0 +1,243 @@
+"""Process of the link to the cluster: ``python -m carlab.experiment.cluster.link ADDRESS NAME DEVICE``.
+
+It alone talks to Ray. Ray ends a process whose cluster is gone, so it must not be the process of the car. The
+training service on the cluster has a name and outlives the link: a new link finds the running training again.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+from carlab.core.clock import MonotonicClock
+from carlab.core.errors import ConfigError
+from carlab.core.version import VERSION
+from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
+from carlab.experiment.cluster.service import TrainingService, sha256
+from carlab.experiment.cluster.settings import LinkSettings
+from carlab.jobs.child_jobs import read_files, write_files
+from carlab.jobs.ray_executor import connect, first_line
+
+NAMESPACE = "carlab"
+GOODBYE_S = 2.0
+Emit = Callable[[LinkEvent], None]
+
+
+class Service(Protocol):
+    """A ``TrainingService``, here or on the cluster."""
+
+    def missing(self, manifest: Mapping[str, str]) -> list[str]:
+        """As ``TrainingService.missing``."""
+        ...
+
+    def receive(self, content: bytes) -> None:
+        """As ``TrainingService.receive``."""
+        ...
+
+    def begin(self, manifest: Mapping[str, str]) -> None:
+        """As ``TrainingService.begin``."""
+        ...
+
+    def state(self) -> Mapping[str, Any]:
+        """As ``TrainingService.state``."""
+        ...
+
+    def fetch(self, name: str) -> bytes:
+        """As ``TrainingService.fetch``."""
+        ...
+
+    def end(self) -> None:
+        """End the service."""
+        ...
+
+
+class RayService:
+    """The training service as a Ray actor with a name, which is created unless it exists.
+
+    Args:
+        address: of the cluster.
+        name: of the service.
+        device: of the training; ``cuda`` reserves one GPU.
+        settings: times of the link.
+
+    Raises:
+        ConfigError: no cluster answers, or no machine of it has a GPU.
+    """
+
+    def __init__(self, address: str, name: str, device: str, settings: LinkSettings) -> None:
+        self._ray = connect(address)
+        n_gpus = int(device == "cuda")
+        if n_gpus and self._ray.cluster_resources().get("GPU", 0) < 1:
+            raise _Refused(f"--ray {address}: the cluster has no GPU; add a machine that has one, or use --device cpu.")
+        self._actor = (
+            self._ray.remote(TrainingService)
+            .options(
+                name=name, namespace=NAMESPACE, lifetime="detached", get_if_exists=True, num_cpus=1, num_gpus=n_gpus,
+                max_restarts=0, max_concurrency=4,
+            )
+            .remote(VERSION, settings.idle_s)
+        )  # fmt: skip
+
+    def _call(self, method: str, *arguments: Any) -> Any:
+        """Call a method of the actor. Raises _LostWorkerError, _Refused or ConnectionError."""
+        try:
+            return self._ray.get(getattr(self._actor, method).remote(*arguments))
+        except self._ray.exceptions.ActorUnavailableError as error:
+            raise ConnectionError(first_line(error)) from error
+        except self._ray.exceptions.RayActorError as error:
+            if "install the same version" in str(error):
+                raise _Refused(_sentence_of(str(error))) from error
+            raise _LostWorkerError(first_line(error)) from error
+        except self._ray.exceptions.RayError as error:
+            raise ConnectionError(first_line(error)) from error
+
+    def missing(self, manifest: Mapping[str, str]) -> list[str]:
+        """As ``TrainingService.missing``."""
+        return list(self._call("missing", dict(manifest)))
+
+    def receive(self, content: bytes) -> None:
+        """As ``TrainingService.receive``."""
+        self._call("receive", content)
+
+    def begin(self, manifest: Mapping[str, str]) -> None:
+        """As ``TrainingService.begin``."""
+        self._call("begin", dict(manifest))
+
+    def state(self) -> Mapping[str, Any]:
+        """As ``TrainingService.state``."""
+        return dict(self._call("state"))
+
+    def fetch(self, name: str) -> bytes:
+        """As ``TrainingService.fetch``."""
+        return bytes(self._call("fetch", name))
+
+    def end(self) -> None:
+        """End the service on the cluster."""
+        self._ray.kill(self._actor, no_restart=True)
+
+
+class _Refused(Exception):
+    """The cluster cannot be used as it is."""
+
+
+class _LostWorkerError(Exception):
+    """The process of the training service died."""
+
+
+def _sentence_of(text: str) -> str:
+    """The line of a traceback that has the sentence of a ConfigError."""
+    lines = [line for line in text.splitlines() if "install the same version" in line]
+    return lines[-1].partition("ConfigError: ")[2] or lines[-1].strip()
+
+
+def run_order(
+    service: Service, request: LinkRequest, emit: Emit, settings: LinkSettings, pause: Callable[[float], None]
+) -> None:
+    """Send the files of an order, wait for its training, and write the result.
+
+    Args:
+        service: the training service.
+        request: folders of order and result.
+        emit: receives what happens; the last event is ``done``, ``failed`` or ``lost worker``.
+        settings: times of the link.
+        pause: waits for a number of seconds.
+    """
+    files = read_files(Path(request.order), ".")
+    manifest = {name: sha256(content) for name, content in files.items()}
+    for name in service.missing(manifest):
+        service.receive(files[name])
+        emit(LinkEvent("answer"))
+    service.begin(manifest)
+    while (state := service.state())["state"] == "training":
+        name, done, total = state["activity"]
+        emit(LinkEvent("answer", activity=(name, done, total)))
+        pause(settings.poll_s)
+    if state["state"] != "done":
+        emit(LinkEvent("failed" if state["state"] == "failed" else "lost worker", state["message"]))
+        return
+    for name in state["files"]:
+        if not (Path(request.to) / name).is_file():
+            write_files(Path(request.to), {name: service.fetch(name)})
+            emit(LinkEvent("answer"))
+    emit(LinkEvent("done"))
+
+
+def serve(open_service: Callable[[], Service], requests: Iterable[str], emit: Emit, settings: LinkSettings) -> None:
+    """Connect, and run one order after the other; every error is an event.
+
+    Args:
+        open_service: connects to the cluster.
+        requests: lines of ``LinkRequest``.
+        emit: receives what happens.
+        settings: times of the link.
+    """
+    clock = MonotonicClock()
+    try:
+        service = open_service()
+        emit(LinkEvent("connected"))
+        for line in requests:
+            run_order(
+                service, LinkRequest.from_line(line), emit, settings,
+                lambda seconds: clock.sleep_until(clock.now_s() + seconds),
+            )  # fmt: skip
+    except _Refused as error:
+        emit(LinkEvent("refused", str(error)))
+    except _LostWorkerError as error:
+        emit(LinkEvent("lost worker", str(error)))
+    except (ConfigError, OSError, RuntimeError) as error:
+        emit(LinkEvent("unreachable", first_line(error)))
+
+
+def main(service_of: Callable[[str, str, str, LinkSettings], Service] = RayService) -> int:
+    """Serve the requests on standard input; events go to standard output.
+
+    Args:
+        service_of: connects to the service, from address, name, device and settings.
+    """
+    address, name, device, *_ = sys.argv[1:]
+    settings = LinkSettings()
+    events = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # Whatever Ray prints must not mix with the events.
+    services: list[Service] = []
+
+    def open_service() -> Service:
+        services.append(service_of(address, name, device, settings))
+        services[0].state()
+        return services[0]
+
+    def emit(event: LinkEvent) -> None:
+        events.write(event.to_line())
+        events.flush()
+
+    def end() -> None:
+        """End service and process, even if the cluster does not answer."""
+        threading.Timer(GOODBYE_S, os._exit, (0,)).start()
+        for service in services:
+            service.end()
+        os._exit(0)
+
+    serve(open_service, _lines_until(sys.stdin, end), emit, settings)
+    return 0
+
+
+def _lines_until(stream: TextIO, end: Callable[[], None]) -> Iterator[str]:
+    """Lines of a stream as they arrive; its end calls ``end`` at once, also while a line is being worked on."""
+    lines: queue.Queue[str] = queue.Queue()
+
+    def read() -> None:
+        for line in stream:
+            lines.put(line)
+        end()
+
+    threading.Thread(target=read, name="requests", daemon=True).start()
+    while True:
+        yield lines.get()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
