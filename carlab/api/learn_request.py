@@ -51,7 +51,7 @@ class LearnRequest:
     task: str | Task | None
     track: Path | str | None
     ray: str
-    ray_wait_s: float
+    ray_wait: float
 
     @property
     def car_options(self) -> str:

@@ -136,7 +136,7 @@ def learn(
     updates: int = 30000, seed: int = 0, device: Device | None = None, place: bool = True,
     resume: Path | str | None = None, out: Path | str = "runs", name: str = "learn", rerun: bool = True,
     live: bool = False, viewer: str | None = None, vehicle: Path | CarFile | None = None,
-    reality: Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait_s: float = RAY_WAIT_S,
+    reality: Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
     hooks: LearnHooks | None = None,
 ) -> LearnRun:  # fmt: skip
     """Fit the car to all recordings, train a policy of a task in the learned car, drive an episode, and repeat.
@@ -168,7 +168,7 @@ def learn(
         reality: as for ``carlab.drive``.
         dry_run: real inputs, but no command is sent.
         ray: train on Ray: ``local``, or the address of a cluster; empty: a child process. The car stays here.
-        ray_wait_s: time without an answer of the cluster after which a training runs on this computer [s].
+        ray_wait: time without an answer of the cluster after which a training runs on this computer [s].
         hooks: callbacks.
 
     Returns:
@@ -181,7 +181,7 @@ def learn(
     return _learn(LearnRequest(
         car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
         None if resume is None else Path(resume), Path(out), name, rerun, live, viewer, vehicle, reality, dry_run,
-        task, track, ray, ray_wait_s,
+        task, track, ray, ray_wait,
     ), hooks or LearnHooks())  # fmt: skip
 
 
@@ -278,7 +278,7 @@ def _cluster_trainer(request: LearnRequest, campaign: Campaign, hooks: LearnHook
 
     require_ray()
     check_task(campaign.plan)
-    settings = LinkSettings(wait_s=request.ray_wait_s)
+    settings = LinkSettings(wait_s=request.ray_wait)
     run = hashlib.sha256(f"{platform.node()} {campaign.run.path.absolute()}".encode()).hexdigest()[:16]
     link = LinkProcess(request.ray, f"training {VERSION} {run}", campaign.plan.device)
     return ClusterTrainer(request.ray, link, hooks.on_link, settings)
@@ -302,7 +302,7 @@ def _check(request: LearnRequest) -> None:
     above_zero(**counts)
     whole_number(**counts)
     at_least(0, history=request.history, seed=request.seed)
-    above_zero(ray_wait=request.ray_wait_s)
+    above_zero(ray_wait=request.ray_wait)
     if not request.ray:
         available(request.device or "cpu")
     if request.method not in get_args(Method):

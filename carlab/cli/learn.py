@@ -158,7 +158,7 @@ class Learn:
                 device=self.device,
                 place=self.place,
                 ray=self.ray,
-                ray_wait_s=self.ray_wait,
+                ray_wait=self.ray_wait,
                 resume=self.resume,
                 out=self.out,
                 name=self.name,
@@ -241,7 +241,7 @@ class Learn:
             console.print(
                 f"{done} of {run.wanted} episodes; resume with: "
                 f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}"
-                f"{self.which_task.to_text()}{self._ray_text()}",
+                f"{self.which_task.to_text()}{self.ray_text()}",
                 soft_wrap=True,
             )
             last = run.end
@@ -252,7 +252,8 @@ class Learn:
             )
         return 0
 
-    def _ray_text(self) -> str:
+    def ray_text(self) -> str:
+        """The options of the cluster as command-line text, with a leading space; empty without a cluster."""
         wait = "" if self.ray_wait == RAY_WAIT_S else f" --ray-wait {self.ray_wait:g}"
         return f" --ray {shlex.quote(self.ray)}{wait}" if self.ray else ""
 

@@ -9,6 +9,7 @@ import importlib.util
 import logging
 import os
 import platform
+import socket
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
@@ -23,6 +24,7 @@ LOCAL = "local"
 MAX_RETRIES = 3
 """Number of further attempts after the death of a worker."""
 POLL_S = 0.2
+CONNECT_TIMEOUT_S = 5.0
 
 
 class RayExecutor:
@@ -100,13 +102,21 @@ def connect(address: str) -> Any:
 
     quiet: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
     try:
+        _require_listener(address)
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **quiet)
     except (ConnectionError, RuntimeError, ValueError, OSError) as error:
         raise ConfigError(
-            f"--ray {address}: no Ray cluster answers ({first_line(error)}); start one with 'ray start --head', or use "
-            "--ray local."
+            f"--ray {address}: no Ray cluster answers ({first_line(error)}); start one with 'ray start --head' and the "
+            "same RAY_AUTH_TOKEN, or use --ray local."
         ) from error
     return ray
+
+
+def _require_listener(address: str) -> None:
+    """Raise OSError if nothing listens at an address HOST:PORT; Ray itself would try for many minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_TIMEOUT_S).close()
 
 
 def first_line(error: BaseException) -> str:

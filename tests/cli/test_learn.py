@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import tyro
@@ -22,6 +23,7 @@ import tyro
 import carlab.cars as carlab_cars
 from carlab.api import learning
 from carlab.cli import run
+from carlab.cli.learn import Learn
 from carlab.cli.options import CarOptions
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
@@ -74,6 +76,7 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
         ("--episodes 0", "--episodes 0: give a number above zero."),
         ("--history -1", "--history -1: give at least 0."),
         ("--seed -1", "--seed -1: give at least 0."),
+        ("--ray local --ray-wait 0", "--ray-wait 0: give a number above zero."),
         ("--ticks 0", "--ticks 0: give a number above zero."),
         ("--history 100", "--ticks 100: give more than --history (100), for at least one transition."),
         ("--ticks 3", "--ticks 3: give more than --history (4), for at least one transition."),
@@ -317,6 +320,37 @@ def test_interrupted_run_prints_the_command_that_resumes_it(
     code, text = carlab("learn", "--resume", folder)
     assert code == 130
     assert f"2 of 5 episodes; resume with: carlab learn --resume {folder}" in text
+
+
+def test_missing_ray_is_refused_before_the_run(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    code, text = carlab("learn", "--ray", "local", "--out", tmp_path / "runs", *TINY)
+    assert code == 2
+    assert "--ray needs Ray, which is not installed; run: pip install 'carlab[ray]'." in text
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_training_on_ray_gives_the_run_without_ray(
+    carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
+) -> None:
+    """The same seed gives the same policies and drives; the second training starts from the first one's files."""
+    pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
+    code, text = carlab("learn", "--ray", "local", "--car", "sim", "--episodes", 2, "--out", tmp_path, *TINY)
+    assert code == 0, text
+    (folder,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    for name in ("0001", "0002"):
+        file = f"models/{name}/policy.npz"
+        with np.load(folder / file) as found, np.load(learned[2] / file) as expected:
+            assert all(np.array_equal(found[key], expected[key]) for key in expected)
+        one, other = (read_episode(path / "episodes" / f"{name}.mcap") for path in (folder, learned[2]))
+        np.testing.assert_array_equal(one.states, other.states)
+
+
+def test_resume_command_names_the_cluster() -> None:
+    command = Learn(ray="ray://box:10001", ray_wait=30.0)
+    parsed = tyro.cli(Learn, args=shlex.split(command.ray_text()))
+    assert (parsed.ray, parsed.ray_wait) == ("ray://box:10001", 30.0)
+    assert Learn().ray_text() == ""
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import contextlib
 import itertools
 import json
 import os
+import secrets
 import signal
 import subprocess
 import sys
@@ -53,11 +54,8 @@ class Cluster:
 
 
 @contextlib.contextmanager
-def process_group(command: list[str], environment: dict[str, str] | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen(
-        command, start_new_session=True, env=os.environ | (environment or {}), stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )  # fmt: skip
+def process_group(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    process = subprocess.Popen(command, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     assert process.stdout is not None
     try:
         yield process
@@ -78,33 +76,31 @@ def cluster_without_ray(tmp_path: Path) -> Iterator[Cluster]:
     settings = LinkSettings(wait_s=12.0, lost_wait_s=6.0, message_s=2.0, reconnect_s=6.0, pause_s=0.5, poll_s=0.2)
     with process_group([sys.executable, SERVER, "serve", str(port)]):
         wait_for_port(port)
-        network = TcpLink(port)
-        yield Cluster(network, str(network.port), (sys.executable, SERVER, "link"), settings)
-        network.close()
+        with contextlib.closing(TcpLink(port)) as network:
+            yield Cluster(network, str(network.port), (sys.executable, SERVER, "link"), settings)
+
+
+@pytest.fixture(autouse=True)
+def token(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A token of the clusters of these tests."""
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
 
 
 @contextlib.contextmanager
 def cluster_of_ray(tmp_path: Path) -> Iterator[Cluster]:
     pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
     ports = {name: free_port() for name in ("port", "ray-client-server-port", "dashboard-agent-listen-port")}
-    command = [
-        "ray",
-        "start",
-        "--head",
-        "--block",
-        "--num-cpus=2",
-        "--include-dashboard=false",
-        "--disable-usage-stats",
-    ]
+    command = ["ray", "start", "--head", "--block", "--num-cpus=2", "--node-ip-address=127.0.0.1"]
+    command += ["--include-dashboard=false", "--disable-usage-stats"]
     command += [f"--{name}={port}" for name, port in ports.items()]
     settings = LinkSettings(wait_s=40.0, lost_wait_s=25.0, message_s=2.0, reconnect_s=20.0, pause_s=0.5)
     with process_group(command) as head:
         assert head.stdout is not None
         assert any(b"Ray runtime started" in line for line in head.stdout)
-        network = TcpLink(ports["ray-client-server-port"])
-        program = (sys.executable, "-m", "carlab.experiment.cluster.link")
-        yield Cluster(network, f"ray://127.0.0.1:{network.port}", program, settings)
-        network.close()
+        with contextlib.closing(TcpLink(ports["ray-client-server-port"])) as network:
+            program = (sys.executable, "-m", "carlab.experiment.cluster.link")
+            yield Cluster(network, f"ray://127.0.0.1:{network.port}", program, settings)
 
 
 @dataclass
@@ -199,6 +195,46 @@ def test_car_is_in_neutral_and_the_run_finishes_while_the_link_is_cut_and_restor
         assert np.diff([e.t_s for e in waiting]).max() < 0.5
     driving_s = (run.ticks_s[0][0], run.ticks_s[-1][-1])
     assert not [e for e in entries if e.name == "motor_timeout" and driving_s[0] < e.t_s < driving_s[1]]
+
+
+@pytest.mark.timeout(300)
+def test_training_of_a_killed_worker_starts_again(tmp_path: Path) -> None:
+    """The process of the training service is killed during a training; Ray gets another one."""
+    said: list[str] = []
+    killed: list[int] = []
+    choice = choose_car("sim", seed=0)
+    run = RunDirectory.create(tmp_path, "kill")
+    with cluster_of_ray(tmp_path) as cluster:
+        link = LinkProcess(cluster.address, f"kill {os.getpid()}", "cpu", cluster.program)
+
+        def on_training(activity: str, done: int, total: int) -> None:
+            if not killed and activity == "learning the car":
+                killed.extend(worker_processes(os.environ["RAY_AUTH_TOKEN"]))
+                os.kill(killed[0], signal.SIGKILL)
+
+        def train_here(*arguments: Any) -> None:
+            pytest.fail("trained on this computer")
+
+        trainer = ClusterTrainer(cluster.address, link, said.append, cluster.settings, train_here)
+        with trainer, choice.car:
+            campaign = Campaign(
+                choice, tiny_plan(choice), 1, run, CampaignHooks(on_training=on_training), max_ticks=TICKS,
+                record_rerun=False, trainer=trainer,
+            )  # fmt: skip
+            assert len(list(campaign.run_episodes())) == 1
+    assert len(killed) == 1
+    assert [p.name for p in run.recordings()] == ["0001.mcap"]
+
+
+def worker_processes(token: str) -> list[int]:
+    """Processes of the training service of the cluster with a token."""
+    found = []
+    for folder in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            is_service = (folder / "cmdline").read_bytes().startswith(b"ray::TrainingService")
+            if is_service and token.encode() in (folder / "environ").read_bytes():
+                found.append(int(folder.name))
+    return found
 
 
 def test_stopped_link_process_is_a_slow_link_and_is_replaced(tmp_path: Path) -> None:

@@ -113,8 +113,9 @@ def test_proof_on_ray_has_the_reports_and_the_seal_of_a_proof_on_this_machine(
 
 def test_unreachable_cluster_is_refused_with_the_remedy() -> None:
     pytest.importorskip("ray", reason="Ray is an extra: pip install 'carlab[ray]'")
-    with pytest.raises(ConfigError, match=r"no Ray cluster answers .* use --ray local"), RayExecutor("localhost:1"):
-        pass
+    for address in ("localhost:1", "ray://127.0.0.1:1"):
+        with pytest.raises(ConfigError, match=r"no Ray cluster answers .* use --ray local"), RayExecutor(address):
+            pass
 
 
 def test_machine_with_another_version_is_refused(cluster: RayExecutor, monkeypatch: pytest.MonkeyPatch) -> None:

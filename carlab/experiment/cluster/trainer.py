@@ -131,7 +131,9 @@ class _Waiting:
         self._number = number
         self._progress = progress
         self._settings = trainer.settings
-        self._wait_s = self._settings.lost_wait_s if trainer.is_lost else self._settings.wait_s
+        self._wait_s = self._settings.wait_s
+        if trainer.is_lost:
+            self._wait_s = min(self._wait_s, self._settings.lost_wait_s)
         self._answered_s = trainer.clock.now_s()
         self._sent_s = self._answered_s
         self._retry_s: float | None = None
