@@ -427,6 +427,13 @@ def test_service_of_another_version_is_refused() -> None:
         TrainingService("99.0")
 
 
+def test_service_without_the_device_is_refused() -> None:
+    if torch.cuda.is_available():
+        pytest.skip("this computer has a CUDA device")
+    with pytest.raises(ConfigError, match="^On the machine .* of the cluster: .* torch finds no CUDA device here"):
+        TrainingService(VERSION, "cuda")
+
+
 def test_plan_is_unchanged_by_its_journey() -> None:
     plan = replace(small_plan(), task_choice=choose_task("laps"), device="cuda", model_steps=None)
     order = TrainingOrder(plan, Path("models"), (), ENVELOPE)

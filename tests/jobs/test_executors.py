@@ -134,6 +134,15 @@ def test_cluster_without_a_gpu_is_refused() -> None:
     assert "ConfigError: --ray local: the cluster has no GPU; add a machine, or" in done.stderr
 
 
+def test_lost_cluster_ends_the_command_with_the_remedy(cluster: RayExecutor, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wait(*arguments: object, **options: object) -> None:
+        raise ConnectionError("the channel is closed")
+
+    monkeypatch.setattr(cluster._ray, "wait", wait)
+    with pytest.raises(DataError, match=r"does not answer any more \(the channel is closed\); finished cases are kept"):
+        cluster.run(ChildJob((PYTHON, "-c", ""), 60.0), never)
+
+
 def test_missing_ray_is_refused_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"pip install 'carlab\[ray\]'"):

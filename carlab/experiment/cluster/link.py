@@ -80,7 +80,7 @@ class RayService:
                 name=name, namespace=NAMESPACE, lifetime="detached", get_if_exists=True, num_cpus=1, num_gpus=n_gpus,
                 max_restarts=0, max_concurrency=4,
             )
-            .remote(VERSION, settings.idle_s)
+            .remote(VERSION, device, settings.idle_s)
         )  # fmt: skip
 
     def _call(self, method: str, *arguments: Any) -> Any:
@@ -90,8 +90,8 @@ class RayService:
         except self._ray.exceptions.ActorUnavailableError as error:
             raise ConnectionError(first_line(error)) from error
         except self._ray.exceptions.RayActorError as error:
-            if "install the same version" in str(error):
-                raise _Refused(_sentence_of(str(error))) from error
+            if sentence := str(error).partition("ConfigError: ")[2]:
+                raise _Refused(first_line(ConfigError(sentence))) from error
             raise _LostWorkerError(first_line(error)) from error
         except self._ray.exceptions.RayError as error:
             raise ConnectionError(first_line(error)) from error
@@ -127,12 +127,6 @@ class _Refused(Exception):
 
 class _LostWorkerError(Exception):
     """The process of the training service died."""
-
-
-def _sentence_of(text: str) -> str:
-    """The line of a traceback that has the sentence of a ConfigError."""
-    lines = [line for line in text.splitlines() if "install the same version" in line]
-    return lines[-1].partition("ConfigError: ")[2] or lines[-1].strip()
 
 
 def run_order(

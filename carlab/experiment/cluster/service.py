@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import tempfile
 import threading
 from collections.abc import Mapping
@@ -12,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from carlab.core.clock import MonotonicClock
-from carlab.core.errors import CarlabError
+from carlab.core.errors import CarlabError, ConfigError
 from carlab.experiment.campaign.training_process import TrainingDiedError, train_in_subprocess
 from carlab.experiment.cluster.order import RESULT_FILES, TrainingOrder
 from carlab.jobs.child_jobs import write_files
 from carlab.jobs.ray_executor import require_same_version
+from learning.devices import available
 
 IDLE_POLL_S = 5.0
 
@@ -49,14 +51,19 @@ class TrainingService:
 
     Args:
         version: version of carlab of the sender.
+        device: of the trainings.
         idle_s: time without a question after which this process ends, even if it trains [s]; None: it does not end.
 
     Raises:
-        ConfigError: this machine has another version.
+        ConfigError: this machine has another version, or not the device.
     """
 
-    def __init__(self, version: str, idle_s: float | None = None) -> None:
+    def __init__(self, version: str, device: str = "cpu", idle_s: float | None = None) -> None:
         require_same_version(version)
+        try:
+            available(device)
+        except ConfigError as error:
+            raise ConfigError(f"On the machine {platform.node()} of the cluster: {error}") from error
         self._contents: dict[str, bytes] = {}
         self._training: _Training | None = None
         self._lock = threading.Lock()
