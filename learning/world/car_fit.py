@@ -7,7 +7,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -15,8 +15,9 @@ from torch import Tensor
 from carlab.core.errors import DataError
 from carlab.core.observation import STATE_FEATURES
 from learning.functional_svgd.authors_fsvgd import WorldDynamics
+from learning.networks.array_file import read_arrays, whole_number, write_arrays
 from learning.networks.normaliser import Normaliser
-from learning.networks.particles import Network
+from learning.networks.particles import Activation, Network
 from learning.posterior.distillation import DistillationSettings, distil, measurement_points
 from learning.posterior.inference import infer
 from learning.posterior.particle_posterior import ParticlePosterior
@@ -38,6 +39,10 @@ PRIOR_FUNCTION = 1.0
 MAX_ROWS = 800
 """Maximum number of rows of the fit; a random subset of more."""
 _UNIT_SAMPLES = 2000
+_UNITS = ("input_mean", "input_std", "output_mean", "output_std")
+_OPTIONAL = ("turn", "trend", "correlation", "reach")
+_FRAMES = ("body", "world")
+_ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +146,62 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
     Raises:
         OSError: the disk is full.
     """
+    buffer = io.BytesIO()  # torch.save to a full disk would not raise OSError.
+    torch.save(_content(dynamics), buffer)
+    path.write_bytes(buffer.getvalue())
+
+
+def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
+    """Read a learned car onto a device.
+
+    Raises:
+        DataError: the file cannot be read, or has another version or shape.
+    """
+    return _read(path, device, lambda: torch.load(path, weights_only=True, map_location="cpu"))
+
+
+def save_car_arrays(dynamics: LearnedCar, path: Path) -> None:
+    """Write a learned car as arrays, for another computer: the file has no pickle. Raises OSError if the disk is full.
+
+    Parts that the car does not have are left out.
+    """
+    content = _content(dynamics)
+    means_and_stds = dict(zip(_UNITS, content.pop("units"), strict=True))
+    arrays = {name: part for name, part in content.items() if isinstance(part, Tensor)} | means_and_stds
+    write_arrays(path, arrays | {
+        "version": FILE_VERSION, "history": dynamics.history, "frame": _FRAMES.index(content["frame"]),
+        "activation": _ACTIVATIONS.index(content["activation"]), "network": torch.tensor(content["network"]),
+        "freedom": torch.tensor(content["freedom"], dtype=torch.float64),
+    })  # fmt: skip
+
+
+def load_car_arrays(path: Path) -> LearnedCar:
+    """Read the output of ``save_car_arrays``. Raises DataError as ``load_car``."""
+
+    def read() -> dict[str, Any]:
+        arrays = read_arrays(path)
+        tensors = {k: torch.from_numpy(v.copy()) for k, v in arrays.items()}
+        optional: dict[str, Any] = dict.fromkeys(_OPTIONAL)
+        return optional | tensors | {
+            "version": whole_number(arrays, "version"), "history": whole_number(arrays, "history"),
+            "frame": _FRAMES[whole_number(arrays, "frame")], "network": [int(n) for n in arrays["network"]],
+            "activation": _ACTIVATIONS[whole_number(arrays, "activation")], "units": [tensors[k] for k in _UNITS],
+        }  # fmt: skip
+
+    def read_or_refuse() -> dict[str, Any]:
+        try:
+            return read()
+        except DataError as error:  # A clause without the file and a remedy.
+            raise ValueError(str(error)) from error
+
+    return _read(path, "cpu", read_or_refuse)
+
+
+def _content(dynamics: LearnedCar) -> dict[str, Any]:
+    """Content of a file: ``freedom`` is ``dof``, ``turn`` is ``decorrelation``, ``reach`` is ``input_clip``."""
     posterior = dynamics.posterior.to("cpu")
     units = posterior.normaliser
-    content: dict[str, Any] = {
+    return {
         "version": FILE_VERSION,
         "frame": "body" if isinstance(dynamics, CarDynamics) else "world",
         "history": dynamics.history,
@@ -158,23 +216,13 @@ def save_car(dynamics: LearnedCar, path: Path) -> None:
         "correlation": posterior.correlation,
         "reach": posterior.input_clip,
     }
-    buffer = io.BytesIO()  # torch.save to a full disk would not raise OSError.
-    torch.save(content, buffer)
-    path.write_bytes(buffer.getvalue())
 
 
-def load_car(path: Path, device: torch.device | str = "cpu") -> LearnedCar:
-    """Read a learned car onto a device.
-
-    Some keys of the file differ from the attributes: ``freedom`` is ``dof``, ``turn`` is ``decorrelation``, ``reach``
-    is ``input_clip``.
-
-    Raises:
-        DataError: the file cannot be read, or has another version or shape.
-    """
+def _read(path: Path, device: torch.device | str, read: Callable[[], dict[str, Any]]) -> LearnedCar:
+    """The car of a content that ``read`` reads from a file. Raises DataError if it cannot be read."""
     remedy = "remove its folder to train again"
     try:
-        content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
+        content = read()
         version = content["version"]
         if version != FILE_VERSION:
             raise DataError(f"{path} has version {version}, this program reads version {FILE_VERSION}; {remedy}.")
@@ -222,7 +270,7 @@ def _check_shapes(car: LearnedCar) -> None:
         "reach": (posterior.input_clip, (d,)),
     }  # fmt: skip
     for name, (part, shape) in parts.items():
-        if part is None and name in ("turn", "trend", "correlation", "reach"):
+        if part is None and name in _OPTIONAL:
             continue
         if not isinstance(part, Tensor) or part.layout != torch.strided or not part.is_floating_point():
             raise ValueError(f"{name} is not an array of numbers")
@@ -247,4 +295,15 @@ def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
-__all__ = ["PAPER_METHODS", "CarFitSettings", "LearnedCar", "Method", "car_units", "fit_car", "load_car", "save_car"]
+__all__ = [
+    "PAPER_METHODS",
+    "CarFitSettings",
+    "LearnedCar",
+    "Method",
+    "car_units",
+    "fit_car",
+    "load_car",
+    "load_car_arrays",
+    "save_car",
+    "save_car_arrays",
+]

@@ -53,6 +53,15 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> RunDirectory:
     return run
 
 
+@pytest.fixture(scope="module")
+def sent(trained: RunDirectory, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The second model as it travels."""
+    folder = tmp_path_factory.mktemp("sent") / "0002"
+    order = TrainingOrder(small_plan(), trained.models, tuple(trained.recordings()), ENVELOPE)
+    write_files(folder, order.result())
+    return folder
+
+
 @pytest.fixture
 def run(trained: RunDirectory, tmp_path: Path) -> RunDirectory:
     """A copy of the run without the second model, which is to be trained."""
@@ -129,15 +138,18 @@ def start(trainer: ClusterTrainer, run: RunDirectory, **options: Any) -> dict[st
 DONE = [(1.0, LEARNING), (3.0, LinkEvent("done"))]
 
 
-def test_result_of_the_cluster_is_the_model_of_the_run(trained: RunDirectory, run: RunDirectory) -> None:
-    link = FakeLink(DONE, result=trained.models / "0002")
+def test_result_of_the_cluster_is_the_model_of_the_run(trained: RunDirectory, run: RunDirectory, sent: Path) -> None:
+    link = FakeLink(DONE, result=sent)
     trainer, said, here = trainer_of(link)
     progress: list[tuple[str, int, int]] = []
     figures = trainer(
         small_plan(), run.models, run.recordings(), ENVELOPE, lambda *what: progress.append(what), lambda: False
     )
     assert figures == json.loads((trained.models / "0002" / "training.json").read_text())
-    assert {p.name for p in (run.models / "0002").iterdir()} == RESULT_FILES
+    for name in ("dynamics.pt", "policy.npz", "prior.toml", "training.json"):
+        found, expected = (models / "0002" / name for models in (run.models, trained.models))
+        assert found.read_bytes() == expected.read_bytes()
+    assert len(list((run.models / "0002").iterdir())) == 4
     assert progress == [("learning the car", 10, 60)]
     assert (said, here.plans) == ([], [])
     assert sorted(p.name for p in run.models.iterdir()) == ["0001", "0002"]
@@ -158,8 +170,8 @@ def test_lost_link_is_announced_and_then_the_training_runs_here(run: RunDirector
     assert link.calls[-1] == "cut"
 
 
-def test_restored_link_is_used_within_the_wait(trained: RunDirectory, run: RunDirectory) -> None:
-    link = FakeLink([(1.0, LEARNING)], [(2.0, LinkEvent("connected")), *DONE], result=trained.models / "0002")
+def test_restored_link_is_used_within_the_wait(run: RunDirectory, sent: Path) -> None:
+    link = FakeLink([(1.0, LEARNING)], [(2.0, LinkEvent("connected")), *DONE], result=sent)
     trainer, said, here = trainer_of(link)
     figures = start(trainer, run)
     assert figures is not None
@@ -168,8 +180,8 @@ def test_restored_link_is_used_within_the_wait(trained: RunDirectory, run: RunDi
     assert said[1:] == ["The cluster ray://box:10001 answers again; the training before episode 2 runs there."]
 
 
-def test_next_training_tries_the_lost_cluster_again(trained: RunDirectory, run: RunDirectory) -> None:
-    link = FakeLink([], [], [], [], [], DONE, result=trained.models / "0002")
+def test_next_training_tries_the_lost_cluster_again(run: RunDirectory, sent: Path) -> None:
+    link = FakeLink(result=sent)
     trainer, said, here = trainer_of(link)
     start(trainer, run)
     first_s = link.clock.now_s()
@@ -258,13 +270,19 @@ class Payload:
 
 
 def other_history(folder: Path, created: Path) -> None:
-    train(small_plan(history=3), folder.parent / "other", [], ENVELOPE, lambda *what: None)
-    for name in ("dynamics.pt", "policy.npz"):
-        shutil.copyfile(folder.parent / "other" / "0001" / name, folder / name)
+    order = TrainingOrder(small_plan(history=3), folder.parent / "other", (), ENVELOPE)
+    train(order.plan, order.models, [], ENVELOPE, lambda *what: None)
+    files = order.result()
+    write_files(folder, {name: files[name] for name in ("dynamics.npz", "policy.npz")})
 
 
 def payload_in_the_model(folder: Path, created: Path) -> None:
-    torch.save({"version": Payload(created)}, folder / "dynamics.pt")
+    torch.save({"version": Payload(created)}, folder / "dynamics.npz")
+
+
+def pickled_array_in_the_model(folder: Path, created: Path) -> None:
+    with (folder / "dynamics.npz").open("wb") as file:
+        np.savez(file, version=np.array([Payload(created)], dtype=object))
 
 
 def payload_in_the_policy(folder: Path, created: Path) -> None:
@@ -284,18 +302,20 @@ DAMAGES: dict[str, tuple[Callable[[Path, Path], object], str]] = {
     "history": (other_history, "another number of past commands"),
     "episode": (other_episode, "of episode 7"),
     "figures": (lambda folder, created: (folder / "training.json").write_text("["), "training.json cannot be read"),
-    "code in the model": (payload_in_the_model, "dynamics.pt"),
+    "truncated model": (lambda folder, created: (folder / "dynamics.npz").write_bytes(b"PK"), "The learned car in"),
+    "code in the model": (payload_in_the_model, "The learned car in"),
+    "pickled array in the model": (pickled_array_in_the_model, "The learned car in"),
     "code in the policy": (payload_in_the_policy, "The policy in"),
 }
 
 
 @pytest.mark.parametrize("name", DAMAGES)
 def test_damaged_or_foreign_result_is_discarded_and_runs_no_code(
-    trained: RunDirectory, run: RunDirectory, tmp_path: Path, name: str
+    sent: Path, run: RunDirectory, tmp_path: Path, name: str
 ) -> None:
     damage, message = DAMAGES[name]
     result, created = tmp_path / "result", tmp_path / "created"
-    shutil.copytree(trained.models / "0002", result)
+    shutil.copytree(sent, result)
     damage(result, created)
     trainer, said, _ = trainer_of(FakeLink(DONE, result=result))
     assert start(trainer, run) == {"trained": "here"}
@@ -307,23 +327,18 @@ def test_damaged_or_foreign_result_is_discarded_and_runs_no_code(
     assert sorted(p.name for p in run.models.iterdir()) == ["0001"]
 
 
-def test_prior_of_the_result_is_that_of_the_run(trained: RunDirectory, run: RunDirectory, tmp_path: Path) -> None:
-    result = tmp_path / "result"
-    shutil.copytree(trained.models / "0002", result)
-    (result / "prior.toml").write_text("rubbish")
-    start(trainer_of(FakeLink(DONE, result=result))[0], run)
-    assert (run.models / "0002" / "prior.toml").read_text() == small_plan().prior_toml
-
-
 def test_order_is_read_as_it_was_sent(run: RunDirectory, tmp_path: Path) -> None:
     envelope = SafetyEnvelope(max_throttle=0.3, arena_m=((0.0, 0.0), (1.0, 0.5), (0.0, 2.0)))
     sent = TrainingOrder(small_plan(seed=4), run.models, tuple(run.recordings()), envelope)
     files = sent.files()
-    assert set(files) == {"order.json", "episodes/0001.mcap", "models/0001/dynamics.pt", "models/0001/policy.npz"}
+    assert set(files) == {"order.json", "episodes/0001.mcap", "models/0001/dynamics.npz", "models/0001/policy.npz"}
+    assert not [name for name, content in files.items() if b".pkl" in content], "no file contains a pickle"
     write_files(tmp_path / "order", files)
     read = TrainingOrder.read(tmp_path / "order")
     assert (read.plan, read.envelope, read.number) == (sent.plan, envelope, 2)
     assert read.recordings[0].read_bytes() == run.recordings()[0].read_bytes()
+    for name in ("dynamics.pt", "policy.npz"):
+        assert (read.models / "0001" / name).read_bytes() == (run.models / "0001" / name).read_bytes()
 
 
 def test_task_of_a_user_travels_as_its_file(run: RunDirectory, tmp_path: Path) -> None:
@@ -372,7 +387,7 @@ def test_training_of_the_service_equals_the_training_here(
     service = TrainingService(VERSION)
     order = TrainingOrder(small_plan(), run.models, tuple(run.recordings()), ENVELOPE)
     result, events = served(service, order, tmp_path)
-    assert [e.kind for e in events if e.activity is None] == ["answer"] * 8 + ["done"], "four files each way"
+    assert [e.kind for e in events if e.activity is None] == ["answer"] * 7 + ["done"], "four files there, three back"
     assert {e.activity[0] for e in events if e.activity is not None} >= {"learning to drive"}
     assert {p.name for p in result.iterdir()} == RESULT_FILES
     with np.load(result / "policy.npz") as found, np.load(trained.models / "0002" / "policy.npz") as expected:
@@ -430,7 +445,7 @@ def test_service_of_another_version_is_refused() -> None:
 def test_service_without_the_device_is_refused() -> None:
     if torch.cuda.is_available():
         pytest.skip("this computer has a CUDA device")
-    with pytest.raises(ConfigError, match="^On the machine .* of the cluster: .* torch finds no CUDA device here"):
+    with pytest.raises(ConfigError, match=r"^On the machine .* of the cluster: .* torch finds no CUDA device here"):
         TrainingService(VERSION, "cuda")
 
 

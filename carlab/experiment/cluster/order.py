@@ -4,11 +4,11 @@
 | --- | --- |
 | order.json | plan, limits of the safety gate, names of the recordings |
 | episodes/0001.mcap ... | recordings |
-| models/000k/dynamics.pt, policy.npz | model and policy of the training before, if there was one |
+| models/000k/dynamics.npz, policy.npz | model and policy of the training before, if there was one |
 | task.py | a user's task |
 
-All files are data of a run folder. They are read by the loaders of the run folder, which run no code of them; only a
-user's task is code.
+Recordings and policies are the files of a run folder. The model travels as arrays, because the run folder's
+``dynamics.pt`` contains a pickle. Readers run no code of these files; only a user's task is code.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,13 @@ from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign.training import DYNAMICS_FILE, FIGURES_FILE, PRIOR_FILE, model_folder
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from learning.policy.sac_agent import AGENT_FILE, SacAgent, SacSettings
-from learning.world.car_fit import load_car
+from learning.world.car_fit import load_car, load_car_arrays, save_car, save_car_arrays
 
 ORDER_FILE, TASK_FILE = "order.json", "task.py"
 EPISODES, MODELS = "episodes", "models"
-RESULT_FILES = frozenset({DYNAMICS_FILE, AGENT_FILE, PRIOR_FILE, FIGURES_FILE})
+ARRAYS_FILE = "dynamics.npz"
+RESULT_FILES = frozenset({ARRAYS_FILE, AGENT_FILE, FIGURES_FILE})
+"""Files of a result as they travel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +81,8 @@ class TrainingOrder:
         files |= {f"{EPISODES}/{path.name}": path.read_bytes() for path in self.recordings}
         earlier = model_folder(self.models, self.number - 1)
         if earlier.is_dir():
-            names = (DYNAMICS_FILE, AGENT_FILE)
-            files |= {f"{MODELS}/{earlier.name}/{name}": (earlier / name).read_bytes() for name in names}
+            sent = sent_files(earlier, (AGENT_FILE,))
+            files |= {f"{MODELS}/{earlier.name}/{name}": content for name, content in sent.items()}
         if self.plan.task_choice.file:
             files[TASK_FILE] = Path(self.plan.task_choice.file).read_bytes()
         return files
@@ -92,6 +95,8 @@ class TrainingOrder:
             plan = plan_from_json(content["plan"])
             if plan.task_choice.sha256:
                 plan = replace(plan, task_choice=replace(plan.task_choice, file=str(folder / TASK_FILE)))
+            for arrays in (folder / MODELS).glob(f"*/{ARRAYS_FILE}"):
+                save_car(load_car_arrays(arrays), arrays.with_name(DYNAMICS_FILE))
             names = [Path(str(name)).name for name in content["recordings"]]
             return cls(
                 plan, folder / MODELS, tuple(folder / EPISODES / name for name in names), _envelope(content["envelope"])
@@ -99,8 +104,12 @@ class TrainingOrder:
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(f"The order of a training cannot be read ({error!r}); install the same carlab.") from error
 
+    def result(self) -> dict[str, bytes]:
+        """The files of the finished training, as they travel."""
+        return sent_files(self.folder, (AGENT_FILE, FIGURES_FILE))
+
     def publish(self, arrived: Path) -> dict[str, Any]:
-        """Check the files of a finished training, and move them to their folder.
+        """Check the files of a finished training, and move them to their folder as files of the run.
 
         Args:
             arrived: folder next to that of the result.
@@ -112,6 +121,7 @@ class TrainingOrder:
             DataError: a file is missing, surplus or damaged, or belongs to another training; nothing is moved.
         """
         figures = self._checked(arrived)
+        (arrived / ARRAYS_FILE).unlink()
         (arrived / PRIOR_FILE).write_text(self.plan.prior_toml, encoding="utf-8")
         shutil.rmtree(self.folder, ignore_errors=True)
         os.replace(arrived, self.folder)
@@ -121,7 +131,7 @@ class TrainingOrder:
         names = {str(path.relative_to(arrived)) for path in arrived.rglob("*")}
         if names != RESULT_FILES:
             raise DataError(f"the files are {', '.join(sorted(names)) or 'missing'}")
-        car = load_car(arrived / DYNAMICS_FILE)
+        car = load_car_arrays(arrived / ARRAYS_FILE)
         agent = SacAgent.load(arrived, SacSettings(), self.plan.seed)
         if (car.history, agent.observation_size) != (self.plan.history, feature_size(self.plan.history)):
             raise DataError("model and policy have another number of past commands")
@@ -131,7 +141,15 @@ class TrainingOrder:
             raise DataError(f"{FIGURES_FILE} cannot be read ({error})") from error
         if figures.get("episode") != self.number:
             raise DataError(f"they are of episode {figures.get('episode')}")
+        save_car(car, arrived / DYNAMICS_FILE)
         return figures
+
+
+def sent_files(model: Path, names: Sequence[str]) -> dict[str, bytes]:
+    """The learned car of a folder as arrays, and further files, by name. Raises DataError if the car cannot be read."""
+    with tempfile.TemporaryDirectory(prefix="arrays-") as folder:
+        save_car_arrays(load_car(model / DYNAMICS_FILE), arrays := Path(folder) / ARRAYS_FILE)
+        return {ARRAYS_FILE: arrays.read_bytes()} | {name: (model / name).read_bytes() for name in names}
 
 
 def check_task(plan: TrainingPlan) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 from carlab.core.clock import MonotonicClock
 from carlab.core.errors import CarlabError, ConfigError
 from carlab.experiment.campaign.training_process import TrainingDiedError, train_in_subprocess
-from carlab.experiment.cluster.order import RESULT_FILES, TrainingOrder
+from carlab.experiment.cluster.order import TrainingOrder
 from carlab.jobs.child_jobs import write_files
 from carlab.jobs.ray_executor import require_same_version
 from learning.devices import available
@@ -142,7 +142,7 @@ class TrainingService:
                     training.stopped.is_set,
                 )  # fmt: skip
                 if not training.stopped.is_set():
-                    training.result = {name: (order.folder / name).read_bytes() for name in RESULT_FILES}
+                    training.result = order.result()
                     training.state = "done"
             except TrainingDiedError as error:
                 training.message, training.state = str(error), "lost"
