@@ -18,6 +18,7 @@ from carlab.core.clock import MonotonicClock
 from carlab.core.errors import ConfigError
 from carlab.core.version import VERSION
 from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
+from carlab.experiment.cluster.order import RESULT_FILES
 from carlab.experiment.cluster.service import TrainingService, sha256
 from carlab.experiment.cluster.settings import LinkSettings
 from carlab.jobs.child_jobs import read_files, write_files
@@ -154,8 +155,9 @@ def run_order(
     if state["state"] != "done":
         emit(LinkEvent("failed" if state["state"] == "failed" else "lost worker", state["message"]))
         return
-    for name in state["files"]:
-        if not (Path(request.to) / name).is_file():
+    there = {name: sha256(content) for name, content in read_files(Path(request.to), ".").items()}
+    for name in RESULT_FILES:
+        if there.get(name) != state["files"][name]:
             write_files(Path(request.to), {name: service.fetch(name)})
             emit(LinkEvent("answer"))
     emit(LinkEvent("done"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import platform
 import tempfile
@@ -20,6 +21,8 @@ from carlab.jobs.child_jobs import write_files
 from carlab.jobs.ray_executor import require_same_version
 from learning.devices import available
 
+log = logging.getLogger(__name__)
+
 IDLE_POLL_S = 5.0
 
 
@@ -34,7 +37,7 @@ class _Training:
 
     Attributes:
         manifest: contents of the order's files (SHA-256) by name.
-        state: ``training``, ``done``, ``failed`` (with a message) or ``lost`` (its process died).
+        state: ``training``, ``done``, ``failed`` (as it would fail anywhere) or ``lost`` (by a fault of this machine).
     """
 
     manifest: dict[str, str]
@@ -99,16 +102,19 @@ class TrainingService:
             training.thread.start()
 
     def state(self) -> dict[str, Any]:
-        """State of the training: ``state``, ``message``, ``activity`` (name, done, total), ``files`` if it is done."""
+        """State of the training: ``state``, ``message``, ``activity`` (name, done, total).
+
+        If it is done also ``files``: contents of the result (SHA-256) by name.
+        """
         self._asked_s = self._clock.now_s()
         training = self._training
         if training is None:
-            return {"state": "lost", "message": "there is no training", "activity": ("", 0, 1), "files": []}
+            return {"state": "lost", "message": "there is no training", "activity": ("", 0, 1), "files": {}}
         return {
             "state": training.state,
             "message": training.message,
             "activity": training.activity,
-            "files": sorted(training.result) if training.state == "done" else [],
+            "files": {k: sha256(v) for k, v in training.result.items()} if training.state == "done" else {},
         }
 
     def fetch(self, name: str) -> bytes:
@@ -146,8 +152,11 @@ class TrainingService:
                     training.state = "done"
             except TrainingDiedError as error:
                 training.message, training.state = str(error), "lost"
-            except (CarlabError, OSError) as error:
+            except CarlabError as error:
                 training.message, training.state = str(error), "failed"
+            except Exception as error:
+                log.exception("Training failed")
+                training.message, training.state = f"{type(error).__name__}: {error}", "lost"
 
 
 __all__ = ["TrainingService", "sha256"]

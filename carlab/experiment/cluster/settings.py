@@ -14,6 +14,7 @@ class LinkSettings:
     Attributes:
         wait_s: time without an answer after which a training runs on this computer [s]; a training takes about a
             minute.
+        connect_s: time for the first connection [s], before the car is opened; Ray takes 10 to 20 s.
         lost_wait_s: the same for a cluster that did not answer the last time [s], so that a run without a cluster is
             delayed little; a connection takes 5 to 10 s.
         message_s: time without an answer after which the run prints that it waits [s]; longer than a connection takes.
@@ -28,6 +29,7 @@ class LinkSettings:
     """
 
     wait_s: float = 120.0
+    connect_s: float = 60.0
     lost_wait_s: float = 30.0
     message_s: float = 15.0
     reconnect_s: float = 30.0

@@ -21,6 +21,7 @@ from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
 from carlab.experiment.cluster.order import TrainingOrder
 from carlab.experiment.cluster.settings import LinkSettings
 from carlab.jobs.child_jobs import write_files
+from carlab.recording.sink import describe_os_error
 from learning.devices import available
 
 log = logging.getLogger(__name__)
@@ -65,9 +66,9 @@ class ClusterTrainer:
             while (event := self.link.poll(POLL_S)) is None or event.kind != "connected":
                 if event is not None:
                     raise ConfigError(event.message)
-                if self.clock.now_s() - began_s > self.settings.wait_s:
+                if self.clock.now_s() - began_s > self.settings.connect_s:
                     raise ConfigError(
-                        f"--ray {self.address}: the cluster has not answered for {self.settings.wait_s:g} s; check "
+                        f"--ray {self.address}: the cluster has not answered for {self.settings.connect_s:g} s; check "
                         "that it has a free core (or GPU), or leave out --ray."
                     )
         except BaseException:
@@ -94,9 +95,11 @@ class ClusterTrainer:
         shutil.rmtree(arrived, ignore_errors=True)
         try:
             with tempfile.TemporaryDirectory(prefix="order-") as folder:
-                write_files(Path(folder), order.files())
+                write_files(Path(folder), _files_of(order))
                 waiting = _Waiting(self, LinkRequest(folder, str(arrived)), order.number, progress)
                 return self._published(order, arrived) if waiting.until_done(stop) else None
+        except OSError as error:
+            raise DataError(describe_os_error(error, models)) from error
         except _RunHereError as error:
             reason = str(error)
         finally:
@@ -209,6 +212,15 @@ class _Waiting:
             self._trainer.link.cut()
             self._trainer.link.send(self._request)
             self._sent_s, self._retry_s = now_s, None
+
+
+def _files_of(order: TrainingOrder) -> dict[str, bytes]:
+    try:
+        return order.files()
+    except OSError as error:
+        raise DataError(
+            f"{error.filename} cannot be read ({error.strerror}); the training before episode {order.number} needs it."
+        ) from error
 
 
 def _plan_here(plan: TrainingPlan) -> TrainingPlan:
