@@ -120,8 +120,9 @@ def _require_listener(address: str) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """First line of the text of an error, or its type."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    """First line of the text of an error, with the last one after a colon; without a text its type."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return f"{lines[0]} {lines[-1].strip()}" if lines[0].endswith(":") and len(lines) > 1 else lines[0]
 
 
 def _run_here(version: str, job: ChildJob) -> JobEnd:

@@ -260,10 +260,17 @@ def test_training_here_uses_a_device_of_this_computer(run: RunDirectory) -> None
 def test_cluster_that_cannot_be_used_is_refused_at_the_start(
     events: list[tuple[float, LinkEvent]], message: str
 ) -> None:
-    link = FakeLink(events)
+    link = FakeLink(events, events)
     with pytest.raises(ConfigError, match=message), trainer_of(link)[0]:
         pass
     assert link.calls[-1] == "close"
+
+
+def test_first_connection_has_a_second_attempt() -> None:
+    """The server of Ray's clients may fail while the cluster starts."""
+    link = FakeLink([(1.0, LinkEvent("unreachable", "starting"))], [(1.0, LinkEvent("connected"))])
+    with trainer_of(link)[0]:
+        assert link.calls == ["send", "cut", "send"]
 
 
 class Payload:

@@ -59,22 +59,31 @@ class ClusterTrainer:
     is_lost: bool = False
 
     def __enter__(self) -> ClusterTrainer:
-        """Open the link. Raises ConfigError if the cluster does not answer or cannot be used."""
+        """Open the link, with a second attempt. Raises ConfigError if the cluster does not answer or cannot be used."""
         try:
-            self.link.send(None)
-            began_s = self.clock.now_s()
-            while (event := self.link.poll(POLL_S)) is None or event.kind != "connected":
-                if event is not None:
-                    raise ConfigError(event.message)
-                if self.clock.now_s() - began_s > self.settings.connect_s:
-                    raise ConfigError(
-                        f"--ray {self.address}: the cluster has not answered for {self.settings.connect_s:g} s; check "
-                        "that it has a free core (or GPU), or leave out --ray."
-                    )
+            if not self._connects(is_last=False):
+                self._connects(is_last=True)
         except BaseException:
             self.link.close()
             raise
         return self
+
+    def _connects(self, *, is_last: bool) -> bool:
+        """Whether the link connects to the cluster; the last attempt raises ConfigError in place of False."""
+        self.link.send(None)
+        began_s = self.clock.now_s()
+        while (event := self.link.poll(POLL_S)) is None or event.kind != "connected":
+            if event is not None and event.kind == "unreachable" and not is_last:
+                self.link.cut()
+                return False
+            if event is not None:
+                raise ConfigError(event.message)
+            if self.clock.now_s() - began_s > self.settings.connect_s:
+                raise ConfigError(
+                    f"--ray {self.address}: the cluster has not answered for {self.settings.connect_s:g} s; check that "
+                    "it has a free core (or GPU), or leave out --ray."
+                )
+        return True
 
     def __exit__(self, *exc_info: object) -> None:
         """End the service on the cluster, and close the link."""
