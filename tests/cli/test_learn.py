@@ -23,6 +23,7 @@ import tyro
 import carlab.cars as carlab_cars
 from carlab.api import learning
 from carlab.cli import run
+from carlab.cli.console import progress
 from carlab.cli.learn import Learn
 from carlab.cli.options import CarOptions
 from carlab.recording.mcap.source import read_episode
@@ -344,6 +345,12 @@ def test_training_on_ray_gives_the_run_without_ray(
             assert all(np.array_equal(found[key], expected[key]) for key in expected)
         one, other = (read_episode(path / "episodes" / f"{name}.mcap") for path in (folder, learned[2]))
         np.testing.assert_array_equal(one.states, other.states)
+
+
+def test_sentence_about_the_link_is_printed_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress() as bar:
+        Learn()._hooks(bar).on_link("The cluster ray://[::1]:10001 answers again.")
+    assert "The cluster ray://[::1]:10001 answers again." in capsys.readouterr().out
 
 
 def test_resume_command_names_the_cluster() -> None:
