@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from carlab.api.arguments import above_zero, at_least
-from carlab.cli.bench_options import BenchOptions, check_options
+from carlab.cli.bench_options import BenchOptions, check_options, row_counts
 from carlab.cli.bench_output import write_figures
 from carlab.cli.console import console, table
 from carlab.cli.options import json_file
@@ -28,7 +28,7 @@ class Bench(BenchOptions):
             return self._speed()
         above_zero(
             seeds=self.seeds, jobs=self.jobs, steps=self.steps, episodes=self.episodes, updates=self.updates,
-            **{"rows": min(self.rows)} if self.rows else {},
+            **{"rows": min(counts)} if (counts := row_counts(self)) else {},
         )  # fmt: skip
         at_least(0, first_seed=self.first_seed)
         if self.what == "realcars":

@@ -101,12 +101,14 @@ def run_jobs(
         return in_order(), len(found) < len(jobs)
 
 
-def bench_job(options: BenchOptions, rows: int, seed: int, more: Sequence[str], files: Mapping[str, bytes]) -> ChildJob:
+def bench_job(
+    options: BenchOptions, rows: int | str, seed: int, more: Sequence[str], files: Mapping[str, bytes]
+) -> ChildJob:
     """The command of one number of rows and one seed; its figures are in the output ``FIGURES``.
 
     Args:
         options: of the study.
-        rows: number of rows.
+        rows: number of rows, or ``all``.
         seed: of data and fit.
         more: further options.
         files: contents of the files that it reads.

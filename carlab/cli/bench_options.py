@@ -44,9 +44,9 @@ class BenchOptions:
     a car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of their car (with --data). realcar:
     recordings in the folder --data, the last one held out."""
 
-    rows: tuple[int, ...] = ()
-    """regression, priors and rollouts: numbers of training rows; by default those of the paper's figure, or 200 and
-    800 (rollouts)."""
+    rows: tuple[int | Literal["all"], ...] = ()
+    """regression, priors and rollouts: numbers of training rows; by default those of the paper's figure, or 200, 800
+    and all (rollouts). rollouts: "all" also fits the car to rollouts over all prediction windows."""
 
     seeds: int = 3
     """Repetitions of each fit: with other true systems, other rows of a recording, or (parking) other runs."""
@@ -200,6 +200,13 @@ def check_options(given: BenchOptions) -> None:
         if not any(place.holds(given) for place in PLACES[name]):
             places = " and ".join(place.command for place in PLACES[name])
             raise ConfigError(f"--{name.replace('_', '-')} has no effect in '{_command(given)}'; use it with {places}.")
+    if "all" in given.rows and not ROLLOUTS.holds(given):
+        raise ConfigError(f"--rows all has no effect in '{_command(given)}'; use it with {ROLLOUTS.command}.")
+
+
+def row_counts(given: BenchOptions) -> tuple[int, ...]:
+    """The numbers of rows that are given as numbers."""
+    return tuple(count for count in given.rows if count != "all")
 
 
 def _command(given: BenchOptions) -> str:
@@ -210,4 +217,4 @@ def _command(given: BenchOptions) -> str:
     return f"{command} --data {given.data}" if READ.holds(given) else command
 
 
-__all__ = ["EVERYWHERE", "PLACES", "BenchOptions", "check_options"]
+__all__ = ["EVERYWHERE", "PLACES", "BenchOptions", "check_options", "row_counts"]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from carlab.api.recordings import required_file
 from carlab.cli.bench_jobs import StudyJob, bench_job, recorded_files, uses_jobs
+from carlab.cli.bench_options import row_counts
 from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
 from carlab.cli.console import console, progress
 from carlab.core.errors import ConfigError, DataError
@@ -57,7 +58,7 @@ def run_priors(options: BenchOptions) -> int:
             return report(scores, stopped, options, f"{what}, {options.seeds} seeds", "prior", work)
         scores, stopped = run_and_write(
             lambda progress: run_prior_study(
-                case, priors, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,
+                case, priors, rows=row_counts(options), seeds=options.seeds, first_seed=options.first_seed,
                 steps=options.steps, device=options.device, progress=progress,
             ),
             options,
@@ -77,7 +78,7 @@ def _jobs(
     contents[MODEL] = model.read_bytes()
     jobs = []
     seeds = range(options.first_seed, options.first_seed + options.seeds)
-    for rows, seed in itertools.product(checked_counts(case, options.rows), seeds):
+    for rows, seed in itertools.product(checked_counts(case, row_counts(options)), seeds):
         job = bench_job(options, rows, seed, [*recorded, "--diagnosed", MODEL], contents)
         jobs.append(score_job(job, case.name, rows, seed, priors))
     return jobs

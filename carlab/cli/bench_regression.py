@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.cli.bench_jobs import DATA, StudyJob, bench_job, recorded_files, uses_jobs
+from carlab.cli.bench_options import row_counts
 from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
 from carlab.cli.console import console
 from carlab.core.errors import ConfigError
@@ -32,7 +33,7 @@ def _run_here(options: BenchOptions, case: str | RecordedCase) -> tuple[list[Sco
 
     return run_and_write(
         lambda progress: run_study(
-            case, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed, methods=options.methods,
+            case, rows=row_counts(options), seeds=options.seeds, first_seed=options.first_seed, methods=options.methods,
             structure=options.structure, data=options.data, steps=options.steps, device=options.device,
             progress=progress,
         ),
@@ -48,7 +49,12 @@ def _jobs(options: BenchOptions, case: str | RecordedCase) -> list[StudyJob[Scor
 
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     plan = plan_study(
-        case, rows=options.rows, seeds=seeds, methods=options.methods, structure=options.structure, data=options.data
+        case,
+        rows=row_counts(options),
+        seeds=seeds,
+        methods=options.methods,
+        structure=options.structure,
+        data=options.data,
     )
     given = ["--case", options.case, *(["--structure"] if options.structure else [])]
     files: dict[str, bytes] = {}

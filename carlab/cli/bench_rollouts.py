@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
     from carlab.core.episode_data import EpisodeData
     from carlab.studies.regression.recordings import RecordedCase
-    from carlab.studies.rollouts import RolloutScore
+    from carlab.studies.rollouts import RolloutScore, Rows
 
     Recordings = Sequence[Sequence[EpisodeData]]
 
@@ -76,7 +76,7 @@ def _jobs(
     assert case.rows is not None
     more, contents = recorded_files(files, options.car, case.rows.history)
 
-    def job(rows: int, seed: int) -> StudyJob[RolloutScore]:
+    def job(rows: Rows, seed: int) -> StudyJob[RolloutScore]:
         label = f"{rows} rows, seed {seed}"
 
         def failed(reason: str) -> list[RolloutScore]:
@@ -106,8 +106,9 @@ def _print(scores: Sequence[RolloutScore], held_out: str) -> None:
     columns = ["rows", "seed", "rollouts", "after [s]", "position rms [m]", "yaw rms [rad]", "energy score [m]",
                "ahead", "left", "yaw", "vx", "vy", "yaw rate", "one-step nll"]  # fmt: skip
     rows = [
-        [str(s.rows), str(s.seed), s.model, f"{s.horizon_s:g}", f"{s.position_rms_m:.3f}", f"{s.yaw_rms_rad:.3f}",
-         f"{s.energy_m:.4f}", *(f"{c:.2f}" for c in s.coverage), f"{s.nll:.2f}"]
+        [f"{s.rows} (all)" if s.all_rows else str(s.rows), str(s.seed), s.model, f"{s.horizon_s:g}",
+         f"{s.position_rms_m:.3f}", f"{s.yaw_rms_rad:.3f}", f"{s.energy_m:.4f}",
+         *(f"{c:.2f}" for c in s.coverage), f"{s.nll:.2f}"]
         for s in scores
     ]  # fmt: skip
     table(f"Coverage of 90 % bands and errors on {held_out}", columns, rows)

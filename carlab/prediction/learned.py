@@ -12,7 +12,7 @@ from carlab.core.observation import decode_state, encode
 from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import PredictionWindows
 from learning.world.disturbance import RolloutModel, start_rollouts
-from learning.world.disturbance_fit import DriveWindows
+from learning.world.drive_windows import DriveWindows
 
 N_SAMPLES = 64
 

@@ -1,16 +1,18 @@
 """Calibration of predicted rollouts of a learned car on a held-out recording.
 
-Each car is fitted to a number of random rows of the recordings to fit. Its disturbance is estimated from the errors
-over windows of blocks that the car was not fitted to (cross-validation). Two kinds of rollouts are compared: steps with
+Each car is fitted to a number of random rows of the recordings to fit, or to all rows: then its particles are also
+fitted to rollouts over all windows (``learning.world.rollout_fit``). Its disturbance is estimated from the errors over
+windows of blocks that the car was not fitted to (cross-validation). Two kinds of rollouts are compared: steps with
 independent particles and noise, and one particle with a disturbance for each rollout.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -30,10 +32,17 @@ from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import DisturbedCar, RolloutModel
 from learning.world.disturbance_fit import MAX_WINDOWS, RolloutErrors, fit_disturbance, pooled, rollout_errors
+from learning.world.rollout_fit import fit_rollouts
 
-COUNTS = (200, 800)
+ALL_ROWS: Literal["all"] = "all"
+Rows = int | Literal["all"]
+"""Number of random rows of a fit, or all rows."""
+COUNTS: tuple[Rows, ...] = (200, 800, ALL_ROWS)
+ONE_STEP_ROWS = 800
+"""Random rows of the one-step posterior from which a fit to all rows starts."""
 HORIZONS_S = (0.3, 0.5, 1.0)
-STRIDE_S = 0.2
+STRIDE_S, FIT_STRIDE_S = 0.2, 0.1
+"""Time between the starts of windows for scores and disturbances, and for the fit to rollouts."""
 N_FOLDS, BLOCK_S = 3, 20.0
 """Folds of the cross-validation, and length of the blocks that are assigned to them in turn [s]."""
 N_SAMPLES = 200
@@ -49,7 +58,7 @@ class RolloutScore:
 
     Attributes:
         model: kind of rollouts.
-        rows, seed: rows of the fit, and the seed of rows, fit and samples.
+        rows, seed: number of rows of the fit, and the seed of rows, fit and samples.
         horizon_s: horizon [s].
         coverage: share of windows within the nominal 90 % band, for x ahead, y left, yaw, vx, vy and yaw rate.
         band: mean width of the bands in the same order [m, m, rad, m/s, m/s, rad/s].
@@ -58,6 +67,8 @@ class RolloutScore:
         energy_m: mean energy score of the position (Gneiting and Raftery 2007, section 4.3) [m]; less is better.
         nll: negative log-likelihood of the one-step predictions [nat per step].
         windows: number of windows.
+        all_rows: whether the fit has all rows and rollouts; otherwise its rows are random and its likelihood is that of
+            one step.
     """
 
     model: str
@@ -71,13 +82,14 @@ class RolloutScore:
     energy_m: float
     nll: float
     windows: int
+    all_rows: bool = False
 
 
 def run_rollout_study(
     case: RecordedCase,
     recordings: Sequence[Sequence[EpisodeData]],
     *,
-    rows: Sequence[int] = (),
+    rows: Sequence[Rows] = (),
     seeds: int = 3,
     first_seed: int = 0,
     steps: int | None = None,
@@ -90,7 +102,7 @@ def run_rollout_study(
     Args:
         case: rows of the recordings, the last one held out.
         recordings: the recordings of the case.
-        rows: numbers of rows of a fit; by default ``COUNTS``.
+        rows: numbers of rows of a fit, or ``ALL_ROWS``; by default ``COUNTS``.
         seeds: number of repetitions.
         first_seed: the smallest seed.
         steps: of the particles' optimiser; by default those of the regression study.
@@ -107,6 +119,18 @@ def run_rollout_study(
     fold_of_row = _folds_of_rows(case, recordings)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
     fit_windows, held_out = recorded_windows(fitted), recorded_windows(recordings[-1])
+    dense_windows = recorded_windows(fitted, FIT_STRIDE_S)
+
+    def fit(count: Rows, seed: int, held_out_fold: int | None) -> CarDynamics:
+        assert case.rows is not None
+        rows, windows = case.rows, dense_windows
+        if held_out_fold is not None:
+            rows = rows.take(fold_of_row != held_out_fold)
+            windows = windows.take((_folds_of(windows) != held_out_fold).all(axis=0))
+        if count == ALL_ROWS:
+            return fit_all(case, rows, windows, seed, steps, device)
+        return fit_rows(case, rows, count, seed, steps, device)
+
     total = len(counts) * seeds * (N_FOLDS + 1)
     for done, (count, seed) in enumerate(itertools.product(counts, range(first_seed, first_seed + seeds))):
         errors: list[RolloutErrors] = []
@@ -114,27 +138,30 @@ def run_rollout_study(
             if stop():
                 return
             progress(f"{count} rows, seed {seed}, fold {fold + 1}", done * (N_FOLDS + 1) + fold, total)
-            car = fit_rows(case, case.rows.take(fold_of_row != fold), count, seed, steps, device)
-            errors.append(fold_errors(car, fit_windows, fold))
+            errors.append(fold_errors(fit(count, seed, fold), fit_windows, fold))
         progress(f"{count} rows, seed {seed}", done * (N_FOLDS + 1) + N_FOLDS, total)
-        car = fit_rows(case, case.rows, count, seed, steps, device)
-        process = fit_disturbance(pooled(errors))
+        car = fit(count, seed, None)
+        models: dict[str, RolloutModel] = {
+            INDEPENDENT: car, DISTURBED: DisturbedCar(car, fit_disturbance(pooled(errors))),
+        }  # fmt: skip
         nll = _one_step_nll(car, case.held_out)
-        models: dict[str, RolloutModel] = {INDEPENDENT: car, DISTURBED: DisturbedCar(car, process)}
         for name, model in models.items():
-            yield from scores_of(name, model, held_out, count, seed, nll)
+            for score in scores_of(name, model, held_out, seed):
+                n_rows = len(case.rows) if count == ALL_ROWS else count
+                yield replace(score, rows=n_rows, all_rows=count == ALL_ROWS, nll=nll)
     progress("", total, total)
 
 
 def checked_counts(
-    case: RecordedCase, recordings: Sequence[Sequence[EpisodeData]], rows: Sequence[int]
-) -> tuple[int, ...]:
+    case: RecordedCase, recordings: Sequence[Sequence[EpisodeData]], rows: Sequence[Rows]
+) -> tuple[Rows, ...]:
     """Numbers of rows, by default ``COUNTS``. Raises DataError if a fold has fewer rows."""
     counts = tuple(rows) or COUNTS
     fold_of_row = _folds_of_rows(case, recordings)
     smallest = min(int((fold_of_row != fold).sum()) for fold in range(N_FOLDS))
-    if max(counts) > smallest:
-        raise DataError(f"The folds have {smallest} rows, not {max(counts)}; give fewer with --rows.")
+    largest = max((count for count in counts if count != ALL_ROWS), default=0)
+    if largest > smallest:
+        raise DataError(f"The folds have {smallest} rows, not {largest}; give fewer with --rows.")
     return counts
 
 
@@ -154,6 +181,16 @@ def fit_rows(
     return CarDynamics(task.distilled(case.prior, outputs, size).posterior.to("cpu"), rows.history)
 
 
+def fit_all(
+    case: RecordedCase, rows: Transitions, windows: PredictionWindows, seed: int, steps: int | None, device: str
+) -> CarDynamics:
+    """Fit to ``ONE_STEP_ROWS`` random rows, then to rollouts over windows and to all rows; the car is on the CPU."""
+    start = fit_rows(case, rows, min(ONE_STEP_ROWS, len(rows)), seed, steps, device)
+    start = CarDynamics(start.posterior.to(device), start.history)
+    car = fit_rollouts(start, drive_windows(windows, start.history), rows, seed=seed)
+    return CarDynamics(car.posterior.to("cpu"), car.history)
+
+
 def folds(recording: np.ndarray, t_s: FloatArray) -> np.ndarray:
     """Fold (n,) of moments (n,) in recordings (n,): blocks of ``BLOCK_S`` in turn."""
     return np.asarray((t_s // BLOCK_S).astype(np.int64) + recording) % N_FOLDS
@@ -161,20 +198,23 @@ def folds(recording: np.ndarray, t_s: FloatArray) -> np.ndarray:
 
 def fold_errors(car: CarDynamics, windows: PredictionWindows, fold: int) -> RolloutErrors:
     """Errors of a car over the windows that lie within the blocks of one fold."""
-    first, last = (folds(windows.recording, windows.t0_s + dt) for dt in (0.0, windows.horizon_s))
+    first, last = _folds_of(windows)
     chosen = windows.take((first == fold) & (last == fold)).thinned(MAX_WINDOWS)
     return rollout_errors(car, drive_windows(chosen, car.history))
 
 
-def recorded_windows(recording: Sequence[EpisodeData]) -> PredictionWindows:
+def _folds_of(windows: PredictionWindows) -> np.ndarray:
+    """Folds (2, S) of the starts and ends of windows."""
+    return np.stack([folds(windows.recording, windows.t0_s + dt) for dt in (0.0, windows.horizon_s)])
+
+
+def recorded_windows(recording: Sequence[EpisodeData], stride_s: float = STRIDE_S) -> PredictionWindows:
     """Windows of the longest horizon with initial states as recorded: a one-step model is fitted to these."""
-    return as_recorded(cut_windows(tracks_of(recording), max(HORIZONS_S), STRIDE_S))
+    return as_recorded(cut_windows(tracks_of(recording), max(HORIZONS_S), stride_s))
 
 
-def scores_of(
-    name: str, model: RolloutModel, windows: PredictionWindows, count: int, seed: int, nll: float
-) -> Iterator[RolloutScore]:
-    """Scores of a model on windows, by horizon."""
+def scores_of(name: str, model: RolloutModel, windows: PredictionWindows, seed: int) -> Iterator[RolloutScore]:
+    """Scores of a model on windows, by horizon, without the number of rows and the one-step likelihood."""
     paths = LearnedModel(model, N_SAMPLES, seed).sample(windows)
     errors = prediction_errors(np.moveaxis(paths, 2, 0), windows)
     for horizon_s in HORIZONS_S:
@@ -182,13 +222,13 @@ def scores_of(
         low, high = np.quantile(at, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], axis=0)
         mean = at.mean(axis=0)
         yield RolloutScore(
-            name, count, seed, horizon_s,
+            name, 0, seed, horizon_s,
             tuple(((low <= 0) & (high >= 0)).mean(axis=0).tolist()),
             tuple((high - low).mean(axis=0).tolist()),
             float(np.sqrt(np.mean(mean[:, 0] ** 2 + mean[:, 1] ** 2))),
             float(np.sqrt(np.mean(mean[:, 2] ** 2))),
             energy_score(at[..., :2]),
-            nll,
+            math.nan,
             len(windows),
         )  # fmt: skip
 
@@ -225,12 +265,15 @@ def _period_s(recordings: Sequence[Sequence[EpisodeData]]) -> float:
 
 
 __all__ = [
+    "ALL_ROWS",
     "DISTURBED",
     "INDEPENDENT",
     "RolloutScore",
+    "Rows",
     "as_json",
     "checked_counts",
     "energy_score",
+    "fit_all",
     "fit_rows",
     "fold_errors",
     "folds",

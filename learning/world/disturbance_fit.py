@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 from carlab.core.errors import DataError
-from carlab.core.observation import decode_state, encode
 from learning.outliers import DOF_CANDIDATES, log_student, tail_scales
 from learning.posterior.draws import Assignment
-from learning.world.car_dynamics import CarDynamics, advance, inputs_of
+from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import CHANNELS, TAIL_COMPONENTS, DisturbanceProcess, change_by
+from learning.world.drive_windows import DriveWindows, roll_out
 
 CORRELATION_TIMES_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 """Candidates of the correlation time: from one step to longer than a window."""
@@ -36,44 +36,6 @@ MIN_WINDOWS = 8
 """Minimum number of windows: seven numbers are estimated."""
 _ITERATIONS = 25
 Times = tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class DriveWindows:
-    """S windows of a drive, each in the frame of its initial pose.
-
-    Attributes:
-        velocities: vx, vy [m/s] and yaw rate [rad/s] at the start (S, 3).
-        past_commands: (S, H, 2) before the start.
-        commands: (S, K, 2).
-        motion: measured states (S, K, 6) after each step: x ahead and y left of the initial pose, yaw relative to it,
-            and the body velocities.
-        period_s: period of the steps.
-    """
-
-    velocities: Tensor
-    past_commands: Tensor
-    commands: Tensor
-    motion: Tensor
-    period_s: float
-
-    def __len__(self) -> int:
-        return len(self.velocities)
-
-    @property
-    def features(self) -> Tensor:
-        """Features (S, 7 + 2 H) at the start, at the origin."""
-        encoded: Tensor = encode(
-            torch.cat([torch.zeros_like(self.velocities), self.velocities], dim=1), self.past_commands
-        )
-        return encoded
-
-    def take(self, rows: Tensor) -> DriveWindows:
-        """Some of the windows, by index."""
-        velocities, past, commands, motion = (
-            v[rows] for v in (self.velocities, self.past_commands, self.commands, self.motion)
-        )
-        return DriveWindows(velocities, past, commands, motion, self.period_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,17 +115,14 @@ def _paths(
         accelerations: disturbance of each rollout (N, K, 3); None: zero.
     """
     assignment = Assignment.of_particles(particle, len(car.draws.parameters))
-    features = windows.features[window].float()
-    yaw, states = torch.zeros(len(window)), []
-    for k in range(windows.commands.shape[1]):
-        action = windows.commands[window, k].float()
-        change = car.draws.without_noise(inputs_of(features, action), assignment)
-        if accelerations is not None:
-            change = change + change_by(accelerations[:, k], windows.period_s)
-        features, yaw = advance(features, action, change), yaw + change[:, 2]
-        state = decode_state(features)
-        states.append(torch.cat([state[:, :2], yaw[:, None], state[:, 3:]], dim=1))
-    return torch.stack(states, dim=1)
+
+    def change(inputs: Tensor, step: int) -> Tensor:
+        undisturbed = car.draws.without_noise(inputs, assignment)
+        if accelerations is None:
+            return undisturbed
+        return undisturbed + change_by(accelerations[:, step], windows.period_s)
+
+    return roll_out(windows.take(window), change)
 
 
 def fit_disturbance(errors: RolloutErrors) -> DisturbanceProcess:
@@ -247,4 +206,4 @@ def _maximise_scale(
         return -float(loss()), (ahead, left, yaw)
 
 
-__all__ = ["DriveWindows", "RolloutErrors", "fit_disturbance", "pooled", "rollout_errors"]
+__all__ = ["RolloutErrors", "fit_disturbance", "pooled", "rollout_errors"]

@@ -98,3 +98,9 @@ def test_commands_of_the_readme_are_accepted(command: str) -> None:
     parsed = tyro.extras.subcommand_cli_from_dict(_verbs(), args=shlex.split(command)[1:], prog="carlab")
     assert isinstance(parsed, Bench)
     check_options(parsed)
+
+
+def test_all_rows_are_refused_in_studies_of_few_rows() -> None:
+    check_options(Bench("rollouts", rows=(200, "all")))
+    with pytest.raises(ConfigError, match="--rows all has no effect in 'bench priors'; use it with 'bench rollouts'"):
+        check_options(Bench("priors", rows=(200, "all")))

@@ -20,11 +20,11 @@ from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import DisturbanceProcess, DisturbedCar, start_rollouts
 from learning.world.disturbance_fit import (
     MAX_SCALE,
-    DriveWindows,
     fit_disturbance,
     pooled,
     rollout_errors,
 )
+from learning.world.drive_windows import DriveWindows
 
 PERIOD_S, DECAY, STEPS = 1.0 / 30.0, 0.05, 30
 INPUTS = 3 + 2

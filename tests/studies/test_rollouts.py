@@ -16,6 +16,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.studies.rollouts import DISTURBED, INDEPENDENT, energy_score, folds
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
+from learning.world.drive_windows import DriveWindows
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import drive
 
@@ -62,6 +63,29 @@ def test_study_prints_calibrated_bands_of_a_wrong_model(
     rms = {s["model"]: s["position_rms_m"] for s in scores if s["horizon_s"] == 1.0}
     assert rms[DISTURBED] == pytest.approx(rms[INDEPENDENT], rel=0.1)
     assert f"{rms[DISTURBED]:.3f}" in capsys.readouterr().out
+
+
+def test_fit_to_all_rows_has_the_windows_of_its_rows(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Windows of a held-out fold would start at states that are not among the rows."""
+    numbers = []
+
+    def fit(car: CarDynamics, windows: DriveWindows, rows: Transitions, *, seed: int) -> CarDynamics:
+        known = {tuple(row) for row in np.round(rows.inputs[:, :3], 4)}
+        starts = [tuple(row) for row in np.round(windows.velocities.double().numpy(), 4)]
+        assert np.mean([start in known for start in starts]) > 0.95
+        numbers.append((len(rows), len(windows)))
+        return car
+
+    monkeypatch.setattr(study, "fit_rows", linear_car)
+    monkeypatch.setattr(study, "fit_rollouts", fit)
+    command = ["bench", "rollouts", "--data", str(folder), "--rows", "all", "--seeds", "1", "--history", "3"]
+    assert run([*command, "--car", "rc_car"]) == 0
+    (*folds, (rows, windows)) = numbers
+    assert [n / rows for n, _ in folds] == pytest.approx([2 / 3] * 3, abs=0.05)
+    assert max(n for _, n in folds) < 0.67 * windows, "windows that overlap a held-out block are left out"
+    assert f"{rows} (all)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
