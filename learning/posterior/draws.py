@@ -70,19 +70,15 @@ class Draws:
     @classmethod
     def of(cls, posterior: ParticlePosterior) -> Draws:
         """Create the sampler of a posterior, on its device."""
-        units, noise = posterior.normaliser, posterior.noise_std.double().diag()
-        to_raw = units.output_std.double().diag()
-        if units.decorrelation is not None:
-            to_raw = torch.linalg.inv_ex(units.decorrelation.double()).inverse.T @ to_raw
+        noise = posterior.noise_std.double().diag()
         if posterior.correlation is not None:
             noise = torch.linalg.cholesky_ex(posterior.correlation.double()).L.T @ noise
-        width = len(units.input_mean)
-        trend = torch.zeros((1 + width, len(noise))).to(noise) if posterior.trend is None else posterior.trend.double()
         parameters = posterior.parameters.clone()
-        weights, biases = posterior.network.split(parameters)[-1]
-        weights.copy_(weights.double() @ to_raw)
-        biases.copy_((biases.double() + trend[0]) @ to_raw + units.output_mean)
-        slopes, noise = (v.to(parameters) for v in (trend[1:] @ to_raw, noise @ to_raw))
+        head = posterior.network.split(parameters)[-1]
+        weights, biases, slopes = with_raw_outputs(posterior, *head)
+        head[0].copy_(weights)
+        head[1].copy_(biases)
+        noise = (noise @ _to_raw(posterior)).to(parameters)
         return cls(posterior, parameters, slopes, noise, posterior.noise_scales)
 
     def __call__(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
@@ -120,4 +116,32 @@ class Draws:
         return values
 
 
-__all__ = ["Assignment", "Draws"]
+def with_raw_outputs(posterior: ParticlePosterior, weights: Tensor, biases: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Change the heads of networks from normalised to raw outputs; differentiable.
+
+    Args:
+        posterior: with the units and the trend.
+        weights: of the heads (L, hidden, O).
+        biases: of the heads (L, 1, O).
+
+    Returns:
+        Weights and biases for raw outputs, the constant of the trend included, and the slopes (D, O) of the trend in
+        raw outputs for each normalised input.
+    """
+    units, to_raw = posterior.normaliser, _to_raw(posterior)
+    shape = (1 + len(units.input_mean), len(to_raw))
+    trend = torch.zeros(shape).to(to_raw) if posterior.trend is None else posterior.trend.double()
+    raw_biases = (biases.double() + trend[0]) @ to_raw + units.output_mean
+    return (weights.double() @ to_raw).to(weights), raw_biases.to(biases), (trend[1:] @ to_raw).to(weights)
+
+
+def _to_raw(posterior: ParticlePosterior) -> Tensor:
+    """Matrix (O, O) that multiplies normalised outputs from the right and gives raw outputs, without their mean."""
+    units = posterior.normaliser
+    to_raw = units.output_std.double().diag()
+    if units.decorrelation is not None:
+        to_raw = torch.linalg.inv_ex(units.decorrelation.double()).inverse.T @ to_raw
+    return to_raw
+
+
+__all__ = ["Assignment", "Draws", "with_raw_outputs"]

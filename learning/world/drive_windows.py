@@ -8,9 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from carlab.core.observation import decode_state, encode
-from learning.world.car_dynamics import advance, inputs_of
-
 
 @dataclass(frozen=True, slots=True)
 class DriveWindows:
@@ -35,12 +32,10 @@ class DriveWindows:
         return len(self.velocities)
 
     @property
-    def features(self) -> Tensor:
-        """Features (S, 7 + 2 H) at the start, at the origin."""
-        encoded: Tensor = encode(
-            torch.cat([torch.zeros_like(self.velocities), self.velocities], dim=1), self.past_commands
-        )
-        return encoded
+    def inputs(self) -> Tensor:
+        """Inputs (S, 3 + 2 (H + 1)) of the first step."""
+        commands = torch.cat([self.past_commands, self.commands[:, :1]], dim=1)
+        return torch.cat([self.velocities, commands.flatten(1)], dim=1).float()
 
     def take(self, rows: Tensor) -> DriveWindows:
         """Windows by index (N,), with repetitions if indices repeat."""
@@ -60,6 +55,8 @@ class DriveWindows:
 def roll_out(windows: DriveWindows, change: Callable[[Tensor, int], Tensor]) -> Tensor:
     """Roll a car out over windows. Gradients with respect to ``change`` are exact.
 
+    Only velocities and commands are inputs of a step, so poses are integrated after all steps.
+
     Args:
         windows: S windows.
         change: changes (S, 6) in the body frame, in the order of ``transitions.OUTPUTS``, from inputs
@@ -68,15 +65,20 @@ def roll_out(windows: DriveWindows, change: Callable[[Tensor, int], Tensor]) -> 
     Returns:
         States (S, K, 6) after each step, in the frame of the initial pose; yaw is continuous.
     """
-    features = windows.features.float()
-    yaw, states = torch.zeros(len(windows), device=features.device), []
+    start = windows.velocities.float()
+    commands = torch.cat([windows.past_commands, windows.commands], dim=1).float()
+    history = windows.past_commands.shape[1]
+    velocities, changes = start, []
     for k in range(windows.commands.shape[1]):
-        action = windows.commands[:, k].float()
-        step = change(inputs_of(features, action), k)
-        features, yaw = advance(features, action, step), yaw + step[:, 2]
-        state = decode_state(features)
-        states.append(torch.cat([state[:, :2], yaw[:, None], state[:, 3:]], dim=1))
-    return torch.stack(states, dim=1)
+        inputs = torch.cat([velocities, commands[:, k : k + history + 1].flatten(1)], dim=1)
+        changes.append(change(inputs, k))
+        velocities = velocities + changes[-1][:, 3:]
+    ahead, left, turn, *_ = torch.stack(changes, dim=-1).unbind(dim=1)
+    yaw = turn.cumsum(dim=1)
+    sin, cos = torch.sin(yaw - turn), torch.cos(yaw - turn)
+    x, y = (cos * ahead - sin * left).cumsum(dim=1), (sin * ahead + cos * left).cumsum(dim=1)
+    gained = torch.stack(changes, dim=1)[..., 3:].cumsum(dim=1)
+    return torch.cat([torch.stack([x, y, yaw], dim=-1), start[:, None] + gained], dim=-1)
 
 
 __all__ = ["DriveWindows", "roll_out"]

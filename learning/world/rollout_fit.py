@@ -25,9 +25,11 @@ from torch import Tensor
 
 from carlab.core.errors import DataError, DivergedError
 from learning.networks.adam import Adam
+from learning.networks.particles import Layers
+from learning.posterior.draws import with_raw_outputs
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.transitions import Transitions
-from learning.world.car_dynamics import CarDynamics, inputs_of
+from learning.world.car_dynamics import CarDynamics
 from learning.world.drive_windows import DriveWindows, roll_out
 
 
@@ -144,7 +146,8 @@ class _Problem:
         particles = len(posterior.parameters)
         chosen = torch.randint(len(self.windows), (count,), generator=generator).to(self.inputs.device)
         with torch.no_grad():
-            paths = self._paths(posterior, chosen.expand(particles, -1))
+            layers = posterior.network.split(posterior.parameters)
+            paths = self._paths(_Functions.of(posterior, layers), chosen.expand(particles, -1))
         error = paths.mean(dim=0) - self.windows.motion[chosen].to(paths)
         unit = 1.4826 * error.abs().median(dim=0).values
         return torch.maximum(unit, self.settings.min_unit_share * unit[-1]).clamp_min(1e-6)
@@ -161,48 +164,83 @@ class _Problem:
             unit: of the errors of rollouts (K, 6).
             generator: of the inputs at which functions are compared.
         """
-        leaf = parameters.detach().requires_grad_()
-        posterior = replace(self.car.posterior, parameters=leaf)
+        # Leaves by layer: views of one tensor would each have a gradient of its full size in every step.
+        network = self.car.posterior.network
+        layers = [(w.detach().requires_grad_(), b.detach().requires_grad_()) for w, b in network.split(parameters)]
+        functions = _Functions.of(self.car.posterior, layers)
         settings = self.settings
-        loss = self._rollout_loss(posterior, chosen, unit)
-        loss = loss + settings.one_step_weight * self._one_step_loss(posterior, batch)
-        loss = loss + settings.anchor_weight * self._anchor_loss(posterior, chosen, generator)
-        (gradient,) = torch.autograd.grad(loss, leaf)
+        loss = self._rollout_loss(functions, chosen, unit)
+        loss = loss + settings.one_step_weight * self._one_step_loss(functions, batch)
+        loss = loss + settings.anchor_weight * self._anchor_loss(functions, chosen, generator)
+        parts = torch.autograd.grad(loss, [leaf for layer in layers for leaf in layer])
+        gradient = torch.cat([part.flatten(1) for part in parts], dim=1)
         norm: Tensor = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
         return gradient * (settings.max_gradient / norm.clamp_min(settings.max_gradient))
 
-    def _rollout_loss(self, posterior: ParticlePosterior, chosen: Tensor, unit: Tensor) -> Tensor:
+    def _rollout_loss(self, functions: _Functions, chosen: Tensor, unit: Tensor) -> Tensor:
         """Sum over particles of the loss of their rollouts over windows (L, n)."""
-        paths = self._paths(posterior, chosen)
-        measured = self.windows.motion[chosen].to(paths)
-        return _huber((paths - measured) / unit, self.settings.rollout_huber).mean(dim=(1, 2, 3)).sum()
+        error = self._paths(functions, chosen) - self.windows.motion[chosen].float()
+        return _huber(error / unit, self.settings.rollout_huber).mean(dim=(1, 2, 3)).sum()
 
-    def _one_step_loss(self, posterior: ParticlePosterior, batch: Tensor) -> Tensor:
+    def _one_step_loss(self, functions: _Functions, batch: Tensor) -> Tensor:
         """Sum over particles of the loss of their steps at rows (L, m)."""
-        values = posterior.values(posterior.clipped_inputs(self.inputs[batch]))
+        posterior = self.car.posterior
+        values = functions.normalised(posterior.clipped_inputs(self.inputs[batch]))
         error = (values - posterior.normaliser.outputs(self.outputs[batch])) / posterior.noise_std
         return _huber(error, self.settings.one_step_huber).mean(dim=(1, 2)).sum()
 
-    def _anchor_loss(self, posterior: ParticlePosterior, chosen: Tensor, generator: torch.Generator) -> Tensor:
+    def _anchor_loss(self, functions: _Functions, chosen: Tensor, generator: torch.Generator) -> Tensor:
         """Sum over particles of the squared distance from their functions before, around the starts of windows."""
-        starts = self.windows.take(chosen.flatten())
-        inputs = inputs_of(starts.features.float(), starts.commands[:, 0].float()).view(*chosen.shape, -1)
+        posterior, inputs = self.car.posterior, self.windows.inputs[chosen]
         offset = self.settings.anchor_distance * torch.randn(inputs.shape, generator=generator)
         clipped = posterior.clipped_inputs(inputs + offset.to(inputs) * posterior.normaliser.input_std)
         with torch.no_grad():
-            before = self.car.posterior.values(clipped)
-        return ((posterior.values(clipped) - before) ** 2).mean(dim=(1, 2)).sum()
+            before = posterior.values(clipped)
+        return ((functions.normalised(clipped) - before) ** 2).mean(dim=(1, 2)).sum()
 
-    def _paths(self, posterior: ParticlePosterior, chosen: Tensor) -> Tensor:
+    def _paths(self, functions: _Functions, chosen: Tensor) -> Tensor:
         """Paths (L, n, K, 6) of each particle over its windows (L, n)."""
         particles, count = chosen.shape
 
         def change(inputs: Tensor, step: int) -> Tensor:
-            values = posterior.values(posterior.clipped_inputs(inputs.view(particles, count, -1)))
-            return posterior.normaliser.raw_outputs(values).flatten(0, 1)
+            clipped = self.car.posterior.clipped_inputs(inputs.view(particles, count, -1))
+            return functions.raw(clipped).flatten(0, 1)
 
         paths = roll_out(self.windows.take(chosen.flatten()), change)
         return paths.view(particles, count, *paths.shape[1:])
+
+
+@dataclass(frozen=True, slots=True)
+class _Functions:
+    """The functions of L particles with other parameters.
+
+    Attributes:
+        posterior: units and trend.
+        layers: weights and biases.
+        raw_layers: the same with raw outputs.
+        raw_slopes: of the trend in raw outputs (D, 6).
+    """
+
+    posterior: ParticlePosterior
+    layers: Layers
+    raw_layers: Layers
+    raw_slopes: Tensor
+
+    @classmethod
+    def of(cls, posterior: ParticlePosterior, layers: Layers) -> _Functions:
+        """Functions with the given layers."""
+        *hidden, head = layers
+        weights, biases, slopes = with_raw_outputs(posterior, *head)
+        return cls(posterior, layers, [*hidden, (weights, biases)], slopes)
+
+    def normalised(self, clipped: Tensor) -> Tensor:
+        """Normalised outputs (L, n, 6) at clipped inputs of each particle (L, n, D)."""
+        values, trend = self.posterior.network.through(self.layers, clipped)[0], self.posterior.trend
+        return values if trend is None else values + trend[0] + clipped @ trend[1:]
+
+    def raw(self, clipped: Tensor) -> Tensor:
+        """Raw outputs (L, n, 6) at clipped inputs of each particle (L, n, D)."""
+        return self.posterior.network.through(self.raw_layers, clipped)[0] + clipped @ self.raw_slopes
 
 
 def _huber(error: Tensor, delta: float) -> Tensor:
