@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.observation import decode_state, encode
 from carlab.core.quantities import FloatArray
-from carlab.prediction.windows import PredictionWindows
+from carlab.prediction.initial_states import as_recorded
+from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
 from learning.world.disturbance import RolloutModel, start_rollouts
 from learning.world.drive_windows import DriveWindows
 
@@ -99,6 +102,17 @@ def past_commands(windows: PredictionWindows, history: int) -> FloatArray:
     return windows.past_commands[:, length - history :]
 
 
+def recorded_windows(episodes: Sequence[EpisodeData], horizon_s: float, stride_s: float) -> PredictionWindows:
+    """Windows with the period of the recordings and initial states as recorded, to which a one-step model is fitted.
+
+    Raises:
+        DataError: no recording, or the car moves in no window.
+    """
+    if not episodes:
+        raise DataError("There is no recording to cut windows from; record a drive.")
+    return as_recorded(cut_windows(tracks_of(episodes, episodes[0].period_s), horizon_s, stride_s))
+
+
 def drive_windows(windows: PredictionWindows, history: int) -> DriveWindows:
     """The same windows in the frames of their initial poses, for the fit of a disturbance.
 
@@ -120,4 +134,4 @@ def drive_windows(windows: PredictionWindows, history: int) -> DriveWindows:
     return DriveWindows(velocities, past, commands, motions, windows.period_s)
 
 
-__all__ = ["N_SAMPLES", "LearnedModel", "drive_windows", "past_commands", "sample_paths"]
+__all__ = ["N_SAMPLES", "LearnedModel", "drive_windows", "past_commands", "recorded_windows", "sample_paths"]

@@ -21,9 +21,8 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.prediction.errors import prediction_errors
-from carlab.prediction.initial_states import as_recorded
-from carlab.prediction.learned import LearnedModel, drive_windows
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.learned import LearnedModel, drive_windows, recorded_windows
+from carlab.prediction.windows import PredictionWindows
 from carlab.studies.regression.cases import Data
 from carlab.studies.regression.methods import FitTask
 from carlab.studies.regression.recordings import RecordedCase
@@ -118,8 +117,8 @@ def run_rollout_study(
     counts = checked_counts(case, recordings, rows)
     fold_of_row = _folds_of_rows(case, recordings)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
-    fit_windows, held_out = recorded_windows(fitted), recorded_windows(recordings[-1])
-    dense_windows = recorded_windows(fitted, FIT_STRIDE_S)
+    fit_windows, held_out = (recorded_windows(of, max(HORIZONS_S), STRIDE_S) for of in (fitted, recordings[-1]))
+    dense_windows = recorded_windows(fitted, max(HORIZONS_S), FIT_STRIDE_S)
 
     def fit(count: Rows, seed: int, held_out_fold: int | None) -> CarDynamics:
         assert case.rows is not None
@@ -208,11 +207,6 @@ def _folds_of(windows: PredictionWindows) -> np.ndarray:
     return np.stack([folds(windows.recording, windows.t0_s + dt) for dt in (0.0, windows.horizon_s)])
 
 
-def recorded_windows(recording: Sequence[EpisodeData], stride_s: float = STRIDE_S) -> PredictionWindows:
-    """Windows of the longest horizon with initial states as recorded: a one-step model is fitted to these."""
-    return as_recorded(cut_windows(tracks_of(recording), max(HORIZONS_S), stride_s))
-
-
 def scores_of(name: str, model: RolloutModel, windows: PredictionWindows, seed: int) -> Iterator[RolloutScore]:
     """Scores of a model on windows, by horizon, without the number of rows and the one-step likelihood."""
     paths = LearnedModel(model, N_SAMPLES, seed).sample(windows)
@@ -277,7 +271,6 @@ __all__ = [
     "fit_rows",
     "fold_errors",
     "folds",
-    "recorded_windows",
     "run_rollout_study",
     "scores_from_json",
     "scores_of",

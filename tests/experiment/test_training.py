@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from learning_runs import ENVELOPE, HISTORY, TICKS, drive, names, tiny_plan
+from linear_cars import linear_car
 
 from carlab.cars import choose_car
 from carlab.core.episode_data import EpisodeData
@@ -23,12 +24,19 @@ from carlab.experiment.campaign import training
 from carlab.experiment.campaign.training import SUCCESS_BONUS, train
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.campaign.training_process import train_in_subprocess
+from carlab.prediction.learned import drive_windows, recorded_windows
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
 from learning.policy.sac_agent import SacAgent
 from learning.priors.simulator_model import CarModel
+from learning.transitions import transitions_of
 from learning.world import car_fit, model_env
+from learning.world.car_dynamics import CarDynamics
+from learning.world.car_fit import CarFitSettings
+from learning.world.disturbance_fit import rollout_errors
 from learning.world.history import HistoryChoice
+from sim_backends import SimulatorConfig
+from tests.helpers import recorded_drives
 
 
 def test_model_uses_the_velocity_delay_of_the_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,6 +112,24 @@ def test_diverged_training_is_repeated_with_a_smaller_learning_rate(
         train(plan, tmp_path / "other", [], ENVELOPE, lambda *what: None)
     assert "\n" not in str(error.value)
     assert list((tmp_path / "other").iterdir()) == []
+
+
+def test_car_is_fitted_to_rollouts_of_long_enough_episodes() -> None:
+    """A linear car with biased steps predicts its recordings better afterwards; short episodes leave it as it is."""
+    steps = CarFitSettings(steps=700)
+    long, short = (recorded_drives.drive(SimulatorConfig(), seconds, 1) for seconds in (20.0, 1.2))
+    rows = transitions_of([long], HISTORY)
+    bias = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.15])
+    car = linear_car(None, replace(rows, targets=rows.targets + bias), len(rows), 0)
+
+    def fitted(episode: EpisodeData) -> CarDynamics:
+        own = transitions_of([episode], HISTORY)
+        return training._fitted_to_rollouts(car, [episode], own, steps, 1.0, lambda *stage: None)
+
+    windows = drive_windows(recorded_windows([long], 1.0, 0.5), HISTORY)
+    before, after = (float(rollout_errors(c, windows).error.square().mean()) for c in (car, fitted(long)))
+    assert after < 0.5 * before
+    assert fitted(short) is car
 
 
 def test_too_short_episode_gives_no_training_rows(tmp_path: Path) -> None:
