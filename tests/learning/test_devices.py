@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -42,8 +43,11 @@ from learning.priors.simulator_model import CarModel
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.car_fit import CarFitSettings, fit_car, load_car, save_car
+from learning.world.disturbance import DisturbanceProcess
 from learning.world.model_env import ModelEnv
+from learning.world.rollout_fit import RolloutFitSettings, fit_rollouts
 from sim_backends.car_parameters import SimulatorConfig
+from tests.learning.test_disturbance import PERIOD_S, decaying_car, driven_windows
 
 ROWS, HISTORY = 48, 1
 TRUE = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6))
@@ -227,6 +231,21 @@ def car_rows() -> Transitions:
     outputs = car(inputs, draw_parameters(car, 1, generator))[0]
     outputs = outputs + 0.002 * torch.randn(outputs.shape, generator=generator)
     return Transitions(inputs.double().numpy(), outputs.double().numpy(), np.zeros(24), np.arange(24), HISTORY)
+
+
+def test_fit_to_rollouts_is_equal_on_the_device(device: str) -> None:
+    windows = driven_windows(DisturbanceProcess((0.1,) * 3, (0.1,) * 3, PERIOD_S), 12)
+    windows = replace(windows, commands=windows.commands[:, :4], motion=windows.motion[:, :4])
+    inputs = np.random.default_rng(0).normal(size=(20, 5))
+    rows = Transitions(inputs, 0.1 * inputs @ np.ones((5, 6)), np.zeros(20, int), np.arange(20), 0)
+    settings = RolloutFitSettings(updates=3, windows=2, rows=8)
+
+    def fitted(at: str) -> ParticlePosterior:
+        car = decaying_car(torch.full((3,), 0.05))
+        return fit_rollouts(CarDynamics(car.posterior.to(at), 0), windows, rows, settings).posterior
+
+    on_device, on_cpu = on_both(fitted, device)
+    assert_close(on_device.parameters, on_cpu.parameters, 1e-4)
 
 
 def test_learned_car_is_equal_on_the_device_and_can_be_saved_and_refitted(
