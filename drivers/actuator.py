@@ -92,6 +92,10 @@ class Actuator:
             if self._epoch == epoch:
                 self._armed_epoch = epoch
 
+    def await_telemetry(self, timeout_s: float) -> None:
+        """Wait until the telemetry is fresh, ``timeout_s`` at most; a busy host delays it by tenths of a second."""
+        self._await(lambda s: time.monotonic() - s.t_telemetry_s <= self.config.telemetry_stale_s, timeout_s)
+
     def command(self, action: Action) -> Action:
         """Post the newest command and return the command on the wire, clamped and rounded by the calibration.
 

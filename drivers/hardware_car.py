@@ -114,10 +114,11 @@ class HardwareCar(Car):
     def arm(self) -> None:
         """Arm the actuator if actuator and motion capture are ready and the car is at rest.
 
-        Waits half a second at most for late poses (a busy host).
+        Waits half a second at most for late telemetry, and as long for late poses (a busy host).
         """
         self._require_open()
         self.actuator.require_no_fault()
+        self.actuator.await_telemetry(ARM_WAIT_S)
         self._await_poses()
         reasons = [*self.actuator.problems(), *self._pose_problems()]
         estimate = self.estimator.estimate()

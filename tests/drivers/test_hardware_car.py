@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -162,6 +163,21 @@ def test_arming_needs_a_fresh_tracked_pose_at_rest(
         poses.show(x_m, age_s=age_s, tracked=tracked)
     with pytest.raises(NotReadyError, match=reason):
         car.arm()
+
+
+def test_arming_waits_for_late_telemetry(
+    car: HardwareCar, poses: ScriptedPoses, serial_firmware: SerialFirmware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drivers.hardware_car.ARM_WAIT_S", 20.0)
+    car.actuator.config = replace(car.actuator.config, telemetry_stale_s=0.25)
+    serial_firmware.faults.drops_replies = True
+    end_s = time.monotonic() + 20.0
+    while not any("telemetry is" in problem for problem in car.actuator.problems()):
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+    threading.Timer(0.1, setattr, (serial_firmware.faults, "drops_replies", False)).start()
+    poses.n_delayed = 4
+    car.arm()
 
 
 def test_arming_waits_for_late_poses(car: HardwareCar, poses: ScriptedPoses) -> None:
