@@ -58,10 +58,10 @@ class ParameterInfo:
 
 _INF = math.inf
 _BASE = (
-    ParameterInfo("vehicle.mass", "kg", 1.65, 0.0, _INF, True, "mass_kg"),
+    ParameterInfo("vehicle.mass", "kg", 1.65, 0.0, 500.0, True, "mass_kg"),
     ParameterInfo("vehicle.yaw_inertia", "kg m2", 0.06, 0.0, _INF, True, "yaw_inertia_kgm2"),
-    ParameterInfo("vehicle.front_axle", "m", 0.13, 0.0, _INF, True, "front_axle_m"),
-    ParameterInfo("vehicle.rear_axle", "m", 0.17, 0.0, _INF, True, "rear_axle_m"),
+    ParameterInfo("vehicle.front_axle", "m", 0.13, 0.0, 10.0, True, "front_axle_m"),
+    ParameterInfo("vehicle.rear_axle", "m", 0.17, 0.0, 10.0, True, "rear_axle_m"),
     ParameterInfo("tyre.front.B", "1", 2.75, 0.0, _INF, True, "front_b"),
     ParameterInfo("tyre.front.C", "1", 1.45, 0.0, _INF, True, "front_c"),
     ParameterInfo("tyre.front.mu", "1", 0.43, 0.0, _INF, False, "front_mu"),

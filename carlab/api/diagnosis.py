@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -190,7 +191,10 @@ def diagnose(
     to_fit, to_validate = _assigned(as_list(recordings), as_list(held_out))
     _check_effects(effects)
     if holdout_share is not None and to_validate:
-        raise ConfigError("--holdout-share has no effect together with held-out recordings; remove one of them.")
+        raise ConfigError(
+            "--holdout-share has no effect together with held-out recordings (of a run folder, every third episode is "
+            "held out); remove the option, or name single recordings."
+        )
     roles = (to_fit, "fit"), (to_validate, "held out")
     fit, validation = (read_material(items, role, file.simulator.mocap.latency_s) for items, role in roles)
     options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
@@ -248,11 +252,13 @@ def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: Recordi
 
 def _check_effects(effects: Sequence[str]) -> None:
     from carlab.core.errors import ConfigError
-    from sim_backends.effects import EFFECTS
+    from sim_backends.effects import CATALOGUE
 
     for name in effects:
-        if name not in EFFECTS:
-            raise ConfigError(f"There is no effect '{name}'; choose among {', '.join(EFFECTS)}.")
+        if name not in CATALOGUE:
+            near = difflib.get_close_matches(name, CATALOGUE, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"choose among {', '.join(CATALOGUE)}."
+            raise ConfigError(f"There is no effect '{name}' in the catalogue; {hint}")
 
 
 def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLike]:
@@ -279,6 +285,7 @@ def _assigned(
         to_validate += validated
     if same := _paths_of(to_fit) & _paths_of(to_validate):
         raise ConfigError(f"{min(same).name} is both fitted and held out; remove it from one of the lists.")
+    _check_repetition([*to_fit, *to_validate])
     return to_fit, to_validate
 
 
@@ -294,7 +301,20 @@ def recordings_of_runs(
         groups.append([recording for fitted, validated in resolved for recording in (*fitted, *validated)])
     if same := _paths_of(groups[0]) & _paths_of(groups[1]):
         raise ConfigError(f"{min(same).name} is in both groups; remove it from one of them.")
+    for group in groups:
+        _check_repetition(group)
     return groups[0], groups[1]
+
+
+def _check_repetition(items: Iterable[RecordingLike]) -> None:
+    """Raise ConfigError if a file is given twice, for example by itself and by its run folder."""
+    from carlab.core.errors import ConfigError
+
+    known: set[Path] = set()
+    for path in (_path_of(item) for item in items):
+        if path is not None and path.resolve() in known:
+            raise ConfigError(f"{path} is given twice; name it once.")
+        known |= {path.resolve()} if path is not None else set()
 
 
 def _paths_of(items: Iterable[RecordingLike]) -> set[Path]:

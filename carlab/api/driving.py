@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from carlab.api.arguments import above_zero, at_least
 from carlab.api.runs import (
     RunHooks,
+    check_learning_run,
     followed_by,
     has_screen,
     html_picture,
@@ -21,6 +23,7 @@ from carlab.api.runs import (
 )
 from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.manoeuvres import MANOEUVRES
 
 if TYPE_CHECKING:
     from carlab.api.recordings import Recording
@@ -99,9 +102,11 @@ def drive(
         policy: ``parking`` (feedback), a manoeuvre, ``neutral``, ``keyboard``, ``gamepad``, the folder of a run of
             ``carlab.learn`` or of a model in it (RUN/models/0003), or an object, see ``carlab.core.policy.Policy``.
         task: name, FILE.py:CLASS, or an object, see ``carlab.core.task.Task``; default: a learned policy's, or parking.
+            Without it, a manoeuvre of a simulated or emulated car has no arena.
         track: CSV file (x, y, width [m]) for ``laps``; by default the track of the car file, or an oval.
         episodes: number of episodes.
-        ticks: control periods per episode; by default the task's number.
+        ticks: control periods per episode; by default the task's number, a whole manoeuvre, or for ``keyboard`` and
+            ``gamepad`` no limit.
         seed: of start poses and sensor noise.
         max_throttle: upper limit of the throttle in the safety gate, in (0, 1].
         place: start each episode at the task's start pose; False: at the car's current pose.
@@ -131,6 +136,8 @@ def drive(
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
     options = {"seed": seed, "max_ticks": ticks, "place": place, "record_rerun": rerun}
     driver, chosen_task = _policy_and_task(policy, task, track, choice)
+    if task is None and track is None:
+        chosen_task = _without_arena(driver, chosen_task, choice)
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(new_run(out, name, choice, hooks))
         if connect is not None:
@@ -226,6 +233,10 @@ def _drive(
     from carlab.experiment.episodes.session import Session
 
     driver, teleop = _policy(policy, max_throttle, choice.simulator)
+    if isinstance(policy, str) and policy in MANOEUVRES and options["max_ticks"] is None:
+        # One tick more than the manoeuvre, so that the script ends the episode.
+        whole = math.ceil(MANOEUVRES[policy]().duration_s / choice.control_period_s) + 1
+        options = {**options, "max_ticks": whole}
     session_hooks = hooks.session()
     with contextlib.ExitStack() as stack:
         if teleop is not None:
@@ -251,8 +262,6 @@ def _write_results(run: RunDirectory, results: Sequence[EpisodeResult], picture:
 
 
 def _policy_names() -> tuple[str, ...]:
-    from carlab.core.manoeuvres import MANOEUVRES
-
     return ("parking", "neutral", "keyboard", "gamepad", *MANOEUVRES)
 
 
@@ -294,6 +303,7 @@ def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple
     from carlab.experiment.campaign.campaign import PERIOD_TOLERANCE
     from carlab.experiment.campaign.learned_policy import load_policy
 
+    check_learning_run(folder.parent.parent if folder.parent.name == "models" else folder)
     learned = load_policy(folder)
     period_s, own = learned.control_period_s, learned.plan.task_choice
     if abs(period_s - choice.control_period_s) > PERIOD_TOLERANCE * period_s:
@@ -306,6 +316,16 @@ def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple
     return learned.policy, task.resized(learned.plan.history, learned.plan.ticks)
 
 
+def _without_arena(policy: str | Policy, task: Task, choice: CarChoice) -> Task:
+    """The task without its arena for a manoeuvre of a car that cannot move, because most manoeuvres leave the arena."""
+    from carlab.core.quantities import Reality
+    from carlab.core.task import ParkingTask
+
+    is_manoeuvre = isinstance(policy, str) and policy in MANOEUVRES
+    cannot_move = choice.car.reality in (Reality.SIMULATED, Reality.EMULATED)
+    return replace(task, arena_m=()) if is_manoeuvre and cannot_move and isinstance(task, ParkingTask) else task
+
+
 def _envelope(car_limits: SafetyEnvelope, task: Task, max_throttle: float | None) -> SafetyEnvelope:
     """The car's limits; the task's arena if the car has no arena."""
     limits = car_limits if car_limits.arena_m else replace(car_limits, arena_m=task.arena_m)
@@ -316,7 +336,6 @@ def _policy(
     policy: str | Policy, max_throttle: float | None, simulator: SimulatorConfig
 ) -> tuple[Policy, TeleopPolicy | None]:
     """The policy, and the same object as a TeleopPolicy if a person drives (else None)."""
-    from carlab.core.manoeuvres import MANOEUVRES
     from carlab.experiment.episodes.scripted_policies import ManoeuvrePolicy, NeutralPolicy, ReverseParkingPolicy
     from carlab.experiment.episodes.teleop_policy import GamepadSource, KeyboardSource, TeleopPolicy
 

@@ -15,6 +15,7 @@ from carlab.api.arguments import above_zero, at_least, whole_number
 from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
 from carlab.api.runs import (
     RunHooks,
+    check_learning_run,
     existing_run,
     followed_by,
     html_picture,
@@ -234,6 +235,8 @@ def _learn(request: LearnRequest, hooks: LearnHooks) -> LearnRun:
 
     _check(request)
     connect = viewer_connection(request.live, request.viewer)
+    if request.resume is not None:
+        check_learning_run(request.resume)
     started = None if request.resume is None else saved_seed(request.resume)
     choice = choose_car(
         request.car,

@@ -146,7 +146,7 @@ def required_file(path: Path, what: str = "The recording") -> Path:
     if not path.exists():
         raise ConfigError(f"{what} '{path}' does not exist; check the path.")
     if path.is_dir():
-        raise ConfigError(f"{what} '{path}' is a folder; name a file in it.")
+        raise ConfigError(f"{what} '{path}' is a folder; name a file in it (a run has episodes/0001.mcap).")
     return path
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec
 
-from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.errors import ConfigError, DataError, NotReadyError
 from carlab.core.json_files import read_json
 
 if TYPE_CHECKING:
@@ -104,6 +104,17 @@ def existing_run(path: Path | str, choice: CarChoice, hooks: RunHooks) -> Iterat
     run = RunDirectory.open_existing(path)
     with _logged(run, choice, hooks):
         yield run
+
+
+def check_learning_run(path: Path) -> None:
+    """Raise DataError if a path is not the folder of a run of ``carlab learn``."""
+    from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
+
+    if not (path / CAMPAIGN_FILE).is_file():
+        raise DataError(
+            f"{path} is not the folder of a run of carlab learn (it has no {CAMPAIGN_FILE}); name one such as "
+            "runs/2026-11-24_120000_learn."
+        )
 
 
 def _refuse_second_execution() -> None:

@@ -66,6 +66,10 @@ def load_car_file(path: Path) -> CarFile:
         name = path.name
         text = (resources.files("sim_backends") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
         return CarFile(name, text, SimulatorConfig.from_preset(name), None)
+    if path.is_dir():
+        raise ConfigError(
+            f"'{path}' is a folder; name a car file in it (a run has config.toml, a diagnosis model.toml)."
+        )
     if not path.is_file():
         raise ConfigError(
             f"There is no car file '{path}'; name an existing TOML file or one of the presets: "

@@ -20,6 +20,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             code = run(sys.argv[1:] if argv is None else argv)
         finally:
             sys.stdout.flush()
+    except KeyboardInterrupt:  # During the imports of a verb.
+        print("carlab: Interrupted.", file=sys.stderr)
+        code = EXIT_INTERRUPTED
     except BrokenPipeError:  # The reader of a pipe, such as ``head``, has ended.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = EXIT_BROKEN_PIPE

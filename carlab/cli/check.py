@@ -52,7 +52,7 @@ class Check:
             table("Readings", ["reading", "value", "unit"], rows)
         if result.latency is not None and result.latency.parts:
             lines = [
-                [name, f"{p50:.2f}", f"{p99:.2f}", f"{top:.2f}", str(count)]
+                [name, *(f"{ms:z.2f}" for ms in (p50, p99, top)), str(count)]
                 for name, p50, p99, top, count in result.latency.rows()
             ]
             table("Latency [ms]", ["part", "p50", "p99", "max", "samples"], lines)

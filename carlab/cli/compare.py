@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from carlab.cli.console import console, progress
+from carlab.cli.options import new_report
 
 
 @dataclass
@@ -32,7 +33,7 @@ class Compare:
     """Restrict the changes to these effects and base parameters (motor.drive_gain ...)."""
 
     out: Path = Path("comparison")
-    """Folder for compare.json."""
+    """Folder for compare.json, which must not exist yet."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -42,6 +43,7 @@ class Compare:
         from carlab.api import compare
         from carlab.experiment.episodes.interrupts import Interrupts
 
+        new_report(self.out, "compare.json")
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("comparison", total=100, note="")
             found = compare(

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from carlab.cli.console import console, fail, progress
+from carlab.cli.options import new_report
 from carlab.cli.recordings import print_errors
 
 if TYPE_CHECKING:
     from carlab.diagnosis.findings import Diagnosis
 
 EXIT_INCONCLUSIVE = 5
+REPORT_FILE = "report.json"
 
 
 @dataclass
@@ -39,7 +41,7 @@ class Diagnose:
     """Size of the held-out last part as a share of the recording, above 0 and at most 0.5; 0.3 by default."""
 
     out: Path = Path("diagnosis")
-    """Folder for the report."""
+    """Folder for the report; it must have no report yet."""
 
     budget_s: Annotated[float, arg(name="budget")] = 300.0
     """Time limit of the diagnosis without measured curves, networks and adaptation [s]; inf for none. When it ends, the
@@ -80,6 +82,7 @@ class Diagnose:
         from carlab.api import diagnose
         from carlab.experiment.episodes.interrupts import Interrupts
 
+        new_report(self.out, REPORT_FILE)
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("diagnosis", total=100, note="")
             report = diagnose(
@@ -112,6 +115,9 @@ class Diagnose:
         from carlab.diagnosis.report.drift import drift_sentences
         from carlab.diagnosis.report.events import diagnosed_event_sentences
 
+        if diagnosis.data_faults:
+            faults = dict.fromkeys(f"{fault.id.replace('_', ' ')} ({fault.channel})" for fault in diagnosis.data_faults)
+            console.print(f"Faults of the recordings (listed in the report): {', '.join(faults)}.", markup=False)
         console.print(diagnosis.sentence)
         for effect in diagnosis.effects:
             console.print(f"  {effect.sentence}", markup=False)

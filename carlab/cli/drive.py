@@ -45,7 +45,8 @@ class Drive:
     """Number of episodes."""
 
     ticks: int | None = None
-    """Ticks per episode; by default the task's number (parking: 100)."""
+    """Ticks per episode; by default the task's number (parking: 100), a whole scripted manoeuvre, or with keyboard and
+    gamepad no limit."""
 
     seed: int = 0
     """Seed of start poses and sensor noise."""

@@ -18,7 +18,7 @@ class Export:
     """Write a recording as CSV (t,x,y,yaw,vx,vy,yaw_rate,steering,throttle in SI units) or Parquet."""
 
     recording: Positional[Path]
-    """An MCAP (finished or .partial)."""
+    """An MCAP (finished or .partial), or a CSV."""
 
     out: Path
     """FILE.csv, FILE.csv.gz or FILE.parquet."""

@@ -137,7 +137,7 @@ class Import:
     """Known delay of the command columns relative to the sending of the commands [s]."""
 
     rate: float | None = None
-    """Row rate [Hz] of a file without a time column; needs --mapping."""
+    """Row rate [Hz] of a file without a time column."""
 
     verbose: bool = False
     """Show the whole log."""

@@ -76,6 +76,13 @@ def new_file(path: Path, option: str, suffix: str) -> Path:
     return path
 
 
+def new_report(folder: Path, name: str) -> Path:
+    """Return a folder for a report. Raises DataError if it has the file ``name`` of an earlier report."""
+    if (folder / name).exists():
+        raise DataError(f"{folder / name} exists already; remove the folder {folder} or choose another --out.")
+    return folder
+
+
 def json_file(path: Path, option: str) -> Path:
     """Return a path for a JSON file. Raises ConfigError for another suffix or a missing folder."""
     if path.suffix != ".json" or path.is_dir():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from tyro.conf import Positional
@@ -18,6 +20,7 @@ from carlab.cli.recordings import load_episodes
 from carlab.core.errors import ConfigError, NotReadyError
 
 REPORT_FILE = "report.rrd"
+PICTURE_FILE = "summary.png"
 
 
 @dataclass
@@ -44,8 +47,8 @@ class View:
         """View or save."""
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
-        if self.screenshot is not None and self.screenshot.suffix != ".png":
-            raise ConfigError(f"--screenshot {self.screenshot}: name a file that ends in .png.")
+        if self.screenshot is not None:
+            new_file(self.screenshot, "--screenshot", ".png")
         source = self._source()
         if self.save is None and self.screenshot is None:
             return self._open(source)
@@ -61,6 +64,7 @@ class View:
 
     def _source(self) -> _Source:
         path = self.recording
+        summary: Callable[[Path], Path] | None = None
         if path.is_dir():
             if is_run_folder(path):
                 return _Source(path.name, lambda rrd: save_run(path, rrd), lambda png: save_run(path, png))
@@ -68,12 +72,14 @@ class View:
                 raise ConfigError(
                     f"{path} is not the folder of a run or of a diagnosis; name such a folder, or a recording."
                 )
+            if (path / PICTURE_FILE).is_file():
+                summary = partial(shutil.copyfile, path / PICTURE_FILE)
             path /= REPORT_FILE
         if required_file(path).suffix == ".rrd":
             from carlab.recording.rerun.viewer import check_rerun_file
 
             check_rerun_file(path)
-            return _Source(path.stem, lambda rrd: path, None)
+            return _Source(path.stem, lambda rrd: path, summary)
         episodes = load_episodes(path)
         if len(episodes) > 1:
             console.print(f"Showing the longest of {len(episodes)} episodes.")
@@ -103,6 +109,7 @@ class View:
             if source.draw is None:
                 raise
             console.print(f"{error}\nDrawing a plot instead.")
+            path.parent.mkdir(parents=True, exist_ok=True)
             source.draw(path)
         console.print(f"{path}", soft_wrap=True)
 

@@ -15,7 +15,10 @@ class EndReason(enum.Enum):
     STOP_REQUESTED = "Stopped on request; the recording up to here is complete."
     DEADMAN_RELEASED = "The dead-man control was released; hold it while driving."
     EMERGENCY_STOP = "Emergency stop; check the car, then start and arm it again."
-    GEOFENCE = "The car could not have stopped inside the arena; move it back inside, or enlarge [hardware.arena]."
+    GEOFENCE = (
+        "The car could not have stopped inside the arena; move it back inside, drive slower (--max-throttle), or "
+        "enlarge the arena (that of the car file, else that of the task)."
+    )
     OVERSPEED = "The car was faster than its speed limit; lower the throttle or raise max_speed_mps."
     POSE_STALE = "Motion capture sends no poses; check the camera software, the network and that the body is visible."
     POSE_JUMP = "The pose jumped further than the car can drive; check that Motive confuses no other body with the car."

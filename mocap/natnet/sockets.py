@@ -26,7 +26,8 @@ def resolve(host: str, setting: str = "server_address") -> str:
         return socket.gethostbyname(host)
     except (OSError, ValueError) as error:  # ValueError: an invalid name, for example with two consecutive dots
         raise not_ready(
-            f"'{host}' is no known IPv4 address or host name ({error}); check {setting} in [hardware.mocap]."
+            f"'{host}' is no known IPv4 address or host name ({error}); check {setting} in [hardware.mocap], or the "
+            "option of carlab listen."
         ) from error
 
 

@@ -175,12 +175,15 @@ def test_resume_refuses_folders_that_are_no_learning_run(carlab: Carlab, tmp_pat
     (tmp_path / "some").mkdir()
     code, text = carlab("learn", "--resume", tmp_path / "some")
     assert code == 1
-    assert "is not a run's folder" in text
+    assert "is not the folder of a run of carlab learn (it has no campaign.json)" in text
     assert list((tmp_path / "some").iterdir()) == []
     driven = RunDirectory.create(tmp_path, "driven")
+    before = set(driven.path.rglob("*"))
     code, text = carlab("learn", "--resume", driven.path)
     assert code == 1
-    assert "cannot be resumed" in text
+    assert "is not the folder of a run of carlab learn (it has no campaign.json)" in text
+    assert "Errno" not in text
+    assert set(driven.path.rglob("*")) == before
 
 
 @pytest.mark.parametrize(

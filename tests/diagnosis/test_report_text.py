@@ -14,6 +14,7 @@ from carlab.diagnosis.findings import (
     Estimate,
     Evidence,
     FitErrors,
+    SearchExtent,
     Skill,
     Unexplained,
     Where,
@@ -33,6 +34,8 @@ from carlab.diagnosis.report.sentences import (
     verdict_sentence,
     verdict_title,
 )
+from carlab.diagnosis.unexplained.description import ChosenTerm, ResidualModel
+from carlab.diagnosis.unexplained.residual_terms import TERMS
 from sim_backends.effects import CATALOGUE, confusable_effects
 
 CONFUSABLE = confusable_effects()
@@ -212,7 +215,7 @@ def test_next_drive_separates_the_strongest_set() -> None:
     drive, why = next_drive(diagnosis("mismatch", finding("yaw_damping"), finding("motor_lag", ("throttle_delay",))))
     assert drive == "throttle_steps"
     assert "a lag of the motor from a delay of the throttle" in why
-    assert drive_command(drive) == "carlab drive --policy throttle_steps"
+    assert drive_command(drive) == "carlab drive --policy throttle_steps --no-place"
     drive, why = next_drive(diagnosis("mismatch", finding("command_delay", ("mocap_latency",))))
     assert drive == ""
     assert "No manoeuvre separates" in why
@@ -249,3 +252,18 @@ def test_numbers_have_three_significant_digits(value: float, expected: str) -> N
 )
 def test_shares_are_not_rounded_to_0_or_100_per_cent(share: float, expected: str) -> None:
     assert percent(share) == expected
+
+
+@pytest.mark.parametrize(("stopped_by", "remedy"), [("budget", "--budget inf"), ("user", "Diagnose again")])
+def test_remedy_of_a_search_that_was_cut_short_fits_its_cause(stopped_by: str, remedy: str) -> None:
+    cut = replace(diagnosis("none"), search=SearchExtent(False, stopped_by, 300.0))
+    sentence = verdict_sentence(cut)
+    assert remedy in sentence
+    assert ("--budget" in sentence) == (stopped_by == "budget")
+
+
+def test_terms_of_a_class_are_numbered() -> None:
+    terms = [ChosenTerm(term, channel, 1.0, 1.0) for term, channel in zip(TERMS[:2], (0, 1), strict=True)]
+    one, two = (f"{c.term.statement}; acts on {name}" for c, name in zip(terms, ("vx", "vy"), strict=True))
+    assert ResidualModel((terms[0],)).class_statement() == one
+    assert ResidualModel(tuple(terms)).class_statement() == f"(1) {one}; (2) {two}"

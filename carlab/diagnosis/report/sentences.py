@@ -185,9 +185,10 @@ def _with_search(diagnosis: Diagnosis) -> str:
     limit_s = diagnosis.search.budget_s
     if diagnosis.search.stopped_by == "budget" and limit_s is not None:
         why = f"was cut short by the time limit of {with_unit(limit_s, 's')}"
+        remedy = "With --budget inf it runs to its end."
     else:
-        why = "was stopped by the user"
-    return f" The search for effects {why}, so it may have missed some. With --budget inf it runs to its end."
+        why, remedy = "was stopped by the user", "Diagnose again for a complete search."
+    return f" The search for effects {why}, so it may have missed some. {remedy}"
 
 
 def _with_drift(diagnosis: Diagnosis) -> str:
@@ -353,4 +354,4 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
 
 def drive_command(manoeuvre: str) -> str:
     """The command line that drives a manoeuvre; empty for none."""
-    return f"carlab drive --policy {manoeuvre}" if manoeuvre else ""
+    return f"carlab drive --policy {manoeuvre} --no-place" if manoeuvre else ""

@@ -65,7 +65,7 @@ class ResidualModel:
             text = f"{c.term.statement}; acts on {_ACTS_ON[c.channel][0]}"
             if text not in parts:
                 parts.append(text)
-        return ". ".join(parts)
+        return parts[0] if len(parts) == 1 else "; ".join(f"({k}) {text}" for k, text in enumerate(parts, start=1))
 
     def formula(self) -> str:
         """Missing accelerations in SI units; d is steering and u throttle in [-1, 1] after delays, r yaw rate."""

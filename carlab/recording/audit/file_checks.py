@@ -178,6 +178,12 @@ def check_held(t_s: FloatArray, columns: Mapping[str, FloatArray]) -> list[Findi
     return findings
 
 
+def _count(repeats: BoolArray) -> str:
+    """Number of rows (N,) that repeat something, with the verb."""
+    number = int(repeats.sum())
+    return "1 row repeats" if number == 1 else f"{number} rows repeat"
+
+
 def check_stale(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Finding]:
     """Rows that repeat the pose before while the car moves."""
     stale = stale_rows(t_s, np.column_stack([values[name] for name in POSE_CHANNELS]))
@@ -185,7 +191,7 @@ def check_stale(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Findi
         return []
     severity = Severity.WARNING if stale.mean() > 0.01 else Severity.INFO
     sentence = (
-        f"{stale.sum()} rows repeat the pose of the row before although the car moves (first row "
+        f"{_count(stale)} the pose of the row before although the car moves (first row "
         f"{np.argmax(stale) + 1}): the logger was faster than the camera system or lost a frame."
     )
     return [Finding.at(stale, "stale_samples", "x, y, yaw", severity, sentence)]
@@ -222,7 +228,7 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
         beyond = np.abs(column) > 1.0 + 1e-6
         if beyond.any():
             severity = Severity.ERROR if largest > MAX_COMMAND else Severity.WARNING
-            option = f"--{channel}-scale {1 / largest:.3g}"
+            option = f"--{channel}-scale {1 / _full_scale(channel, largest):.3g}"
             sentence = (
                 f"Column '{name}' ({channel}) reaches {largest:.4g} where commands lie in [-1, 1], first in row "
                 f"{np.argmax(beyond) + 1}; say what full command is, for example {option}."
@@ -233,6 +239,11 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
             sentence = f"Column '{name}' ({channel}) is {column[0]:.3g} throughout: its effect cannot be identified."
             findings.append(Finding("constant_command", channel, Severity.WARNING, sentence, len(column)))
     return findings
+
+
+def _full_scale(channel: str, largest: float) -> float:
+    """A plausible full command in the unit of a column: 100 for a throttle in per cent, else the largest command."""
+    return 100.0 if channel == "throttle" and MAX_COMMAND < largest <= 100.0 else largest
 
 
 def check_gate(throttle: FloatArray, gate: FloatArray, name: str) -> list[Finding]:
@@ -256,7 +267,7 @@ def check_reference(t_s: FloatArray, name: str, column: FloatArray, channel: str
         first = int(np.argmax(frozen))
         sentence = (
             f"The pose stands still in {frozen.sum()} rows (first row {first + 1}, {t_s[first]:.2f} s) in which "
-            f"'{name}' shows motion: it is not the car's; leave that part out (--gaps split)."
+            f"'{name}' shows motion: the pose is not the car's; leave that part out (--gaps split)."
         )
         evidence = {"seconds": float(frozen.sum() * np.median(np.diff(t_s)))}
         findings.append(

@@ -117,6 +117,11 @@ def _layout(table: CsvTable, mapping: ColumnMapping | None) -> tuple[ColumnMappi
         raise DataError(
             f"{source} has no column {', '.join(missing)}; it holds {', '.join(table.header)}; correct the mapping."
         )
+    time = mapping.columns.get("t")
+    if mapping.rate_hz is not None and time is not None and time.name in table.header:
+        raise DataError(
+            f"{source} has the time column '{time.name}'; remove --rate, or even out its stamps with --clock even."
+        )
     return mapping, f"{source}: read with mapping '{mapping.layout}'"
 
 

@@ -168,7 +168,8 @@ def velocity_lag(channel: str, period_s: float, fit: ColumnFit) -> Fault | None:
         "remainder": fit.remainder,
         "remainder_unshifted": fit.rms * math.sqrt(fit.unexplained_unshifted),
     }
-    observation = f"{channel} lag the differentiated pose by {fit.lag_s * 1e3:.0f} ms ({rows:.2f} rows{like})"
+    verb = "lag" if "," in channel else "lags"
+    observation = f"{channel} {verb} the differentiated pose by {fit.lag_s * 1e3:.0f} ms ({rows:.2f} rows{like})"
     return Fault("column_shift", channel, observation, evidence, "--velocities pose")
 
 

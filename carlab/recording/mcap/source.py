@@ -96,7 +96,9 @@ def read_recording(path: Path | str) -> Recording:
 
 
 def _not_an_mcap(path: Path, head: bytes) -> str:
-    found = f"it begins with {head!r}" if head else "it is empty"
+    if path.suffix == ".rrd":
+        return f"{path} is for the rerun viewer (carlab view); name the .mcap recording instead."
+    found = f"it begins with {str(head)[1:]}" if head else "it is empty"
     return f"{path} is not an MCAP file ({found}); name an .mcap recording, or read a table with carlab import."
 
 

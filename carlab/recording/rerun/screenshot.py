@@ -21,7 +21,7 @@ _CANNOT = "The rerun viewer cannot draw here"
 _SETTLE_NS = 5 * 10**9
 _NO_DRIVER = (
     "no Vulkan driver is installed; install one that needs no graphics card with "
-    "'apt-get install mesa-vulkan-drivers libvulkan1', or take a picture drawn by matplotlib instead"
+    "'apt-get install mesa-vulkan-drivers libvulkan1'"
 )
 
 

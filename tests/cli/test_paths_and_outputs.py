@@ -1,0 +1,157 @@
+"""Wrong paths, repeated inputs and existing outputs are refused before any work; nothing is overwritten."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab import cli
+from tests.cli.test_bad_input import canonical_csv, write
+
+Carlab = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def drive_csv(tmp_path: Path) -> Path:
+    return write(*canonical_csv(tmp_path, rows=60))
+
+
+@pytest.mark.parametrize(
+    ("name", "verb"), [("report.json", ("diagnose",)), ("compare.json", ("compare", "--with", "b.csv"))]
+)
+def test_existing_report_is_not_replaced(
+    carlab: Carlab, drive_csv: Path, tmp_path: Path, name: str, verb: tuple[str, ...]
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text("{}", encoding="utf-8")
+    code, text = carlab(verb[0], drive_csv, *verb[1:], "--out", out)
+    assert code == 1
+    assert f"{out / name} exists already; remove the folder {out} or choose another --out." in text
+    assert [file.name for file in out.iterdir()] == [name]
+    assert (out / name).read_text() == "{}"
+
+
+def test_existing_picture_is_not_replaced(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "mine.png"
+    picture.write_bytes(b"mine")
+    code, text = carlab("view", drive_csv, "--screenshot", picture)
+    assert code == 1
+    assert "mine.png exists already; remove it or choose another --screenshot." in text
+    assert picture.read_bytes() == b"mine"
+
+
+def test_picture_of_a_diagnosis_needs_no_viewer(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carlab.recording.rerun.screenshot.has_vulkan_driver", lambda: False)
+    (tmp_path / "report.rrd").write_bytes(b"RRF2 the report")
+    (tmp_path / "summary.png").write_bytes(b"the summary")
+    code, _ = carlab("view", tmp_path, "--screenshot", tmp_path / "new" / "copy.png")
+    assert code == 0
+    assert (tmp_path / "new" / "copy.png").read_bytes() == b"the summary"
+
+
+@pytest.mark.parametrize("verb", ["diagnose", "compare"])
+def test_recording_that_is_given_twice_is_refused(carlab: Carlab, drive_csv: Path, tmp_path: Path, verb: str) -> None:
+    second = ["--with", tmp_path / "other.csv"] if verb == "compare" else []
+    code, text = carlab(verb, drive_csv, tmp_path / "." / "drive.csv", *second, "--out", tmp_path / "out")
+    assert code == 2
+    assert "drive.csv is given twice; name it once." in text
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (("drive", "--car", "FOLDER"), "is a folder; name a car file in it"),
+        (("drive", "--vehicle", "FOLDER"), "is a folder; name a car file in it"),
+        (("replay", "FOLDER"), "is a folder; name a file in it"),
+        (("diagnose", "CSV", "--effects", "steering_lagg"), "in the catalogue; did you mean 'steering_lag'?"),
+        (("diagnose", "CSV", "--effects", "drive_map"), "There is no effect 'drive_map' in the catalogue"),
+    ],
+)
+def test_message_names_the_mistake(
+    carlab: Carlab,
+    drive_csv: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    argv: tuple[str, ...],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    places = {"FOLDER": "folder", "CSV": str(drive_csv)}
+    code, text = carlab(*(places.get(word, word) for word in argv))
+    assert code == 2
+    assert message in text
+    assert {file.name for file in tmp_path.iterdir()} == {"folder", "drive.csv"}
+
+
+@pytest.mark.parametrize(
+    ("table", "name"),
+    [("[vehicle]\nmass = 1650", "vehicle.mass"), ("[vehicle]\nfront_axle = 130", "vehicle.front_axle")],
+)
+def test_grams_and_millimetres_are_refused(carlab: Carlab, tmp_path: Path, table: str, name: str) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text(table, encoding="utf-8")
+    code, text = carlab("drive", "--car", path, "--out", tmp_path / "runs")
+    assert code == 2
+    assert name in text
+    assert "is it in another unit?" in text
+
+
+def test_rerun_file_is_not_exported_and_the_message_says_what_to_name(carlab: Carlab, tmp_path: Path) -> None:
+    (tmp_path / "0001.rrd").write_bytes(b"RRF2\x00")
+    code, text = carlab("export", tmp_path / "0001.rrd", "--out", tmp_path / "a.csv")
+    assert code == 1
+    assert "is for the rerun viewer (carlab view); name the .mcap recording instead." in text
+
+
+def test_throttle_in_per_cent_has_the_scale_of_per_cent(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    data[:, 8] = 30.0 + np.sin(data[:, 0])
+    code, text = carlab("import", write(path, data))
+    assert code == 1
+    assert "for example --throttle-scale 0.01." in text
+
+
+def test_rate_of_a_file_with_a_time_column_is_refused(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
+    code, text = carlab("import", drive_csv, "--rate", "30", "--out", tmp_path / "a.mcap")
+    assert code == 1
+    assert "has the time column 't'; remove --rate" in text
+
+
+def test_interrupt_during_the_imports_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "_verbs", interrupted)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["drive"])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "carlab: Interrupted.\n"
+
+
+def test_manoeuvre_of_a_simulated_car_is_driven_to_its_end(carlab: Carlab, tmp_path: Path) -> None:
+    """steering_steps takes 7.2 s and 7 m; the arena of parking is 4.2 m long and its episode 3.3 s."""
+    code, text = carlab("drive", "--policy", "steering_steps", "--out", tmp_path, "--no-rerun", "--no-picture")
+    assert code == 0, text
+    (run,) = tmp_path.iterdir()
+    (episode,) = json.loads((run / "result.json").read_text())["episodes"]
+    assert episode["end_reason"] == "POLICY_FINISHED"
+    assert episode["ticks"] == pytest.approx(7.2 * 30, abs=2)
+
+
+def test_manoeuvre_with_a_task_stays_in_its_arena(carlab: Carlab, tmp_path: Path) -> None:
+    code, text = carlab(
+        *("drive", "--policy", "steering_steps", "--task", "parking", "--out", tmp_path, "--no-rerun", "--no-picture")
+    )
+    assert code == 4
+    assert "enlarge the arena" in text
