@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -56,9 +57,12 @@ def compare(
         raise ConfigError("A comparison needs two groups, for example carlab compare monday.mcap --with friday.mcap.")
     first, second = recordings_of_runs(first, second)
     known = [c.id for c in change_candidates(file.simulator)]
+    candidates = (candidates,) if isinstance(candidates, str) else candidates
     for name in candidates:
         if name not in known:
-            raise ConfigError(f"'{name}' cannot change in this car; choose among {', '.join(known)}.")
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"choose among {', '.join(known)}."
+            raise ConfigError(f"'{name}' cannot change in this car; {hint}")
     latency_s = file.simulator.mocap.latency_s
     groups = [read(items, role, latency_s) for items, role in ((first, "first group"), (second, "second group"))]
     found = search(

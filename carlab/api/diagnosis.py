@@ -189,6 +189,7 @@ def diagnose(
 
     file = load_car(car)
     to_fit, to_validate = _assigned(as_list(recordings), as_list(held_out))
+    effects = (effects,) if isinstance(effects, str) else effects
     _check_effects(effects)
     if holdout_share is not None and to_validate:
         raise ConfigError(

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 from carlab.api.arguments import above_zero, at_least
 from carlab.api.runs import (
     RunHooks,
-    check_learning_run,
     followed_by,
     has_screen,
     html_picture,
     html_table,
+    learning_run,
     new_run,
     viewer_connection,
     write_result,
@@ -303,8 +303,8 @@ def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple
     from carlab.experiment.campaign.campaign import PERIOD_TOLERANCE
     from carlab.experiment.campaign.learned_policy import load_policy
 
-    check_learning_run(folder.parent.parent if folder.parent.name == "models" else folder)
-    learned = load_policy(folder)
+    with learning_run(folder.parent.parent if folder.parent.name == "models" else folder):
+        learned = load_policy(folder)
     period_s, own = learned.control_period_s, learned.plan.task_choice
     if abs(period_s - choice.control_period_s) > PERIOD_TOLERANCE * period_s:
         raise ConfigError(

@@ -20,6 +20,7 @@ from carlab.api.runs import (
     followed_by,
     html_picture,
     html_table,
+    learning_run,
     new_run,
     viewer_connection,
     write_result,
@@ -335,7 +336,8 @@ def _resumed(request: LearnRequest, choice: CarChoice, hooks: LearnHooks, stack:
     assert request.resume is not None
     run = stack.enter_context(existing_run(request.resume, choice, hooks))
     check_same_car(run, choice, request.car_options)
-    campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
+    with learning_run(request.resume):
+        campaign = resumed_campaign(run, choice, CampaignHooks(), request.device)
     task_choice = campaign.plan.task_choice.named_again(given_task(request.task, request.track, choice.track))
     campaign.plan = replace(campaign.plan, task_choice=task_choice)
     load_checked(task_choice, choice.envelope.arena_m)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, ParamSpec
 
 from carlab.core.errors import ConfigError, DataError, NotReadyError
 from carlab.core.json_files import read_json
+from carlab.core.version import VERSION
 
 if TYPE_CHECKING:
     from rerun import RecordingStream
@@ -104,6 +105,26 @@ def existing_run(path: Path | str, choice: CarChoice, hooks: RunHooks) -> Iterat
     run = RunDirectory.open_existing(path)
     with _logged(run, choice, hooks):
         yield run
+
+
+@contextmanager
+def learning_run(path: Path) -> Iterator[None]:
+    """Context that reads the folder of a run of ``carlab learn``.
+
+    Raises:
+        DataError: the path is no such folder, or it cannot be read; the message names another version that wrote it.
+    """
+    check_learning_run(path)
+    try:
+        yield
+    except DataError as error:
+        try:
+            version = str(read_json(path / "environment.json").get("carlab", VERSION))
+        except (OSError, ValueError):
+            raise error from None
+        if version == VERSION:
+            raise
+        raise DataError(f"{error} carlab {version} wrote it; read it with that version, this is {VERSION}.") from error
 
 
 def check_learning_run(path: Path) -> None:

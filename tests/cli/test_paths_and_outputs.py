@@ -155,3 +155,14 @@ def test_manoeuvre_with_a_task_stays_in_its_arena(carlab: Carlab, tmp_path: Path
     )
     assert code == 4
     assert "enlarge the arena" in text
+
+
+def test_run_of_another_version_names_that_version(carlab: Carlab, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "campaign.json").write_text('{"plan": {"a_later_setting": 1}}', encoding="utf-8")
+    (run / "environment.json").write_text('{"carlab": "9.8.7"}', encoding="utf-8")
+    code, text = carlab("drive", "--policy", run, "--out", tmp_path / "runs")
+    assert code == 1
+    assert "carlab 9.8.7 wrote it; read it with that version" in text
+    assert not (tmp_path / "runs").exists()

@@ -48,7 +48,7 @@ class UnexplainedSettings:
     max_terms: int = 3
     """Maximum number of terms of the formula."""
     term_chi2_min: float = 28.0
-    """Minimum chi2 of a term; about 400 terms are compared."""
+    """Minimum chi2 of a term; 121 terms are compared on each of five channels."""
     next_term_share: float = 0.12
     """Minimum gain of an additional term, as a share of the first term's gain."""
     simplest_gain_share: float = 0.97
