@@ -165,7 +165,7 @@ def test_invalid_arguments_are_refused(tmp_path: Path) -> None:
 
 def test_one_name_need_not_be_in_a_list(tmp_path: Path) -> None:
     path = csv_file(tmp_path / "drive.csv")
-    with pytest.raises(ConfigError, match="'steering_lagg'.*did you mean 'steering_lag'"):
+    with pytest.raises(ConfigError, match=r"'steering_lagg'.*did you mean 'steering_lag'"):
         carlab.diagnose(path, effects="steering_lagg")
-    with pytest.raises(ConfigError, match="'motor_lagg'.*did you mean 'motor_lag'"):
+    with pytest.raises(ConfigError, match=r"'motor_lagg'.*did you mean 'motor_lag'"):
         carlab.compare(path, csv_file(tmp_path / "other.csv"), candidates="motor_lagg")
