@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -77,9 +78,18 @@ def new_file(path: Path, option: str, suffix: str) -> Path:
 
 
 def new_report(folder: Path, name: str) -> Path:
-    """Return a folder for a report. Raises DataError if it has the file ``name`` of an earlier report."""
+    """Return a folder for a report, before the work begins.
+
+    Raises:
+        DataError: it has the file ``name`` of an earlier report, or it cannot be created.
+    """
     if (folder / name).exists():
         raise DataError(f"{folder / name} exists already; remove the folder {folder} or choose another --out.")
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not existing.is_dir():
+        raise DataError(f"--out {folder}: {existing} is a file; choose another folder.")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise DataError(f"--out {folder}: {existing} is not writable; choose another folder or change its permissions.")
     return folder
 
 

@@ -171,7 +171,8 @@ def read_track(path: Path | str) -> Track:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:
             lines = [line for line in csv.reader(file) if line and not line[0].lstrip().startswith("#")]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"The track {path} cannot be read ({error}); name a CSV file with x, y, width.") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"The track {path} cannot be read ({reason}); name a CSV file with x, y, width.") from error
     header = [cell.strip().lower().removesuffix("_m") for cell in lines[0]] if lines else []
     if missing := [name for name in COLUMNS if name not in header]:
         raise ConfigError(f"The track {path} lacks the column {missing[0]}; its first line must be x,y,width [m].")

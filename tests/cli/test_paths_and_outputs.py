@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from carlab import cli
+from carlab.recording.csv.table import read_csv
 from tests.cli.test_bad_input import canonical_csv, write
 
 Carlab = Callable[..., tuple[int, str]]
@@ -34,6 +35,20 @@ def test_existing_report_is_not_replaced(
     assert f"{out / name} exists already; remove the folder {out} or choose another --out." in text
     assert [file.name for file in out.iterdir()] == [name]
     assert (out / name).read_text() == "{}"
+
+
+@pytest.mark.parametrize("verb", ["diagnose", "compare"])
+def test_folder_that_cannot_be_written_is_refused_before_the_work(
+    carlab: Carlab, drive_csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    """The recording does not exist: its error would come first if the folder were checked later."""
+    code, text = carlab(verb, tmp_path / "missing.csv", "--out", drive_csv / "out")
+    assert code == 1
+    assert f"{drive_csv} is a file; choose another folder." in text
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    code, text = carlab(verb, tmp_path / "missing.csv", "--out", tmp_path / "out")
+    assert code == 1
+    assert f"{tmp_path} is not writable" in text
 
 
 def test_existing_picture_is_not_replaced(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
@@ -166,3 +181,19 @@ def test_run_of_another_version_names_that_version(carlab: Carlab, tmp_path: Pat
     assert code == 1
     assert "carlab 9.8.7 wrote it; read it with that version" in text
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("head", ["# ", "#", "# Recorded on Monday, by hand\n# ", "# Recorded on Monday\n"])
+def test_comments_before_the_header_are_skipped(carlab: Carlab, drive_csv: Path, tmp_path: Path, head: str) -> None:
+    """numpy.savetxt writes its header as a comment."""
+    commented = tmp_path / "commented.csv"
+    commented.write_text(head + drive_csv.read_text(), encoding="utf-8")
+    np.testing.assert_array_equal(read_csv(commented).column("yaw"), read_csv(drive_csv).column("yaw"))
+    assert carlab("import", commented, "--out", tmp_path / "a.mcap")[0] == 0
+
+
+def test_decimal_comma_is_named(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
+    drive_csv.write_text(drive_csv.read_text().replace(",", ";").replace(".", ","), encoding="utf-8")
+    code, text = carlab("import", drive_csv, "--out", tmp_path / "a.mcap")
+    assert code == 1
+    assert "which is not a number; write numbers with a decimal point." in text

@@ -38,9 +38,10 @@ class CsvTable:
         """Return a numeric column (N,). Raises DataError if it holds text."""
         if name in self.texts:
             row, cell = self.texts[name]
+            has_decimal_comma = _is_number(cell.replace(",", ".", 1))
+            remedy = "write numbers with a decimal point" if has_decimal_comma else "correct or empty that cell"
             raise DataError(
-                f"Row {row} of column '{name}' in {self.path.name} holds {cell!r}, which is not a number; "
-                "correct or empty that cell."
+                f"Row {row} of column '{name}' in {self.path.name} holds {cell!r}, which is not a number; {remedy}."
             )
         return self.columns[name]
 
@@ -48,11 +49,12 @@ class CsvTable:
 def read_csv(path: Path | str) -> CsvTable:
     """Read a file with one header line, separated by commas, semicolons or tabs; ``.gz`` is decompressed.
 
+    Lines before the header that begin with ``#`` are skipped. The header may begin with ``#``, as numpy.savetxt writes.
     Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Raises DataError if the file is missing, empty,
     truncated or not text, or if a row has another number of cells than the header.
     """
     path = Path(path)
-    text = _read_text(path)
+    text = _without_comments(_read_text(path))
     first = text.split("\n", 1)[0]
     delimiter = max(",;\t", key=first.count)
     try:
@@ -84,6 +86,17 @@ def read_csv(path: Path | str) -> CsvTable:
             first_text = next(k for k, cell in enumerate(cells) if not _is_number(cell))
             texts[name] = (first_text + 1, cells[first_text])
     return CsvTable(path, header, columns, texts)
+
+
+def _without_comments(text: str) -> str:
+    """The text from its header on; a header after ``#`` has as many cells as the next line."""
+    while text.startswith("#"):
+        line, _, rest = text.partition("\n")
+        delimiter = max(",;\t", key=line.count)
+        if 0 < line.count(delimiter) == rest.partition("\n")[0].count(delimiter):
+            return text.lstrip("# ")
+        text = rest
+    return text
 
 
 def _read_text(path: Path) -> str:
