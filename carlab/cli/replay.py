@@ -83,9 +83,13 @@ class Replay:
             new_file(self.save, "--save", ".rrd")
         simulated = self.which_car.choose(seed=self.seed).car.reality is Reality.SIMULATED
         if not simulated or self.drive:
-            if self.adapt:
-                raise ConfigError("--adapt predicts a recording with a simulator; remove it, or drive without it.")
+            for option in ("adapt", "save"):
+                if getattr(self, option):
+                    raise ConfigError(f"--{option} is for predictions by a simulated car; remove it to drive.")
             return self._drive()
+        for option, value in (("seconds", self.seconds), ("reality", self.which_car.reality)):
+            if value is not None:
+                raise ConfigError(f"--{option} has no effect on predictions; add --drive, or remove it.")
         self._predict()
         return 0
 

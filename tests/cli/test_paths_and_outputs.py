@@ -197,3 +197,20 @@ def test_decimal_comma_is_named(carlab: Carlab, drive_csv: Path, tmp_path: Path)
     code, text = carlab("import", drive_csv, "--out", tmp_path / "a.mcap")
     assert code == 1
     assert "which is not a number; write numbers with a decimal point." in text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--seconds", "2"), "--seconds has no effect on predictions; add --drive, or remove it."),
+        (("--reality", "rc_car"), "--reality has no effect on predictions; add --drive, or remove it."),
+        (("--drive", "--save", "a.rrd"), "--save is for predictions by a simulated car; remove it to drive."),
+        (("--drive", "--adapt"), "--adapt is for predictions by a simulated car; remove it to drive."),
+    ],
+)
+def test_option_of_the_other_kind_of_replay_is_refused(
+    carlab: Carlab, drive_csv: Path, options: tuple[str, ...], message: str
+) -> None:
+    code, text = carlab("replay", drive_csv, *options)
+    assert code == 2
+    assert message in text

@@ -83,4 +83,4 @@ def test_adaptation_to_a_car_that_turns_more_than_its_simulator_is_printed(carla
 def test_adaptation_and_driving_exclude_each_other(carlab: Carlab, tmp_path: Path) -> None:
     code, text = carlab("replay", circle(tmp_path / "drive.csv", 5.0), "--adapt", "--drive")
     assert code == 2
-    assert "--adapt predicts a recording with a simulator; remove it, or drive without it." in text
+    assert "--adapt is for predictions by a simulated car; remove it to drive." in text

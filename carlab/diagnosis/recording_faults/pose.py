@@ -82,9 +82,9 @@ def _check_repeats(repair: EpisodeRepair) -> None:
     if not stale.any():
         return
     count = int(stale.sum())
+    rows = f"1 row ({stale.mean():.2%}) repeats" if count == 1 else f"{count} rows ({stale.mean():.2%}) repeat"
     observation = (
-        f"{count} rows ({stale.mean():.1%}) repeat the previous pose although the car moves (the logger was faster "
-        "than the cameras, or a frame was lost)"
+        f"{rows} the previous pose although the car moves (the logger was faster than the cameras, or a frame was lost)"
     )
     channel = "x, y, yaw, vx, vy, yaw_rate" if repair.has_velocity_columns else "x, y, yaw"
     repair.repaired(Fault("stale_samples", channel, observation), _interpolate(repair, stale, columns=6), count)
