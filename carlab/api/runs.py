@@ -124,7 +124,9 @@ def learning_run(path: Path) -> Iterator[None]:
             raise error from None
         if version == VERSION:
             raise
-        raise DataError(f"{error} carlab {version} wrote it; read it with that version, this is {VERSION}.") from error
+        raise DataError(
+            f"{path} was written by carlab {version}, and carlab {VERSION} cannot read it; use that version."
+        ) from error
 
 
 def check_learning_run(path: Path) -> None:

@@ -141,7 +141,7 @@ def check_excitation(tracks: Sequence[Track], settings: WindowSettings) -> None:
         raise Inconclusive(
             f"The recordings to fit contain {seconds:.1f} s of driving (without parts that are held out). A diagnosis "
             f"needs at least {settings.min_fit_s:.0f} s, better 100 s, with changing speed and steering, for example "
-            "carlab drive --policy gamepad --ticks 3600, or where there is room --policy steering_steps --episodes 14."
+            "carlab drive --policy gamepad --ticks 3600, or --episodes 30 of the parking policy."
         )
     speed = np.concatenate([np.hypot(t.smooth[:, 3], t.smooth[:, 4]) for t in tracks])
     if np.quantile(speed, 0.9) < settings.min_speed_mps:

@@ -179,7 +179,8 @@ def test_run_of_another_version_names_that_version(carlab: Carlab, tmp_path: Pat
     (run / "environment.json").write_text('{"carlab": "9.8.7"}', encoding="utf-8")
     code, text = carlab("drive", "--policy", run, "--out", tmp_path / "runs")
     assert code == 1
-    assert "carlab 9.8.7 wrote it; read it with that version" in text
+    assert "was written by carlab 9.8.7, and carlab" in text
+    assert "a_later_setting" not in text
     assert not (tmp_path / "runs").exists()
 
 

@@ -336,7 +336,7 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
     if diagnosis.verdict == "inconclusive":
         drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
         own = advice if advice != diagnosis.sentence else ""
-        return drive, own or "This drive provides the excitation that these recordings lack."
+        return drive, own or "Diagnose this drive together with these recordings, which lack excitation."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
         channels = diagnosis.unexplained.channels
         along = bool(channels) and channels[0] in ("x", "vx")
