@@ -76,7 +76,7 @@ _BASE = (
     ParameterInfo("mocap.rate", "Hz", 120.0, 0.0, 10_000.0, True, "rate_hz"),
     ParameterInfo("mocap.position_std", "m", 0.0003, 0.0, _INF, False, "position_std_m"),
     ParameterInfo("mocap.yaw_std", "rad", 0.002, 0.0, math.pi, False, "yaw_std_rad"),
-    ParameterInfo("mocap.latency", "s", 0.008, 0.0, 10.0, False, "latency_s"),
+    ParameterInfo("mocap.latency", "s", 0.008, 0.0, 1.0, False, "latency_s"),
     ParameterInfo("mocap.dropout", "1", 0.0, 0.0, 1.0, False, "dropout"),
 )
 

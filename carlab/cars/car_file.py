@@ -22,6 +22,9 @@ from sim_backends.car_parameters import TABLES, SimulatorConfig, preset_names
 
 _ARMING = tuple(f.name for f in fields(HardwareConfig) if f.name.startswith("arm_"))
 
+MAX_ARENA_M = 500.0
+"""Largest coordinate of an arena [m]. An arena in millimetres would never stop the car."""
+
 
 @dataclass(frozen=True, slots=True)
 class RealCar:
@@ -130,9 +133,16 @@ def _real_car(tables: Any, path: Path) -> RealCar:
         calibration=from_table(ActuatorCalibration, table("calibration"), f"[hardware.calibration] of {path}"),
         **{name: number(tables[name], f"'{name}' in {where}") for name in _ARMING if name in tables},
     )
+    corners_m = as_polygon(arena["corners_m"], f"corners_m in [hardware.arena] of {path}")
+    farthest_m = max(abs(coordinate) for corner in corners_m for coordinate in corner)
+    if farthest_m > MAX_ARENA_M:
+        raise ConfigError(
+            f"corners_m in [hardware.arena] of {path} has a corner at {farthest_m:g} m; it must be at most "
+            f"{MAX_ARENA_M:g} m (is it in another unit?)."
+        )
     return RealCar(
         name=str(tables.get("name", path.stem)),
         hardware=hardware,
         mocap=from_table(MocapConfig, table("mocap"), f"[hardware.mocap] of {path}"),
-        envelope=replace(envelope, arena_m=as_polygon(arena["corners_m"], f"corners_m in [hardware.arena] of {path}")),
+        envelope=replace(envelope, arena_m=corners_m),
     )

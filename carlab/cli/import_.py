@@ -153,6 +153,8 @@ class Import:
         stem = self.recording.name.removesuffix(".gz").removesuffix(".csv")
         out = self.out if self.out is not None else self.recording.with_name(f"{stem}.mcap")
         new_file(out, "--out", ".mcap")
+        if self.report is not None:
+            new_file(self.report, "--report", ".json")
         imported = import_csv(self.recording, mapping=self._mapping())
         console.print(imported.announcement)
         print_findings(imported.report)

@@ -215,3 +215,31 @@ def test_option_of_the_other_kind_of_replay_is_refused(
     code, text = carlab("replay", drive_csv, *options)
     assert code == 2
     assert message in text
+
+
+def test_arena_in_millimetres_is_refused(carlab: Carlab, tmp_path: Path) -> None:
+    """It would be a geofence that never stops the car."""
+    path = tmp_path / "car.toml"
+    corners = "[[-1400, -2600], [2800, -2600], [2800, 1500], [-1400, 1500]]"
+    path.write_text(f"[hardware.arena]\ncorners_m = {corners}\n", encoding="utf-8")
+    code, text = carlab("check", "--car", path)
+    assert code == 2
+    assert "has a corner at 2800 m; it must be at most 500 m (is it in another unit?)." in text
+
+
+def test_latency_in_milliseconds_is_refused(carlab: Carlab, tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text("[mocap]\nlatency = 8\n", encoding="utf-8")
+    code, text = carlab("drive", "--car", path, "--out", tmp_path / "runs")
+    assert code == 2
+    assert "mocap.latency is 8 s; it must be at most 1 (is it in another unit?)." in text
+
+
+def test_existing_findings_are_not_replaced(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
+    findings = tmp_path / "findings.json"
+    findings.write_text("mine", encoding="utf-8")
+    code, text = carlab("import", drive_csv, "--out", tmp_path / "a.mcap", "--report", findings)
+    assert code == 1
+    assert "findings.json exists already; remove it or choose another --report." in text
+    assert findings.read_text() == "mine"
+    assert not (tmp_path / "a.mcap").exists()
