@@ -13,6 +13,7 @@ import pytest
 
 from carlab.cars import load_car_file
 from carlab.cli import _verbs, run
+from carlab.core.car import Car
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -193,3 +194,10 @@ def test_site_builds_without_warnings(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "site" / "reference" / "cli.html").is_file()
+
+
+def test_page_about_a_new_car_lists_its_interface() -> None:
+    page = (ROOT / "docs/how-to/add-a-car.md").read_text(encoding="utf-8")
+    names = Car.__abstractmethods__ | set(Car.__annotations__)
+    assert {"arm", "clock"} <= names
+    assert [name for name in sorted(names) if f"`{name}" not in page] == []
