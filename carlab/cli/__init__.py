@@ -47,7 +47,7 @@ def run(argv: Sequence[str]) -> int:
     try:
         return int(verb.run())
     except CarlabError as error:
-        fail(str(error))
+        fail(f"{error}{_where_options_belong(argv[0], error)}")
         return error.exit_code
     except KeyboardInterrupt:
         fail("Interrupted.")
@@ -65,6 +65,15 @@ def run(argv: Sequence[str]) -> int:
         causes = "the path, its permissions and the disk" if error.filename else "addresses, cables and permissions"
         fail(f"{prefix}{error.strerror or error}; check {causes}.")
         return 1
+
+
+def _where_options_belong(verb: str, error: Exception) -> str:
+    """A sentence for a refused CSV whose message names options that only ``carlab import`` has; else empty."""
+    from carlab.recording.audit.report import RefusedError
+
+    if verb == "import" or not isinstance(error, RefusedError) or not any(f.option for f in error.findings):
+        return ""
+    return f" Convert the file with carlab import and this option first, then {verb} the .mcap file."
 
 
 _DESCRIPTION = "Drive, learn and diagnose small race cars: real cars, cars with emulated hardware, and simulated cars."

@@ -253,5 +253,5 @@ def recognise_layout(header: Sequence[str], where: str) -> ColumnMapping:
     hint = f" (is it '{near[0]}'?)" if near else ""
     raise DataError(
         f"{where} has no column {', '.join(lacking)}{hint}; it holds {', '.join(header)}; "
-        f"say which column is which with a mapping file, or add the column."
+        f"say which column is which with carlab import --mapping FILE.toml, or add the column."
     )

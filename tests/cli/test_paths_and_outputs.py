@@ -243,3 +243,21 @@ def test_existing_findings_are_not_replaced(carlab: Carlab, drive_csv: Path, tmp
     assert "findings.json exists already; remove it or choose another --report." in text
     assert findings.read_text() == "mine"
     assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("verb", ["diagnose", "replay", "view"])
+def test_message_of_a_verb_without_import_options_names_the_import(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path, data = canonical_csv(tmp_path)
+    data[:, 8] *= 100.0
+    write(path, data)
+    hint = f"Convert the file with carlab import and this option first, then {verb} the .mcap file."
+    code, text = carlab(verb, path)
+    assert code == 1
+    assert "--throttle-scale 0.01" in text
+    assert text.endswith(hint)
+    assert "Convert the file" not in carlab("import", path)[1]
+    write(path, data, header="time,x,y,yaw,vx,vy,yaw_rate,steering,throttle")
+    assert "carlab import --mapping FILE.toml" in carlab(verb, path)[1]
