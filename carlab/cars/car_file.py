@@ -85,6 +85,8 @@ def load_car_file(path: Path) -> CarFile:
         raise ConfigError(f"{path} is not a text file; name a car file in TOML.") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path} is not valid TOML ({error}); correct it.") from error
+    if not tables:
+        raise ConfigError(f"{path} is empty; a car file has at least one table such as [vehicle].")
     check_keys(tables, (*TABLES, "hardware", "recording_noise", "track"), str(path))
     noise = tables.pop("recording_noise", None)
     if noise is not None:

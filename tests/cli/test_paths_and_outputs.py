@@ -261,3 +261,11 @@ def test_message_of_a_verb_without_import_options_names_the_import(
     assert "Convert the file" not in carlab("import", path)[1]
     write(path, data, header="time,x,y,yaw,vx,vy,yaw_rate,steering,throttle")
     assert "carlab import --mapping FILE.toml" in carlab(verb, path)[1]
+
+
+def test_empty_car_file_is_not_the_default_car(carlab: Carlab, tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text("# cut off\n", encoding="utf-8")
+    code, text = carlab("drive", "--car", path, "--out", tmp_path / "runs")
+    assert code == 2
+    assert "car.toml is empty; a car file has at least one table such as [vehicle]." in text
