@@ -185,20 +185,13 @@ def diagnose(
         ConfigError: an argument is invalid.
         DataError: a recording cannot be read, or the report cannot be written.
     """
-    from carlab.core.errors import ConfigError
-
     file = load_car(car)
     to_fit, to_validate = _assigned(as_list(recordings), as_list(held_out))
-    effects = (effects,) if isinstance(effects, str) else effects
-    _check_effects(effects)
-    if holdout_share is not None and to_validate:
-        raise ConfigError(
-            "--holdout-share has no effect together with held-out recordings (of a run folder, every third episode is "
-            "held out); remove the option, or name single recordings."
-        )
+    effects = _checked_effects(effects)
+    _check_share(holdout_share, to_validate)
     roles = (to_fit, "fit"), (to_validate, "held out")
     fit, validation = (read_material(items, role, file.simulator.mocap.latency_s) for items, role in roles)
-    options = {"effects": tuple(effects) or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
+    options = {"effects": effects or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
     options |= {"discrepancy": discrepancy, "adapt": adapt, "keep_events": keep_events, "budget_s": budget_s}
     report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})
     if out is not None:
@@ -251,15 +244,28 @@ def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: Recordi
     return CarFile(f"{name} (diagnosed)", text, with_parameter_std(worded, simulator), None, noise)
 
 
-def _check_effects(effects: Sequence[str]) -> None:
+def _check_share(holdout_share: float | None, held_out: Sequence[RecordingLike]) -> None:
+    from carlab.core.errors import ConfigError
+
+    if holdout_share is not None and held_out:
+        raise ConfigError(
+            "--holdout-share has no effect together with held-out recordings (of a run folder, every third episode is "
+            "held out); remove the option, or name single recordings."
+        )
+
+
+def _checked_effects(effects: Sequence[str]) -> tuple[str, ...]:
+    """Names of effects as a tuple; a single string is one name. Raises ConfigError for an unknown one."""
     from carlab.core.errors import ConfigError
     from sim_backends.effects import CATALOGUE
 
-    for name in effects:
+    names = (effects,) if isinstance(effects, str) else tuple(effects)
+    for name in names:
         if name not in CATALOGUE:
             near = difflib.get_close_matches(name, CATALOGUE, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"choose among {', '.join(CATALOGUE)}."
             raise ConfigError(f"There is no effect '{name}' in the catalogue; {hint}")
+    return names
 
 
 def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLike]:

@@ -136,8 +136,6 @@ def drive(
     choice = choose_car(car, vehicle=vehicle, reality=reality, dry_run=dry_run, seed=seed)
     options = {"seed": seed, "max_ticks": ticks, "place": place, "record_rerun": rerun}
     driver, chosen_task = _policy_and_task(policy, task, track, choice)
-    if task is None and track is None:
-        chosen_task = _without_arena(driver, chosen_task, choice)
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(new_run(out, name, choice, hooks))
         if connect is not None:
@@ -295,7 +293,8 @@ def _policy_and_task(
     chosen = load_checked(given or PARKING, choice.envelope.arena_m)
     if policy == "parking" and not isinstance(chosen, ParkingTask):
         raise ConfigError(f"The parking policy only parks; choose another --policy for --task {chosen.name}.")
-    return str(policy) if isinstance(policy, Path) else policy, chosen
+    policy = str(policy) if isinstance(policy, Path) else policy
+    return policy, chosen if given is not None else _without_arena(policy, chosen, choice)
 
 
 def _learned(folder: Path, given: TaskChoice | None, choice: CarChoice) -> tuple[Policy, Task]:
