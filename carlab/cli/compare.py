@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from carlab.cli.console import console, progress
-from carlab.cli.options import new_report
+from carlab.cli.options import report_folder
 
 
 @dataclass
@@ -33,7 +33,7 @@ class Compare:
     """Restrict the changes to these effects and base parameters (motor.drive_gain ...)."""
 
     out: Path = Path("comparison")
-    """Folder for compare.json, which must not exist yet."""
+    """Folder for compare.json; an earlier one in it is replaced."""
 
     verbose: bool = False
     """Show the whole log."""
@@ -43,7 +43,7 @@ class Compare:
         from carlab.api import compare
         from carlab.experiment.episodes.interrupts import Interrupts
 
-        new_report(self.out, "compare.json")
+        report_folder(self.out)
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("comparison", total=100, note="")
             found = compare(

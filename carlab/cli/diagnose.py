@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from carlab.cli.console import console, fail, progress
-from carlab.cli.options import new_report
+from carlab.cli.options import report_folder
 from carlab.cli.recordings import print_errors
 
 if TYPE_CHECKING:
     from carlab.diagnosis.findings import Diagnosis
 
 EXIT_INCONCLUSIVE = 5
-REPORT_FILE = "report.json"
 
 
 @dataclass
@@ -41,7 +40,7 @@ class Diagnose:
     """Size of the held-out last part as a share of the recording, above 0 and at most 0.5; 0.3 by default."""
 
     out: Path = Path("diagnosis")
-    """Folder for the report; it must have no report yet."""
+    """Folder for the report; an earlier report in it is replaced."""
 
     budget_s: Annotated[float, arg(name="budget")] = 300.0
     """Time limit of the diagnosis without measured curves, networks and adaptation [s]; inf for none. When it ends, the
@@ -82,7 +81,7 @@ class Diagnose:
         from carlab.api import diagnose
         from carlab.experiment.episodes.interrupts import Interrupts
 
-        new_report(self.out, REPORT_FILE)
+        report_folder(self.out)
         with Interrupts() as interrupts, progress() as bar:
             row = bar.add_task("diagnosis", total=100, note="")
             report = diagnose(

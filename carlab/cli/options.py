@@ -77,14 +77,12 @@ def new_file(path: Path, option: str, suffix: str) -> Path:
     return path
 
 
-def new_report(folder: Path, name: str) -> Path:
-    """Return a folder for a report, before the work begins.
+def report_folder(folder: Path) -> Path:
+    """Return a folder for a report, before the work begins; an earlier report in it will be replaced.
 
     Raises:
-        DataError: it has the file ``name`` of an earlier report, or it cannot be created.
+        DataError: it cannot be created or written.
     """
-    if (folder / name).exists():
-        raise DataError(f"{folder / name} exists already; remove the folder {folder} or choose another --out.")
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
         raise DataError(f"--out {folder}: {existing} is a file; choose another folder.")

@@ -282,15 +282,17 @@ def cut_windows(
     """Cut tracks into windows in which the car moves, without those with rows of events.
 
     Args:
-        tracks: at least one track; all have the same period.
+        tracks: all have the same period.
         horizon_s: length of a window.
         stride_s: time between the starts of windows.
         block_s: length of the blocks that count as independent.
         with_events: also cut windows with rows of events.
 
     Raises:
-        DataError: the car moves in no window.
+        DataError: no track, or the car moves in no window.
     """
+    if not tracks:
+        raise DataError("The recordings have no stretch without a gap that is long enough; record a longer drive.")
     period_s = tracks[0].period_s
     steps = max(round(horizon_s / period_s), 1)
     stride = max(round(stride_s / period_s), 1)

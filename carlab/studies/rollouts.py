@@ -121,11 +121,7 @@ def run_rollout_study(
     dense_windows = recorded_windows(fitted, max(HORIZONS_S), FIT_STRIDE_S)
 
     def fit(count: Rows, seed: int, held_out_fold: int | None) -> CarDynamics:
-        assert case.rows is not None
-        rows, windows = case.rows, dense_windows
-        if held_out_fold is not None:
-            rows = rows.take(fold_of_row != held_out_fold)
-            windows = windows.take((_folds_of(windows) != held_out_fold).all(axis=0))
+        rows, windows = _without_fold(case, dense_windows, fold_of_row, held_out_fold)
         if count == ALL_ROWS:
             return fit_all(case, rows, windows, seed, steps, device)
         return fit_rows(case, rows, count, seed, steps, device)
@@ -140,15 +136,33 @@ def run_rollout_study(
             errors.append(fold_errors(fit(count, seed, fold), fit_windows, fold))
         progress(f"{count} rows, seed {seed}", done * (N_FOLDS + 1) + N_FOLDS, total)
         car = fit(count, seed, None)
-        models: dict[str, RolloutModel] = {
-            INDEPENDENT: car, DISTURBED: DisturbedCar(car, fit_disturbance(pooled(errors))),
-        }  # fmt: skip
-        nll = _one_step_nll(car, case.held_out)
-        for name, model in models.items():
-            for score in scores_of(name, model, held_out, seed):
-                n_rows = len(case.rows) if count == ALL_ROWS else count
-                yield replace(score, rows=n_rows, all_rows=count == ALL_ROWS, nll=nll)
+        process = fit_disturbance(pooled(errors))
+        yield from _scores(case, car, DisturbedCar(car, process), held_out, count, seed)
     progress("", total, total)
+
+
+def _scores(
+    case: RecordedCase, car: CarDynamics, disturbed: DisturbedCar, windows: PredictionWindows, count: Rows, seed: int
+) -> Iterator[RolloutScore]:
+    """Scores of both kinds of rollouts on held-out windows."""
+    assert case.rows is not None
+    assert case.held_out is not None
+    n_rows = len(case.rows) if count == ALL_ROWS else count
+    nll = _one_step_nll(car, case.held_out)
+    models: tuple[tuple[str, RolloutModel], ...] = ((INDEPENDENT, car), (DISTURBED, disturbed))
+    for name, model in models:
+        for score in scores_of(name, model, windows, seed):
+            yield replace(score, rows=n_rows, all_rows=count == ALL_ROWS, nll=nll)
+
+
+def _without_fold(
+    case: RecordedCase, windows: PredictionWindows, fold_of_row: np.ndarray, fold: int | None
+) -> tuple[Transitions, PredictionWindows]:
+    """Rows and windows without those of a fold; all of them for None."""
+    assert case.rows is not None
+    if fold is None:
+        return case.rows, windows
+    return case.rows.take(fold_of_row != fold), windows.take((_folds_of(windows) != fold).all(axis=0))
 
 
 def checked_counts(

@@ -21,22 +21,6 @@ def drive_csv(tmp_path: Path) -> Path:
     return write(*canonical_csv(tmp_path, rows=60))
 
 
-@pytest.mark.parametrize(
-    ("name", "verb"), [("report.json", ("diagnose",)), ("compare.json", ("compare", "--with", "b.csv"))]
-)
-def test_existing_report_is_not_replaced(
-    carlab: Carlab, drive_csv: Path, tmp_path: Path, name: str, verb: tuple[str, ...]
-) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / name).write_text("{}", encoding="utf-8")
-    code, text = carlab(verb[0], drive_csv, *verb[1:], "--out", out)
-    assert code == 1
-    assert f"{out / name} exists already; remove the folder {out} or choose another --out." in text
-    assert [file.name for file in out.iterdir()] == [name]
-    assert (out / name).read_text() == "{}"
-
-
 @pytest.mark.parametrize("verb", ["diagnose", "compare"])
 def test_folder_that_cannot_be_written_is_refused_before_the_work(
     carlab: Carlab, drive_csv: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str
