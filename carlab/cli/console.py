@@ -18,6 +18,8 @@ from rich.text import Text
 from carlab.core.quantities import Reality
 
 FILE_WIDTH_CHARS = 140
+PACKAGES = ("carlab", "drivers", "learning", "mocap", "sim_backends")
+"""Packages of the program, whose logs ``--verbose`` shows."""
 
 
 def _console(*, stderr: bool) -> Console:
@@ -94,7 +96,9 @@ def progress(speed_estimate_period_s: float = 30.0) -> Iterator[Progress]:
 
 
 def log_to_console(*, verbose: bool) -> None:
-    """Show warnings of the program's log on the console; with ``verbose``, all messages."""
+    """Show warnings on the console; with ``verbose``, the whole log of the program, of libraries from INFO on."""
     handler = RichHandler(console=error_console, show_path=False, show_time=verbose, rich_tracebacks=False)
     handler.setLevel(logging.DEBUG if verbose else logging.WARNING)
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler], format="%(message)s")
+    logging.basicConfig(level=logging.INFO, handlers=[handler], format="%(message)s")
+    for package in PACKAGES if verbose else ():
+        logging.getLogger(package).setLevel(logging.DEBUG)

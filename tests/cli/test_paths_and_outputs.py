@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from carlab import cli
+from carlab.cli.console import PACKAGES, log_to_console
 from carlab.recording.csv.table import read_csv
 from tests.cli.test_bad_input import canonical_csv, write
 
@@ -253,3 +255,13 @@ def test_empty_car_file_is_not_the_default_car(carlab: Carlab, tmp_path: Path) -
     code, text = carlab("drive", "--car", path, "--out", tmp_path / "runs")
     assert code == 2
     assert "car.toml is empty; a car file has at least one table such as [vehicle]." in text
+
+
+def test_verbose_log_has_details_of_the_program_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Matplotlib's search for fonts filled pages."""
+    for name in ("", *PACKAGES):
+        monkeypatch.setattr(logging.getLogger(name), "level", logging.WARNING)
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    log_to_console(verbose=True)
+    assert logging.getLogger("carlab.diagnosis").isEnabledFor(logging.DEBUG)
+    assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.DEBUG)
