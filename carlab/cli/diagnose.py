@@ -43,8 +43,9 @@ class Diagnose:
     """Folder for the report; an earlier report in it is replaced."""
 
     budget_s: Annotated[float, arg(name="budget")] = 300.0
-    """Time limit of the diagnosis without measured curves, networks and adaptation [s]; inf for none. When it ends, the
-    report covers the effects found so far, and says so."""
+    """Time limit of the diagnosis without measured curves, networks and adaptation [s]; inf for none. The search ends
+    at 85 % of it, and the report covers the effects found so far and says so. The checks after a search that was cut
+    short can exceed the limit by a third."""
 
     effects: tuple[str, ...] = ()
     """Restrict the search to these effects of the catalogue."""
