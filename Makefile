@@ -40,7 +40,7 @@ layers:
 # Tests that drive against the clock mostly wait; tests that only compute take the processors whenever those wait.
 # Each file runs in one process, which shares its fixtures; files with few long tests come first, so that none is last.
 COMPUTING := tests/examples tests/diagnosis tests/cli tests/studies tests/benchmark tests/jobs tests/learning \
-	$(addprefix tests/experiment/,test_child_process.py test_quick_check.py test_priors_and_predictions.py test_training.py test_cluster_training.py test_learning_on_a_device.py) \
+	$(addprefix tests/experiment/,test_child_process.py test_quick_check.py test_priors_and_predictions.py test_training.py test_cluster_training.py test_cluster_orders.py test_learning_on_a_device.py) \
 	tests/prediction tests/sim_backends tests/api tests/recording tests/test_architecture.py
 YIELD := nice -n 19
 computing driving: export OMP_NUM_THREADS := 1

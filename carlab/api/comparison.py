@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -48,6 +47,7 @@ def compare(
         DataError: a group is too short or too uniform; the message states what to record.
     """
     from carlab.core.errors import ConfigError
+    from carlab.core.tables import nearest_name
     from carlab.diagnosis.comparison.candidates import change_candidates
     from carlab.diagnosis.comparison.compare import compare as search
 
@@ -60,9 +60,7 @@ def compare(
     candidates = (candidates,) if isinstance(candidates, str) else candidates
     for name in candidates:
         if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"choose among {', '.join(known)}."
-            raise ConfigError(f"'{name}' cannot change in this car; {hint}")
+            raise ConfigError(f"'{name}' cannot change in this car; {nearest_name(name, known)}")
     latency_s = file.simulator.mocap.latency_s
     groups = [read(items, role, latency_s) for items, role in ((first, "first group"), (second, "second group"))]
     found = search(

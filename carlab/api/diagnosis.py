@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -257,14 +256,13 @@ def _check_share(holdout_share: float | None, held_out: Sequence[RecordingLike])
 def _checked_effects(effects: Sequence[str]) -> tuple[str, ...]:
     """Names of effects as a tuple; a single string is one name. Raises ConfigError for an unknown one."""
     from carlab.core.errors import ConfigError
+    from carlab.core.tables import nearest_name
     from sim_backends.effects import CATALOGUE
 
     names = (effects,) if isinstance(effects, str) else tuple(effects)
     for name in names:
         if name not in CATALOGUE:
-            near = difflib.get_close_matches(name, CATALOGUE, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"choose among {', '.join(CATALOGUE)}."
-            raise ConfigError(f"There is no effect '{name}' in the catalogue; {hint}")
+            raise ConfigError(f"There is no effect '{name}' in the catalogue; {nearest_name(name, list(CATALOGUE))}")
     return names
 
 

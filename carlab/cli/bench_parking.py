@@ -52,19 +52,19 @@ class _Run:
 def run_parking(options: BenchOptions) -> int:
     """Drive the missing runs of the study, and print the figures of all runs."""
     runs = _runs(options)
-    begun = _begun(runs, options)
-    code = _drive_as_jobs(runs, begun, options) if uses_jobs(options) else _drive_here(runs, begun, options)
+    started = _started_runs(runs, options)
+    code = _drive_as_jobs(runs, started, options) if uses_jobs(options) else _drive_here(runs, started, options)
     if code in (0, EXIT_FAILED) and (curves := _curves(runs, options)):
         _report(curves, options)
     return code
 
 
-def _begun(runs: Sequence[_Run], options: BenchOptions) -> dict[str, Path]:
+def _started_runs(runs: Sequence[_Run], options: BenchOptions) -> dict[str, Path]:
     """Folders of the runs that exist, by name. Raises ConfigError if one was started with other options."""
     from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
     from carlab.studies.parking import check_run, run_folder
 
-    begun = {}
+    started = {}
     for run in runs:
         folder = run_folder(options.runs, run.label, run.seed)
         if folder is not None and (folder / CAMPAIGN_FILE).is_file():
@@ -72,11 +72,11 @@ def _begun(runs: Sequence[_Run], options: BenchOptions) -> dict[str, Path]:
             if "method" in run.options:
                 expected["method"] = ("--methods", run.options["method"])
             check_run(folder, expected)
-            begun[run.name] = folder
-    return begun
+            started[run.name] = folder
+    return started
 
 
-def _drive_here(runs: Sequence[_Run], begun: Mapping[str, Path], options: BenchOptions) -> int:
+def _drive_here(runs: Sequence[_Run], started: Mapping[str, Path], options: BenchOptions) -> int:
     """Start or resume the runs in this process; returns the exit code of the first that fails, or 0."""
     from carlab.cli.learn import Learn
     from carlab.cli.options import CarOptions
@@ -87,7 +87,7 @@ def _drive_here(runs: Sequence[_Run], begun: Mapping[str, Path], options: BenchO
         reality = write_reality(run.reality, options.runs / "realities") if run.reality else None
         code = Learn(
             CarOptions("sim", reality=reality), episodes=options.episodes, updates=options.updates,
-            model_steps=options.steps, seed=run.seed, device=options.device, resume=begun.get(run.name),
+            model_steps=options.steps, seed=run.seed, device=options.device, resume=started.get(run.name),
             out=options.runs, name=run.name, rerun=False, **run.options,
         ).run()  # fmt: skip
         if code != 0:
@@ -95,7 +95,7 @@ def _drive_here(runs: Sequence[_Run], begun: Mapping[str, Path], options: BenchO
     return 0
 
 
-def _drive_as_jobs(runs: Sequence[_Run], begun: Mapping[str, Path], options: BenchOptions) -> int:
+def _drive_as_jobs(runs: Sequence[_Run], started: Mapping[str, Path], options: BenchOptions) -> int:
     """Start or resume the incomplete runs as parallel jobs; returns the exit code."""
     from carlab.recording.run_folder import RunDirectory
 
@@ -107,11 +107,11 @@ def _drive_as_jobs(runs: Sequence[_Run], begun: Mapping[str, Path], options: Ben
             fail(failures[-1])
             return []
 
-        job = _job(run, begun.get(run.name), options)
-        return StudyJob(f"{run.label}, seed {run.seed}", job, lambda end: [_moved(end, options.runs)], failed)
+        job = _job(run, started.get(run.name), options)
+        return StudyJob(f"{run.label}, seed {run.seed}", job, lambda end: [_stored(end, options.runs)], failed)
 
     def is_complete(run: _Run) -> bool:
-        return run.name in begun and len(RunDirectory(begun[run.name]).recordings()) >= options.episodes
+        return run.name in started and len(RunDirectory(started[run.name]).recordings()) >= options.episodes
 
     jobs = [study_job(run) for run in runs if not is_complete(run)]
     _, stopped = run_jobs(jobs, options, "runs", lambda new, done: None)
@@ -121,7 +121,7 @@ def _drive_as_jobs(runs: Sequence[_Run], begun: Mapping[str, Path], options: Ben
     return EXIT_FAILED if failures else 0
 
 
-def _job(run: _Run, begun: Path | None, options: BenchOptions) -> ChildJob:
+def _job(run: _Run, started: Path | None, options: BenchOptions) -> ChildJob:
     """A run as a job: ``carlab learn``, with a copy of the run's folder if it exists."""
     from carlab.studies.parking_realities import write_reality
 
@@ -131,16 +131,16 @@ def _job(run: _Run, begun: Path | None, options: BenchOptions) -> ChildJob:
         reality = write_reality(run.reality, options.runs / "realities")
         files[reality.name] = reality.read_bytes()
         command += ["--reality", reality.name]
-    if begun is not None:
-        files |= {f"{RUNS}/{name}": content for name, content in read_files(begun.parent, begun.name).items()}
-        command += ["--resume", f"{RUNS}/{begun.name}"]
+    if started is not None:
+        files |= {f"{RUNS}/{name}": content for name, content in read_files(started.parent, started.name).items()}
+        command += ["--resume", f"{RUNS}/{started.name}"]
     given = {"episodes": options.episodes, "updates": options.updates, "seed": run.seed, "out": RUNS, "name": run.name}
     given |= run.options | ({} if options.steps is None else {"model-steps": options.steps})
     command += [word for name, value in given.items() for word in (f"--{name}", str(value))]
     return ChildJob(tuple(command), math.inf, files, (RUNS,), environment=ONE_THREAD)
 
 
-def _moved(end: JobEnd, runs: Path) -> Path:
+def _stored(end: JobEnd, runs: Path) -> Path:
     """Write the run folder of an ended job to the runs of the study. Raises ValueError if the run is incomplete."""
     names = {Path(name).parts[1] for name in end.outputs}
     if end.end.exit_status != 0 or len(names) != 1:

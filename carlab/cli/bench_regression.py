@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from carlab.cli.bench_jobs import DATA, StudyJob, bench_job, recorded_files, uses_jobs
 from carlab.cli.bench_options import row_counts
 from carlab.cli.bench_output import report, run_and_write, run_jobs_and_write, score_job
+from carlab.cli.bench_priors import recordings_in
 from carlab.cli.console import console
 from carlab.core.errors import ConfigError
 
@@ -87,7 +88,6 @@ def _recorded(options: BenchOptions) -> RecordedCase:
 
 def _recordings(options: BenchOptions) -> list[Path]:
     """Recordings of --case realcar, the last one held out."""
-    if options.data is None or not options.data.is_dir():
-        given = "" if options.data is None else f" ('{options.data}' is not a folder)"
-        raise ConfigError(f"--case realcar needs --data FOLDER{given}, with at least two recordings (MCAP or CSV).")
-    return sorted(p for p in options.data.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
+    if options.data is None:
+        raise ConfigError("--case realcar needs --data FOLDER, with at least two recordings (MCAP or CSV).")
+    return recordings_in(options.data)

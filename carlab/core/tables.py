@@ -7,7 +7,7 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from carlab.core.errors import ConfigError
@@ -20,9 +20,13 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
     names = sorted(known)
     for key in table:
         if key not in names:
-            near = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
-            hint = f"did you mean '{near[0]}'?" if near else f"known keys: {', '.join(names)}."
-            raise ConfigError(f"Unknown key '{key}' in {where}; {hint}")
+            raise ConfigError(f"Unknown key '{key}' in {where}; {nearest_name(key, names, 'known keys:')}")
+
+
+def nearest_name(name: str, known: Sequence[str], otherwise: str = "choose among") -> str:
+    """End of a message about an unknown name: the nearest known name, or ``otherwise`` and all of them."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"did you mean '{near[0]}'?" if near else f"{otherwise} {', '.join(known)}."
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:

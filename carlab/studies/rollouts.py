@@ -9,9 +9,8 @@ independent particles and noise, and one particle with a disturbance for each ro
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -151,8 +150,7 @@ def _scores(
     nll = _one_step_nll(car, case.held_out)
     models: tuple[tuple[str, RolloutModel], ...] = ((INDEPENDENT, car), (DISTURBED, disturbed))
     for name, model in models:
-        for score in scores_of(name, model, windows, seed):
-            yield replace(score, rows=n_rows, all_rows=count == ALL_ROWS, nll=nll)
+        yield from scores_of(name, model, windows, n_rows, seed, nll, all_rows=count == ALL_ROWS)
 
 
 def _without_fold(
@@ -221,8 +219,10 @@ def _folds_of(windows: PredictionWindows) -> np.ndarray:
     return np.stack([folds(windows.recording, windows.t0_s + dt) for dt in (0.0, windows.horizon_s)])
 
 
-def scores_of(name: str, model: RolloutModel, windows: PredictionWindows, seed: int) -> Iterator[RolloutScore]:
-    """Scores of a model on windows, by horizon, without the number of rows and the one-step likelihood."""
+def scores_of(
+    name: str, model: RolloutModel, windows: PredictionWindows, rows: int, seed: int, nll: float, *, all_rows: bool
+) -> Iterator[RolloutScore]:
+    """Scores of a model on windows, by horizon."""
     paths = LearnedModel(model, N_SAMPLES, seed).sample(windows)
     errors = prediction_errors(np.moveaxis(paths, 2, 0), windows)
     for horizon_s in HORIZONS_S:
@@ -230,14 +230,15 @@ def scores_of(name: str, model: RolloutModel, windows: PredictionWindows, seed: 
         low, high = np.quantile(at, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], axis=0)
         mean = at.mean(axis=0)
         yield RolloutScore(
-            name, 0, seed, horizon_s,
+            name, rows, seed, horizon_s,
             tuple(((low <= 0) & (high >= 0)).mean(axis=0).tolist()),
             tuple((high - low).mean(axis=0).tolist()),
             float(np.sqrt(np.mean(mean[:, 0] ** 2 + mean[:, 1] ** 2))),
             float(np.sqrt(np.mean(mean[:, 2] ** 2))),
             energy_score(at[..., :2]),
-            math.nan,
+            nll,
             len(windows),
+            all_rows,
         )  # fmt: skip
 
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from carlab.core.errors import DataError, DivergedError
 from learning.networks.adam import Adam
@@ -75,7 +76,7 @@ def fit_rollouts(
     seed: int = 0,
     progress: Callable[[int], None] = lambda update: None,
 ) -> CarDynamics:
-    """Adjust the particles of a car to rollouts. The noise of one step is kept.
+    """Adjust the particles of a car to rollouts. The noise of one step does not change.
 
     Args:
         car: fitted with a one-step likelihood, on any device.
@@ -244,9 +245,8 @@ class _Functions:
 
 
 def _huber(error: Tensor, delta: float) -> Tensor:
-    """Huber loss (Huber 1964, "Robust estimation of a location parameter"), element by element."""
-    size = error.abs()
-    return torch.where(size <= delta, 0.5 * error**2, delta * size - 0.5 * delta**2)
+    """Huber loss of each element (Huber 1964, "Robust estimation of a location parameter")."""
+    return functional.huber_loss(error, torch.zeros_like(error), reduction="none", delta=delta)
 
 
 __all__ = ["RolloutFitSettings", "fit_rollouts"]

@@ -192,7 +192,7 @@ def test_car_is_in_neutral_and_the_run_finishes_while_the_link_is_cut_and_restor
         waiting = [e for e in currents if before[-1] + 1.0 < e.t_s < after[0] - 1.0]
         assert len(waiting) > 20
         assert {e.value for e in waiting} == {0.0}, "the car is in neutral while it waits and trains"
-        assert np.diff([e.t_s for e in waiting]).max() < 2.0, "the sender never ends; a busy host delays it"
+        assert np.diff([e.t_s for e in waiting]).max() < 2.0, "the sender runs all the time; a busy host delays it"
     driving_s = (run.ticks_s[0][0], run.ticks_s[-1][-1])
     assert not [e for e in entries if e.name == "motor_timeout" and driving_s[0] < e.t_s < driving_s[1]]
 

@@ -84,3 +84,8 @@ def log_sent_actions(choice: CarChoice) -> list[Action]:
 
     choice.car.command = logged  # type: ignore[method-assign]
     return sent
+
+
+def small_plan(**changes: Any) -> TrainingPlan:
+    """A plan whose training takes a second."""
+    return tiny_plan(choose_car("sim"), model_steps=20, updates=8, **changes)

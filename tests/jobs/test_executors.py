@@ -59,7 +59,7 @@ def test_failed_job_states_its_last_line(executor: Executor) -> None:
     assert (done.end.exit_status, done.failure) == (3, "last")
 
 
-@pytest.mark.parametrize("name", ["../outside", "/tmp/outside", "a/../../outside"])
+@pytest.mark.parametrize("name", ["../outside", "/outside", "a/../../outside"])
 def test_file_outside_its_folder_is_not_written(tmp_path: Path, name: str) -> None:
     (tmp_path / "job").mkdir()
     with pytest.raises(DataError, match="is not a path within the folder"):

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from decaying_car import PERIOD_S, decaying_car, driven_windows
 from torch import Tensor
 
 from carlab.core.episode_data import EpisodeData
@@ -47,7 +48,6 @@ from learning.world.disturbance import DisturbanceProcess
 from learning.world.model_env import ModelEnv
 from learning.world.rollout_fit import RolloutFitSettings, fit_rollouts
 from sim_backends.car_parameters import SimulatorConfig
-from tests.learning.test_disturbance import PERIOD_S, decaying_car, driven_windows
 
 ROWS, HISTORY = 48, 1
 TRUE = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6))

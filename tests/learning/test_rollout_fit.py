@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from decaying_car import DECAY, PERIOD_S, STEPS, decaying_car, driven_windows
 
 from carlab.core.errors import DataError
 from learning.transitions import Transitions
 from learning.world.disturbance import DisturbanceProcess
 from learning.world.drive_windows import DriveWindows, roll_out
 from learning.world.rollout_fit import RolloutFitSettings, fit_rollouts
-from tests.learning.test_disturbance import DECAY, PERIOD_S, STEPS, decaying_car, driven_windows
 
 OFFSET, NOISE = 0.01, 0.05
 """Error of the learned change of vx in a step, and noise of one step: five times larger [m/s]."""

@@ -76,7 +76,7 @@ class Scene:
     def drive(self, concealed: Sequence[Concealed]) -> Driven:
         """Drive both recordings with the effects; returns the refit, the recordings and the held-out windows.
 
-        The last result is kept, because a case of one effect is driven again with the size that was found last.
+        The last result is stored: a case of one effect is driven again with the size of the last trial.
         """
         if self._last is None or self._last[0] != tuple(concealed):
             self._last = tuple(concealed), self._drive(concealed)

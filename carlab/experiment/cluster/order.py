@@ -7,7 +7,7 @@
 | models/000k/dynamics.npz, policy.npz | model and policy of the training before, if there was one |
 | task.py | a user's task |
 
-Recordings and policies are the files of a run folder. The model travels as arrays, because the run folder's
+Recordings and policies are the files of a run folder. The model is sent as arrays, because the run folder's
 ``dynamics.pt`` contains a pickle. Readers run no code of these files; only a user's task is code.
 """
 
@@ -35,7 +35,7 @@ ORDER_FILE, TASK_FILE = "order.json", "task.py"
 EPISODES, MODELS = "episodes", "models"
 ARRAYS_FILE = "dynamics.npz"
 RESULT_FILES = frozenset({ARRAYS_FILE, AGENT_FILE, FIGURES_FILE})
-"""Files of a result as they travel."""
+"""Files of a result as the cluster sends them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class TrainingOrder:
             raise DataError(f"The order of a training cannot be read ({error!r}); install the same carlab.") from error
 
     def result(self) -> dict[str, bytes]:
-        """The files of the finished training, as they travel."""
+        """The files of the finished training, as the cluster sends them."""
         return sent_files(self.folder, (AGENT_FILE, FIGURES_FILE))
 
     def publish(self, arrived: Path) -> dict[str, Any]:
