@@ -27,9 +27,12 @@ if TYPE_CHECKING:
         RecordingUse,
         Verdict,
     )
+    from carlab.jobs.function_workers import FunctionWorkers
 
 RecordingLike = Any
 """A Recording, an EpisodeData, or the path of an MCAP, a CSV or a run's folder."""
+MIN_SHARED_S = 120.0
+"""Recorded time [s] from which several processes share a diagnosis by default; each needs seconds to start."""
 REPORTED_FAULTS = (
     *("yaw_wrap_spikes", "outliers", "stale_samples", "clock_drift", "column_shift", "column_scale"),
     *("wrong_unit", "wrong_sign", "wrong_frame", "integration_error"),
@@ -152,6 +155,7 @@ def diagnose(
     adapt: bool = False,
     keep_events: bool = False,
     seed: int = 0,
+    jobs: int | None = None,
     budget_s: float = 300.0,
     out: Path | str | None = None,
     progress: Callable[[str, float], None] = lambda activity, share: None,
@@ -172,6 +176,8 @@ def diagnose(
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed; takes a minute.
         keep_events: fit and score windows with events (collisions, a hand) too; the report lists them in any case.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
+        jobs: number of processes that share the fits; the result is the same for each number. By default one for short
+            recordings, and one for each core for recordings of two minutes or more.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search. ``inf`` for none.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
@@ -192,10 +198,25 @@ def diagnose(
     fit, validation = (read_material(items, role, file.simulator.mocap.latency_s) for items, role in roles)
     options = {"effects": effects or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
     options |= {"discrepancy": discrepancy, "adapt": adapt, "keep_events": keep_events, "budget_s": budget_s}
-    report = _diagnosed(fit, validation, file, seed, options | {"progress": progress, "stop": stop})
+    with _workers(jobs, fit.episodes) as workers:
+        report = _diagnosed(
+            fit, validation, file, seed, {**options, "workers": workers, "progress": progress, "stop": stop}
+        )
     if out is not None:
         report.save(out)
     return report
+
+
+def _workers(jobs: int | None, episodes: Sequence[EpisodeData]) -> FunctionWorkers:
+    """Processes that share the fits. Raises ConfigError for a number below one."""
+    from carlab.core.errors import ConfigError
+    from carlab.jobs.function_workers import FunctionWorkers, cores_count
+
+    if jobs is not None and jobs < 1:
+        raise ConfigError(f"--jobs {jobs}: give the number of processes, at least 1.")
+    recorded_s = sum(float(episode.times_s[-1] - episode.times_s[0]) for episode in episodes if len(episode.times_s))
+    default = cores_count() if recorded_s > MIN_SHARED_S else 1
+    return FunctionWorkers(default if jobs is None else jobs)
 
 
 def _diagnosed(

@@ -47,6 +47,10 @@ class Diagnose:
     at 85 % of it, and the report covers the effects found so far and says so. The checks after a search that was cut
     short can exceed the limit by a third."""
 
+    jobs: int | None = None
+    """Number of processes that share the fits; the result is the same for each number. By default one for short
+    recordings, and one for each core for recordings of two minutes or more."""
+
     effects: tuple[str, ...] = ()
     """Restrict the search to these effects of the catalogue."""
 
@@ -97,6 +101,7 @@ class Diagnose:
                 adapt=self.adapt,
                 keep_events=self.keep_events,
                 budget_s=self.budget_s,
+                jobs=self.jobs,
                 seed=self.seed,
                 out=self.out,
                 progress=lambda activity, share: bar.update(row, completed=round(100 * share), note=activity),

@@ -38,6 +38,7 @@ from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings, Identification
 from carlab.diagnosis.skill import skill_of
 from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.diagnosis.unexplained.vibration import find_vibration
+from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.network_ensemble import EnsembleSettings, check_duration, train_ensemble
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
 from carlab.prediction.windows import PredictionWindows, tracks_of
@@ -99,6 +100,7 @@ def diagnose(
     adapt: bool = False,
     keep_events: bool = False,
     budget_s: float | None = None,
+    workers: FunctionWorkers | None = None,
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Outcome:
@@ -121,6 +123,7 @@ def diagnose(
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
         keep_events: fit and score windows with events (collisions) too; they are listed in any case.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search (``SearchTimer``).
+        workers: processes that share the fits of the search; by default this process alone.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
 
@@ -134,7 +137,7 @@ def diagnose(
     stages = curves, ceiling, discrepancy, adapt, keep_events
     request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
-    control = RunControl(progress, stop, decisions.append, timer.ends_search)
+    control = RunControl(progress, stop, decisions.append, timer.ends_search, workers or FunctionWorkers())
     recordings, faults = _prepare_recordings(fit, held_out, request, progress)
     recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
     scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))

@@ -16,7 +16,7 @@ from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
-from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.selection.refit import refit_without_each
 from carlab.diagnosis.selection.search import restrict
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
@@ -86,9 +86,7 @@ def _with_standing_effects(
     model = found.model
     while model.effects:
         removed = {}
-        for name in model.effects:
-            others = tuple(e for e in model.effects if e != name)
-            without = refit(problem, others, model.fit, model.scale)
+        for name, without in refit_without_each(problem, model, control).items():
             conditions = conditions_of(name, model, without.fit)
             removed[name] = (without, conditions, _margin(conditions))
         weakest = min(removed, key=lambda name: removed[name][2])

@@ -18,13 +18,16 @@ from carlab.core.errors import ConfigError
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.findings import SearchExtent
+from carlab.diagnosis.identification.fit import Scale
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.search_timer import SearchTimer
+from carlab.diagnosis.selection import refit as refit_module
 from carlab.diagnosis.selection.forward import Path as SelectionPath
 from carlab.diagnosis.selection.forward import extend
-from carlab.diagnosis.selection.problem import RunControl, SearchProblem
+from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
+from carlab.jobs.function_workers import FunctionWorkers
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.effects import CATALOGUE, confusable_effects
 
@@ -32,6 +35,15 @@ Table = dict[str, np.ndarray]
 TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
 FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_out_stride_s=0.5))
 """Half as many windows as by default. They overlap less, so they have nearly as much information."""
+LENIENT = replace(
+    DEFAULT.selection,
+    accept_chi2_min=1.0,
+    accept_unseen_share=-1.0,
+    accept_unseen_ratio=-1.0,
+    keep_z_min=-5.0,
+    min_score_chi2=0.0,
+)
+"""Low thresholds of significance."""
 DRAG, MISALIGNMENT = "aerodynamic_drag", "mocap_yaw_misalignment"
 
 
@@ -74,19 +86,30 @@ def names(outcome: Outcome) -> list[str]:
     return [effect.id for effect in outcome.diagnosis.effects]
 
 
-@pytest.mark.parametrize(("min_size", "expected"), [(0.2, [DRAG]), (0.0, [DRAG, MISALIGNMENT])])
-def test_negligible_effect_is_not_named(drag: Case, tmp_path: Path, min_size: float, expected: list[str]) -> None:
-    """A misalignment of 0.5 mrad changes the lateral velocity by 1 mm/s. Thresholds of significance are lowered."""
-    lenient = replace(
-        DEFAULT.selection,
-        accept_chi2_min=1.0,
-        accept_unseen_share=-1.0,
-        accept_unseen_ratio=-1.0,
-        keep_z_min=-5.0,
-        min_score_chi2=0.0,
-        min_practical_size=min_size,
-    )
-    assert names(found(drag, tmp_path, (5e-4, 5e-4), replace(DEFAULT, selection=lenient))) == expected
+def test_negligible_effect_is_not_named(drag: Case, tmp_path: Path) -> None:
+    """A misalignment of 0.5 mrad changes the lateral velocity by 1 mm/s; the test below names it without a limit."""
+    settings = replace(FEWER, selection=replace(LENIENT, min_practical_size=0.2))
+    assert names(found(drag, tmp_path, (5e-4, 5e-4), settings)) == [DRAG]
+
+
+def test_result_is_the_same_with_two_processes(drag: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two effects are named, so every stage refits; one process repeats no refit."""
+    fits: list[bytes] = []
+
+    def counted(problem: SearchProblem, effects: tuple[str, ...], start: np.ndarray, scale: Scale) -> Model:
+        fits.append(repr((effects, start.tolist(), scale.sigma.tolist())).encode())
+        return fit_from(problem, effects, start, scale)
+
+    fit_from = refit_module._fit_from
+    settings = replace(FEWER, selection=replace(LENIENT, min_practical_size=0.0))
+    with FunctionWorkers(2) as workers:
+        shared = found(drag, tmp_path, (5e-4, 5e-4), settings, workers=workers).diagnosis
+    monkeypatch.setattr(refit_module, "_fit_from", counted)
+    alone = found(drag, tmp_path, (5e-4, 5e-4), settings).diagnosis
+    assert [effect.id for effect in alone.effects] == [DRAG, MISALIGNMENT]
+    assert replace(shared, seconds=0.0) == replace(alone, seconds=0.0)
+    assert len(fits) > 2
+    assert len(set(fits)) == len(fits)
 
 
 def test_effect_that_raises_the_held_out_error_is_withdrawn(drag: Case, tmp_path: Path) -> None:

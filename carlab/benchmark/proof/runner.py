@@ -30,7 +30,7 @@ from carlab.core.errors import DataError
 from carlab.jobs.child_jobs import PYTHON, ChildJob, Executor, JobEnd
 from carlab.jobs.child_processes import ONE_THREAD, ChildEnd
 
-DIAGNOSE = (PYTHON, "-m", "carlab", "diagnose", "--decisions")
+DIAGNOSE = (PYTHON, "-m", "carlab", "diagnose", "--decisions", "--jobs", "1")
 COMPARED = ("single", "multiple", "null", "parameters", "outside")
 WITH_EFFECTS = ("single", "pair", "multiple")
 WORKER = (PYTHON, "-m", "carlab.benchmark.proof.worker")

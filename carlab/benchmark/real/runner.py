@@ -40,7 +40,8 @@ from carlab.jobs.child_processes import ChildEnd
 
 OTHER, CAR, MODEL = "other_{}.csv", "car.toml", "model.toml"
 CARLAB = (PYTHON, "-m", "carlab")
-REFERENCE_OPTIONS = ("--effects", "command_delay", "--curves")
+ONE_PROCESS = ("--jobs", "1")
+REFERENCE_OPTIONS = ("--effects", "command_delay", "--curves", *ONE_PROCESS)
 CONCEALABLE_EFFECTS = tuple(sorted({name for kind in KINDS for name in kind.names if "." not in name}))
 
 
@@ -63,7 +64,7 @@ class Tool:
     def arguments(self, untouched: Sequence[str], others: Sequence[str]) -> list[str]:
         """The command line of one case."""
         recordings = [*untouched, "--with", *others] if self.verb == "compare" else [*others]
-        options = [] if self.verb == "compare" else ["--effects", *CONCEALABLE_EFFECTS]
+        options = [] if self.verb == "compare" else ["--effects", *CONCEALABLE_EFFECTS, *ONE_PROCESS]
         return [*self.command, self.verb, *recordings, "--car", MODEL, "--out", "out", *options]
 
 

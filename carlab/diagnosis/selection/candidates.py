@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
@@ -22,15 +23,18 @@ log = logging.getLogger(__name__)
 def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -> tuple[Candidate, ...]:
     """Refitted candidates, sorted by gain; those tested on unseen blocks come first."""
     names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
-    screened = screen_candidates(problem, model, names)
-    refitted = []
+    screened = screen_candidates(problem, model, names, control)
     chosen = _to_refit(problem, model, screened)
     done, steps = len(model.effects), problem.settings.selection.max_effects
-    for k, result in enumerate(chosen):
-        control.progress(f"refitting with {result.effect}", (done + 0.5 * k / len(chosen)) / steps)
-        if control.ends_search():
-            break
-        refitted.append(refit_candidate(problem, model, result))
+    fitted = control.workers.map(
+        refit_candidate,
+        [(replace(problem), model, result) for result in chosen],
+        stop=control.ends_search,
+        started=lambda k: control.progress(
+            f"refitting with {chosen[k].effect}", (done + 0.5 * k / len(chosen)) / steps
+        ),
+    )
+    refitted = [candidate for candidate in fitted if candidate is not None]
     refitted.sort(key=lambda c: -c.gain)
     return _tested(problem, model, refitted, control) if refitted else ()
 
@@ -59,14 +63,16 @@ def _tested(
     settings = problem.settings.selection
     fitter = problem.fitter(model.scale)
     reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_unseen_error)
-    found = []
-    for k, candidate in enumerate(refitted):
-        if control.ends_search() or (candidate.gain < settings.min_gain_share * refitted[0].gain and k >= 2):
-            found.append(candidate)
-            continue
-        share = (len(model.effects) + 0.7) / settings.max_effects
-        control.progress(f"testing {candidate.effect} on unseen blocks", share)
-        found.append(with_unseen_gain(problem, fitter, candidate, reference))
+    min_gain = settings.min_gain_share * refitted[0].gain
+    count = sum(c.gain >= min_gain or k < 2 for k, c in enumerate(refitted))
+    share = (len(model.effects) + 0.7) / settings.max_effects
+    tested = control.workers.map(
+        with_unseen_gain,
+        [(replace(problem), fitter, candidate, reference) for candidate in refitted[:count]],
+        stop=control.ends_search,
+        started=lambda k: control.progress(f"testing {refitted[k].effect} on unseen blocks", share),
+    )
+    found = [new or old for new, old in zip(tested, refitted[:count], strict=True)] + refitted[count:]
     found.sort(key=lambda c: (not c.is_tested, -(c.gain + c.unseen_gain)))
     for c in found:
         if c.is_tested:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.selection.refit import refit_without_each
 
 log = logging.getLogger(__name__)
 
@@ -38,11 +38,10 @@ def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> di
     folds, limit = problem.folds(), problem.settings.selection.max_unseen_error
     with_all = fitter.leave_fold_out_loss(model.fit, folds, limit)
     found = {}
-    for name in model.effects:
-        control.progress(f"without {name}", 0.93)
-        without = refit(problem, tuple(e for e in model.effects if e != name), model.fit, model.scale).fit
-        rise, error = clustered_gain(fitter.leave_fold_out_loss(without, folds, limit), with_all, problem.windows)
-        found[name] = Deletion(without, rise / error)
+    for name, reduced in refit_without_each(problem, model, control).items():
+        loss = fitter.leave_fold_out_loss(reduced.fit, folds, limit)
+        rise, error = clustered_gain(loss, with_all, problem.windows)
+        found[name] = Deletion(reduced.fit, rise / error)
     return found
 
 

@@ -6,11 +6,12 @@ The first accepted effect is often a proxy of the true effect.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 from carlab.diagnosis.identification.fit import design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
-from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
-from carlab.diagnosis.selection.refit import fit_with_scale, refit, refit_candidate
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
+from carlab.diagnosis.selection.refit import fit_with_scale, refit_candidate, refit_without_each
 from carlab.diagnosis.selection.screening import Screen
 
 log = logging.getLogger(__name__)
@@ -20,15 +21,13 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
     """Remove earlier effects that are no longer significant, and swap those with a better confusable effect."""
     if len(model.effects) < 2 or control.ends_search():
         return model
-    fitter = problem.fitter(model.scale)
-    for name in model.effects[:-1]:
-        others = tuple(e for e in model.effects if e != name)
-        reduced = refit(problem, others, model.fit, model.scale)
-        chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / design_effect_of(fitter.with_covariance(model.fit), name)
+    with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
+    for name, reduced in refit_without_each(problem, model, control, model.effects[:-1]).items():
+        chi2 = 2.0 * (reduced.fit.cost - model.fit.cost) / design_effect_of(with_covariance, name)
         if chi2 < problem.settings.selection.keep_chi2_min:
             log.info("%s is no longer significant (chi2 %.1f)", name, chi2)
-            config = problem.config_with(others)
-            smaller = fit_with_scale(problem, others, config, reduced.fit.free, reduced.fit.z)
+            config = problem.config_with(reduced.effects)
+            smaller = fit_with_scale(problem, reduced.effects, config, reduced.fit.free, reduced.fit.z)
             return apply_moves(problem, smaller, control)
         swapped = _swap(problem, model, reduced, name, control)
         if swapped is not None:
@@ -38,25 +37,37 @@ def apply_moves(problem: SearchProblem, model: Model, control: RunControl) -> Mo
 
 def _swap(problem: SearchProblem, model: Model, reduced: Model, name: str, control: RunControl) -> Model | None:
     """The model with a confusable effect in place of ``name``; None if none is significantly better."""
-    settings = problem.settings.selection
-    screening = problem.settings.screening
-    fitter = problem.fitter(model.scale)
-    screen = Screen(fitter, problem.config_with(reduced.effects), reduced.fit, screening.max_windows, screening)
-    gain = reduced.fit.cost - model.fit.cost
-    for other in problem.confusable.get(name, ()):
-        if control.ends_search() or other in model.effects or not problem.is_candidate(other):
-            continue
-        screened = screen.score(other, effect_parameters(other, problem.nominal))
-        if screened.score < settings.swap_score_share * gain:
-            continue
-        rival = refit_candidate(problem, reduced, screened)
-        design_effect = design_effect_of(fitter.with_covariance(rival.fit), other)
-        chi2 = 2.0 * (model.fit.cost - rival.fit.cost) / design_effect
-        if chi2 > settings.keep_chi2_min:
-            log.info("%s replaces %s (chi2 %.1f)", other, name, chi2)
+    settings, screening = problem.settings.selection, problem.settings.screening
+    confusable = problem.confusable.get(name, ())
+    others = [other for other in confusable if other not in model.effects and problem.is_candidate(other)]
+    if not others or control.ends_search():
+        return None
+    fitter, config = problem.fitter(model.scale), problem.config_with(reduced.effects)
+    screen = Screen(fitter, config, reduced.fit, screening.max_windows, screening)
+    min_score = settings.swap_score_share * (reduced.fit.cost - model.fit.cost)
+    arguments = [(replace(problem), model, reduced, screen, other, min_score) for other in others]
+    for swap in control.workers.map(_fitted_swap, arguments, stop=control.ends_search):
+        if swap is not None and swap[1] > settings.keep_chi2_min:
+            rival, chi2 = swap
+            log.info("%s replaces %s (chi2 %.1f)", rival.effect, name, chi2)
             fit = rival.fit
-            return fit_with_scale(problem, (*reduced.effects, other), fit.config, fit.free, fit.z)
+            return fit_with_scale(problem, (*reduced.effects, rival.effect), fit.config, fit.free, fit.z)
     return None
+
+
+def _fitted_swap(
+    problem: SearchProblem, model: Model, reduced: Model, screen: Screen, other: str, min_score: float
+) -> tuple[Candidate, float] | None:
+    """Fit ``other`` in addition to ``reduced``, with the chi2 by which it is better than ``model``.
+
+    None if its screening score is below ``min_score``.
+    """
+    screened = screen.score(other, effect_parameters(other, problem.nominal))
+    if screened.score < min_score:
+        return None
+    rival = refit_candidate(problem, reduced, screened)
+    design_effect = design_effect_of(problem.fitter(model.scale).with_covariance(rival.fit), other)
+    return rival, 2.0 * (model.fit.cost - rival.fit.cost) / design_effect
 
 
 __all__ = ["apply_moves"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, clustered_gain, design_effect_of
@@ -62,15 +62,14 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
         return PairwiseResult()
     with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
     own_loss = _unseen_loss(problem, model, model.fit)
+    fitted = _fitted_rivals(problem, eliminated, control)
     chi2, rivals, better = {}, {}, {}
     for name in model.effects:
-        others = tuple(e for e in model.effects if e != name)
-        reduced = Model(others, eliminated.deletions[name].without, model.scale)
-        gain = reduced.fit.cost - model.fit.cost
+        gain = eliminated.deletions[name].without.cost - model.fit.cost
         chi2[name] = 2.0 * gain / design_effect_of(with_covariance, name)
         compared = []
-        for rival in _fitted_rivals(problem, model, reduced, name, control):
-            difference, error = clustered_gain(_unseen_loss(problem, model, rival.fit), own_loss, problem.windows)
+        for rival, loss in fitted[name]:
+            difference, error = clustered_gain(loss, own_loss, problem.windows)
             log.info("%s against %s: %.1f (%.1f standard errors)", name, rival.effect, difference, difference / error)
             compared.append((difference, error, rival))
         compared.sort(key=lambda each: each[0])
@@ -81,24 +80,44 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
 
 
 def _fitted_rivals(
-    problem: SearchProblem, model: Model, reduced: Model, name: str, control: RunControl
-) -> list[Candidate]:
-    """Confusable effects of ``name`` that explain a similar part when they replace it in ``model``."""
-    screening = problem.settings.screening
-    fitter = problem.fitter(model.scale)
-    screen = Screen(fitter, problem.config_with(reduced.effects), reduced.fit, screening.max_windows, screening)
-    min_gain = problem.settings.selection.min_gain_share * (reduced.fit.cost - model.fit.cost)
-    found = []
-    for other in problem.confusable.get(name, ()):
-        if other in model.effects or not problem.is_candidate(other):
-            continue
-        if control.stop():
-            break
-        control.progress(f"{name} or {other}?", 0.95)
-        rival = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
-        if rival.gain >= min_gain:
-            found.append(rival)
+    problem: SearchProblem, eliminated: EliminationResult, control: RunControl
+) -> dict[str, list[tuple[Candidate, FloatArray]]]:
+    """For each effect of a model, the confusable effects in its place that explain a similar part.
+
+    Each has its loss on unseen blocks (S,).
+    """
+    model = eliminated.model
+    pairs = [
+        (name, other)
+        for name in model.effects
+        for other in problem.confusable.get(name, ())
+        if other not in model.effects and problem.is_candidate(other)
+    ]
+    fitted = control.workers.map(
+        _fitted_rival,
+        [(replace(problem), model, eliminated.deletions[name].without, name, other) for name, other in pairs],
+        stop=control.stop,
+        started=lambda k: control.progress(f"{pairs[k][0]} or {pairs[k][1]}?", 0.95),
+    )
+    found: dict[str, list[tuple[Candidate, FloatArray]]] = {name: [] for name in model.effects}
+    for (name, _), rival in zip(pairs, fitted, strict=True):
+        if rival is not None:
+            found[name].append(rival)
     return found
+
+
+def _fitted_rival(
+    problem: SearchProblem, model: Model, without: Fit, name: str, other: str
+) -> tuple[Candidate, FloatArray] | None:
+    """Fit ``other`` in place of ``name``, with its loss on unseen blocks (S,); None if it explains too little."""
+    screening = problem.settings.screening
+    reduced = Model(tuple(e for e in model.effects if e != name), without, model.scale)
+    fitter, config = problem.fitter(model.scale), problem.config_with(reduced.effects)
+    screen = Screen(fitter, config, without, screening.max_windows, screening)
+    rival = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
+    if rival.gain < problem.settings.selection.min_gain_share * (without.cost - model.fit.cost):
+        return None
+    return rival, _unseen_loss(problem, model, rival.fit)
 
 
 def _unseen_loss(problem: SearchProblem, model: Model, fit: Fit) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from carlab.diagnosis.identification.fit_parameters import (
     with_effect,
 )
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
+from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE, EFFECTS
@@ -33,6 +34,7 @@ class SearchProblem:
     measured_std  standard deviations (6,) of the noise of the measured channels
     confusable    confusable effects by effect id
     candidates    effects that may be accepted
+    refits        models of earlier refits (``selection.refit``)
     """
 
     nominal: SimulatorConfig
@@ -42,6 +44,7 @@ class SearchProblem:
     confusable: Mapping[str, Sequence[str]]
     candidates: tuple[str, ...] = field(default_factory=lambda: tuple(CATALOGUE))
     settings: DiagnosisSettings = DEFAULT
+    refits: dict[Hashable, Model] = field(init=False, default_factory=dict, compare=False, repr=False)
 
     def free_parameters(self, effects: Sequence[str]) -> tuple[FitParameter, ...]:
         """Free parameters of a fit with ``effects``."""
@@ -171,12 +174,14 @@ class RunControl:
     record      called with each decision about an effect
     ends_search called between fits of the search; if it returns true, no further effect is added, but all checks of the
                 accepted effects follow
+    workers     processes that share independent fits
     """
 
     progress: Callable[[str, float], None] = lambda activity, share: None
     stop: Callable[[], bool] = lambda: False
     record: Callable[[Decision], None] = lambda decision: None
     ends_search: Callable[[], bool] = lambda: False
+    workers: FunctionWorkers = field(default_factory=FunctionWorkers)
 
 
 def is_applicable(config: SimulatorConfig, effect: str) -> bool:

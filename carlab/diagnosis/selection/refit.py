@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
 from carlab.diagnosis.identification.fit_parameters import FitParameter
-from carlab.diagnosis.selection.problem import Candidate, Model, SearchProblem
+from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
@@ -17,10 +18,44 @@ from sim_backends.car_parameters import SimulatorConfig
 
 
 def refit(problem: SearchProblem, effects: tuple[str, ...], initial: Fit, scale: Scale) -> Model:
-    """Fit with ``effects``, starting from their values in ``initial``."""
-    free = problem.free_parameters(effects)
+    """Fit with ``effects``, starting from their values in ``initial``; an equal refit is not repeated."""
+    start = _start(problem, effects, initial)
+    key = _key(effects, start, scale)
+    if key not in problem.refits:
+        problem.refits[key] = _fit_from(problem, effects, start, scale)
+    return problem.refits[key]
+
+
+def refit_without_each(
+    problem: SearchProblem, model: Model, control: RunControl, names: Sequence[str] | None = None
+) -> dict[str, Model]:
+    """For each effect of a model (or each of ``names``), the model without it, refitted."""
+    removed = model.effects if names is None else names
+    others = {name: tuple(e for e in model.effects if e != name) for name in removed}
+    starts = {name: _start(problem, effects, model.fit) for name, effects in others.items()}
+    keys = {name: _key(effects, starts[name], model.scale) for name, effects in others.items()}
+    new = [name for name in removed if keys[name] not in problem.refits]
+    fitted = control.workers.map(
+        _fit_from,
+        [(replace(problem), others[name], starts[name], model.scale) for name in new],
+        started=lambda k: control.progress(f"without {new[k]}", 0.93),
+    )
+    problem.refits.update((keys[name], each) for name, each in zip(new, fitted, strict=True) if each is not None)
+    return {name: problem.refits[key] for name, key in keys.items()}
+
+
+def _start(problem: SearchProblem, effects: tuple[str, ...], initial: Fit) -> FloatArray:
+    """Coordinates of a fit with ``effects`` at the values of ``initial``; 0 without a value."""
     known = {f.name: float(z) for f, z in zip(initial.free, initial.z, strict=True)}
-    start = np.array([known.get(f.name, 0.0) for f in free])
+    return np.array([known.get(f.name, 0.0) for f in problem.free_parameters(effects)])
+
+
+def _key(effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Hashable:
+    return effects, start.tobytes(), scale.steps.tobytes(), scale.sigma.tobytes()
+
+
+def _fit_from(problem: SearchProblem, effects: tuple[str, ...], start: FloatArray, scale: Scale) -> Model:
+    free = problem.free_parameters(effects)
     return Model(effects, problem.fitter(scale).fit(problem.config_with(effects), free, start), scale)
 
 
@@ -81,4 +116,4 @@ def _values(free: Sequence[FitParameter], z: FloatArray) -> dict[str, FloatArray
     return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
 
 
-__all__ = ["fit_base", "fit_with_scale", "refit", "refit_candidate"]
+__all__ = ["fit_base", "fit_with_scale", "refit", "refit_candidate", "refit_without_each"]

@@ -7,7 +7,7 @@ significant rival describes the residual.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem, SearchResult
@@ -57,7 +57,7 @@ def replacing_physics(problem: SearchProblem, found: SearchResult, control: RunC
         reduced = refit(problem, kept, found.best, found.scale)
         numbers = sum(len(EFFECTS[n].parameters) for n in replaced)
         min_score = settings.min_score_share * (reduced.fit.cost - found.best.cost)
-        for rival in _fitted_rivals(problem, reduced, min_score):
+        for rival in _fitted_rivals(problem, reduced, min_score, control):
             more_numbers = len(EFFECTS[rival.effect].parameters) - numbers
             penalty = 0.5 * settings.chi2_per_number * design_effect * more_numbers
             lead = found.best.cost - rival.fit.cost - penalty
@@ -75,19 +75,21 @@ def additional_physics(problem: SearchProblem, found: SearchResult, control: Run
     design_effect = problem.fitter(found.scale).with_covariance(found.best).design_effect
     min_gain = 0.5 * chi2_min * design_effect
     model = found.model if found.effects else refit(problem, (), found.base, found.scale)
-    best = max(_fitted_rivals(problem, model, min_gain), key=lambda c: c.gain, default=None)
+    best = max(_fitted_rivals(problem, model, min_gain, control), key=lambda c: c.gain, default=None)
     if best is None or best.gain < min_gain:
         return None
     log.info("%s in addition: gain %.1f", best.effect, best.gain)
     return RivalPhysics(best.effect, best.fit, best.gain, found.effects)
 
 
-def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float) -> list[Candidate]:
+def _fitted_rivals(problem: SearchProblem, model: Model, min_score: float, control: RunControl) -> list[Candidate]:
     """Rivals added to ``model`` whose screening scores are above ``min_score``, fitted, the highest score first."""
     rivals = [e for e in EFFECTS.values() if not e.catalogued and not isinstance(e, (MeasuredCurve, Disturbance))]
     names = [e.id for e in rivals if e.id not in problem.nominal.effects]
-    screened = [result for result in screen_candidates(problem, model, names) if result.score > min_score]
-    return [refit_candidate(problem, model, result) for result in screened[: problem.settings.rivals.max_refits]]
+    screened = [result for result in screen_candidates(problem, model, names, control) if result.score > min_score]
+    chosen = screened[: problem.settings.rivals.max_refits]
+    fitted = control.workers.map(refit_candidate, [(replace(problem), model, result) for result in chosen])
+    return [candidate for candidate in fitted if candidate is not None]
 
 
 __all__ = ["RivalPhysics", "additional_physics", "replacing_physics"]

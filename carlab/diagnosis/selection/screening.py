@@ -16,7 +16,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter, effect_parameters, with_effect
-from carlab.diagnosis.selection.problem import Model, SearchProblem
+from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.settings import DEFAULT, ScreeningSettings
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
@@ -182,13 +182,15 @@ class _Probe:
         return [{name: float(f.value(np.array(z))) for (name, f), z in zip(pairs, p, strict=True)} for p in sized]
 
 
-def screen_candidates(problem: SearchProblem, model: Model, names: Sequence[str]) -> tuple[ScreeningResult, ...]:
+def screen_candidates(
+    problem: SearchProblem, model: Model, names: Sequence[str], control: RunControl
+) -> tuple[ScreeningResult, ...]:
     """Screening scores of effects added to a model, the highest first."""
     settings = problem.settings.screening
     fitter = problem.fitter(model.scale)
     screen = Screen(fitter, problem.config_with(model.effects), model.fit, settings.max_windows, settings)
-    scored = [screen.score(name, effect_parameters(name, problem.nominal)) for name in names]
-    return tuple(sorted(scored, key=lambda result: -result.score))
+    scored = control.workers.map(screen.score, [(name, effect_parameters(name, problem.nominal)) for name in names])
+    return tuple(sorted((each for each in scored if each is not None), key=lambda result: -result.score))
 
 
 __all__ = ["Screen", "ScreeningResult", "screen_candidates"]

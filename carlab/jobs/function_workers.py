@@ -1,0 +1,191 @@
+"""Calls of a function with many arguments, shared between this process and child processes."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, Pipe
+from typing import Any, Self, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from carlab.jobs.child_processes import ONE_THREAD
+
+log = logging.getLogger(__name__)
+
+WORKER = ("-m", "carlab.jobs.function_worker")
+Made = TypeVar("Made")
+
+
+def cores_count() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class FunctionWorkers:
+    """Shares calls between this process and child processes.
+
+    Results do not depend on the process that computes them: linear algebra has one thread in all of them. Children
+    start with the first shared calls. Functions, arguments and results travel as pickles, between this process and its
+    own children only. If a call fails in a child, this process makes it again, and all calls that follow: the child may
+    have died, or may lack what a program added after its start, such as a new effect.
+
+    Args:
+        processes: Number of processes, this one included.
+    """
+
+    def __init__(self, processes: int = 1) -> None:
+        self.processes = processes
+        self._children: list[_Child] = []
+        self._child_failed = False
+        self._limits: Any = None
+
+    def __enter__(self) -> Self:
+        """Limit linear algebra to one thread."""
+        self._limits = threadpool_limits(1, "blas")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the children, and restore the number of threads."""
+        self.close()
+        if self._limits is not None:
+            self._limits.restore_original_limits()
+            self._limits = None
+
+    def map(
+        self,
+        function: Callable[..., Made],
+        arguments: Sequence[tuple[Any, ...]],
+        *,
+        stop: Callable[[], bool] = lambda: False,
+        started: Callable[[int], None] = lambda index: None,
+    ) -> list[Made | None]:
+        """Call a function with each tuple of arguments.
+
+        Args:
+            function: A function of a module, or a method of a picklable object.
+            arguments: Positional arguments of each call.
+            stop: Polled by this process before each of its calls; if it returns true, no further call begins.
+            started: Called with the index of each call of this process before it begins.
+
+        Returns:
+            The results in the order of the arguments; None for calls that did not begin.
+        """
+        results: list[Made | None] = [None] * len(arguments)
+        pending = deque(range(len(arguments)))
+        threads = self._start_sharing(function, arguments, pending, results)
+        try:
+            while pending or any(thread.is_alive() for thread in threads):
+                if stop():
+                    pending.clear()
+                index = _next(pending)
+                if index is None:  # all calls have begun; one that fails in a child becomes pending again
+                    for thread in threads:
+                        thread.join()
+                    continue
+                started(index)
+                results[index] = function(*arguments[index])
+        except BaseException:
+            pending.clear()
+            self.close()  # ends the calls of the children
+            raise
+        finally:
+            for thread in threads:
+                thread.join()
+        self._child_failed = self._child_failed or any(thread.failed for thread in threads)
+        return results
+
+    def close(self) -> None:
+        """End the children; a later ``map`` starts new ones."""
+        for child in self._children:
+            child.kill()
+        self._children = []
+
+    def _start_sharing(
+        self,
+        function: Callable[..., Made],
+        arguments: Sequence[tuple[Any, ...]],
+        pending: deque[int],
+        results: list[Made | None],
+    ) -> list[_Sharing]:
+        if len(arguments) < 2 or self._child_failed:
+            return []
+        while len(self._children) < self.processes - 1:
+            self._children.append(_Child())
+        threads = [_Sharing(child, function, arguments, pending, results) for child in self._children]
+        for thread in threads:
+            thread.start()
+        return threads
+
+
+class _Child:
+    """A child process that makes one call at a time. It has its own session, so ^C reaches only the parent."""
+
+    def __init__(self) -> None:
+        self.connection, remote = Pipe()
+        with remote:
+            self._process = subprocess.Popen(
+                (sys.executable, *WORKER, str(remote.fileno())),
+                pass_fds=(remote.fileno(),),
+                env={**os.environ, **ONE_THREAD},
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self.connection.close()
+
+
+class _Sharing(threading.Thread):
+    """Hands pending calls to a child until none is left, or until one fails, which is pending again."""
+
+    def __init__(
+        self,
+        child: _Child,
+        function: Callable[..., Any],
+        arguments: Sequence[tuple[Any, ...]],
+        pending: deque[int],
+        results: list[Any],
+    ) -> None:
+        super().__init__(name="function worker", daemon=True)
+        self.child, self.function, self.arguments = child, function, arguments
+        self.pending, self.results = pending, results
+        self.failed = False
+
+    def run(self) -> None:
+        while (index := _next(self.pending)) is not None:
+            try:
+                self.child.connection.send((self.function, self.arguments[index]))
+                self.results[index] = self.child.connection.recv()
+            except Exception as error:  # whatever it is, the parent makes this call again, or raises the same error
+                log.info("a call in a child process failed (%s: %s)", type(error).__name__, error)
+                self.failed = True
+                self.pending.append(index)
+                return
+
+
+def _next(pending: deque[int]) -> int | None:
+    try:
+        return pending.popleft()
+    except IndexError:
+        return None
+
+
+def serve(connection: Connection) -> None:
+    """Make the calls that arrive, until the other end is closed. A call that fails ends the process."""
+    while True:
+        try:
+            function, arguments = connection.recv()
+        except EOFError:
+            return
+        connection.send(function(*arguments))
+
+
+__all__ = ["FunctionWorkers", "cores_count", "serve"]
