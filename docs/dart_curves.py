@@ -21,7 +21,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from carlab.api.diagnosis import read_material
+from carlab.api.material import read_material
 from carlab.cars import load_car_file
 from carlab.diagnosis.curves.support import recorded_forces
 from carlab.prediction.windows import tracks_of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.api.cars import load_car
-from carlab.api.recordings import Recording, is_csv, required_file
+from carlab.api.material import Material, RecordingLike, as_list, assigned, read_material
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -18,26 +17,17 @@ if TYPE_CHECKING:
     from carlab.core.recording_noise import RecordingNoise
     from carlab.diagnosis.diagnose import Outcome
     from carlab.diagnosis.findings import (
-        DataFault,
         Diagnosis,
         EffectFinding,
         Estimate,
         Exhibits,
         FitErrors,
-        RecordingUse,
         Verdict,
     )
     from carlab.jobs.function_workers import FunctionWorkers
 
-RecordingLike = Any
-"""A Recording, an EpisodeData, or the path of an MCAP, a CSV or a run's folder."""
 MIN_SHARED_S = 120.0
 """Recorded time [s] from which several processes share a diagnosis by default; each needs seconds to start."""
-REPORTED_FAULTS = (
-    *("yaw_wrap_spikes", "outliers", "stale_samples", "clock_drift", "column_shift", "column_scale"),
-    *("wrong_unit", "wrong_sign", "wrong_frame", "integration_error"),
-)
-"""Findings of the CSV audit that the report lists as data faults if they were repaired."""
 
 
 @dataclass(frozen=True)
@@ -131,17 +121,6 @@ class DiagnosisReport:
         return "\n  ".join([self.sentence, *(effect.sentence for effect in self.diagnosis.effects)])
 
 
-@dataclass(slots=True)
-class Material:
-    """Episodes with the names of their recordings and data faults; ``notes`` are sentences about conversions."""
-
-    episodes: list[EpisodeData] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-    faults: list[DataFault] = field(default_factory=list)
-    uses: list[RecordingUse] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-
-
 def diagnose(
     recordings: RecordingLike | Iterable[RecordingLike],
     car: str | Path | CarFile = "sim",
@@ -191,7 +170,7 @@ def diagnose(
         DataError: a recording cannot be read, or the report cannot be written.
     """
     file = load_car(car)
-    to_fit, to_validate = _assigned(as_list(recordings), as_list(held_out))
+    to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
     effects = _checked_effects(effects)
     _check_share(holdout_share, to_validate)
     roles = (to_fit, "fit"), (to_validate, "held out")
@@ -285,129 +264,3 @@ def _checked_effects(effects: Sequence[str]) -> tuple[str, ...]:
         if name not in CATALOGUE:
             raise ConfigError(f"There is no effect '{name}' in the catalogue; {nearest_name(name, list(CATALOGUE))}")
     return names
-
-
-def as_list(given: RecordingLike | Iterable[RecordingLike]) -> list[RecordingLike]:
-    """Recordings as a list, with strings converted to paths."""
-    from carlab.core.episode_data import EpisodeData
-
-    single = isinstance(given, (str, Path, Recording, EpisodeData))
-    return [Path(item) if isinstance(item, str) else item for item in ([given] if single else given)]
-
-
-def _assigned(
-    recordings: list[RecordingLike], held_out: list[RecordingLike]
-) -> tuple[list[RecordingLike], list[RecordingLike]]:
-    """Recordings to fit and to hold out, with run folders resolved. Raises ConfigError if one is both."""
-    from carlab.core.errors import ConfigError
-
-    if not recordings:
-        raise ConfigError("Name at least one recording to fit, for example carlab diagnose drive.mcap.")
-    to_fit: list[RecordingLike] = []
-    to_validate = list(held_out)
-    for item in recordings:
-        fitted, validated = _episodes_of_run(item) if isinstance(item, Path) else ([item], [])
-        to_fit += fitted
-        to_validate += validated
-    if same := _paths_of(to_fit) & _paths_of(to_validate):
-        raise ConfigError(f"{min(same).name} is both fitted and held out; remove it from one of the lists.")
-    _check_repetition([*to_fit, *to_validate])
-    return to_fit, to_validate
-
-
-def recordings_of_runs(
-    first: list[RecordingLike], second: list[RecordingLike]
-) -> tuple[list[RecordingLike], list[RecordingLike]]:
-    """Two groups with run folders replaced by their episodes. Raises ConfigError if a recording is in both."""
-    from carlab.core.errors import ConfigError
-
-    groups: list[list[RecordingLike]] = []
-    for items in (first, second):
-        resolved = [_episodes_of_run(item) if isinstance(item, Path) else ([item], []) for item in items]
-        groups.append([recording for fitted, validated in resolved for recording in (*fitted, *validated)])
-    if same := _paths_of(groups[0]) & _paths_of(groups[1]):
-        raise ConfigError(f"{min(same).name} is in both groups; remove it from one of them.")
-    for group in groups:
-        _check_repetition(group)
-    return groups[0], groups[1]
-
-
-def _check_repetition(items: Iterable[RecordingLike]) -> None:
-    """Raise ConfigError if a file is given twice, for example by itself and by its run folder."""
-    from carlab.core.errors import ConfigError
-
-    known: set[Path] = set()
-    for path in (_path_of(item) for item in items):
-        if path is not None and path.resolve() in known:
-            raise ConfigError(f"{path} is given twice; name it once.")
-        known |= {path.resolve()} if path is not None else set()
-
-
-def _paths_of(items: Iterable[RecordingLike]) -> set[Path]:
-    return {path.resolve() for item in items if (path := _path_of(item))}
-
-
-def _episodes_of_run(path: Path) -> tuple[list[Path], list[Path]]:
-    """Episodes of a run folder to fit and to hold out (every third); for other paths the path itself, to fit."""
-    if not (path / "episodes").is_dir():
-        return [path], []
-    from carlab.core.errors import ConfigError
-    from carlab.recording.mcap.source import has_ticks
-
-    driven = [recording for recording in sorted((path / "episodes").glob("*.mcap")) if has_ticks(recording)]
-    if not driven:
-        raise ConfigError(f"{path} has no finished episode; drive one first.")
-    return [p for k, p in enumerate(driven) if k % 3 != 2], driven[2::3]
-
-
-def _path_of(item: RecordingLike) -> Path | None:
-    return item.path if isinstance(item, Recording) else item if isinstance(item, Path) else None
-
-
-def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Material:
-    """Read episodes for a diagnosis: CSV files are repaired, states of MCAP files get one known age."""
-    material = Material()
-    for item in items:
-        material.uses.append(_read_item(item, role, latency_s, material))
-        material.names += [material.uses[-1].path] * (len(material.episodes) - len(material.names))
-    return material
-
-
-def _read_item(item: RecordingLike, role: str, latency_s: float, material: Material) -> RecordingUse:
-    """Add the episodes of one recording."""
-    from carlab.api.recordings import load
-    from carlab.diagnosis.findings import RecordingUse
-    from carlab.diagnosis.state_alignment import align_states
-
-    path = _path_of(item)
-    if path is None:
-        material.episodes.append(align_states(item, latency_s))
-        digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
-        return RecordingUse(str(item.metadata.get("source", "episode")), digest, role)
-    if is_csv(required_file(path)):
-        _read_csv(path, item.mapping if isinstance(item, Recording) else None, material)
-    else:
-        read = item if isinstance(item, Recording) else load(path)
-        material.episodes += [align_states(episode, latency_s) for episode in read.episodes]
-        if read.is_recovered:
-            ticks = read.episode.ticks
-            material.notes.append(f"{path} is an incomplete recording; {ticks} complete ticks were recovered.")
-    return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
-
-
-def _read_csv(path: Path, mapping: Any, material: Material) -> None:
-    """Add a CSV's episodes and its repaired data faults; the diagnosis detects faults without repair itself."""
-    from carlab.diagnosis.findings import DataFault
-    from carlab.recording.audit.report import Severity
-    from carlab.recording.csv.repairing_import import import_repaired
-
-    read = import_repaired(path, mapping=mapping)
-    material.episodes += list(read.imported.episodes)
-    material.notes.append(read.imported.announcement)
-    repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
-    rows = read.imported.episodes[-1].ticks + 1
-    material.faults += [
-        DataFault(f.id, f.channel, f.count or rows, f"repaired: {f.sentence}")
-        for f in (*read.repaired, *repaired)
-        if f.id in REPORTED_FAULTS
-    ]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.api.cars import load_car
-from carlab.api.diagnosis import Material, RecordingLike, as_list, read_material
+from carlab.api.material import Material, RecordingLike, as_list, read_material
 from carlab.api.runs import html_table
 
 if TYPE_CHECKING:
