@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from carlab.api.arguments import at_least
 from carlab.api.cars import load_car
 from carlab.api.material import Material, RecordingLike, as_list, assigned, read_material
 
@@ -169,6 +170,7 @@ def diagnose(
         ConfigError: an argument is invalid.
         DataError: a recording cannot be read, or the report cannot be written.
     """
+    at_least(1, jobs=jobs)
     file = load_car(car)
     to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
     effects = _checked_effects(effects)
@@ -187,12 +189,9 @@ def diagnose(
 
 
 def _workers(jobs: int | None, episodes: Sequence[EpisodeData]) -> FunctionWorkers:
-    """Processes that share the fits. Raises ConfigError for a number below one."""
-    from carlab.core.errors import ConfigError
+    """Processes that share the fits."""
     from carlab.jobs.function_workers import FunctionWorkers, cores_count
 
-    if jobs is not None and jobs < 1:
-        raise ConfigError(f"--jobs {jobs}: give the number of processes, at least 1.")
     recorded_s = sum(float(episode.times_s[-1] - episode.times_s[0]) for episode in episodes if len(episode.times_s))
     default = cores_count() if recorded_s > MIN_SHARED_S else 1
     return FunctionWorkers(default if jobs is None else jobs)

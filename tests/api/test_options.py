@@ -115,6 +115,8 @@ def test_replay_of_recorded_actions_reaches_the_same_position(tmp_path: Path) ->
         (lambda: carlab.drive("sim", seed="x"), "--seed x: give a whole number"),
         (lambda: carlab.drive("sim", policy=5), "--policy 5: give a name"),
         (lambda: carlab.drive("sim", viewer=5), "--viewer 5: give the address"),
+        (lambda: carlab.diagnose("drive.csv", jobs=0), "--jobs 0: give at least 1"),
+        (lambda: carlab.diagnose("drive.csv", jobs=1.5), "--jobs 1.5: give a whole number"),
         (lambda: carlab.learn("sim", updates=1.5), "--updates 1.5: give a whole number"),
         (lambda: carlab.learn("sim", episodes="a"), "--episodes a: give a number"),
         (lambda: carlab.learn("sim", method="x"), "--method x: choose one of gp-sim-posterior"),
