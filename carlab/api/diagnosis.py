@@ -156,8 +156,7 @@ def diagnose(
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed; takes a minute.
         keep_events: fit and score windows with events (collisions, a hand) too; the report lists them in any case.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
-        jobs: number of processes that share the fits; the result is the same for each number. By default one for short
-            recordings, and one for each core for recordings of two minutes or more.
+        jobs: number of processes, with equal results; by default one, or all cores from two minutes of recordings on.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search. ``inf`` for none.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
@@ -172,20 +171,27 @@ def diagnose(
     """
     at_least(1, jobs=jobs)
     file = load_car(car)
-    to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
     effects = _checked_effects(effects)
-    _check_share(holdout_share, to_validate)
-    roles = (to_fit, "fit"), (to_validate, "held out")
-    fit, validation = (read_material(items, role, file.simulator.mocap.latency_s) for items, role in roles)
+    fit, validation = _read_recordings(recordings, held_out, holdout_share, file)
     options = {"effects": effects or None, "holdout_share": holdout_share, "curves": curves, "ceiling": ceiling}
     options |= {"discrepancy": discrepancy, "adapt": adapt, "keep_events": keep_events, "budget_s": budget_s}
-    with _workers(jobs, fit.episodes) as workers:
-        report = _diagnosed(
-            fit, validation, file, seed, {**options, "workers": workers, "progress": progress, "stop": stop}
-        )
+    report = _diagnosed(fit, validation, file, seed, jobs, options | {"progress": progress, "stop": stop})
     if out is not None:
         report.save(out)
     return report
+
+
+def _read_recordings(
+    recordings: RecordingLike | Iterable[RecordingLike],
+    held_out: RecordingLike | Iterable[RecordingLike],
+    holdout_share: float | None,
+    car: CarFile,
+) -> tuple[Material, Material]:
+    """Recordings to fit and held-out ones. Raises ConfigError for arguments that exclude each other."""
+    to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
+    _check_share(holdout_share, to_validate)
+    latency_s = car.simulator.mocap.latency_s
+    return read_material(to_fit, "fit", latency_s), read_material(to_validate, "held out", latency_s)
 
 
 def _workers(jobs: int | None, episodes: Sequence[EpisodeData]) -> FunctionWorkers:
@@ -198,7 +204,7 @@ def _workers(jobs: int | None, episodes: Sequence[EpisodeData]) -> FunctionWorke
 
 
 def _diagnosed(
-    fit: Material, validation: Material, file: CarFile, seed: int, options: Mapping[str, Any]
+    fit: Material, validation: Material, file: CarFile, seed: int, jobs: int | None, options: Mapping[str, Any]
 ) -> DiagnosisReport:
     from carlab.diagnosis.diagnose import Inconclusive
     from carlab.diagnosis.diagnose import diagnose as search
@@ -210,16 +216,18 @@ def _diagnosed(
 
     uses, faults = (*fit.uses, *validation.uses), (*fit.faults, *validation.faults)
     try:
-        outcome = search(
-            fit.episodes,
-            validation.episodes,
-            file.simulator,
-            Texts(effect_sentence, separating_drive, confusable_effects()),
-            uses=uses,
-            data_faults=faults,
-            seed=seed,
-            **options,
-        )
+        with _workers(jobs, fit.episodes) as workers:
+            outcome = search(
+                fit.episodes,
+                validation.episodes,
+                file.simulator,
+                Texts(effect_sentence, separating_drive, confusable_effects()),
+                uses=uses,
+                data_faults=faults,
+                seed=seed,
+                workers=workers,
+                **options,
+            )
     except Inconclusive as error:
         known = error.data_faults or faults
         why = str(error)

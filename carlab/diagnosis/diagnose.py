@@ -118,12 +118,11 @@ def diagnose(
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
         curves: fit measured curves where named effects leave a residual.
-        ceiling: train a black box, and compare with its error.
-        discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
+        ceiling, discrepancy: train a black box, or networks that correct the diagnosed simulator; report their errors.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
         keep_events: fit and score windows with events (collisions) too; they are listed in any case.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search (``SearchTimer``).
-        workers: processes that share the fits of the search; by default this process alone.
+        workers: processes that share the fits; by default this process alone.
         progress: callback with the activity and the completed share in [0, 1].
         stop: callback; if it returns true, the search ends and its result is scored and reported.
 
@@ -138,8 +137,7 @@ def diagnose(
     request = Request(nominal, texts, uses, data_faults, effects, share, seed, settings, *stages)
     decisions: list[Decision] = []
     control = RunControl(progress, stop, decisions.append, timer.ends_search, workers or FunctionWorkers())
-    recordings, faults = _prepare_recordings(fit, held_out, request, progress)
-    recordings, noise = _estimate_noise(recordings, nominal, settings.identification)
+    recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
     scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
     diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=timer.extent())
@@ -148,8 +146,8 @@ def diagnose(
 
 def _prepare_recordings(
     fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], request: Request, progress: Progress
-) -> tuple[SplitRecordings, tuple[DataFault, ...]]:
-    """Repair faults, split the recordings and cut them into windows."""
+) -> tuple[SplitRecordings, Noise, tuple[DataFault, ...]]:
+    """Repair faults, split the recordings, cut them into windows, and estimate their noise."""
     settings = request.settings.windows
     nominal = request.nominal
     progress("reading", 0.0)
@@ -169,7 +167,8 @@ def _prepare_recordings(
         raise
     if request.ceiling or request.discrepancy:
         check_duration(recordings.fit_tracks, EnsembleSettings())
-    return recordings, faults
+    recordings, noise = _estimate_noise(recordings, nominal, request.settings.identification)
+    return recordings, noise, faults
 
 
 def _estimate_noise(
