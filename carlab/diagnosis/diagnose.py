@@ -118,7 +118,8 @@ def diagnose(
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis uses no random numbers.
         settings: thresholds of all stages.
         curves: fit measured curves where named effects leave a residual.
-        ceiling, discrepancy: train a black box, or networks that correct the diagnosed simulator; report their errors.
+        ceiling: train a black box, and compare with its error.
+        discrepancy: train a learned discrepancy of the corrected simulator, and report its error.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed in the car.
         keep_events: fit and score windows with events (collisions) too; they are listed in any case.
         budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search (``SearchTimer``).
@@ -140,6 +141,11 @@ def diagnose(
     recordings, noise, faults = _prepare_recordings(fit, held_out, request, progress)
     scored, naming = _search_effects(recordings, noise, request, replace(control, progress=timer.progress(progress)))
     outcome = _assemble_result(scored, naming, recordings, replace(request, data_faults=faults), control)
+    return _with_run(outcome, timer, decisions)
+
+
+def _with_run(outcome: Outcome, timer: SearchTimer, decisions: Sequence[Decision]) -> Outcome:
+    """The outcome with time, extent and decisions of the search."""
     diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=timer.extent())
     return replace(outcome, diagnosis=diagnosis, exhibits=replace(outcome.exhibits, decisions=tuple(decisions)))
 
