@@ -12,11 +12,12 @@ _IMPORTED_ONCE = (
     "learning.policy.sac_agent",
     "learning.world.drawn_cars",
     "learning.world.model_env",
+    "torch._dynamo",  # torch imports it when the first optimiser is created
 )
 
 
 def child_context() -> ForkServerContext:
-    """Context of child processes that compute between two drives; each begins without the 2 s of these imports.
+    """Context of child processes that compute between two drives; each begins without the 3 s of these imports.
 
     Unlike a fork of this process, a fork of the server has none of its threads, ports and files.
     """
