@@ -104,7 +104,7 @@ class _Operations(TorchDispatchMode):
         to = kwargs.get("device")
         if not on_stand_in and to != INTERNAL_DEVICE:
             return func(*args, **kwargs)
-        self.used.add(func._schema.name.removeprefix("aten::") + f".{func._schema.overload_name}".rstrip("."))
+        self.used.add(_name(func))
         if func is _aten.copy_.default:
             _inner(args[0]).copy_(_inner(args[1]))
             return args[0]
@@ -118,9 +118,20 @@ class _Operations(TorchDispatchMode):
         if any(isinstance(v, torch.Generator) for v in (*args, *kwargs.values())):
             raise RuntimeError("Expected a 'cuda' device type for generator but found 'cpu'")
         result = func(*_inner(args), **{name: _inner(value) for name, value in kwargs.items()})
-        if on_stand_in and func._schema.is_mutable:
+        if on_stand_in and _is_mutable(func):
             return args[0] if isinstance(result, Tensor) else result
         return result if to == CPU else _outer(result)
+
+
+@cache
+def _name(func: Any) -> str:
+    """Return the name of an operation in torch's operator list."""
+    return str(func._schema.name.removeprefix("aten::") + f".{func._schema.overload_name}".rstrip("."))
+
+
+@cache
+def _is_mutable(func: Any) -> bool:
+    return bool(func._schema.is_mutable)
 
 
 def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
@@ -145,7 +156,7 @@ def _outer(value: Any) -> Any:
 
 def _refuse_mixed_devices(func: Any, tensors: list[Tensor]) -> None:
     for k, tensor in enumerate(tensors):
-        written = k == 0 and func._schema.is_mutable
+        written = k == 0 and _is_mutable(func)
         if not isinstance(tensor, StandInTensor) and (tensor.ndim or written or func in _NO_SCALARS):
             raise RuntimeError(f"Expected all tensors to be on the same device, but found cpu and cuda:0! ({func})")
 
