@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 import tomli_w
 import tyro
+from forked_jobs import run_forked_job
 from linear_cars import linear_car
 
 from carlab.cars import load_car_file
 from carlab.cli import _verbs
-from carlab.jobs.child_jobs import ChildJob, Executor, JobEnd, LocalExecutor
+from carlab.jobs.child_jobs import ChildJob, Executor, JobEnd
 from carlab.jobs.child_processes import ChildEnd
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import drive
@@ -35,7 +36,7 @@ class FakeExecutor:
     abandoned: int = 1000
     jobs: int = 1
     seen: list[ChildJob] = field(default_factory=list)
-    run_here: Callable[[ChildJob, Callable[[], bool]], JobEnd] = LocalExecutor().run
+    run_here: Callable[[ChildJob, Callable[[], bool]], JobEnd] = run_forked_job
 
     def run(self, job: ChildJob, abandon: Callable[[], bool]) -> JobEnd:
         self.seen.append(job)
@@ -108,9 +109,11 @@ def assert_equal_scores(found: list[dict[str, Any]], expected: list[dict[str, An
 def test_parallel_jobs_have_the_scores_of_one_process_in_the_same_order(
     carlab: Carlab, regression_scores: list[dict[str, Any]], tmp_path: Path
 ) -> None:
+    """One method: each job is a program that imports everything; the tests below run both methods in forks."""
     out = tmp_path / "out.json"
-    assert carlab(*REGRESSION, "--out", out, "--jobs", 2)[0] == 0
-    assert_equal_scores(scores_in(out), regression_scores)
+    one_method = [word for word in REGRESSION if word != "gp-posterior"]
+    assert carlab(*one_method, "--out", out, "--jobs", 2)[0] == 0
+    assert_equal_scores(scores_in(out), [s for s in regression_scores if s["method"] == "SysID"])
     assert out.with_suffix(".png").is_file()
 
 
