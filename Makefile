@@ -44,6 +44,8 @@ COMPUTING := tests/examples tests/diagnosis tests/cli tests/studies tests/benchm
 	tests/prediction tests/sim_backends tests/api tests/recording tests/test_architecture.py
 YIELD := nice -n 19
 computing driving: export OMP_NUM_THREADS := 1
+# Processes that the tests start read the bytecode of carlab instead of compiling it again.
+computing driving: export PYTHONDONTWRITEBYTECODE :=
 
 computing:
 	$(YIELD) $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder $(COMPUTING)
