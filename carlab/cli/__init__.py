@@ -1,6 +1,7 @@
 """``carlab VERB``: one file per verb; the help texts are the docstrings.
 
-Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 130 interrupted, 141 the reader of a pipe ended.
+Exit codes: 0 done, 1 failed, 2 usage, 3 not ready, 4 safety stop, 5 recordings not sufficient (``diagnose``), 130
+interrupted, 141 the reader of a pipe ended.
 """
 
 from __future__ import annotations
@@ -42,7 +43,13 @@ def run(argv: Sequence[str]) -> int:
     if list(argv) == ["--version"]:
         console.print(f"carlab {VERSION}")
         return 0
-    verb = tyro.extras.subcommand_cli_from_dict(_verbs(), args=list(argv), prog="carlab", description=_DESCRIPTION)
+    verbs = _verbs()
+    if not {"-h", "--help"}.isdisjoint(argv):
+        from carlab.cli.help_texts import join_help_lines
+        from carlab.cli.options import CarOptions, TaskOptions
+
+        join_help_lines((*(each for each in verbs.values() if isinstance(each, type)), CarOptions, TaskOptions))
+    verb = tyro.extras.subcommand_cli_from_dict(verbs, args=list(argv), prog="carlab", description=_DESCRIPTION)
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))
     try:
         return int(verb.run())
