@@ -1,4 +1,4 @@
-"""Diagnosis of recordings: effects that a simulator does not model."""
+"""Diagnosis of recordings: physics that a simulator lacks."""
 
 from __future__ import annotations
 
@@ -141,23 +141,23 @@ def diagnose(
     progress: Callable[[str, float], None] = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> DiagnosisReport:
-    """Identify effects in recordings that a simulator does not model, and validate them on held-out data.
+    """Identify physics that recordings show and a simulator lacks, and validate it on held-out recordings.
 
     Args:
-        recordings: one recording or several, to fit: a ``Recording``, an ``EpisodeData``, a path (MCAP, CSV), or the
-            folder of a run, of which every third episode is held out.
+        recordings: one recording or several, to fit: a ``Recording``, an ``EpisodeData``, a path (MCAP, CSV), or a
+            run folder, of which every third episode is held out.
         car: the simulator to check: a car file, its path, or a name (``sim``, ``eth_rc_car`` ...).
-        held_out: recordings for validation only; by default the last part of each recording is held out.
-        holdout_share: size of that part, above 0 and at most 0.5; 0.3 by default.
+        held_out: held-out recordings, which no fit uses; by default the last part of each recording is held out.
+        holdout_share: length of that part as a share of the recording, above 0 and at most 0.5; 0.3 by default.
         effects: restrict the search to these effects of the catalogue.
-        curves: fit measured curves where named effects leave more than a tenth of the error; takes minutes.
-        ceiling: train a black box, to show how much of the error can be explained at all; takes minutes.
+        curves: fit measured curves if named effects leave more than a tenth of the squared excess; takes minutes.
+        ceiling: train a black box, to show how much of the error can be predicted at all; takes minutes.
         discrepancy: train networks that correct the diagnosed simulator, and report their error; takes minutes.
         adapt: adapt the corrected simulator along the held-out recordings, and report what changed; takes a minute.
-        keep_events: fit and score windows with events (collisions, a hand) too; the report lists them in any case.
+        keep_events: also fit and score windows with events (collisions, a hand); the report lists them in any case.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
         jobs: number of processes, with equal results; by default one, or all cores from two minutes of recordings on.
-        budget_s: time limit [s] without curves, networks and adaptation; its end cuts the search. ``inf`` for none.
+        budget_s: time limit [s] without curves, networks and adaptation, ``inf`` for none; the search ends at 75 %.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
         stop: once it returns true, the search ends and the report covers the findings so far.

@@ -17,21 +17,21 @@ class BenchOptions:
     """Options of all uses of ``carlab bench``."""
 
     what: Positional[Literal["speed", "regression", "priors", "parking", "realcars", "rollouts"]] = "speed"
-    """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender; ratios within one run.
-    regression: gp-sim-posterior, Sim-FSVGD and baselines on the cases of the paper. priors: gp-sim-posterior without a
-    prior and with the kinematic, the nominal and the diagnosed prior, on a simulated car with two concealed effects or
-    on the recordings in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs
-    are continued.
-    realcars: prediction errors on held-out drives of a real car in --data, for constant velocity, the car file, refit,
-    diagnosis, measured curves, a learned discrepancy, a black box and adaptation. rollouts: coverage and error of the
-    rollouts of a learned car on the last recording in --data, with and without a disturbance."""
+    """speed: simulator, gradients, learning, NatNet decoding, lateness of the command sender. regression: models fitted
+    to few rows, by carlab's methods, the paper's methods and baselines, on the cases of the paper. priors: carlab's
+    method with four priors (none, kinematic, nominal, diagnosed), on a simulated car with two concealed effects or on
+    the recordings in --data. parking: carlab learn on the simulated car, for each method; existing runs in --runs are
+    continued. realcars: prediction errors on held-out recordings of a real car in --data, for constant velocity, the
+    car file, refit, named effects, measured curves, a learned discrepancy, a black box and adaptation. rollouts:
+    coverage and error of the rollouts of a learned car on the last recording in --data, with and without a
+    disturbance."""
 
     out: Path | None = None
-    """Write the figures to FILE.json (regression, priors and rollouts after each fit). regression, priors and parking
-    also draw FILE.png; priors stores its recordings and the diagnosis in the folder FILE."""
+    """Write the figures to FILE.json (regression, priors and rollouts: after each fit). regression, priors and parking
+    also draw FILE.png. priors stores its recordings and the diagnosis in the folder FILE."""
 
     seconds: float = 10.0
-    """speed: length of each condition of the sender's measurement [s]."""
+    """speed: duration of each measurement of the command sender [s]."""
 
     case: Literal[
         "1d", "pendulum", "pendulum_motor", "pendulum_detent", "pendulum_saturation", "pendulum_friction", "car",
@@ -40,32 +40,34 @@ class BenchOptions:
     """regression: the system. 1d: sinusoids, two points. pendulum: the prior has no friction and drag, as in the
     authors' code. pendulum_motor: as in the paper; the prior has no drag, dry friction and motor lag.
     pendulum_detent, pendulum_saturation, pendulum_friction: the prior has no detent, saturation of the motor, or
-    friction that depends on the angle. car: one step of
-    a car with Pacejka tyres, kinematic prior. racecar: the authors' arrays of their car (with --data). realcar:
-    recordings in the folder --data, the last one held out."""
+    friction that depends on the angle. car: one step of a car with Pacejka tyres, kinematic prior. racecar: the
+    authors' arrays of their car (with --data). realcar: recordings in the folder --data, the last one held out."""
 
     rows: tuple[int | Literal["all"], ...] = ()
     """regression, priors and rollouts: numbers of training rows; by default those of the paper's figure, or 200, 800
     and all (rollouts). rollouts: "all" also fits the car to rollouts over all prediction windows."""
 
     seeds: int = 3
-    """Repetitions of each fit: with other true systems, other rows of a recording, or (parking) other runs."""
+    """Number of repetitions of each fit, with other true systems or other rows of a recording; parking: number of
+    runs."""
 
     first_seed: int = 0
-    """Smallest seed of the repetitions."""
+    """Seed of the first repetition."""
 
     jobs: int = 1
-    """Number of parallel parts of the study (a number of rows, seed and method, or a run); with more than one, each has
-    one thread. ^C ends the study after the running parts, a second ^C at once."""
+    """Number of parallel jobs; with more than one, each has one thread. A job is one number of rows with one seed
+    (regression: and one method), or one run. ^C ends the study after the running jobs, a second ^C at once."""
 
     ray: str = ""
-    """Run the parts on Ray in place of --jobs: local for the cores of this machine, or the address of a cluster with
-    the same version of carlab. A part whose worker dies runs again, or fails alone. Needs pip install 'carlab[ray]'."""
+    """Run the jobs on Ray in place of --jobs: local for the cores of this machine, or the address of a cluster with the
+    same version of carlab. If a worker dies, its job runs again; a job that fails does not end the others. Needs pip
+    install 'carlab[ray]'."""
 
     methods: tuple[str, ...] = ()
-    """regression: some of gp-sim-average, gp-sim-posterior, sim-posterior, gp-posterior (carlab's: a Gaussian process
-    with a simulator, averaged, alone, or without one), sim-fsvgd, fsvgd (the paper's, as published), sim-fsvgd-mended,
-    fsvgd-mended (without the errors of their code), SysID, GreyBox, ensemble, ridge; parking: some of gp-sim-posterior,
+    """regression, carlab's methods: gp-sim-posterior (a simulator with a Gaussian-process discrepancy), sim-posterior
+    (a simulator without a discrepancy), gp-posterior (a Gaussian process without a simulator), gp-sim-average (average
+    of these three). The paper's: sim-fsvgd, fsvgd (as in the authors' code), sim-fsvgd-mended, fsvgd-mended (without
+    the errors of that code). Baselines: SysID, GreyBox, ensemble, ridge. parking: some of gp-sim-posterior,
     gp-posterior, sim-fsvgd, sim-fsvgd-mended, fsvgd. All by default."""
 
     structure: bool = False
@@ -74,13 +76,14 @@ class BenchOptions:
 
     data: Path | None = None
     """regression: folder with the authors' arrays (pendulum_seed0_n5.npz and so on); by default rows are generated.
-    realcar, priors and rollouts: folder with recordings, the last one held out. realcars: folder with recordings."""
+    --case realcar, priors and rollouts: folder with recordings, the last one held out. realcars: folder with
+    recordings."""
 
     held_out: tuple[str, ...] = ()
-    """realcars: parts of the names of the held-out recordings; by default the last recording."""
+    """realcars: text that the names of the held-out recordings contain; by default the last recording is held out."""
 
     fit: tuple[str, ...] = ()
-    """realcars: parts of the names of the recordings to fit; by default all that are not held out."""
+    """realcars: text that the names of the fitted recordings contain; by default all that are not held out."""
 
     effects: tuple[str, ...] = ()
     """realcars: restrict the search to these effects of the catalogue."""
@@ -89,12 +92,12 @@ class BenchOptions:
     """realcars: also fit and score prediction windows with events (collisions, a hand that moves the car)."""
 
     car: Path = Path("eth_rc_car")
-    """realcar: car file of the prior simulator, with ranges and the standard deviations of a diagnosis. rollouts: the
-    same. priors with --data, and realcars: car file of the nominal simulator, which is diagnosed."""
+    """--case realcar, and rollouts: car file of the prior simulator, with ranges or the standard deviations of a
+    diagnosis. priors with --data, and realcars: car file of the nominal simulator, which is diagnosed."""
 
     history: int | None = None
-    """realcar, priors and rollouts: number of past commands; by default estimated from the recordings (the paper has
-    3)."""
+    """--case realcar, priors and rollouts: number of past commands; by default estimated from the recordings (the paper
+    has 3)."""
 
     diagnosed: Path | None = None
     """priors: model.toml of a diagnosis without the last recording; by default the study runs the diagnosis."""
@@ -110,8 +113,8 @@ class BenchOptions:
 
     realities: int | None = None
     """parking: number of simulated cars that differ from the prior (at most 8: low grip, servo lag, long delay, weak
-    motor, patch, two lags, slope, load transfer). --methods are then nominal, auto (--prior of carlab learn) and
-    no-simulator."""
+    motor, low-friction patch, two lags, slope, load transfer). --methods are then the priors nominal and auto (--prior
+    of carlab learn), and no-simulator."""
 
     episodes: int = 20
     """parking: episodes of each run."""
@@ -124,8 +127,8 @@ class BenchOptions:
     of the authors' code."""
 
     device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the models; with --ray, each part on cuda has one GPU of the cluster. speed: of the learning benchmarks
-    only; the others run on the CPU."""
+    """Device of the models; with --ray, each job on cuda has one GPU of the cluster. speed: device of the learning
+    benchmarks; the others run on the CPU."""
 
     verbose: bool = False
     """Show the whole log."""

@@ -17,23 +17,24 @@ class Compare:
     """Find what changed between two groups of drives of one car: another day, battery, floor, tyre or set-up.
 
     Names the smallest set of effects and parameters that differ, each with a 90 % interval, and writes compare.json.
-    Each group needs 50 s of driving. ^C ends the search and keeps the changes so far.
+    Each group needs 50 s of driving. ^C ends the search; compare.json then has the changes found so far.
     """
 
     recordings: Positional[tuple[Path, ...]]
-    """MCAP or CSV files of the first group, or folders of runs."""
+    """MCAP or CSV files of the first group, or run folders."""
 
     changed: Annotated[tuple[Path, ...], arg(name="with")] = ()
     """Recordings of the second group."""
 
     car: str = "sim"
-    """Simulator of the car: a car file (preferably model.toml of a diagnosis), a preset (eth_rc_car ...), or sim."""
+    """Simulator of the car: a car file (preferably model.toml of a diagnosis), a preset (eth_rc_car ...), or sim (the
+    default car)."""
 
     candidates: tuple[str, ...] = ()
     """Restrict the changes to these effects and base parameters (motor.drive_gain ...)."""
 
     out: Path = Path("comparison")
-    """Folder for compare.json; an earlier one in it is replaced."""
+    """Folder for compare.json; an earlier compare.json in it is replaced."""
 
     verbose: bool = False
     """Show the whole log."""

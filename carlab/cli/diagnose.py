@@ -20,32 +20,32 @@ EXIT_INCONCLUSIVE = 5
 
 @dataclass
 class Diagnose:
-    """Identify effects in recordings that a simulator does not model, and validate them on held-out data.
+    """Identify physics that recordings show and a simulator lacks, and validate it on held-out recordings.
 
     Writes report.html, report.json, report.rrd, summary.png and model.toml (the car file with the identified effects
-    and parameters). ^C ends the search and reports the findings so far. Exit code 0 with a verdict, 5 if the recordings
-    are not sufficient for a verdict.
+    and parameters). ^C ends the search; the report then has the effects found so far. Exit code 0 with a verdict, 5 if
+    the recordings are not sufficient for a verdict.
     """
 
     recordings: Positional[tuple[Path, ...]]
-    """MCAP or CSV files to fit, or folders of runs: every third episode of a run is held out."""
+    """MCAP or CSV files to fit, or run folders. Every third episode of a run folder is held out."""
 
     car: str = "sim"
-    """Simulator to check: a car file, a preset (eth_rc_car, dart_jetracer ...), or sim."""
+    """Simulator to diagnose: a car file, a preset (eth_rc_car, dart_jetracer ...), or sim (the default car)."""
 
     held_out: Annotated[tuple[Path, ...], arg(aliases=("--holdout",))] = ()
-    """Recordings for validation only; by default the last part of each recording is held out."""
+    """Held-out recordings: no fit uses them. By default the last part of each recording is held out."""
 
     holdout_share: float | None = None
-    """Size of the held-out last part as a share of the recording, above 0 and at most 0.5; 0.3 by default."""
+    """Length of the held-out last part as a share of the recording, above 0 and at most 0.5; 0.3 by default."""
 
     out: Path = Path("diagnosis")
     """Folder for the report; an earlier report in it is replaced."""
 
     budget_s: Annotated[float, arg(name="budget")] = 300.0
-    """Time limit of the diagnosis without measured curves, networks and adaptation [s]; inf for none. The search ends
-    at 85 % of it, and the report covers the effects found so far and says so. The checks after a search that was cut
-    short can exceed the limit by a third."""
+    """Time limit [s] of the diagnosis without measured curves, networks and adaptation; inf: no limit. The search for
+    effects ends at 75 % of the limit. The report then has the effects found so far and says that the search was cut
+    short. The checks after such a search can exceed the limit."""
 
     jobs: int | None = None
     """Number of processes that share the fits; the result is the same for each number. By default one for short
@@ -55,11 +55,12 @@ class Diagnose:
     """Restrict the search to these effects of the catalogue."""
 
     curves: bool = False
-    """Fit measured curves (drive force, steering, tyres) if named effects leave more than a tenth of the squared error
-    above the noise."""
+    """Fit measured curves (drive force, steering, tyres) if the named effects leave more than a tenth of the refit's
+    squared excess (error above the noise floor)."""
 
     ceiling: bool = False
-    """Train a black box, to show how much of the error can be explained at all. Needs 60 s of driving."""
+    """Train a black box (networks without a simulator), to show how much of the error can be predicted at all. Needs 60
+    s of driving."""
 
     adapt: bool = False
     """Adapt the simulator along the held-out recordings, and report what changed in the car since the fitted
@@ -70,7 +71,8 @@ class Diagnose:
     listed and left out."""
 
     discrepancy: bool = False
-    """Train networks that correct the diagnosed simulator, and report their error. Needs 60 s of driving."""
+    """Train networks that correct the accelerations of the diagnosed simulator, and report their error. Needs 60 s of
+    driving."""
 
     seed: int = 0
     """Seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers."""

@@ -37,16 +37,16 @@ class Drive:
     which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     policy: str = "parking"
-    """parking (feedback), neutral, teleoperation (keyboard, gamepad: hold the dead-man), a scripted manoeuvre
+    """parking (feedback), neutral (no motion), keyboard or gamepad (hold the dead-man control), a scripted manoeuvre
     (steering_steps, throttle_steps, steering_chirp, figure_eight, throttle_ramp, coast_down, slow_circle), or the
-    folder of a run of carlab learn: its newest policy (RUN/models/0003: that of episode 3)."""
+    run folder of carlab learn: its newest policy (RUN/models/0003: the policy of episode 3)."""
 
     episodes: int = 1
     """Number of episodes."""
 
     ticks: int | None = None
-    """Ticks per episode; by default the task's number (parking: 100), a whole scripted manoeuvre, or with keyboard and
-    gamepad no limit."""
+    """Ticks per episode. By default the task's number (parking: 100); for a scripted manoeuvre its duration; with
+    keyboard or gamepad no limit."""
 
     seed: int = 0
     """Seed of start poses and sensor noise."""

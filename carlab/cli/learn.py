@@ -36,8 +36,8 @@ def _training_messages(figures: dict[str, Any]) -> list[str]:
     messages = [str(figures["history_words"])] if "history_asked" in figures else []
     if (ticks := figures.get("needed_ticks")) is not None:
         messages.append(
-            f"In the learned car the policy parks only in longer drives: in half of them within {ticks} ticks. A run "
-            f"with --ticks {ticks} has enough time."
+            f"In the learned car the policy parks only in longer episodes: in half of them within {ticks} ticks. Start "
+            f"a run with --ticks {ticks} to give it this time."
         )
     return messages
 
@@ -45,7 +45,7 @@ def _training_messages(figures: dict[str, Any]) -> list[str]:
 def _print_figures(bar: Progress, row: EpisodeFigures) -> None:
     bar.console.print(
         f"episode {row.episode}: return {row.total_reward:.1f} "
-        f"(predicted {row.predicted_return:.1f}, with 90 % probability {row.predicted_low:.1f} to "
+        f"(predicted {row.predicted_return:.1f}, 90 % interval {row.predicted_low:.1f} to "
         f"{row.predicted_high:.1f}){_cost_text(row)}, {row.outcome}; "
         f"learned from {row.rows} rows (model {row.model_seconds:.0f} s, policy {row.policy_seconds:.0f} s)",
         soft_wrap=True,
@@ -54,7 +54,7 @@ def _print_figures(bar: Progress, row: EpisodeFigures) -> None:
 
 @dataclass
 class Learn:
-    """Fit the car, train a policy of a task in the learned car, drive an episode with it, and repeat.
+    """Fit a model of the car (the learned car), train a policy in it, drive an episode with the policy, and repeat.
 
     The goal of parking is the origin of the motion capture with heading along x, in 100 ticks (3.3 s at 30 Hz). Before
     each episode a person places a real car at the printed start pose; simulated and emulated cars are placed
@@ -73,11 +73,11 @@ class Learn:
     """Ticks per episode, more than --history; by default the task's number (parking: 100)."""
 
     prior: str = "kinematic"
-    """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), auto (at first nominal;
-    between episodes, effects and parameters that the recordings support enter it, and those that they contradict leave
-    it; the run prints what changed), or FILE.toml (for example a diagnosed model.toml with its effects and standard
-    deviations). Ranges are those of the file; without them, 30 % about motor gain, damping and steering angle and, with
-    wheel slip, about yaw inertia and the tyres' stiffness and friction."""
+    """The prior simulator: kinematic (the car file without wheel slip), nominal (the car file), auto, or FILE.toml (for
+    example model.toml of a diagnosis). auto begins with nominal; between episodes, effects and parameters that the
+    recordings support are added to the prior, and those that they contradict are removed; the run prints each change.
+    Parameters lie in the ranges of the file. Without ranges, motor gain, damping and steering angle lie within 30 % of
+    their values; with wheel slip also yaw inertia and the tyres' stiffness and friction."""
 
     method: Method = "gp-sim-posterior"
     """gp-sim-posterior: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method).
@@ -87,18 +87,18 @@ class Learn:
     history: int | None = None
     """Number of past commands that model and policy observe. By default it covers the command delay, the latency of
     motion capture and the window of the velocity estimate (4 for the simulated car; the paper's methods have 3).
-    After three episodes the number that the recordings support is printed."""
+    After three episodes the run prints the number that the recordings support."""
 
     model_steps: int | None = None
     """Steps of the model's optimiser before each episode: 2500 by default (the paper's methods: at most 40 000)."""
 
     updates: int = 30000
-    """Gradient steps of SAC before an episode: 1.5 times as many before the first episode; after the third, the number
-    is multiplied by 3 / episode."""
+    """Gradient steps of SAC before an episode. Before the first episode the number is 1.5 times as large; after the
+    third it is multiplied by 3 / episode."""
 
     seed: int = 0
-    """Seed of all random numbers; the same seed gives the same run (with --prior auto, up to the first diagnosis, which
-    has a time limit)."""
+    """Seed of all random numbers. The same seed gives the same run; with --prior auto only up to the first diagnosis,
+    because a diagnosis has a time limit."""
 
     device: Device | None = None
     """Device of the training: by default cpu, or that of the resumed run. The policy drives on the CPU."""
@@ -106,8 +106,8 @@ class Learn:
     ray: str = ""
     """Train on Ray while the car stays with this computer: local, or the address of a cluster (ray://HOST:10001) with
     the same version of carlab, for example a computer with a GPU (--device cuda). While the cluster does not answer,
-    the car stays in neutral and the run waits; then it trains on this computer, and tries the cluster again before the
-    next episode. Needs pip install 'carlab[ray]'."""
+    the car stays in neutral and the run waits (--ray-wait). Then the run trains on this computer, and tries the cluster
+    again before the next episode. Needs pip install 'carlab[ray]'."""
 
     ray_wait: float = RAY_WAIT_S
     """Time without an answer of the cluster after which a training runs on this computer [s]."""
@@ -117,8 +117,8 @@ class Learn:
     pose."""
 
     resume: Path | None = None
-    """Folder of a run to resume. --car must be the same, --episodes and --device may change, all other options are
-    those of the run."""
+    """Run folder to resume. --car must be the same, --episodes and --device may change, and all other options are those
+    of the run."""
 
     out: Path = Path("runs")
     """Parent of the run's folder."""
@@ -220,7 +220,7 @@ class Learn:
             on_figures=functools.partial(_print_figures, bar),
             on_checking=functools.partial(show_progress, "quick check of the simulator", 0, 1),
             on_check=on_check,
-            on_repairing=functools.partial(show_progress, "repair of the prior", 0, 1),
+            on_repairing=functools.partial(show_progress, "correction of the prior", 0, 1),
             on_prior=on_prior,
             on_link=lambda sentence: bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False),
         )

@@ -27,11 +27,11 @@ class CarOptions:
     """Car file with physics and motion capture of sim and emulated, which replaces the default car."""
 
     dry_run: bool = False
-    """Real inputs, but no command is sent."""
+    """Measure and compute commands, but send none to the car."""
 
     reality: Path | None = None
-    """Car file with the true physics of a simulated or emulated car. Learning and diagnosis do not read it; they
-    observe differences to the car's own file only through recordings."""
+    """Car file with the true physics of a simulated or emulated car, which differ from the file of --car or --vehicle.
+    Learning and diagnosis do not read it; they see the difference only in recordings."""
 
     def arguments(self) -> dict[str, Any]:
         """These options as keyword arguments of ``carlab.drive`` and other calls."""
@@ -54,9 +54,9 @@ class TaskOptions:
     """Options that select the task."""
 
     task: str | None = None
-    """parking, obstacles (parking behind four discs), path (figure eight), laps, or FILE.py:CLASS: a class of your own
-    file, derived from carlab.core.task.Task. By default parking, or the task of a run that is resumed or driven again;
-    a run folder keeps no code, so such a run needs FILE.py:CLASS again."""
+    """parking, obstacles (parking behind four discs), path (figure eight), laps, or FILE.py:CLASS: a class in your own
+    file, derived from carlab.core.task.Task. By default parking, or the task of a run that is resumed or driven again.
+    A run folder contains no code, so a run with your own task needs FILE.py:CLASS again."""
 
     track: Path | None = None
     """CSV file with the columns x, y (centre line in driving direction) and width [m], for laps. By default [track] of

@@ -36,21 +36,21 @@ DAY_S = 86400.0
 
 @dataclass
 class Prove:
-    """Benchmark the diagnosis on new recordings with concealed effects, and score it against the sealed answers.
+    """Measure how often a diagnosis is correct, on new recordings with concealed effects and sealed answers.
 
-    Prints a hash of the answers before the first diagnosis. Takes hours (--set short: minutes). ^C ends after the
-    running cases, a second ^C at once; the same command continues. Writes scores.json, confusion.png, detection.png,
-    results.md.
+    Prints a hash of the answers before the first diagnosis. Takes hours (--set short: minutes). ^C ends the proof after
+    the running cases, a second ^C at once; the same command continues it. Writes scores.json, confusion.png,
+    detection.png and results.md.
     """
 
     out: Path = Path("proof")
-    """Folder of the benchmark; an unfinished benchmark with the same options is continued."""
+    """Folder of the proof; an unfinished proof with the same options is continued."""
 
     set: Literal["short", "full", "development", "hard", "hard-development", "real"] = "short"
-    """short: five small cases; full: about 390 cases of the test set; development: 390 other cases; hard: about 280
-    cases with three to five effects, 30 s of recording, a wrong kind of base model, feedback driving only, or jitter in
-    the stamps; hard-development: 280 other ones; real: about 150 cases with effects of commands and sensors concealed
-    in recordings of a real car."""
+    """short: five small cases. full: 388 cases of the test set. hard: 276 cases with three to five effects, 30 s of
+    recording, a wrong kind of base model, feedback driving only, or jitter in the stamps. development,
+    hard-development: as many cases with other seeds, for tuning. real: about 150 cases with effects of commands and
+    sensors concealed in recordings of a real car."""
 
     data: Path | None = None
     """Only --set real: folder with recordings of one car, at least 160 s."""
@@ -63,16 +63,16 @@ class Prove:
     model."""
 
     simulator: Literal["own", "commonroad", "commonroad-drift"] = "own"
-    """own: effects concealed in carlab's simulator; commonroad: no seal, recordings of an independent simulator, the
-    multi-body model of the package commonroad-vehicle-models; commonroad-drift: its single-track drift model. The
-    latter two write study.md and study.json."""
+    """own: effects concealed by carlab's case generator. commonroad: recordings of an independent simulator, the
+    multi-body model of the package commonroad-vehicle-models. commonroad-drift: the single-track drift model of this
+    package. The latter two have no seal, and write study.md and study.json."""
 
     seed: int = 0
     """Seed of the cases."""
 
     limit: int | None = None
-    """Number of cases drawn from the set, of a hard set equally many of each kind; for a public simulator, number of
-    drives (1 by default)."""
+    """Number of cases drawn from the set (of a hard set, equally many of each kind). With --simulator commonroad:
+    number of drives, 1 by default."""
 
     jobs: int = 1
     """Number of parallel cases; with more than one, each case has one thread."""
@@ -85,14 +85,14 @@ class Prove:
     """Time limit of a diagnosis [s]; a longer diagnosis counts as failed."""
 
     oracle: bool = True
-    """Diagnose again with the true names, for the oracle ratio."""
+    """Also diagnose each case with the true names given, for the oracle ratio (the best result that is possible)."""
 
     baselines: bool = True
     """Also score PySINDy, a Gaussian process, stepwise BIC and cross-correlation on the same cases."""
 
     calibrate: bool = False
-    """Run no case; print the rates of false and missed names over the range of each decision threshold, from the
-    finished diagnoses of the folder. Use it with --set development; never tune thresholds on the test set."""
+    """Run no case. Print the rates of false and missed names over the range of each decision threshold, from the
+    finished diagnoses in the folder. Use it with --set development; never tune thresholds on the test set."""
 
     verbose: bool = False
     """Show the whole log."""

@@ -29,9 +29,10 @@ class Replay:
     """Print the prediction errors of a simulator on a recording, or send the recorded actions to a car again.
 
     On a simulated car: predict --horizon seconds ahead from many initial states along the recording, and print the
-    errors and those of constant velocity, as carlab diagnose does: in the whole recording, and in the last part, which
-    a diagnosis of this recording alone holds out. On any other car (or with --drive): put the car at the recorded
-    start, send the recorded actions at their times, record the drive, and print its difference from the recording.
+    errors of the simulator and of constant velocity. The errors are computed as in carlab diagnose, for the whole
+    recording and for its last part, which a diagnosis of this recording alone holds out. On any other car (or with
+    --drive): put the car at the recorded start, send the recorded actions at their times, record the drive, and print
+    its difference from the recording.
     """
 
     recording: Positional[Path]
@@ -49,8 +50,8 @@ class Replay:
     """Length of the last part as a share of the recording, above 0 and at most 0.5."""
 
     adapt: bool = False
-    """Also predict with adaptation to the recent past: drive force, steering trim, grip and force forward are estimated
-    from the rows before each prediction."""
+    """Also predict with adaptation: drive force, steering trim, grip and force forward are estimated from the rows
+    before each prediction."""
 
     keep_events: bool = False
     """Also score prediction windows with events (collisions, a hand that moves the car). By default they are listed and
@@ -60,10 +61,10 @@ class Replay:
     """Write FILE.rrd with the recording and the predictions."""
 
     drive: bool = False
-    """Drive also if the car is simulated, instead of predicting."""
+    """Drive a simulated car too, instead of predicting."""
 
     seconds: float | None = None
-    """Drive only this first part of the recording [s]."""
+    """Length of the first part of the recording that is driven [s]; by default the whole recording."""
 
     seed: int = 0
     """Seed of the sensor noise."""
