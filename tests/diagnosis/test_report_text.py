@@ -168,7 +168,8 @@ def test_first_sentence_states_where_constant_velocity_is_better_and_why() -> No
     assert verdict_sentence(replace(fitted, skill=(better, not_significant))) == verdict_sentence(fitted)
     expected = (
         "This model predicts held-out recording 2 at low speed worse than constant velocity (0.15 m against 0.06 m "
-        "after 1 s). Velocities hardly change there, so such a drive does not separate causes. The simulator leaves out"
+        "after 1 s). Velocities hardly change there, so this drive does not separate the possible causes. "
+        "The simulator leaves out"
     )
     assert verdict_sentence(replace(fitted, skill=(better, worse))).startswith(expected)
     wrong = replace(worse, constant_velocity_m=0.12)
@@ -192,8 +193,9 @@ def test_verdicts_state_faults_residuals_and_reasons() -> None:
     assert "(wrong unit)" in verdict_sentence(replace(diagnosis("data"), data_faults=(fault,)))
     unexplained = Unexplained(0.7, ("vx",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
     unexplained_diagnosis = replace(diagnosis("unexplained"), unexplained=unexplained)
-    assert "longitudinal velocity, mostly where speed > 1 m/s. Class: even in steering." in verdict_sentence(
-        unexplained_diagnosis
+    assert (
+        "longitudinal velocity, mostly where speed > 1 m/s. Class of the missing physics: even in steering."
+        in verdict_sentence(unexplained_diagnosis)
     )
     assert next_drive(unexplained_diagnosis)[0] == "coast_down"
     why = "Too short; drive throttle_ramp."

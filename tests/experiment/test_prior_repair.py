@@ -48,7 +48,7 @@ CAR = SimulatorConfig.from_preset()
 PLAIN = replace(CAR, priors={})
 LAG = "effects.motor_lag.time_constant"
 DELAY = "effects.command_delay.extra_delay"
-MOTOR_LAG = Correction("motor_lag", {LAG: 0.08}, {LAG: 0.01}, 1, "quick check", "explains 90%")
+MOTOR_LAG = Correction("motor_lag", {LAG: 0.08}, {LAG: 0.01}, 1, "quick check", "it explains 90 %")
 
 
 def cause(name: str, share: float, *, tie: bool = False, **values: float) -> dict[str, Any]:
@@ -69,7 +69,7 @@ def test_effect_with_support_on_unseen_windows_enters_with_its_uncertainty() -> 
     (entered,) = version.corrections
     assert (entered.id, entered.values, entered.episodes) == ("motor_lag", {LAG: 0.08}, 1)
     assert entered.std[LAG] == pytest.approx(0.016), "the difference of the halves"
-    assert version.sentence.startswith("The prior changes after episode 1: motor_lag (time_constant 0.08 s) enters")
+    assert version.sentence.startswith("The prior changes after episode 1: motor_lag (time_constant 0.08 s) is added")
     assert "\n" not in version.sentence
     prior = corrected(CAR, version.corrections)
     assert prior.effects == {"motor_lag": {"time_constant": 0.08}}
@@ -110,7 +110,7 @@ def test_cause_that_ties_with_an_unusable_first_one_enters() -> None:
 def test_contradicted_effect_leaves() -> None:
     version = repaired(PriorVersion((MOTOR_LAG,), 4), CAR, left(3, contradicted=("motor_lag",)))
     assert version.corrections == ()
-    assert "motor_lag leaves (episode 3 is predicted better without it)" in version.sentence
+    assert "motor_lag is removed (episode 3 is predicted better without it)" in version.sentence
 
 
 def test_complete_diagnosis_replaces_and_cut_one_only_adds() -> None:
@@ -118,7 +118,7 @@ def test_complete_diagnosis_replaces_and_cut_one_only_adds() -> None:
     delay = Correction("command_delay", {DELAY: 0.05}, {DELAY: 0.002}, 4, "diagnosis", "held out")
     complete = repaired(before, CAR, Findings(4, diagnosed=(delay,), diagnosis="mismatch"))
     assert [c.id for c in complete.corrections] == ["command_delay"]
-    assert "motor_lag leaves (the diagnosis of 4 episodes does not confirm it)" in complete.sentence
+    assert "motor_lag is removed (the diagnosis of 4 episodes does not confirm it)" in complete.sentence
     assert complete.diagnosed == 4
     cut = repaired(before, CAR, Findings(4, diagnosed=(delay,), diagnosis="mismatch", is_complete=False))
     assert {c.id for c in cut.corrections} == {"command_delay", "motor_lag"}
@@ -223,7 +223,7 @@ def test_real_diagnosis_of_a_run_finds_the_lag(tmp_path: Path) -> None:
 def test_run_uses_the_newest_version_of_the_prior_when_it_is_resumed(tmp_path: Path) -> None:
     choice = choose_car("sim", seed=0)
     run = RunDirectory.create(tmp_path, "auto")
-    version = PriorVersion((MOTOR_LAG,), 4, "The prior changes after episode 1: motor_lag enters.")
+    version = PriorVersion((MOTOR_LAG,), 4, "The prior changes after episode 1: motor_lag is added.")
     sentences: list[str] = []
     figures: list[EpisodeFigures] = []
     hooks = CampaignHooks(on_prior=lambda v: sentences.append(v.sentence), on_figures=figures.append)

@@ -54,10 +54,13 @@ def short(check: QuickCheck) -> str:
 def _likely_causes(check: QuickCheck, decide: str) -> str:
     if not check.causes:
         return f"No single effect of the catalogue and no parameter of the car file explains it; {decide}."
-    parts = [_cause(c) for c in check.causes]
-    text = f"Most likely cause: {parts[0]} of the excess error explained on windows that were not fitted"
-    for cause, part in zip(check.causes[1:], parts[1:], strict=True):
-        text += f"; {'indistinguishable from it' if cause.ties_with_first else 'less likely'}: {part}"
+    first, *others = check.causes
+    text = (
+        f"Most likely cause: {_cause(first)}, which explains {percent(first.share)} of the excess on held-out windows"
+    )
+    for cause in others:
+        label = "indistinguishable from it" if cause.ties_with_first else "less likely"
+        text += f"; {label}: {_cause(cause)}, {percent(cause.share)}"
     return f"{text}; {decide}."
 
 
@@ -71,7 +74,7 @@ def _cause(cause: Cause) -> str:
             text += f" instead of {number(p.before)}"
         values.append(text)
     refit = " with other parameters of the car file" if cause.with_refit else ""
-    return f"{name} ({', '.join(values)}){refit}, {percent(cause.share)}"
+    return f"{name} ({', '.join(values)}){refit}"
 
 
 __all__ = ["sentences", "short"]

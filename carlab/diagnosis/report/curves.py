@@ -34,10 +34,10 @@ def ceiling_sentence(diagnosis: Diagnosis) -> str:
     if ceiling is None:
         return ""
     return (
-        f"Of the refit's squared excess the model explains {percent(ceiling.by_model)}; networks predict another "
-        f"{percent(ceiling.predictable)} from past commands and velocities; neither predicts "
-        f"{percent(ceiling.unpredictable)}. The model explains {percent(ceiling.explained_of_predictable)} of the "
-        "predictable part."
+        f"The model explains {percent(ceiling.by_model)} of the refit's squared excess over the noise floor. Networks "
+        f"predict another {percent(ceiling.predictable)} from past commands and velocities. Neither predicts the "
+        f"other {percent(ceiling.unpredictable)}. The model explains {percent(ceiling.explained_of_predictable)} of "
+        "the predictable part."
     )
 
 

@@ -20,7 +20,7 @@ def drift_sentence(drift: Drift, horizon_s: float) -> str:
     """What changed in one recording, and what adaptation to it gains."""
     what = " ".join(_change_sentence(c) for c in drift.changes)
     if not what:
-        what = "No single one of drive force, steering trim, grip and force forward explains it."
+        what = "None of the four quantities (drive force, steering trim, grip, force forward) explains it alone."
     head = f"In held-out recording {drift.recording} the car differs from the fitted recordings."
     if not _is_in_similar_states(drift):
         head = f"In held-out recording {drift.recording} the car differs from the model."
@@ -29,15 +29,16 @@ def drift_sentence(drift: Drift, horizon_s: float) -> str:
             "the car or an error of the model in these states."
         )
     before, after = with_unit(drift.model_m, "m"), with_unit(drift.adapted_m, "m")
-    gain = f"With adaptation to the recent past, the position error after {with_unit(horizon_s, 's')} goes from"
+    gain = f"With adaptation, the position error after {with_unit(horizon_s, 's')} goes from"
     return f"{head} {what} {gain} {before} to {after}."
 
 
 def drift_sentences(diagnosis: Diagnosis) -> list[str]:
     """Evidence and time constant of each drift, and one sentence for all recordings without one."""
     made = [
-        f"Drift in held-out recording {d.recording}: {number(d.standard_errors)} standard errors on unseen windows, "
-        f"likeliest time constant {with_unit(d.time_constant_s, 's')}."
+        f"Drift in held-out recording {d.recording}: a slow adaptation predicts its windows better by "
+        f"{number(d.standard_errors)} standard errors. The most likely time constant is "
+        f"{with_unit(d.time_constant_s, 's')}."
         for d in diagnosis.drift
         if d.is_drift
     ]
@@ -45,8 +46,8 @@ def drift_sentences(diagnosis: Diagnosis) -> list[str]:
     if without:
         word = "recordings" if len(without) > 1 else "recording"
         made.append(
-            f"No drift is found in held-out {word} {listed(without)}: a slow adaptation predicts unseen windows no "
-            "better than the model, or its errors depend on the state."
+            f"No drift is found in held-out {word} {listed(without)}: a slow adaptation predicts the windows no better "
+            "than the model does, or the errors of the model depend on the state rather than on time."
         )
     return made
 

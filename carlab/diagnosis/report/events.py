@@ -16,10 +16,10 @@ def event_sentences(use: EventUse, without: FitErrors | None = None, with_them: 
         return []
     head = "One event that no tyre can cause" if count == 1 else f"{count} events that no tyre can cause"
     if not use.are_left_out:
-        head += " (collision, hand): kept in fit and score."
+        head += " (collision, hand). Fit and score contain them."
     else:
         windows = [f"{n} {name}" for n, name in ((use.fit_windows, "fitted"), (use.held_out_windows, "scored")) if n]
-        head += f" (collision, hand): {' and '.join(windows) or 'no'} prediction windows are left out."
+        head += f" (collision, hand). {' and '.join(windows) or 'No'} prediction windows are left out."
     if without is not None and with_them is not None:
         head += (
             f" With them, the position error of the model is {with_unit(with_them.position_m, 'm')} instead of "

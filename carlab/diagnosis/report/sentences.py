@@ -217,7 +217,7 @@ def worse_than_constant_velocity(diagnosis: Diagnosis) -> str:
     place = f"recording {worst.recording}" + ("" if worst.regime == "all" else f" at {worst.regime}")
     steady = worst.constant_velocity_m < settings.steady_share * worst.travelled_m
     why = (
-        "Velocities hardly change there, so such a drive does not separate causes."
+        "Velocities hardly change there, so this drive does not separate the possible causes."
         if steady
         else "The car has changed since the fitted recordings."
         if has_changed(diagnosis, worst.recording)
@@ -259,7 +259,8 @@ def _mismatch(diagnosis: Diagnosis) -> str:
         share = f", which removes {percent(removed)} of the error above the noise" if math.isfinite(removed) else ""
         text += f" With {'it' if len(effects) == 1 else 'them'}, {fall}{share}."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
-        text += f" {percent(diagnosis.unexplained.share)} of the refit's squared excess stays unexplained."
+        share = percent(diagnosis.unexplained.share)
+        text += f" {share} of the refit's squared excess over the noise floor stays unexplained."
     return text
 
 
@@ -306,7 +307,7 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         return text + "."
     where = listed([CHANNEL_WORDS.get(c, c) for c in rest.channels])
     shows = f" The error appears in {where}" if where else " The error appears"
-    return f"{text}.{shows}, {regime_words(rest.regime)}. Class: {rest.kind or 'unknown'}."
+    return f"{text}.{shows}, {regime_words(rest.regime)}. Class of the missing physics: {rest.kind or 'unknown'}."
 
 
 def _inconclusive(diagnosis: Diagnosis) -> str:

@@ -191,13 +191,14 @@ def corrections_of(diagnosis: Diagnosis, model: SimulatorConfig, episodes: int) 
             continue
         own = {name: value for name, value in values.items() if name.startswith(f"effects.{effect.id}.")}
         std = {f"effects.{effect.id}.{name}": estimate.std for name, estimate in effect.parameters.items()}
-        fall = f"its removal raises the error of held-out episodes by {effect.evidence.held_out_error_reduction:.0%}"
-        corrections.append(Correction(effect.id, own, _valid(std, values), episodes, "diagnosis", fall))
+        rise = 100.0 * effect.evidence.held_out_error_reduction
+        why = f"its removal raises the error of held-out episodes by {rise:.0f} %"
+        corrections.append(Correction(effect.id, own, _valid(std, values), episodes, "diagnosis", why))
     refitted = {name: values[name] for name in diagnosis.parameters if name in values}
     std = _valid({name: estimate.std for name, estimate in diagnosis.parameters.items()}, values)
     if refitted:
-        fall = f"fitted to {episodes} episodes"
-        corrections.append(Correction(PARAMETERS, refitted, std, episodes, "diagnosis", fall))
+        why = f"fitted to {episodes} episodes"
+        corrections.append(Correction(PARAMETERS, refitted, std, episodes, "diagnosis", why))
     return tuple(corrections)
 
 
@@ -230,7 +231,7 @@ def _child(pipe: Any, request: RepairRequest) -> None:
 
 
 def _failed(request: RepairRequest, reason: str) -> PriorVersion:
-    text = f"The repair of the prior after episode {len(request.recordings)} failed ({reason.rstrip('.')})"
+    text = f"The correction of the prior after episode {len(request.recordings)} failed ({reason.rstrip('.')})"
     return replace(request.before, sentence=f"{text}; the prior is unchanged.")
 
 

@@ -27,7 +27,7 @@ MIN_HISTORY, MAX_HISTORY = 3, 8
 LARGEST_GIVEN_HISTORY = 100
 """Largest number of past commands of a file; a user may ask for more than ``MAX_HISTORY``."""
 MIN_ENTRY_SHARE = 0.3
-"""Minimum share of the error that a cause of the quick check explains on windows that were not fitted."""
+"""Minimum share of the error on held-out windows that a cause of the quick check explains."""
 MIN_STD_SHARE = 0.2
 """Minimum standard deviation of a number of the quick check, relative to its change: one cause is fitted alone."""
 
@@ -178,12 +178,12 @@ def repaired(before: PriorVersion, car: SimulatorConfig, found: Findings) -> Pri
 def _by_diagnosis(before: PriorVersion, found: Findings) -> tuple[tuple[Correction, ...], list[str]]:
     assert found.diagnosed is not None
     after = list(found.diagnosed)
-    why = [f"{c.text()} enters ({c.evidence})" for c in after if c.id not in _ids(before.corrections)]
+    why = [f"{c.text()} is added ({c.evidence})" for c in after if c.id not in _ids(before.corrections)]
     for c in before.corrections:
         if c.id in _ids(after):
             continue
         if found.is_complete or c.id in found.contradicted:
-            why.append(f"{c.id} leaves (the diagnosis of {found.episodes} episodes does not confirm it)")
+            why.append(f"{c.id} is removed (the diagnosis of {found.episodes} episodes does not confirm it)")
         else:
             after.append(c)  # A search that was cut short refutes nothing.
     if not why:
@@ -194,7 +194,7 @@ def _by_diagnosis(before: PriorVersion, found: Findings) -> tuple[tuple[Correcti
 def _by_check(before: PriorVersion, car: SimulatorConfig, found: Findings) -> tuple[tuple[Correction, ...], list[str]]:
     after = [c for c in before.corrections if c.id not in found.contradicted]
     why = [
-        f"{c.id} leaves (episode {found.episodes} is predicted better without it)"
+        f"{c.id} is removed (episode {found.episodes} is predicted better without it)"
         for c in before.corrections
         if c.id in found.contradicted
     ]
@@ -204,7 +204,7 @@ def _by_check(before: PriorVersion, car: SimulatorConfig, found: Findings) -> tu
         merged = {**(replaced[0].values if replaced else {}), **entry.values}
         std = {**(replaced[0].std if replaced else {}), **entry.std}
         after = [c for c in after if c.id != entry.id] + [replace(entry, values=merged, std=std)]
-        why.append(f"{entry.text()} {'changes' if replaced else 'enters'} ({entry.evidence})")
+        why.append(f"{entry.text()} {'changes' if replaced else 'is added'} ({entry.evidence})")
     return tuple(after), why
 
 
@@ -226,7 +226,7 @@ def _entry(found: Findings) -> Correction | None:
         if spread > 0.0 and not info.choices:
             std[name] = spread
     name = str(cause["id"]).removeprefix("effects.")
-    share = f"explains {cause['share']:.0%} of the error on windows that were not fitted"
+    share = f"it explains {100.0 * cause['share']:.0f} % of the error on held-out windows"
     return Correction(name if name in EFFECTS else PARAMETERS, values, std, found.episodes, "quick check", share)
 
 
