@@ -117,8 +117,8 @@ def drive(
         live: open the rerun viewer, which follows the run.
         viewer: address of an open viewer that follows the run, ``rerun+http://HOST:9876/proxy``.
         vehicle: car file that replaces the default car of ``sim`` and ``emulated``.
-        reality: car file with the true physics of a simulated or emulated car, which only its recordings reveal.
-        dry_run: real inputs, but no command is sent.
+        reality: car file with the true physics of a simulated or emulated car. Learning and diagnosis do not read it.
+        dry_run: measure and compute commands, but send none to the car.
         hooks: callbacks.
 
     Returns:

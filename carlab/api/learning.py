@@ -1,4 +1,4 @@
-"""Learning a task: fit the car, train a policy in the learned car, drive, repeat."""
+"""Learning a task: fit a model of the car (the learned car), train a policy in it, drive, repeat."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
 
 @dataclass(slots=True)
 class LearnHooks(RunHooks):
-    """Callbacks of a campaign; the defaults do nothing.
+    """Callbacks of a learning run; the defaults do nothing.
 
     Attributes:
         on_training: receives activity, steps done and total steps.
@@ -57,8 +57,8 @@ class LearnHooks(RunHooks):
         on_figures: receives the figures of a finished episode.
         on_checking: called before the quick check of an episode against the simulator.
         on_check: receives the result of the quick check.
-        on_repairing: called before the repair of the prior (``prior="auto"``).
-        on_prior: receives the version of the prior after the repair, with the sentence that states what changed.
+        on_repairing: called before the correction of the prior (``prior="auto"``).
+        on_prior: receives the version of the prior after the correction, with the sentence that states what changed.
         on_link: receives a sentence when the cluster does not answer, is replaced by this computer, or answers again.
     """
 
@@ -141,7 +141,7 @@ def learn(
     reality: Path | CarFile | None = None, dry_run: bool = False, ray: str = "", ray_wait: float = RAY_WAIT_S,
     hooks: LearnHooks | None = None,
 ) -> LearnRun:  # fmt: skip
-    """Fit the car to all recordings, train a policy of a task in the learned car, drive an episode, and repeat.
+    """Fit a model of the car (the learned car), train a policy in it, drive an episode with the policy, and repeat.
 
     Args:
         car: as for ``carlab.drive``.
@@ -150,8 +150,8 @@ def learn(
         episodes: total number of episodes; by default 20, or the number of the resumed run.
         ticks: control periods per episode; by default the task's number.
         prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model. ``auto`` starts
-            with the nominal one; between episodes, effects and parameters that the recordings support enter it, and
-            those that the recordings contradict leave it.
+            with the nominal one; between episodes, effects and parameters that the recordings support are added to it,
+            and those that the recordings contradict are removed.
         method: ``gp-sim-posterior``; ``gp-posterior`` without a simulator; ``sim-fsvgd``, ``sim-fsvgd-mended`` and
             ``fsvgd`` are the paper's algorithms with its settings.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
@@ -168,7 +168,7 @@ def learn(
         viewer: as for ``carlab.drive``.
         vehicle: as for ``carlab.drive``.
         reality: as for ``carlab.drive``.
-        dry_run: real inputs, but no command is sent.
+        dry_run: measure and compute commands, but send none to the car.
         ray: train on Ray: ``local``, or the address of a cluster; empty: a child process. The car stays here.
         ray_wait: time without an answer of the cluster after which a training runs on this computer [s].
         hooks: callbacks.

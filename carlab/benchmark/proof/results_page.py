@@ -38,7 +38,7 @@ def results_page(
         parts += [
             "## Comparison with the baselines",
             "Baselines cannot answer with sets, so names count strictly here. Scores of the baselines use the "
-            "generator's model and the true noise floor; those of the tool use its own model and its own estimate.",
+            "generator's model and the true noise floor. Scores of the diagnosis (column tool) use neither.",
             markdown(("figure", *COLUMNS), comparison_rows(comparison)),
         ]
     parts += ["## Detection curves", DETECTION, "![Share of effects found over the excess](detection.png)"]

@@ -10,20 +10,20 @@ from carlab.benchmark.proof.results_page import markdown
 from carlab.benchmark.public_simulators.commonroad import DRIVER_GRIP, FULL_MPS2, MAX_ANGLE_RAD, SCALE
 
 ASKED_RATIO = 0.5
-STANCES = {"yes": "in the equations", "akin": "acts alike", "no": "not in the equations"}
+STANCES = {"yes": "in the equations", "akin": "resembles a term of the equations", "no": "not in the equations"}
 
 
 def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
     """Page from the content of study.json."""
     parts = [
-        "# Diagnosis of a simulator that nobody here wrote",
+        "# Diagnosis of recordings of an independent simulator",
         f"{facts['package']}, scaled by {SCALE:g} in length and by dynamic similarity in all else. Full steering is "
-        f"{MAX_ANGLE_RAD:g} rad, full throttle asks for {FULL_MPS2:g} m/s2; the package's own bounds come on top. A "
-        f"person drives who keeps rolling and uses {DRIVER_GRIP:.0%} of the tyres' grip; "
-        f"{facts['seconds_to_fit']:g} s to fit, {facts['seconds_held_out']:g} s held out, 30 Hz, noise on the pose, "
-        "velocities by differentiating. The nominal car file has mass, axle distances and delays as measured and "
-        "guesses for the rest.",
-        f"Asked: held-out error with effects at most {ASKED_RATIO:g} of the refit's. {_verdict(rows)}",
+        f"{MAX_ANGLE_RAD:g} rad, full throttle requests {FULL_MPS2:g} m/s2; the limits of the package also apply. A "
+        f"simulated person drives without stopping and uses {DRIVER_GRIP:.0%} of the grip of the tyres. "
+        f"{facts['seconds_to_fit']:g} s are fitted and {facts['seconds_held_out']:g} s held out, at 30 Hz, with noise "
+        "on the pose and velocities differentiated from it. The nominal car file has measured mass, axle distances "
+        "and delays, and guesses for all other parameters.",
+        f"Target: held-out error with effects at most {ASKED_RATIO:g} of the refit's. {_verdict(rows)}",
         markdown(
             ("seed", "verdict", "nominal", "refit", "with effects", "ratio", "named", "seconds"),
             [_score_cells(row) for row in rows],
@@ -39,14 +39,14 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
         if row["unexplained"]:
             left = row["unexplained"]
             parts.append(
-                f"Unexplained: {left.get('share', math.nan):.0%} of the refit's excess, channels "
+                f"Unexplained: {left.get('share', math.nan):.0%} of the refit's squared excess, channels "
                 f"{', '.join(left.get('channels', [])) or 'none'}; {left.get('class') or 'no class'}"
                 + (f"; {left['formula']}" if left.get("formula") else "")
                 + "."
             )
         if row["data_faults"]:
             parts.append(f"Data faults reported: {', '.join(row['data_faults'])}. The recording has none.")
-        parts.append(markdown(("how far the drive went", "value"), [(k, f"{v:g}") for k, v in row["activity"].items()]))
+        parts.append(markdown(("range of the drive", "value"), [(k, f"{v:g}") for k, v in row["activity"].items()]))
     return "\n\n".join(parts) + "\n"
 
 

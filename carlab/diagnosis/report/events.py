@@ -16,7 +16,7 @@ def event_sentences(use: EventUse, without: FitErrors | None = None, with_them: 
         return []
     head = "One event that no tyre can cause" if count == 1 else f"{count} events that no tyre can cause"
     if not use.are_left_out:
-        head += " (collision, hand). Fit and score contain them."
+        head += f" (collision, hand). {'It is' if count == 1 else 'They are'} kept in fit and score."
     else:
         windows = [f"{n} {name}" for n, name in ((use.fit_windows, "fitted"), (use.held_out_windows, "scored")) if n]
         head += f" (collision, hand). {' and '.join(windows) or 'No'} prediction windows are left out."

@@ -166,7 +166,7 @@ def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, c
 def wrong_command_sign(channel: str, answer: CommandResponse, evidence: Mapping[str, float] | None = None) -> Fault:
     """The fault of a command that the motion follows the other way round."""
     effect = "turns right" if channel == "steering" else "is driven backward"
-    observation = f"with positive {channel} the car {effect} (it explains {answer.best:.0%} of the motion so)"
+    observation = f"with positive {channel} the car {effect} (this explains {answer.best:.0%} of the motion)"
     return Fault("wrong_sign", channel, observation, evidence or {}, f"--{channel}-sign -1")
 
 

@@ -189,7 +189,7 @@ def backward_differences(t_s: FloatArray, states: FloatArray, segment: FloatArra
     if to_backward > min(0.4 * robust_std(speed[rows] / centred[rows]), 0.02):
         return None
     observation = (
-        f"the velocities are backward differences of the pose (the speed to {to_backward:.1%}), so they are half a row "
-        f"({500 * float(np.median(np.diff(t_s))):.0f} ms) late"
+        f"the velocities are backward differences of the pose (the speeds agree within {to_backward:.1%}), so they are "
+        f"half a row ({500 * float(np.median(np.diff(t_s))):.0f} ms) late"
     )
     return Fault("column_shift", "vx, vy, yaw_rate", observation)
