@@ -17,13 +17,13 @@ from carlab.diagnosis.report.svg import Chart, bar_rows, padded
 
 MODELS = ("nominal", "refit", "with_effects")
 LABELS = {
-    "nominal": "car file as given",
-    "refit": "parameters refitted",
+    "nominal": "nominal (car file as given)",
+    "refit": "refit (fitted parameters)",
     "with_effects": "with effects",
     "with_curves": "with measured curves",
     "with_discrepancy": "with a learned discrepancy",
     "black_box": "black box",
-    "adapted": "adapted to the recent past",
+    "adapted": "adapted to the drive",
     "constant_velocity": "constant velocity",
     "noise floor": "noise floor",
     "noise_floor": "noise floor",
