@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.diagnosis.curves.curve_rival import curve_in_addition, replacing_curve
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
@@ -25,6 +26,7 @@ from carlab.diagnosis.unexplained.description import ResidualModel, describe, fi
 from carlab.diagnosis.unexplained.vibration import Vibration
 from carlab.diagnosis.weak_effects import without_harmful_effects, without_negligible_effects
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects.curves import SteeringCurve
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +62,8 @@ def accept_names(
     """
     found = without_negligible_effects(problem, found, control)
     names = found.effects
-    rival = replacing_physics(problem, found, control)
-    if rival is not None:
+    rival = replacing_physics(problem, found, control) or replacing_curve(problem, found, control)
+    if rival is not None and rival.names != found.effects:
         found = restrict(problem, found, rival.names, control)
     residual = residual_of(problem, found)
     if rival is None:
@@ -81,9 +83,21 @@ def accept_names(
     if names and not found.effects:
         log.info("%s: withdrawn as a spurious attribution", ", ".join(names))
         residual = residual_of(problem, found)
-        if rival is None or rival.names:
-            rival = additional_physics(problem, found, control)
+        rival = _rival_without_names(problem, found, rival, control)
     return NamingResult(found, residual, rival, vibration)
+
+
+def _rival_without_names(
+    problem: SearchProblem, found: SearchResult, rival: RivalPhysics | None, control: RunControl
+) -> RivalPhysics | None:
+    """The uncatalogued physics that explains most if all names are withdrawn, or None."""
+    if rival is not None and not rival.names:
+        return rival
+    additional = additional_physics(problem, found, control)
+    if rival is None or rival.effect != SteeringCurve.id:
+        return additional
+    curve = curve_in_addition(problem, found, ())
+    return curve if additional is None or curve.gain > additional.gain else additional
 
 
 def residual_of(problem: SearchProblem, found: SearchResult, term_chi2_min: float | None = None) -> ResidualModel:

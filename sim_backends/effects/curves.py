@@ -227,7 +227,7 @@ class SteeringCurve(MeasuredCurve, ActuatorEffect):
     id = "steering_curve"
     quantity = "wheel angle"
     summary = "The wheel angle is a measured curve over its command."
-    class_statement = "a curve of the wheel angle over its command"
+    class_statement = "a map of the steering command: the wheel angle is a curve over it"
     command = "steering"
     order = 65
     unit, typical, bound = "rad", 0.03, 0.6

@@ -147,6 +147,11 @@ class RivalSettings:
     """Minimum share of the refit's excess that one or two effects explain: of the loss with free initial states, or of
     the held-out squared score. On 70 development cases of seeds 0 and 5, concealed effects explain 0.53 of the loss
     or more; five spurious names explain 0.17 to 0.49 of it, and two of these 0.25 and 0.27 of the squared score."""
+    curve_z_min: float = 3.0
+    """A steering curve replaces named steering effects that it contains if its loss on unseen blocks, with free initial
+    states, is lower by this [standard errors], and by ``min_curve_share``."""
+    min_curve_share: float = 0.1
+    """Minimum of this fall, as a share of the refit's excess."""
     min_held_out_excess: float = 0.1
     """Minimum squared excess of the refit for this share; a smaller one is as uncertain as the noise floor."""
     weak_term_chi2: float = 14.0

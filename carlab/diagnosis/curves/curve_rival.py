@@ -1,0 +1,103 @@
+"""A measured curve as a rival of the named effects that it contains.
+
+A curve contains the named form as a special case, so it fits about as well if that form is the physics. If it predicts
+unseen blocks significantly better, and explains a relevant further part of the excess, the named form is not the
+physics: the residual is then described by the class of the curve. The initial states of the windows are free, because
+their errors hide most of the difference (``identification.free_initial_states``).
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.identification.fit import Fit, Scale, clustered_gain
+from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
+from carlab.diagnosis.selection.refit import refit
+from carlab.diagnosis.selection.rival_physics import RivalPhysics
+from sim_backends.effects import EFFECTS
+from sim_backends.effects.curves import SteeringCurve
+from sim_backends.effects.steering import SteeringOffset
+
+log = logging.getLogger(__name__)
+
+
+def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunControl) -> RivalPhysics | None:
+    """The steering curve, if it explains significantly more than the accepted static effects of the steering.
+
+    Args:
+        problem: the search problem.
+        found: the accepted effects.
+        control: records the decision about each effect that the curve contains.
+
+    Returns:
+        The curve with the other effects; None if the named effects stand, or without any that the curve contains.
+    """
+    contained = tuple(n for n in found.effects if _is_contained(n))
+    if not contained or not _is_free(problem) or control.stop():
+        return None
+    control.progress(f"measured curve in place of {', '.join(contained)}", 0.96)
+    rival = curve_in_addition(problem, found, tuple(n for n in found.effects if n not in contained))
+    losses = [_unseen_loss(problem, fit, found.scale) for fit in (found.best, rival.fit)]
+    gain, error = clustered_gain(losses[0], losses[1], problem.windows)
+    share = gain / max(_excess(problem, found.base), 1e-9)
+    settings = problem.settings.rivals
+    alternatives = (
+        (Condition("rivals.curve_z_min", gain / error, settings.curve_z_min, above=False),),
+        (Condition("rivals.min_curve_share", share, settings.min_curve_share, above=False),),
+    )
+    stand = any(all(c.holds for c in conditions) for conditions in alternatives)
+    for name in contained:
+        control.record(Decision("stand", name, alternatives, stand, len(found.effects)))
+    log.info("curve in place of %s: %.2f of the excess, z %.1f", ", ".join(contained), share, gain / error)
+    return None if stand else rival
+
+
+def curve_in_addition(problem: SearchProblem, found: SearchResult, names: tuple[str, ...]) -> RivalPhysics:
+    """The steering curve and its offset, fitted together with ``names`` from the point of the accepted effects."""
+    without = refit(problem, names, found.best, found.scale).fit
+    fit = refit(problem, (*names, SteeringOffset.id, SteeringCurve.id), found.best, found.scale).fit
+    return RivalPhysics(SteeringCurve.id, fit, without.cost - fit.cost, names)
+
+
+def _is_contained(effect: str) -> bool:
+    """Whether the steering curve with its offset contains the effect."""
+    return effect == SteeringOffset.id or EFFECTS[effect].represented_by == SteeringCurve.id
+
+
+def _is_free(problem: SearchProblem) -> bool:
+    """Whether neither the curve nor its offset is in the car file."""
+    added = SteeringOffset.id, SteeringCurve.id
+    return all(is_applicable(problem.nominal, e) and e not in problem.nominal.effects for e in added)
+
+
+def _unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
+    """Loss of each window (S,) by a fit without its fold, with free initial states."""
+    return _free_loss(problem, fit, problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds()))
+
+
+def _excess(problem: SearchProblem, base: Fit) -> float:
+    """Loss of the refit with free initial states minus the loss of a perfect simulator, which has 3 for each step."""
+    windows = problem.windows
+    loss = _free_loss(problem, base, np.tile(base.z, (len(windows), 1)))
+    return float(loss.sum()) - 3.0 * (windows.steps - 1) * len(windows)
+
+
+def _free_loss(problem: SearchProblem, fit: Fit, z: FloatArray) -> FloatArray:
+    """Loss of each window (S,) at the coordinates z (S, n) of the fit, with free initial states."""
+    return loss_of_free_initial_states(
+        problem.windows,
+        fit.config,
+        fit.free,
+        z,
+        problem.measured_std,
+        max_error=problem.settings.selection.max_unseen_error,
+        settings=problem.settings.identification,
+    )
+
+
+__all__ = ["curve_in_addition", "replacing_curve"]

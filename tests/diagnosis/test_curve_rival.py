@@ -1,0 +1,84 @@
+"""A measured steering curve as a rival of named steering effects, on cases of the independent generator."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.benchmark import make_case
+from carlab.benchmark.cases.case import Case, CaseKind
+from carlab.benchmark.effects.catalogue import FormName
+from carlab.benchmark.effects.random_physics import MonotoneMap
+from carlab.benchmark.world.measurement import write_csv
+from carlab.cars import load_car_file
+from carlab.diagnosis.decisions import Decision
+from carlab.diagnosis.diagnose import Outcome, diagnose
+from carlab.diagnosis.evidence import Texts
+from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.recording.csv.foreign import import_csv
+from sim_backends import EFFECTS, SimulatorConfig
+from sim_backends.array_ops import ARRAYS
+from sim_backends.effects import CATALOGUE, MeasuredCurve, confusable_effects
+
+TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
+STEERING = ("steering_deadband", "steering_asymmetry", "steering_nonlinearity", "steering_offset", "yaw_damping")
+
+
+@pytest.fixture(autouse=True)
+def _few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search a few effects only, because the whole catalogue takes long."""
+    monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", {name: CATALOGUE[name] for name in STEERING})
+
+
+def made(kind: CaseKind, effect: str, form: FormName) -> Case:
+    return make_case(kind, 3, effects=(effect,), form=form, excess=2.0, fit_s=60, hold_s=30)
+
+
+def found(case: Case, folder: Path) -> Outcome:
+    write_csv(folder / "fit.csv", case.fit)
+    write_csv(folder / "hold.csv", case.hold)
+    case.nominal.write(folder / "car.toml")
+    read = [list(import_csv(folder / name).episodes) for name in ("fit.csv", "hold.csv")]
+    return diagnose(*read, load_car_file(folder / "car.toml").simulator, TEXTS)
+
+
+def decisions_by_curve(outcome: Outcome) -> list[Decision]:
+    """Decisions in which a measured curve was the rival."""
+    return [d for d in outcome.exhibits.decisions if d.alternatives[0][0].setting == "rivals.curve_z_min"]
+
+
+def wheel_angle(model: SimulatorConfig, command: np.ndarray) -> np.ndarray:
+    """Wheel angle [rad] over the steering command by the measured curve and its offset."""
+    curve, values = EFFECTS["steering_curve"], model.values()
+    assert isinstance(curve, MeasuredCurve)
+    angle = model.parameters.max_angle_rad * command
+    return np.asarray(curve.apply(ARRAYS, angle, curve.numbers(values))) + values["effects.steering_offset.angle"]
+
+
+def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
+    """A random increasing map of the steering command resembles an offset, which all other checks accept."""
+    case = made("outside", "random_steering_map", "outside")
+    outcome = found(case, tmp_path)
+    refused = [(d.effect, d.alternatives[0][0].setting) for d in outcome.exhibits.decisions if not d.passed]
+    assert outcome.diagnosis.verdict == "unexplained"
+    assert outcome.diagnosis.effects == ()
+    assert [each for each in refused if each[0] == "steering_offset"] == [("steering_offset", "rivals.curve_z_min")]
+    assert outcome.diagnosis.unexplained is not None
+    assert "a map of the steering command" in outcome.diagnosis.unexplained.kind
+
+    drawn = case.concealed[0].parameters
+    command = np.linspace(-0.9, 0.9, 37)
+    true = case.true_car.max_angle * np.array([MonotoneMap(int(drawn["seed"]), drawn["size"])(u) for u in command])
+    linear = command * float(command @ true) / float(command @ command)
+    error = np.sqrt(np.mean((wheel_angle(outcome.model, command) - true) ** 2))
+    assert error < 0.5 * np.sqrt(np.mean((linear - true) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("effect", "form"),
+    [("steering_deadband", "other"), pytest.param("steering_asymmetry", "catalogue", marks=pytest.mark.slow)],
+)
+def test_steering_effect_that_a_curve_contains_keeps_its_name(effect: str, form: FormName, tmp_path: Path) -> None:
+    outcome = found(made("single", effect, form), tmp_path)
+    assert [e.id for e in outcome.diagnosis.effects] == [effect]
+    assert [(d.effect, d.passed) for d in decisions_by_curve(outcome)] == [(effect, True)]
