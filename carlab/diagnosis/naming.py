@@ -136,7 +136,8 @@ def _are_spurious(
     alternatives: tuple[tuple[Condition, ...], ...] = ((is_irrelevant,), (is_below("spurious_share_many"),))
     if is_small_set:
         explained = explained_share(problem, found, held_out)
-        explain_most = Condition("rivals.min_explained_share", explained, settings.min_explained_share)
+        most = settings.min_explained_share_of_most
+        explain_most = Condition("rivals.min_explained_share_of_most", explained, most)
         of_most = (is_below("spurious_share_of_most"), explain_most)
         alternatives = ((is_irrelevant,), (is_below("spurious_share"),), of_most)
     spurious = not any(all(c.holds for c in conditions) for conditions in alternatives)

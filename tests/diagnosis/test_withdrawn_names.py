@@ -1,4 +1,4 @@
-"""A measured steering curve as a rival of named steering effects, on cases of the independent generator."""
+"""Names that are withdrawn from physics outside the catalogue, on cases of the independent generator."""
 
 from pathlib import Path
 
@@ -21,20 +21,17 @@ from sim_backends.array_ops import ARRAYS
 from sim_backends.effects import CATALOGUE, MeasuredCurve, confusable_effects
 
 TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
-STEERING = ("steering_deadband", "steering_asymmetry", "steering_nonlinearity", "steering_offset", "yaw_damping")
-
-
-@pytest.fixture(autouse=True)
-def _few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search a few effects only, because the whole catalogue takes long."""
-    monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", {name: CATALOGUE[name] for name in STEERING})
+STATIC = ("steering_deadband", "steering_asymmetry", "steering_nonlinearity", "steering_offset", "yaw_damping")
+DYNAMIC = ("steering_lag", "steering_delay", "yaw_damping")
 
 
 def made(kind: CaseKind, effect: str, form: FormName) -> Case:
     return make_case(kind, 3, effects=(effect,), form=form, excess=2.0, fit_s=60, hold_s=30)
 
 
-def found(case: Case, folder: Path) -> Outcome:
+def found(case: Case, folder: Path, candidates: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> Outcome:
+    """Diagnose a case with few candidates, because the whole catalogue takes long."""
+    monkeypatch.setattr("carlab.diagnosis.diagnose.CATALOGUE", {name: CATALOGUE[name] for name in candidates})
     write_csv(folder / "fit.csv", case.fit)
     write_csv(folder / "hold.csv", case.hold)
     case.nominal.write(folder / "car.toml")
@@ -42,9 +39,9 @@ def found(case: Case, folder: Path) -> Outcome:
     return diagnose(*read, load_car_file(folder / "car.toml").simulator, TEXTS)
 
 
-def decisions_by_curve(outcome: Outcome) -> list[Decision]:
-    """Decisions in which a measured curve was the rival."""
-    return [d for d in outcome.exhibits.decisions if d.alternatives[0][0].setting == "rivals.curve_z_min"]
+def decisions_by(outcome: Outcome, setting: str) -> list[Decision]:
+    """Decisions in which a threshold was used."""
+    return [d for d in outcome.exhibits.decisions if any(c.setting == setting for cs in d.alternatives for c in cs)]
 
 
 def wheel_angle(model: SimulatorConfig, command: np.ndarray) -> np.ndarray:
@@ -55,10 +52,10 @@ def wheel_angle(model: SimulatorConfig, command: np.ndarray) -> np.ndarray:
     return np.asarray(curve.apply(ARRAYS, angle, curve.numbers(values))) + values["effects.steering_offset.angle"]
 
 
-def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
+def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A random increasing map of the steering command resembles an offset, which all other checks accept."""
     case = made("outside", "random_steering_map", "outside")
-    outcome = found(case, tmp_path)
+    outcome = found(case, tmp_path, STATIC, monkeypatch)
     refused = [(d.effect, d.alternatives[0][0].setting) for d in outcome.exhibits.decisions if not d.passed]
     assert outcome.diagnosis.verdict == "unexplained"
     assert outcome.diagnosis.effects == ()
@@ -78,7 +75,20 @@ def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
     ("effect", "form"),
     [("steering_deadband", "other"), pytest.param("steering_asymmetry", "catalogue", marks=pytest.mark.slow)],
 )
-def test_steering_effect_that_a_curve_contains_keeps_its_name(effect: str, form: FormName, tmp_path: Path) -> None:
-    outcome = found(made("single", effect, form), tmp_path)
+def test_steering_effect_that_a_curve_contains_keeps_its_name(
+    effect: str, form: FormName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcome = found(made("single", effect, form), tmp_path, STATIC, monkeypatch)
     assert [e.id for e in outcome.diagnosis.effects] == [effect]
-    assert [(d.effect, d.passed) for d in decisions_by_curve(outcome)] == [(effect, True)]
+    assert [(d.effect, d.passed) for d in decisions_by(outcome, "rivals.curve_z_min")] == [(effect, True)]
+
+
+def test_servo_that_sags_under_load_is_no_lag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lag explains most of the excess; terms of steering rate and throttle explain a part of the rest."""
+    outcome = found(made("outside", "sagging_servo", "outside"), tmp_path, DYNAMIC, monkeypatch)
+    assert outcome.diagnosis.verdict == "unexplained"
+    assert outcome.diagnosis.effects == ()
+    assert outcome.diagnosis.unexplained is not None
+    assert "follows the rate of steering where there is throttle" in outcome.diagnosis.unexplained.kind
+    [decision] = decisions_by(outcome, "rivals.min_explained_share_of_most")
+    assert (decision.effect, decision.passed) == ("steering_lag", False)
