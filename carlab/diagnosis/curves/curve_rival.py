@@ -1,7 +1,7 @@
 """A measured curve as a rival of the named effects that it contains.
 
 A curve contains the named form as a special case, so it fits about as well if that form is the physics. If it predicts
-unseen blocks significantly better, and explains a relevant further part of the excess, the named form is not the
+unseen blocks significantly better, by a relevant share of its own gain over the refit, the named form is not the
 physics: the residual is then described by the class of the curve. The initial states of the windows are free, because
 their errors hide most of the difference (``identification.free_initial_states``).
 """
@@ -9,8 +9,6 @@ their errors hide most of the difference (``identification.free_initial_states``
 from __future__ import annotations
 
 import logging
-
-import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
@@ -35,16 +33,18 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
         control: records the decision about each effect that the curve contains.
 
     Returns:
-        The curve with the other effects; None if the named effects stand, or without any that the curve contains.
+        The curve with the other effects. None if the named effects stand, without any that the curve contains, and
+        after a search that was cut short: the curve may then stand for an effect that was not tried.
     """
     contained = tuple(n for n in found.effects if _is_contained(n))
-    if not contained or not _is_free(problem) or control.stop():
+    if not contained or not found.is_complete or not _is_free(problem) or control.stop():
         return None
     control.progress(f"measured curve in place of {', '.join(contained)}", 0.96)
     rival = curve_in_addition(problem, found, tuple(n for n in found.effects if n not in contained))
-    losses = [_unseen_loss(problem, fit, found.scale) for fit in (found.best, rival.fit)]
-    gain, error = clustered_gain(losses[0], losses[1], problem.windows)
-    share = gain / max(_excess(problem, found.base), 1e-9)
+    base, own, with_curve = (_unseen_loss(problem, fit, found.scale) for fit in (found.base, found.best, rival.fit))
+    gain, error = clustered_gain(own, with_curve, problem.windows)
+    total = float((base - with_curve).sum())
+    share = gain / total if total > 0.0 else 0.0
     settings = problem.settings.rivals
     alternatives = (
         (Condition("rivals.curve_z_min", gain / error, settings.curve_z_min, above=False),),
@@ -53,7 +53,7 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
     stand = any(all(c.holds for c in conditions) for conditions in alternatives)
     for name in contained:
         control.record(Decision("stand", name, alternatives, stand, len(found.effects)))
-    log.info("curve in place of %s: %.2f of the excess, z %.1f", ", ".join(contained), share, gain / error)
+    log.info("curve in place of %s: %.2f of its gain, z %.1f", ", ".join(contained), share, gain / error)
     return None if stand else rival
 
 
@@ -77,23 +77,11 @@ def _is_free(problem: SearchProblem) -> bool:
 
 def _unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
     """Loss of each window (S,) by a fit without its fold, with free initial states."""
-    return _free_loss(problem, fit, problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds()))
-
-
-def _excess(problem: SearchProblem, base: Fit) -> float:
-    """Loss of the refit with free initial states minus the loss of a perfect simulator, which has 3 for each step."""
-    windows = problem.windows
-    loss = _free_loss(problem, base, np.tile(base.z, (len(windows), 1)))
-    return float(loss.sum()) - 3.0 * (windows.steps - 1) * len(windows)
-
-
-def _free_loss(problem: SearchProblem, fit: Fit, z: FloatArray) -> FloatArray:
-    """Loss of each window (S,) at the coordinates z (S, n) of the fit, with free initial states."""
     return loss_of_free_initial_states(
         problem.windows,
         fit.config,
         fit.free,
-        z,
+        problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds()),
         problem.measured_std,
         max_error=problem.settings.selection.max_unseen_error,
         settings=problem.settings.identification,
