@@ -157,7 +157,7 @@ def diagnose(
         keep_events: also fit and score windows with events (collisions, a hand); the report lists them in any case.
         seed: seed of the black box and of the learned discrepancy; the rest of a diagnosis draws no random numbers.
         jobs: number of processes, with equal results; by default one, or all cores from two minutes of recordings on.
-        budget_s: time limit [s] without curves, networks and adaptation, ``inf`` for none; the search ends at 75 %.
+        budget_s: time limit [s] without curves, networks and adaptation, ``inf`` for none; the search ends at 60 %.
         out: folder for the report; ``DiagnosisReport.save`` can write it later.
         progress: called with the current activity and the completed share, in [0, 1].
         stop: once it returns true, the search ends and the report covers the findings so far.

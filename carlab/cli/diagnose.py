@@ -44,7 +44,7 @@ class Diagnose:
 
     budget_s: Annotated[float, arg(name="budget")] = 300.0
     """Time limit [s] of the diagnosis without measured curves, networks and adaptation; inf: no limit. The search for
-    effects ends at 75 % of the limit. The report then has the effects found so far and says that the search was cut
+    effects ends at 60 % of the limit. The report then has the effects found so far and says that the search was cut
     short. The checks after such a search can exceed the limit."""
 
     jobs: int | None = None

@@ -202,8 +202,13 @@ class Prove:
 
     def _specs(self) -> list[CaseSpec]:
         from carlab.benchmark.cases.hard_set import drawn_evenly, hard_set
-        from carlab.benchmark.cases.proof_set import drawn, full_set, short_set
+        from carlab.benchmark.cases.proof_set import MAX_DEVELOPMENT_SEED, drawn, full_set, short_set
 
+        if self.set not in ("full", "short") and self.seed > MAX_DEVELOPMENT_SEED:
+            raise ConfigError(
+                f"--seed {self.seed}: --set {self.set} has seeds 0 to {MAX_DEVELOPMENT_SEED}; later ones share cases "
+                "between development and test."
+            )
         if self.set == "short":
             specs = short_set("test", self.seed)
         elif self.set in ("hard", "hard-development"):

@@ -111,6 +111,10 @@ def test_numbers_out_of_range_are_refused(tmp_path: Path, carlab: Carlab) -> Non
         code, text = carlab("prove", "--out", tmp_path / "proof", option, value)
         assert code == 2
         assert option in text
+    for name in ("development", "hard", "hard-development"):  # seed 10 would share cases with the other purpose
+        code, text = carlab("prove", "--out", tmp_path / "proof", "--set", name, "--seed", 10)
+        assert code == 2
+        assert "seeds 0 to 9" in text
     assert not (tmp_path / "proof").exists()
 
 

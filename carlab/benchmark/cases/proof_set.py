@@ -16,6 +16,8 @@ from carlab.benchmark.effects.forms import all_forms
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0)
 SEED_BASE = {"development": 1_000_000, "test": 2_000_000}
+MAX_DEVELOPMENT_SEED = 9
+"""Largest seed of a set for development, and of a hard set: cases of seed 10 share seeds with the other set."""
 # Faults that leave the concealed effects identifiable.
 ON_TOP = ("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples")
 Purpose = Literal["development", "test"]
