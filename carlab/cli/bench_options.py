@@ -135,33 +135,36 @@ class BenchOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Study:
     """A use of ``carlab bench``.
 
     Attributes:
         command: text for messages.
-        holds: whether given options belong to this use.
+        applies_to: whether given options belong to this use.
     """
 
     command: str
-    holds: Callable[[BenchOptions], bool]
+    applies_to: Callable[[BenchOptions], bool]
 
 
-SPEED = Place("'bench speed'", lambda given: given.what == "speed")
-REGRESSION = Place("'bench regression'", lambda given: given.what == "regression")
-REALCAR = Place("'bench regression --case realcar'", lambda given: REGRESSION.holds(given) and given.case == "realcar")
-PENDULUM = Place(
-    "'bench regression --case pendulum'", lambda given: REGRESSION.holds(given) and given.case.startswith("pendulum")
+SPEED = Study("'bench speed'", lambda given: given.what == "speed")
+REGRESSION = Study("'bench regression'", lambda given: given.what == "regression")
+REALCAR = Study(
+    "'bench regression --case realcar'", lambda given: REGRESSION.applies_to(given) and given.case == "realcar"
 )
-PRIORS = Place("'bench priors'", lambda given: given.what == "priors")
-READ = Place("'bench priors --data FOLDER'", lambda given: PRIORS.holds(given) and given.data is not None)
-CONCEALED = Place("'bench priors' without --data", lambda given: PRIORS.holds(given) and given.data is None)
-PARKING = Place("'bench parking'", lambda given: given.what == "parking")
-ROLLOUTS = Place("'bench rollouts'", lambda given: given.what == "rollouts")
-REALCARS = Place("'bench realcars'", lambda given: given.what == "realcars")
+PENDULUM = Study(
+    "'bench regression --case pendulum'",
+    lambda given: REGRESSION.applies_to(given) and given.case.startswith("pendulum"),
+)
+PRIORS = Study("'bench priors'", lambda given: given.what == "priors")
+READ = Study("'bench priors --data FOLDER'", lambda given: PRIORS.applies_to(given) and given.data is not None)
+CONCEALED = Study("'bench priors' without --data", lambda given: PRIORS.applies_to(given) and given.data is None)
+PARKING = Study("'bench parking'", lambda given: given.what == "parking")
+ROLLOUTS = Study("'bench rollouts'", lambda given: given.what == "rollouts")
+REALCARS = Study("'bench realcars'", lambda given: given.what == "realcars")
 
 EVERYWHERE = frozenset({"what", "out", "device", "verbose"})
-PLACES = {
+STUDIES_OF_OPTION = {
     "seconds": (SPEED,),
     "case": (REGRESSION,),
     "rows": (REGRESSION, PRIORS, ROLLOUTS),
@@ -200,10 +203,12 @@ def check_options(given: BenchOptions) -> None:
         name = option.name
         if name in EVERYWHERE or getattr(given, name) == option.default:
             continue
-        if not any(place.holds(given) for place in PLACES[name]):
-            places = " and ".join(place.command for place in PLACES[name])
-            raise ConfigError(f"--{name.replace('_', '-')} has no effect in '{_command(given)}'; use it with {places}.")
-    if "all" in given.rows and not ROLLOUTS.holds(given):
+        if not any(study.applies_to(given) for study in STUDIES_OF_OPTION[name]):
+            studies = " and ".join(study.command for study in STUDIES_OF_OPTION[name])
+            raise ConfigError(
+                f"--{name.replace('_', '-')} has no effect in '{_command(given)}'; use it with {studies}."
+            )
+    if "all" in given.rows and not ROLLOUTS.applies_to(given):
         raise ConfigError(f"--rows all has no effect in '{_command(given)}'; use it with {ROLLOUTS.command}.")
 
 
@@ -215,9 +220,9 @@ def row_counts(given: BenchOptions) -> tuple[int, ...]:
 def _command(given: BenchOptions) -> str:
     """The command with the options that determine its use."""
     command = f"bench {given.what}"
-    if REGRESSION.holds(given):
+    if REGRESSION.applies_to(given):
         return f"{command} --case {given.case}"
-    return f"{command} --data {given.data}" if READ.holds(given) else command
+    return f"{command} --data {given.data}" if READ.applies_to(given) else command
 
 
-__all__ = ["EVERYWHERE", "PLACES", "BenchOptions", "check_options", "row_counts"]
+__all__ = ["EVERYWHERE", "STUDIES_OF_OPTION", "BenchOptions", "check_options", "row_counts"]

@@ -33,7 +33,7 @@ STEPS_PERIOD_S = 600.0
 
 def _training_messages(figures: dict[str, Any]) -> list[str]:
     """Sentences about past commands and ticks, from the figures of a training."""
-    messages = [str(figures["history_words"])] if "history_asked" in figures else []
+    messages = [str(figures["history_message"])] if "supported_history" in figures else []
     if (ticks := figures.get("needed_ticks")) is not None:
         messages.append(
             f"In the learned car the policy parks only in longer episodes: in half of them within {ticks} ticks. Start "

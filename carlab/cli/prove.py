@@ -158,7 +158,7 @@ class Prove:
     def _study(self) -> int:
         from carlab.benchmark.public_simulators.commonroad import require_public_simulator
         from carlab.benchmark.public_simulators.study import study
-        from carlab.benchmark.public_simulators.study_page import ASKED_RATIO
+        from carlab.benchmark.public_simulators.study_page import TARGET_RATIO
         from carlab.experiment.episodes.interrupts import Interrupts
 
         require_public_simulator()
@@ -169,9 +169,9 @@ class Prove:
                 command=_diagnose_command(), timeout_s=self.timeout, say=console.print,
                 abandon=interrupts.requested.is_set,
             )  # fmt: skip
-        met = sum(1 for row in rows if row.get("ratio") is not None and row["ratio"] <= ASKED_RATIO)
+        met = sum(1 for row in rows if row.get("ratio") is not None and row["ratio"] <= TARGET_RATIO)
         console.print(
-            f"Held-out error with effects at most {ASKED_RATIO:g} of the refit's: {met} of {len(rows)} drives. "
+            f"Held-out error with effects at most {TARGET_RATIO:g} of the refit's: {met} of {len(rows)} drives. "
             f"Read {self.out / 'study.md'}."
         )
         if len(rows) < len(seeds):

@@ -198,7 +198,7 @@ def _search_effects(
     identification = request.settings.identification
     floor: FloatArray = np.sqrt(np.mean(noise_floor(windows, noise, nominal, identification)[1:] ** 2, axis=0))
     candidates = tuple(CATALOGUE) if request.effects is None else tuple(request.effects)
-    confusable = request.texts.look_alikes
+    confusable = request.texts.confusable
     problem = SearchProblem(nominal, windows, floor, noise.measured, confusable, candidates, request.settings)
     start, search_share = SEARCH_PROGRESS
 

@@ -143,7 +143,7 @@ def _drift_of(
         recording=int(number) + 1,
         is_drift=is_drift,
         changes=changes,
-        time_constant_s=_likeliest_time_constant_s(slow.model, number),
+        time_constant_s=_most_likely_time_constant_s(slow.model, number),
         model_m=_position_rms(errors["model"][own]),
         adapted_m=_position_rms(errors["adapted"][own]),
         slow_m=_position_rms(slow.errors[own]),
@@ -228,7 +228,7 @@ def _ends(t_s: FloatArray, settings: DriftSettings) -> tuple[NDArray[np.bool_], 
     return t_s <= start_s + part_s, t_s >= end_s - part_s
 
 
-def _likeliest_time_constant_s(model: AdaptiveModel, number: int) -> float:
+def _most_likely_time_constant_s(model: AdaptiveModel, number: int) -> float:
     series = model.series()
     weights = series.weights[series.recording == number, 1 : 1 + len(model.processes.std)].mean(axis=0)
     return float(model.processes.time_constant_s[int(np.argmax(weights))])

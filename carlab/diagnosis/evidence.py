@@ -27,12 +27,12 @@ class Texts:
 
     effect             sentence of an effect with its numbers
     separating_drive   manoeuvre that separates an effect from its confusable ones
-    look_alikes        confusable effects by effect id
+    confusable        confusable effects by effect id
     """
 
     effect: Callable[[str, Mapping[str, Estimate]], str]
     separating_drive: Callable[[str, Sequence[str]], str]
-    look_alikes: Mapping[str, Sequence[str]]
+    confusable: Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True, slots=True)

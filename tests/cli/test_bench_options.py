@@ -12,7 +12,7 @@ import tyro
 
 from carlab.cli import _verbs, run
 from carlab.cli.bench import Bench
-from carlab.cli.bench_options import EVERYWHERE, PLACES, check_options
+from carlab.cli.bench_options import EVERYWHERE, STUDIES_OF_OPTION, check_options
 from carlab.core.errors import ConfigError
 
 README = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
@@ -38,8 +38,8 @@ ACCEPTED = {
 
 def test_every_option_is_assigned_to_studies() -> None:
     names = {option.name for option in fields(Bench)}
-    assert names == EVERYWHERE | set(PLACES)
-    assert not EVERYWHERE & set(PLACES)
+    assert names == EVERYWHERE | set(STUDIES_OF_OPTION)
+    assert not EVERYWHERE & set(STUDIES_OF_OPTION)
     defaults = Bench()
     for name, value in GIVEN.items():
         assert value != getattr(defaults, name), name

@@ -75,8 +75,8 @@ def test_history_length_is_selected_after_three_episodes(tmp_path: Path, monkeyp
     recordings = drive(tmp_path, TICKS, episodes=3).recordings()
     figures = [train(plan, tmp_path / str(n), recordings[:n], ENVELOPE, lambda *what: None) for n in (2, 3)]
     assert episode_counts == [3]
-    assert [f.get("history_asked") for f in figures] == [None, 6]
-    assert "supports 6 past commands" in figures[1]["history_words"]
+    assert [f.get("supported_history") for f in figures] == [None, 6]
+    assert "supports 6 past commands" in figures[1]["history_message"]
 
 
 def test_diverged_training_is_repeated_with_a_smaller_learning_rate(

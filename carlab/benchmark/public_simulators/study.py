@@ -22,7 +22,7 @@ from carlab.benchmark.public_simulators.commonroad import (
     drive_public,
 )
 from carlab.benchmark.public_simulators.commonroad_effects import physics_of, true_values
-from carlab.benchmark.public_simulators.study_page import ASKED_RATIO, study_page
+from carlab.benchmark.public_simulators.study_page import TARGET_RATIO, study_page
 from carlab.benchmark.world.measurement import as_table, write_csv
 from carlab.core.errors import DataError
 from carlab.jobs.child_processes import run_child
@@ -165,7 +165,7 @@ def study(
         if run is None:
             break
         rows.append(_row(car, seed, run, handed / "report.json") | {"activity": activity(car, drive)})
-    write_json(out / "study.json", {"facts": facts, "asked_ratio": ASKED_RATIO, "seeds": rows})
+    write_json(out / "study.json", {"facts": facts, "asked_ratio": TARGET_RATIO, "seeds": rows})
     (out / "study.md").write_text(study_page(facts, rows), encoding="utf-8")
     return rows
 

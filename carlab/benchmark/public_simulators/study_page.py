@@ -9,7 +9,7 @@ from typing import Any
 from carlab.benchmark.proof.results_page import markdown
 from carlab.benchmark.public_simulators.commonroad import DRIVER_GRIP, FULL_MPS2, MAX_ANGLE_RAD, SCALE
 
-ASKED_RATIO = 0.5
+TARGET_RATIO = 0.5
 STANCES = {"yes": "in the equations", "akin": "resembles a term of the equations", "no": "not in the equations"}
 
 
@@ -23,7 +23,7 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
         f"{facts['seconds_to_fit']:g} s are fitted and {facts['seconds_held_out']:g} s held out, at 30 Hz, with noise "
         "on the pose and velocities differentiated from it. The nominal car file has measured mass, axle distances "
         "and delays, and guesses for all other parameters.",
-        f"Target: held-out error with effects at most {ASKED_RATIO:g} of the refit's. {_verdict(rows)}",
+        f"Target: held-out error with effects at most {TARGET_RATIO:g} of the refit's. {_verdict(rows)}",
         markdown(
             ("seed", "verdict", "nominal", "refit", "with effects", "ratio", "named", "seconds"),
             [_score_cells(row) for row in rows],
@@ -51,7 +51,7 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _verdict(rows: Sequence[dict[str, Any]]) -> str:
-    met = [row for row in rows if row.get("ratio") is not None and row["ratio"] <= ASKED_RATIO]
+    met = [row for row in rows if row.get("ratio") is not None and row["ratio"] <= TARGET_RATIO]
     named = [effect["in_equations"] for row in rows for effect in row.get("named", [])]
     counts = ", ".join(f"{named.count(stance)} {words}" for stance, words in STANCES.items())
     return f"Met for {len(met)} of {len(rows)} seeds. Names given: {len(named)} ({counts})."

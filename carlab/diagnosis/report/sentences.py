@@ -166,7 +166,7 @@ def set_noun(effect: EffectFinding) -> str:
 
 def verdict_sentence(diagnosis: Diagnosis) -> str:
     """The verdict in a few sentences with the scores; where constant velocity is better, the first one says so."""
-    made = {
+    sentence_of_verdict = {
         "mismatch": _mismatch,
         "parameters": _parameters,
         "none": _none,
@@ -175,7 +175,7 @@ def verdict_sentence(diagnosis: Diagnosis) -> str:
         "inconclusive": _inconclusive,
     }[diagnosis.verdict]
     tails = _with_curves(diagnosis), _with_drift(diagnosis), _with_search(diagnosis)
-    return f"{worse_than_constant_velocity(diagnosis)}{made(diagnosis)}{''.join(tails)}"
+    return f"{worse_than_constant_velocity(diagnosis)}{sentence_of_verdict(diagnosis)}{''.join(tails)}"
 
 
 def _with_search(diagnosis: Diagnosis) -> str:

@@ -70,7 +70,7 @@ def _tested(
         with_unseen_gain,
         [(replace(problem), fitter, candidate, reference) for candidate in refitted[:count]],
         stop=control.ends_search,
-        started=lambda k: control.progress(f"testing {refitted[k].effect} on unseen blocks", share),
+        started=lambda k: control.progress(f"cross-validating {refitted[k].effect}", share),
     )
     found = [new or old for new, old in zip(tested, refitted[:count], strict=True)] + refitted[count:]
     found.sort(key=lambda c: (not c.is_tested, -(c.gain + c.unseen_gain)))

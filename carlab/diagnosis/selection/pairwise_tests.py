@@ -97,7 +97,7 @@ def _fitted_rivals(
         _fitted_rival,
         [(replace(problem), model, eliminated.deletions[name].without, name, other) for name, other in pairs],
         stop=control.stop,
-        started=lambda k: control.progress(f"{pairs[k][0]} or {pairs[k][1]}?", 0.95),
+        started=lambda k: control.progress(f"comparing {pairs[k][0]} with {pairs[k][1]}", 0.95),
     )
     found: dict[str, list[tuple[Candidate, FloatArray]]] = {name: [] for name in model.effects}
     for (name, _), rival in zip(pairs, fitted, strict=True):

@@ -38,7 +38,7 @@ def refit_without_each(
     fitted = control.workers.map(
         _fit_from,
         [(replace(problem), others[name], starts[name], model.scale) for name in new],
-        started=lambda k: control.progress(f"without {new[k]}", 0.93),
+        started=lambda k: control.progress(f"refitting without {new[k]}", 0.93),
     )
     problem.refits.update((keys[name], each) for name, each in zip(new, fitted, strict=True) if each is not None)
     return {name: problem.refits[key] for name, key in keys.items()}

@@ -169,7 +169,7 @@ def _history_figures(episodes: list[EpisodeData], progress: Progress) -> dict[st
     """The number of past commands that the recordings support, and its message; empty if the data are too few."""
     progress("choosing the number of past commands", 0, 1)
     choice = find_history(episodes)
-    return {} if choice is None else {"history_asked": choice.history, "history_words": choice.message()}
+    return {} if choice is None else {"supported_history": choice.history, "history_message": choice.message()}
 
 
 def _worlds(
