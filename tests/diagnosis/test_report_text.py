@@ -20,10 +20,10 @@ from carlab.diagnosis.findings import (
     Where,
 )
 from carlab.diagnosis.report.sentences import (
-    attained,
     confidence_words,
     drive_command,
     effect_sentence,
+    explained_share,
     next_drive,
     number,
     percent,
@@ -149,15 +149,15 @@ def test_mismatch_names_its_effects_and_its_sets() -> None:
         "(or a delay of the throttle; these recordings do not distinguish them)" in text
     )
     assert "and a yaw damping moment" in text
-    assert "from 4 to 2.5 noise floors), which removes 50 % of the error above the noise" in text
+    assert "from 4 to 2.5 noise floors), which explains 65 % of the refit's squared excess over the noise floor" in text
     assert "distinguish" not in verdict_sentence(diagnosis("mismatch", finding("motor_lag")))
 
 
-def test_attained_share_of_the_error_above_the_noise() -> None:
-    assert attained(diagnosis("mismatch", refit=4.0, with_effects=1.0)) == pytest.approx(1.0)
-    assert math.isnan(attained(diagnosis("none", refit=1.0, with_effects=1.0)))
+def test_explained_share_of_the_squared_excess() -> None:
+    assert explained_share(diagnosis("mismatch", refit=4.0, with_effects=1.0)) == pytest.approx(1.0)
+    assert math.isnan(explained_share(diagnosis("none", refit=1.0, with_effects=1.0)))
     text = verdict_sentence(diagnosis("mismatch", finding("motor_lag"), refit=4.0, with_effects=0.97))
-    assert "removes 100 % of the error above the noise" in text
+    assert "explains 100 % of the refit's squared excess over the noise floor" in text
 
 
 def test_first_sentence_states_where_constant_velocity_is_better_and_why() -> None:

@@ -240,12 +240,13 @@ def _fall(diagnosis: Diagnosis, before: str, after: str) -> str:
     )
 
 
-def attained(diagnosis: Diagnosis) -> float:
-    """Share of the refit's score above 1 that the effects remove, at most 1; NaN if unknown."""
+def explained_share(diagnosis: Diagnosis) -> float:
+    """Share of the refit's squared excess over the noise floor that the effects explain, at most 1; NaN if unknown."""
     held = diagnosis.held_out
     if "refit" not in held or "with_effects" not in held or not held["refit"].score > 1.0:
         return math.nan
-    return (held["refit"].score - held["with_effects"].score) / (held["refit"].score - 1.0)
+    refit, with_effects = (held[name].score ** 2 - 1.0 for name in ("refit", "with_effects"))
+    return 1.0 - max(with_effects, 0.0) / refit
 
 
 def _mismatch(diagnosis: Diagnosis) -> str:
@@ -255,12 +256,11 @@ def _mismatch(diagnosis: Diagnosis) -> str:
     nouns = listed([set_noun(effect) for effect in effects]) or "an effect that is not in this report"
     text = f"The simulator leaves out {count}: {nouns}."
     if fall := _fall(diagnosis, "refit", "with_effects"):
-        removed = min(attained(diagnosis), 1.0)
-        share = f", which removes {percent(removed)} of the error above the noise" if math.isfinite(removed) else ""
-        text += f" With {'it' if len(effects) == 1 else 'them'}, {fall}{share}."
+        share = explained_share(diagnosis)
+        known = f", which explains {percent(share)} of the refit's squared excess over the noise floor"
+        text += f" With {'it' if len(effects) == 1 else 'them'}, {fall}{known if math.isfinite(share) else ''}."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
-        share = percent(diagnosis.unexplained.share)
-        text += f" {share} of the refit's squared excess over the noise floor stays unexplained."
+        text += f" {percent(diagnosis.unexplained.share)} of this excess stays unexplained."
     return text
 
 
