@@ -152,7 +152,8 @@ def estimate(scored: ScoredSearch, name: str) -> Estimate:
     margin = z90 * settings.min_relative_std * abs(value)
     low = max(value - math.hypot(value - min(low, high), margin), free.low)
     high = min(value + math.hypot(max(low, high) - value, margin), free.high)
-    return Estimate(value, (high - low) / (2 * z90), low, high, REGISTRY[name].unit)
+    at_limit = not free.choice and value in (free.low, free.high)
+    return Estimate(value, (high - low) / (2 * z90), low, high, REGISTRY[name].unit, at_limit)
 
 
 def base_estimates(scored: ScoredSearch) -> dict[str, Estimate]:

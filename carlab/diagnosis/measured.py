@@ -11,13 +11,18 @@ from carlab.core.quantities import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A fitted number with its standard deviation and 90 % interval, in ``unit``."""
+    """A fitted number with its standard deviation and 90 % interval, in ``unit``.
+
+    ``at_limit``: whether the fit ended at a bound of the number. Its interval is then too narrow, and another effect or
+    parameter may be the cause.
+    """
 
     value: float
     std: float
     low90: float
     high90: float
     unit: str
+    at_limit: bool = False
 
 
 @dataclass(frozen=True, slots=True)

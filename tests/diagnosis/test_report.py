@@ -105,7 +105,7 @@ def test_json_has_the_keys_of_the_schema_for_each_verdict(case: Diagnosis, tmp_p
             *("held_out_error_reduction", "standard_errors", "visibility", "deletion_fingerprint"),
         }
         for value in effect["parameters"].values():
-            assert set(value) == {"value", "std", "low90", "high90", "unit"}
+            assert set(value) == {"value", "std", "low90", "high90", "unit", "at_limit"}
     assert (report["unexplained"] is None) == (case.verdict != "unexplained")
     if report["unexplained"] is not None:
         assert set(report["unexplained"]) == {"share", "channels", "regime", "class", "formula"}

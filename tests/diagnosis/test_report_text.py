@@ -96,6 +96,8 @@ def test_sentence_of_the_servo_lag() -> None:
     lag = Estimate(0.11, 0.0091, 0.095, 0.125, "s")
     expected = "Left out: the steering servo lags by 0.11 s (0.095 to 0.125 at 90 %)."
     assert effect_sentence("steering_lag", {"time_constant": lag}) == expected
+    bounded = effect_sentence("steering_lag", {"time_constant": replace(lag, at_limit=True)})
+    assert bounded == expected.replace("90 %", "90 %; at the limit of its range")
 
 
 @pytest.mark.parametrize(("angle", "side"), [(0.05, "left"), (-0.05, "right")])

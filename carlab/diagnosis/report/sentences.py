@@ -69,18 +69,19 @@ class _Filled:
             factor, unit = 100.0, "%"
         if "each minute" in spec:
             factor, unit = 6000.0, "% of its first value each minute"
-        return f"{_scaled(value, factor, unit)}{_interval(low, high, factor)}"
+        return f"{_scaled(value, factor, unit)}{_interval(low, high, factor, e.at_limit)}"
 
 
 def _scaled(value: float, factor: float, unit: str) -> str:
     return f"{number(value * factor)} {unit}".strip() if math.isfinite(value) else number(value)
 
 
-def _interval(low: float, high: float, factor: float) -> str:
+def _interval(low: float, high: float, factor: float, at_limit: bool) -> str:
     if not (math.isfinite(low) and math.isfinite(high)):
         return " (interval unknown)" if math.isnan(low) or math.isnan(high) else " (open interval at 90 %)"
-    uncertain_sign = "; its sign is not certain" if low < 0.0 < high else ""
-    return f" ({number(low * factor)} to {number(high * factor)}{AT_90}{uncertain_sign})"
+    notes = "; its sign is not certain" if low < 0.0 < high else ""
+    notes += "; at the limit of its range" if at_limit else ""
+    return f" ({number(low * factor)} to {number(high * factor)}{AT_90}{notes})"
 
 
 class _Fields(dict[str, _Filled]):
