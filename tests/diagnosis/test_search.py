@@ -88,12 +88,12 @@ def names(outcome: Outcome) -> list[str]:
 
 def test_negligible_effect_is_not_named(drag: Case, tmp_path: Path) -> None:
     """A misalignment of 0.5 mrad changes the lateral velocity by 1 mm/s; the test below names it without a limit."""
-    settings = replace(FEWER, selection=replace(LENIENT, min_practical_size=0.2))
+    settings = replace(DEFAULT, selection=replace(LENIENT, min_practical_size=0.2))
     assert names(found(drag, tmp_path, (5e-4, 5e-4), settings)) == [DRAG]
 
 
 def test_result_is_the_same_with_two_processes(drag: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two effects are named, so every stage refits; one process repeats no refit."""
+    """One process repeats no refit, although four stages remove each effect."""
     fits: list[bytes] = []
 
     def counted(problem: SearchProblem, effects: tuple[str, ...], start: np.ndarray, scale: Scale) -> Model:
@@ -101,7 +101,8 @@ def test_result_is_the_same_with_two_processes(drag: Case, tmp_path: Path, monke
         return fit_from(problem, effects, start, scale)
 
     fit_from = refit_module._fit_from
-    settings = replace(FEWER, selection=replace(LENIENT, min_practical_size=0.0))
+    few = replace(FEWER.windows, fit_stride_s=1.2, held_out_stride_s=1.0)
+    settings = replace(FEWER, windows=few, selection=replace(LENIENT, min_practical_size=0.0))
     with FunctionWorkers(2) as workers:
         shared = found(drag, tmp_path, (5e-4, 5e-4), settings, workers=workers).diagnosis
     monkeypatch.setattr(refit_module, "_fit_from", counted)

@@ -1,5 +1,6 @@
 """Names that are withdrawn from physics outside the catalogue, on cases of the independent generator."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,15 @@ from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.diagnose import Outcome, diagnose
 from carlab.diagnosis.evidence import Texts
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
+from carlab.diagnosis.settings import DEFAULT
 from carlab.recording.csv.foreign import import_csv
 from sim_backends import EFFECTS, SimulatorConfig
 from sim_backends.array_ops import ARRAYS
 from sim_backends.effects import CATALOGUE, MeasuredCurve, confusable_effects
 
 TEXTS = Texts(effect_sentence, separating_drive, confusable_effects())
+FEWER = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_out_stride_s=0.5))
+"""Half as many windows as by default. They overlap less, so they have nearly as much information."""
 STATIC = ("steering_deadband", "steering_asymmetry", "steering_nonlinearity", "steering_offset", "yaw_damping")
 DYNAMIC = ("steering_lag", "steering_delay", "yaw_damping")
 
@@ -36,7 +40,7 @@ def found(case: Case, folder: Path, candidates: tuple[str, ...], monkeypatch: py
     write_csv(folder / "hold.csv", case.hold)
     case.nominal.write(folder / "car.toml")
     read = [list(import_csv(folder / name).episodes) for name in ("fit.csv", "hold.csv")]
-    return diagnose(*read, load_car_file(folder / "car.toml").simulator, TEXTS)
+    return diagnose(*read, load_car_file(folder / "car.toml").simulator, TEXTS, settings=FEWER)
 
 
 def decisions_by(outcome: Outcome, setting: str) -> list[Decision]:
@@ -83,6 +87,7 @@ def test_steering_effect_that_a_curve_contains_keeps_its_name(
     assert [(d.effect, d.passed) for d in decisions_by(outcome, "rivals.curve_z_min")] == [(effect, True)]
 
 
+@pytest.mark.slow
 def test_servo_that_sags_under_load_is_no_lag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lag explains most of the excess; terms of steering rate and throttle explain a part of the rest."""
     outcome = found(made("outside", "sagging_servo", "outside"), tmp_path, DYNAMIC, monkeypatch)
