@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import logging
 
-from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
-from carlab.diagnosis.identification.fit import Fit, Scale, clustered_gain
-from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
+from carlab.diagnosis.identification.fit import clustered_gain
+from carlab.diagnosis.selection.pairwise_tests import unseen_loss
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.selection.rival_physics import RivalPhysics
@@ -41,7 +40,7 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
         return None
     control.progress(f"measured curve in place of {', '.join(contained)}", 0.96)
     rival = curve_in_addition(problem, found, tuple(n for n in found.effects if n not in contained))
-    base, own, with_curve = (_unseen_loss(problem, fit, found.scale) for fit in (found.base, found.best, rival.fit))
+    base, own, with_curve = (unseen_loss(problem, fit, found.scale) for fit in (found.base, found.best, rival.fit))
     gain, error = clustered_gain(own, with_curve, problem.windows)
     total = float((base - with_curve).sum())
     share = gain / total if total > 0.0 else 0.0
@@ -73,19 +72,6 @@ def _is_free(problem: SearchProblem) -> bool:
     """Whether neither the curve nor its offset is in the car file."""
     added = SteeringOffset.id, SteeringCurve.id
     return all(is_applicable(problem.nominal, e) and e not in problem.nominal.effects for e in added)
-
-
-def _unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
-    """Loss of each window (S,) by a fit without its fold, with free initial states."""
-    return loss_of_free_initial_states(
-        problem.windows,
-        fit.config,
-        fit.free,
-        problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds()),
-        problem.measured_std,
-        max_error=problem.settings.selection.max_unseen_error,
-        settings=problem.settings.identification,
-    )
 
 
 __all__ = ["curve_in_addition", "replacing_curve"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import replace
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
@@ -28,7 +27,7 @@ def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -
     done, steps = len(model.effects), problem.settings.selection.max_effects
     fitted = control.workers.map(
         refit_candidate,
-        [(replace(problem), model, result) for result in chosen],
+        [(problem.without_refits(), model, result) for result in chosen],
         stop=control.ends_search,
         started=lambda k: control.progress(
             f"refitting with {chosen[k].effect}", (done + 0.5 * k / len(chosen)) / steps
@@ -68,7 +67,7 @@ def _tested(
     share = (len(model.effects) + 0.7) / settings.max_effects
     tested = control.workers.map(
         with_unseen_gain,
-        [(replace(problem), fitter, candidate, reference) for candidate in refitted[:count]],
+        [(problem.without_refits(), fitter, candidate, reference) for candidate in refitted[:count]],
         stop=control.ends_search,
         started=lambda k: control.progress(f"cross-validating {refitted[k].effect}", share),
     )

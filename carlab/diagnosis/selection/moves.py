@@ -6,7 +6,6 @@ The first accepted effect is often a proxy of the true effect.
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 from carlab.diagnosis.identification.fit import design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
@@ -45,7 +44,7 @@ def _swap(problem: SearchProblem, model: Model, reduced: Model, name: str, contr
     fitter, config = problem.fitter(model.scale), problem.config_with(reduced.effects)
     screen = Screen(fitter, config, reduced.fit, screening.max_windows, screening)
     min_score = settings.swap_score_share * (reduced.fit.cost - model.fit.cost)
-    arguments = [(replace(problem), model, reduced, screen, other, min_score) for other in others]
+    arguments = [(problem.without_refits(), model, reduced, screen, other, min_score) for other in others]
     for swap in control.workers.map(_fitted_swap, arguments, stop=control.ends_search):
         if swap is not None and swap[1] > settings.keep_chi2_min:
             rival, chi2 = swap

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, clustered_gain, design_effect_of
+from carlab.diagnosis.identification.fit import Fit, Scale, clustered_gain, design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
@@ -61,7 +61,7 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
     if not model.effects:
         return PairwiseResult()
     with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
-    own_loss = _unseen_loss(problem, model, model.fit)
+    own_loss = unseen_loss(problem, model.fit, model.scale)
     fitted = _fitted_rivals(problem, eliminated, control)
     chi2, rivals, better = {}, {}, {}
     for name in model.effects:
@@ -95,7 +95,7 @@ def _fitted_rivals(
     ]
     fitted = control.workers.map(
         _fitted_rival,
-        [(replace(problem), model, eliminated.deletions[name].without, name, other) for name, other in pairs],
+        [(problem.without_refits(), model, eliminated.deletions[name].without, name, other) for name, other in pairs],
         stop=control.stop,
         started=lambda k: control.progress(f"comparing {pairs[k][0]} with {pairs[k][1]}", 0.95),
     )
@@ -117,22 +117,20 @@ def _fitted_rival(
     rival = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
     if rival.gain < problem.settings.selection.min_gain_share * (without.cost - model.fit.cost):
         return None
-    return rival, _unseen_loss(problem, model, rival.fit)
+    return rival, unseen_loss(problem, rival.fit, model.scale)
 
 
-def _unseen_loss(problem: SearchProblem, model: Model, fit: Fit) -> FloatArray:
+def unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
     """Loss of each window (S,) by a fit without its fold, with free initial states."""
-    identification = problem.settings.identification
-    z = problem.fitter(model.scale).leave_fold_out_coordinates(fit, problem.folds())
     return loss_of_free_initial_states(
         problem.windows,
         fit.config,
         fit.free,
-        z,
+        problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds()),
         problem.measured_std,
         max_error=problem.settings.selection.max_unseen_error,
-        settings=identification,
+        settings=problem.settings.identification,
     )
 
 
-__all__ = ["PairwiseResult", "choose_confusable", "compare_pairs"]
+__all__ = ["PairwiseResult", "choose_confusable", "compare_pairs", "unseen_loss"]

@@ -46,6 +46,10 @@ class SearchProblem:
     settings: DiagnosisSettings = DEFAULT
     refits: dict[Hashable, Model] = field(init=False, default_factory=dict, compare=False, repr=False)
 
+    def without_refits(self) -> SearchProblem:
+        """The same problem without its earlier refits, which another process does not need."""
+        return replace(self)
+
     def free_parameters(self, effects: Sequence[str]) -> tuple[FitParameter, ...]:
         """Free parameters of a fit with ``effects``."""
         own = [f for name in self.nominal.effects for f in effect_parameters(name, self.nominal)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -37,7 +36,7 @@ def refit_without_each(
     new = [name for name in removed if keys[name] not in problem.refits]
     fitted = control.workers.map(
         _fit_from,
-        [(replace(problem), others[name], starts[name], model.scale) for name in new],
+        [(problem.without_refits(), others[name], starts[name], model.scale) for name in new],
         started=lambda k: control.progress(f"refitting without {new[k]}", 0.93),
     )
     problem.refits.update((keys[name], each) for name, each in zip(new, fitted, strict=True) if each is not None)
