@@ -42,13 +42,15 @@ layers:
 COMPUTING := tests/examples tests/diagnosis tests/cli tests/studies tests/benchmark tests/jobs tests/learning \
 	$(addprefix tests/experiment/,test_child_process.py test_quick_check.py test_priors_and_predictions.py test_training.py test_cluster_training.py test_cluster_orders.py test_learning_on_a_device.py) \
 	tests/prediction tests/sim_backends tests/api tests/recording tests/test_architecture.py
+# One process more than processors: some of these tests also drive, and wait.
+PROCESSES = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 YIELD := nice -n 19
 computing driving: export OMP_NUM_THREADS := 1
 # Processes that the tests start read the bytecode of carlab instead of compiling it again.
 computing driving: export PYTHONDONTWRITEBYTECODE :=
 
 computing:
-	$(YIELD) $(BIN)/pytest --numprocesses auto --dist loadfile --no-loadscope-reorder $(COMPUTING)
+	$(YIELD) $(BIN)/pytest --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder $(COMPUTING)
 
 driving:
 	$(BIN)/pytest --numprocesses 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))

@@ -45,10 +45,10 @@ def run(argv: Sequence[str]) -> int:
         return 0
     verbs = _verbs()
     if not {"-h", "--help"}.isdisjoint(argv):
-        from carlab.cli.help_texts import join_help_lines
+        from carlab.cli.help_texts import improve_help
         from carlab.cli.options import CarOptions, TaskOptions
 
-        join_help_lines((*(each for each in verbs.values() if isinstance(each, type)), CarOptions, TaskOptions))
+        improve_help((*(each for each in verbs.values() if isinstance(each, type)), CarOptions, TaskOptions))
     verb = tyro.extras.subcommand_cli_from_dict(verbs, args=list(argv), prog="carlab", description=_DESCRIPTION)
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))
     try:

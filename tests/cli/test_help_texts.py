@@ -1,4 +1,4 @@
-"""Test that help texts are wrapped at the width of the terminal, not at the line breaks of the source code."""
+"""Test that help texts are wrapped at the width of the terminal, and that they print no empty defaults."""
 
 import itertools
 import os
@@ -6,6 +6,8 @@ import subprocess
 import sys
 
 import pytest
+
+from carlab.cli import _verbs, run
 
 WIDTH = 90
 
@@ -28,3 +30,16 @@ def test_each_line_of_a_help_text_is_full(verb: str) -> None:
     ]
     assert len(continued) > 20
     assert [row for row, word in continued if len(f"{row.rstrip()} {word}") <= WIDTH - 4] == []
+
+
+@pytest.mark.parametrize("verb", _verbs())
+def test_option_without_default_has_the_type_of_its_value_only(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        run([verb, "--help"])
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "None" not in printed
+    assert "default: )" not in printed
+    assert "default: '')" not in printed
+    assert printed.count("(default: ") >= 1
+    with pytest.raises(SystemExit, match="2"):
+        run([verb, "--no-such-option"])
