@@ -122,6 +122,8 @@ class Effect:
     """Kinds of the base model for which the effect is identifiable."""
     confusable: ClassVar[tuple[Confusable, ...]] = ()
     """Confusable effects; each pair is listed at one of both effects."""
+    split_into: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """Groups of effects; one effect of each group, together, resembles this effect if their lags are similar."""
 
     name: ClassVar[str] = ""
     """A noun phrase with its article."""

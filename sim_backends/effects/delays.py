@@ -18,6 +18,7 @@ class CommandDelay(DelayEffect):
         "steering and throttle have different delays, or a delay measured at the car equals that of the car file"
     )
     lag_parameter = "extra_delay"
+    split_into = (("steering_delay", "steering_lag"), ("throttle_delay", "motor_lag"))
     parameters = (
         EffectParameter("extra_delay", "s", 0.0, -1.0, 1.0, 0.03, reduces="timing.command_delay", is_delay=True),
     )

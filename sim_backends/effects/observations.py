@@ -101,6 +101,7 @@ class MocapLatency(ObservationEffect):
     sentence = "motion capture measures with a latency of {latency}"
     refuted_if = "a latency measured against a known event, such as a tap on the car, equals that of the car file"
     lag_parameter = "latency"
+    split_into = (("steering_delay", "steering_lag"), ("throttle_delay", "motor_lag"))
     parameters = (EffectParameter("latency", "s", None, 0.0, 1.0, 0.03, same_as="mocap.latency", is_delay=True),)
     confusable = (
         Confusable(

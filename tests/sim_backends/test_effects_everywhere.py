@@ -82,6 +82,8 @@ def test_catalogue_is_complete():
     assert all(bool(effect.class_statement) != effect.catalogued for effect in EFFECTS.values())
     for effect in EFFECTS.values():
         assert {c.effect for c in effect.confusable} <= set(EFFECTS)
+        parts = [EFFECTS[part] for group in effect.split_into for part in group]
+        assert all(each.lag_parameter for each in (effect, *parts) if parts)
 
 
 @functools.cache

@@ -15,6 +15,7 @@ from carlab.diagnosis.selection.forward import Path, best_path, extend
 from carlab.diagnosis.selection.pairwise_tests import choose_confusable, compare_pairs
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import fit_base, refit
+from carlab.diagnosis.selection.timing import replace_shared_delays
 
 
 def search(problem: SearchProblem, control: RunControl) -> SearchResult:
@@ -25,6 +26,7 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
     is_complete = not control.ends_search()
     path = best_path(problem, base, greedy, control)
     eliminated = eliminate(problem, path.model, control)
+    eliminated = replace_shared_delays(problem, eliminated, control)
     model, pairs = choose_confusable(problem, eliminated, control)
     ordered = tuple(sorted(model.effects, key=lambda e: -pairs.chi2[e]))
     return SearchResult(

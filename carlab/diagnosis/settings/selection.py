@@ -111,6 +111,9 @@ class SelectionSettings:
     better_rival_z: float = 1.0
     """A confusable effect replaces an effect if its loss on unseen blocks, with free initial states, is lower by this
     [standard errors]."""
+    split_z_min: float = 2.0
+    """An effect of each command replaces one effect of both commands if the loss on unseen blocks, with free initial
+    states, is lower by this [standard errors], and if the gain is that of a further effect (``accept_chi2_min``)."""
     max_set_rivals: int = 2
     """Maximum number of effects in ``indistinguishable_from`` of report.json."""
 
