@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault, EffectFinding, Estimate, Evidence, Verdict, Where
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
 from carlab.diagnosis.identification.held_out_errors import HeldOut
+from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.unexplained.description import start_features, worst_regime
@@ -41,6 +42,7 @@ class ScoredSearch:
 
     fit      fit with the accepted effects, with covariance
     errors   held-out errors (S, 6) of the models nominal, refit and with_effects
+    is_joint whether initial states were fitted together with the parameters of ``fit``
     """
 
     problem: SearchProblem
@@ -48,21 +50,36 @@ class ScoredSearch:
     held_out: HeldOut
     fit: Fit
     errors: Mapping[str, FloatArray]
+    is_joint: bool = False
 
     @classmethod
     def of(cls, problem: SearchProblem, found: SearchResult, held_out: HeldOut) -> ScoredSearch:
-        """Predict the held-out windows with each model."""
+        """Refine the fits of a search, and predict the held-out windows with each model."""
+        found, is_joint = _refined(problem, found)
         errors_of = {
             "nominal": held_out.final_error(problem.nominal),
             "refit": held_out.final_error(found.base.config),
             "with_effects": held_out.final_error(found.best.config),
         }
-        fit = problem.fitter(found.scale).with_covariance(found.best)
-        return cls(problem, found, held_out, fit, errors_of)
+        fit = found.best if is_joint else problem.fitter(found.scale).with_covariance(found.best)
+        return cls(problem, found, held_out, fit, errors_of, is_joint)
 
     def scores(self) -> dict[str, float]:
         """Held-out score of each model, in noise floors."""
         return {name: self.held_out.score(error) for name, error in self.errors.items()}
+
+
+def _refined(problem: SearchProblem, found: SearchResult) -> tuple[SearchResult, bool]:
+    """The search with joint fits of parameters and initial states, and whether that with all effects is one.
+
+    A fit whose errors exceed the noise stays as it is.
+    """
+    fitter = problem.fitter(found.scale)
+    best = joint_fit(fitter, found.best, problem.measured_std)
+    base = best if found.base is found.best else joint_fit(fitter, found.base, problem.measured_std)
+    history = tuple((name, best or fit if fit is found.best else fit) for name, fit in found.history)
+    refined = replace(found, base=base or found.base, best=best or found.best, history=history)
+    return refined, best is not None
 
 
 def effect_findings(
@@ -91,6 +108,8 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
     found, held_out, full = scored.found, scored.held_out, scored.errors["with_effects"]
     others = tuple(e for e in found.effects if e != name)
     without = refit(scored.problem, others, scored.fit, found.scale).fit
+    fitter = scored.problem.fitter(found.scale)
+    without = joint_fit(fitter, without, scored.problem.measured_std) or without
     error = held_out.final_error(without.config)
     gain, spread = held_out.gain(error, full)
     parameters = {p.name: estimate(scored, f"effects.{name}.{p.name}") for p in EFFECTS[name].parameters}
@@ -147,9 +166,11 @@ def estimate(scored: ScoredSearch, name: str) -> Estimate:
     free, z = fit.free[index], float(fit.z[index])
     assert fit.covariance is not None
     z90 = settings.interval_z
-    std_z = settings.interval_factor * math.sqrt(max(float(fit.covariance[index, index]), 0.0))
+    factor = settings.joint_interval_factor if scored.is_joint else settings.interval_factor
+    min_relative_std = settings.joint_min_relative_std if scored.is_joint else settings.min_relative_std
+    std_z = factor * math.sqrt(max(float(fit.covariance[index, index]), 0.0))
     low, value, high = (float(free.value(np.array(z + k * std_z))) for k in (-z90, 0.0, z90))
-    margin = z90 * settings.min_relative_std * abs(value)
+    margin = z90 * min_relative_std * abs(value)
     low = max(value - math.hypot(value - min(low, high), margin), free.low)
     high = min(value + math.hypot(max(low, high) - value, margin), free.high)
     at_limit = not free.choice and value in (free.low, free.high)

@@ -51,15 +51,32 @@ def loss_of_free_initial_states(
         settings: settings of the fit.
     """
     white, jacobian = _linearised(windows, config, free, z, measured_std)
-    shift = np.zeros((len(windows), 6))
+    _, error, _ = initial_state_correction(white, jacobian, settings.huber_delta)
+    return np.asarray(huber(error.clip(-max_error, max_error), settings.huber_delta).sum(axis=1))
+
+
+def initial_state_correction(
+    white: FloatArray, jacobian: FloatArray, huber_delta: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Initial states that minimise the Huber loss of each window, by reweighted least squares.
+
+    Args:
+        white: whitened errors (S, E).
+        jacobian: their derivatives (S, E, 6) by the initial states.
+        huber_delta: error from which the loss is linear.
+
+    Returns:
+        Change of the initial states (S, 6), the errors (S, E) with it, and the weights (S, E) of these errors.
+    """
+    shift = np.zeros((len(white), 6))
     for _ in range(_REWEIGHTINGS):
         error = np.abs(white + np.einsum("sek,sk->se", jacobian, shift))
-        weight = np.minimum(1.0, settings.huber_delta / np.maximum(error, 1e-12))
+        weight = np.minimum(1.0, huber_delta / np.maximum(error, 1e-12))
         weighted = jacobian * weight[..., None]
         normal = np.swapaxes(weighted, 1, 2) @ jacobian + 1e-9 * np.eye(6)
         shift = -np.linalg.solve(normal, np.einsum("sek,se->sk", weighted, white)[..., None])[..., 0]
     error = white + np.einsum("sek,sk->se", jacobian, shift)
-    return np.asarray(huber(error.clip(-max_error, max_error), settings.huber_delta).sum(axis=1))
+    return shift, error, np.minimum(1.0, huber_delta / np.maximum(np.abs(error), 1e-12))
 
 
 def _linearised(

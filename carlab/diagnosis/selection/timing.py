@@ -69,9 +69,12 @@ def _sets(problem: SearchProblem, model: Model, name: str) -> list[tuple[str, ..
     A single effect in place of a single effect is left to the forward selection, which has compared them.
     """
     groups = EFFECTS[name].split_into
-    if name not in model.effects or not groups or _lag_s(model, name) <= 0.0:
+    if name not in model.effects or not groups:
         return []
-    fewest = 1 if len(_old(model, name)) > 1 else len(groups)
+    is_alone = len(_old(model, name)) == 1
+    if is_alone and _lag_s(model, name) <= 0.0:
+        return []
+    fewest = len(groups) if is_alone else 1
     chosen = itertools.product(*([None, *(e for e in group if problem.is_candidate(e))] for group in groups))
     sets = [tuple(effect for effect in each if effect is not None) for each in chosen]
     return [each for each in sets if len(each) >= fewest]
@@ -108,9 +111,9 @@ def _fitted(problem: SearchProblem, model: Model, name: str, new: tuple[str, ...
 
 
 def _total_lag_s(model: Model, name: str, effect: str) -> float:
-    """Delay of both commands and lags of the command that the effect acts on [s]."""
+    """Delay of both commands and lags of the command that the effect acts on [s], at least 0."""
     group = next(group for group in EFFECTS[name].split_into if effect in group)
-    return _lag_s(model, name) + sum(_lag_s(model, e) for e in group if e in model.effects)
+    return max(_lag_s(model, name) + sum(_lag_s(model, e) for e in group if e in model.effects), 0.0)
 
 
 def _passes(

@@ -21,6 +21,10 @@ class EvidenceSettings:
     """Factor on the width of intervals of the sandwich covariance, which covered 79 % on development cases."""
     min_relative_std: float = 0.01
     """Minimum half width of an interval over ``interval_z``, as a share of the value: allows for model error."""
+    joint_interval_factor: float = 1.5
+    joint_min_relative_std: float = 0.002
+    """The same for joint fits of parameters and initial states, whose errors are a third as large. Chosen on
+    development cases (docs/decisions/0023)."""
     unexplained_score_min: float = 1.2
     """Refit score (noise floors) above which unnamed terms count as missing physics. Chosen on development cases."""
     unexplained_score_min_without_term: float = 1.8

@@ -82,6 +82,10 @@ class IdentificationSettings:
     """Maximum number of parameter sets that are simulated in one batch; bounds the memory of a Jacobian."""
     velocity_min_samples: int = 50
     """Minimum number of samples of the regression of the velocity window."""
+    joint_max_noise_ratio: float = 1.2
+    """Maximum variance of the errors with the best initial states, over that of the measurement noise, for a joint fit
+    of parameters and initial states. Development cases have 0.8 to 0.95 with the true effects, and 1.4 to 2.1 without an
+    effect of excess 2 or 3."""
 
 
 @dataclass(frozen=True, slots=True)

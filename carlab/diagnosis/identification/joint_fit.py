@@ -1,0 +1,196 @@
+"""Joint fit of a simulator's parameters and the initial states of all windows.
+
+A fit with estimated initial states (``fit.Fitter``) is biased: the local polynomial through the poses cannot follow a
+jump of the acceleration, and parameters compensate its error. Here the initial state of each window is fitted together
+with the parameters, so that only measurement noise is left: the maximum likelihood of multiple shooting (Bock and Plitt
+1984, "A multiple shooting algorithm for direct solution of optimal control problems"), by the Gauss-Newton method with
+Huber weights. The initial states are eliminated window by window (variable projection, Kaufman 1975).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from carlab.core.quantities import FloatArray
+from carlab.diagnosis.identification.fit import Fit, Fitter, huber
+from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
+from carlab.diagnosis.identification.free_initial_states import initial_state_correction
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import simulate_windows
+from carlab.prediction.windows import IndexArray
+from sim_backends.car_parameters import SimulatorConfig
+
+_ITERATIONS, _TOLERANCE = 20, 1e-7
+_DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0)
+"""Levenberg-Marquardt dampings that are tried in each iteration, relative to the diagonal."""
+_MAX_WHITE = 1e4
+"""Bound of a whitened error, as in ``fit.Fitter``."""
+_NORMAL_MEDIAN_SQUARE = 0.4549
+"""Median of the square of a standard normal variable."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Linearisation:
+    """Errors at a point with their derivatives, in standard deviations of the noise.
+
+    Attributes:
+        white: errors (S, E) at the best initial states of the linearised windows.
+        states: derivatives by the initial states (S, E, 6).
+        parameters: derivatives by the parameters (S, E, n).
+        shift: change of the initial states (S, 6) to the best ones, in SI units.
+        weights: Huber weights (S, E).
+    """
+
+    white: FloatArray
+    states: FloatArray
+    parameters: FloatArray
+    shift: FloatArray
+    weights: FloatArray
+
+    def projected(self) -> tuple[FloatArray, FloatArray]:
+        """Derivatives by the parameters (S, E, n) with the best initial states, and those of these states (S, 6, n)."""
+        weighted = np.swapaxes(self.states * self.weights[..., None], 1, 2)
+        normal = weighted @ self.states + 1e-9 * np.eye(6)
+        following = -np.linalg.solve(normal, weighted @ self.parameters)
+        return np.asarray(self.parameters + self.states @ following), np.asarray(following)
+
+
+def joint_fit(fitter: Fitter, start: Fit, measured_std: FloatArray) -> Fit | None:
+    """Fit parameters and initial states together, from a fit with estimated initial states.
+
+    Args:
+        fitter: windows, prior and settings.
+        start: the fit to start from.
+        measured_std: standard deviations (6,) of the noise of the measured channels.
+
+    Returns:
+        The simulator with the covariance of its parameters; cost and loss are those with estimated initial states. None
+        if the simulator leaves more than noise (``IdentificationSettings.joint_max_noise_ratio``): then free initial
+        states would hide a part of its error.
+    """
+    problem = _Problem(fitter, start.config, start.free, measured_std)
+    if not start.free or problem.noise_ratio(start.z) > fitter.settings.joint_max_noise_ratio:
+        return None
+    precision = fitter.precision(start.free)
+    z, states, cost = start.z, fitter.windows.initial_states, math.inf
+    for _ in range(_ITERATIONS):
+        before = cost
+        z, states, cost = _iterated(problem, z, states, precision)
+        if before - cost < _TOLERANCE * cost:
+            break
+    return _result(problem, z, states, precision)
+
+
+def _iterated(
+    problem: _Problem, z: FloatArray, states: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Parameters, initial states and cost after one Gauss-Newton step with the best damping, or with no step.
+
+    A window that is far from linear, for example in a spin, keeps its initial state if the correction raises its loss.
+    """
+    at = problem.linearised(z, states)
+    jacobian, following = at.projected()
+    normal, gradient = _normal(jacobian, at)
+    normal += precision
+    diagonal = np.diag(np.diag(normal) + 1e-9)
+    gradient = gradient + precision @ z
+    steps = [-np.linalg.solve(normal + damping * diagonal, gradient) for damping in _DAMPINGS]
+    trials = z + np.array([*steps, np.zeros(len(z))])
+    followed = states + np.einsum("skn,pn->psk", following, trials - z) * problem.std
+    corrected = followed + at.shift
+    losses = [problem.losses(problem.white(trials, each)) for each in (followed, corrected)]
+    keeps = losses[0] <= losses[1]
+    costs = np.minimum(*losses).sum(axis=1) + 0.5 * np.einsum("pi,ij,pj->p", trials, precision, trials)
+    best = int(np.argmin(costs))
+    chosen = np.where(keeps[best][:, None], followed[best], corrected[best])
+    return trials[best], chosen, float(costs[best])
+
+
+def _normal(jacobian: FloatArray, at: _Linearisation) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton matrix (n, n) of the parameters, and their gradient (n,)."""
+    weighted = (jacobian * at.weights[..., None]).reshape(-1, jacobian.shape[-1])
+    return weighted.T @ jacobian.reshape(weighted.shape), weighted.T @ at.white.reshape(-1)
+
+
+def _result(problem: _Problem, z: FloatArray, states: FloatArray, precision: FloatArray) -> Fit:
+    """The fit with the covariance of its parameters."""
+    fitter, free = problem.fitter, problem.free
+    at = problem.linearised(z, states)
+    covariance, design_effects = _covariance(at, fitter.windows.block, precision)
+    config = problem.config.with_values({f.name: float(f.value(np.array(v))) for f, v in zip(free, z, strict=True)})
+    loss = fitter.loss(config)
+    cost = float(loss.sum() + fitter.prior(free, z[None])[0])
+    return Fit(config, free, z, cost, loss, covariance, design_effects)
+
+
+def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Covariance (n, n) by the jackknife over blocks, and its diagonal over that for independent errors (n,).
+
+    Each block is left out by one Gauss-Newton step (the estimator CR3 of Bell and McCaffrey 2002). A few blocks, such
+    as those with slides, determine some parameters. The usual sandwich ignores how strongly a fit follows such blocks,
+    and is too small.
+    """
+    jacobian = at.projected()[0]
+    normal = _normal(jacobian, at)[0] + precision
+    left_out = []
+    blocks = np.unique(block)
+    for each in blocks:
+        own = block == each
+        part = replace(at, white=at.white[own], weights=at.weights[own])
+        normal_of_block, gradient = _normal(jacobian[own], part)
+        left_out.append(np.linalg.lstsq(normal - normal_of_block, gradient, rcond=None)[0])
+    changes = np.array(left_out)
+    covariance = (len(blocks) - 1) / len(blocks) * changes.T @ changes
+    return covariance, np.diag(covariance) / np.maximum(np.diag(np.linalg.pinv(normal)), 1e-30)
+
+
+@dataclass(frozen=True, slots=True)
+class _Problem:
+    """Windows of a fitter, a simulator with n free parameters, and the noise (6,) of the channels."""
+
+    fitter: Fitter
+    config: SimulatorConfig
+    free: tuple[FitParameter, ...]
+    std: FloatArray
+
+    def noise_ratio(self, z: FloatArray) -> float:
+        """Robust variance of the errors with the best initial states, over that of the measurement noise.
+
+        It is estimated by the median of their squares, and is about 1 if the simulator explains the recordings.
+        """
+        error = self.linearised(z, self.fitter.windows.initial_states).white
+        return float(np.median(error**2)) / _NORMAL_MEDIAN_SQUARE
+
+    def losses(self, white: FloatArray) -> FloatArray:
+        """Huber loss of each window (..., S) of whitened errors (..., S, E)."""
+        return np.asarray(huber(white, self.fitter.settings.huber_delta).sum(axis=-1))
+
+    def white(self, z: FloatArray, states: FloatArray) -> FloatArray:
+        """Whitened errors (P, S, E) with parameters (P, n) and initial states (P, S, 6)."""
+        windows, sets = self.fitter.windows, len(z)
+        count = len(windows)
+        stacked = replace(windows.take(np.tile(np.arange(count), sets)), initial_states=states.reshape(-1, 6))
+        values = {f.name: np.repeat(f.value(z[:, k]), count)[None] for k, f in enumerate(self.free)}
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
+            predicted = simulate_windows(stacked, self.config, values).reshape(sets, count, -1, 6)
+            white = prediction_errors(predicted, windows)[:, :, 1:] / self.std
+        white = np.nan_to_num(white, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
+        return np.asarray(white.clip(-_MAX_WHITE, _MAX_WHITE).reshape(sets, count, -1))
+
+    def linearised(self, z: FloatArray, states: FloatArray) -> _Linearisation:
+        """Errors at the best initial states near ``states`` (S, 6), and derivatives."""
+        steps = difference_steps(self.free)
+        moved_z = np.vstack([z, np.tile(z, (6, 1)), z + np.diag(steps)])
+        moved_states = np.tile(states, (len(moved_z), 1, 1))
+        moved_states[1:7] += np.diag(self.std)[:, None]
+        white = self.white(moved_z, moved_states)
+        changes = np.moveaxis(white[1:] - white[0], 0, -1)
+        by_states, by_parameters = changes[..., :6], changes[..., 6:] / steps
+        shift, error, weights = initial_state_correction(white[0], by_states, self.fitter.settings.huber_delta)
+        return _Linearisation(error, by_states, by_parameters, shift * self.std, weights)
+
+
+__all__ = ["joint_fit"]
