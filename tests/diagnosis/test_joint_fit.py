@@ -53,7 +53,9 @@ def test_joint_fit_is_the_least_squares_fit_of_scipy() -> None:
     windows = cut_windows(tracks_of([drive(TRUE, 8.0, 3)]), 0.8, 2.0)
     fitter, start = fitted(windows)
     start = replace(start, z=start.z - 0.1)
-    found = joint_fit(Fitter(windows, SCALE, replace(fitter.settings, huber_delta=1e6)), start, STD)
+    found = joint_fit(
+        Fitter(windows, SCALE, replace(fitter.settings, huber_delta=1e6, joint_max_noise_ratio=9.0)), start, STD
+    )
     assert found is not None
     assert found.covariance is not None
     std = math.sqrt(found.covariance[0, 0])
