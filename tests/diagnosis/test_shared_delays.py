@@ -9,7 +9,7 @@ from carlab.diagnosis.decisions import Decision
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import fit_base, fit_with_scale
-from carlab.diagnosis.selection.timing import replace_shared_delays
+from carlab.diagnosis.selection.shared_delays import replace_shared_delays
 from carlab.prediction.windows import cut_windows, tracks_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters

@@ -15,7 +15,7 @@ from carlab.diagnosis.selection.forward import Path, best_path, extend
 from carlab.diagnosis.selection.pairwise_tests import choose_confusable, compare_pairs
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult
 from carlab.diagnosis.selection.refit import fit_base, refit
-from carlab.diagnosis.selection.timing import replace_shared_delays
+from carlab.diagnosis.selection.shared_delays import replace_shared_delays
 
 
 def search(problem: SearchProblem, control: RunControl) -> SearchResult:
