@@ -283,8 +283,8 @@ def _initial_estimate(problem: _Problem, known_parameters: Tensor | None, genera
 
 def _prior_parameters(problem: _Problem, model: DomainModel, generator: torch.Generator) -> Tensor:
     """Draws (P, K) of the prior; without data, only those with plausible outputs in the simulator's domain."""
-    if len(problem.inputs):
-        return draw_parameters(model, PRIOR_DRAWS, generator).to(problem.inputs)
+    if len(problem.inputs) or not model.size:
+        return draw_parameters(model, PRIOR_DRAWS if model.size else 1, generator).to(problem.inputs)
     drawn = draw_parameters(model, PARAMETER_DRAWS, generator).to(problem.inputs)
     domain = model.inputs(DOMAIN_ROWS, torch.Generator().manual_seed(problem.seed)).to(problem.inputs)
     return drawn[_plausible(simulate(model, domain, drawn, problem.normaliser))]

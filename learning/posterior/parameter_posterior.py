@@ -55,7 +55,7 @@ def posterior_parameters(
         generator: of all randomness, on the CPU.
 
     Returns:
-        Parameters (P, K).
+        Parameters (P, K); one draw of a simulator without parameters.
 
     Raises:
         DataError: the simulator gives no finite number for any draw.
@@ -70,7 +70,7 @@ def posterior_parameters(
         return torch.nan_to_num(-0.5 * (white * white).sum(dim=(0, 1)), nan=-torch.inf)
 
     with torch.no_grad():
-        normal = torch.randn((count, model.size), generator=generator).double().to(device)
+        normal = torch.randn((count if model.size else 1, model.size), generator=generator).double().to(device)
         if not len(inputs) or not model.size:
             return model.parameters(normal).to(inputs)
         walkers = _Walkers(normal, log_likelihood(normal))

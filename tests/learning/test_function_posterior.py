@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
-from gaussian_process_reference import discrepancy_alone, raw_noise, simulator_and_discrepancy
+from gaussian_process_reference import discrepancy_alone, kernel, raw_noise, simulator_and_discrepancy
 from linear_simulator import EMPTY, NOISE, UNITS, Linear, features, rows, tensors, truth
 from scipy.stats import multivariate_normal, norm
 from scipy.stats import t as student
+from torch import Tensor
 
 from learning.evaluation import negative_log_likelihood
 from learning.posterior import inference
-from learning.posterior.discrepancy import PRIOR_DISCREPANCY_STD, PRIOR_LENGTHSCALE
+from learning.posterior.discrepancy import CHOLESKY_JITTER, PRIOR_DISCREPANCY_STD, PRIOR_LENGTHSCALE
 from learning.posterior.inference import PARAMETER_DRAWS, infer
 
 
@@ -144,6 +146,46 @@ class TestWithSimulator:
         small, large = (infer(Linear(), x, y, UNITS, NOISE).discrepancy.scales for y in (right, wrong))
         assert (small < 0.7 * large).all()
         assert (small < PRIOR_DISCREPANCY_STD).all()
+
+
+KNOWN = torch.tensor([[0.8, -1.1, 0.4]])
+
+
+@dataclass(frozen=True)
+class Known(Linear):
+    """The same simulator with known parameters."""
+
+    size: int = 0
+
+    def __call__(self, inputs: Tensor, parameters: Tensor) -> Tensor:
+        return super().__call__(inputs, KNOWN.to(inputs).expand(len(parameters), -1))
+
+
+class TestWithKnownParameters:
+    def test_posterior_equals_the_gaussian_process_of_the_residual(self):
+        """One draw is enough, because all are equal."""
+        x, y = rows(30)
+        query, _ = rows(40, seed=1)
+        posterior = infer(Known(), x, y, UNITS, NOISE)
+        assert posterior.parameters.shape == (1, 0)
+        mean, std = posterior.predict(query)
+        simulated = {name: (features(v) @ KNOWN[0].double().numpy()).T for name, v in (("x", x), ("query", query))}
+        between = [
+            kernel(posterior.discrepancy, a, b, KNOWN) for a, b in ((x, x), (x, query), (query, query))
+        ]  # fmt: skip
+        for k, (noise, unit) in enumerate(zip(raw_noise(posterior), UNITS.output_std.double().numpy(), strict=True)):
+            covariance = between[0][k] + (noise**2 + CHOLESKY_JITTER * unit**2) * np.eye(len(x))
+            gain = np.linalg.solve(covariance, between[1][k]).T
+            exact = simulated["query"][:, k] + gain @ (y.double().numpy() - simulated["x"])[:, k]
+            variance = np.diag(between[2][k] - gain @ between[1][k]) + noise**2
+            assert np.allclose(mean[:, k], exact, atol=2e-5)
+            assert np.allclose(std[:, k], np.sqrt(variance), rtol=1e-4)
+
+    def test_prior_without_rows_is_the_simulator_and_the_discrepancy(self):
+        query, _ = rows(10, seed=1)
+        posterior = infer(Known(), EMPTY, EMPTY, UNITS, NOISE)
+        assert posterior.parameters.shape == (1, 0)
+        assert np.allclose(posterior.predict(query)[0], (features(query) @ KNOWN[0].double().numpy()).T, atol=1e-5)
 
 
 class TestWithoutRows:
