@@ -88,6 +88,10 @@ class BenchOptions:
     effects: tuple[str, ...] = ()
     """realcars: restrict the search to these effects of the catalogue."""
 
+    curves: bool = False
+    """rollouts with --rows all: the prior simulator has measured curves (drive force, steering, tyres), which are
+    fitted to the recordings to fit; each fold of the cross-validation has its own."""
+
     keep_events: bool = False
     """realcars: also fit and score prediction windows with events (collisions, a hand that moves the car)."""
 
@@ -177,6 +181,7 @@ STUDIES_OF_OPTION = {
     "data": (REGRESSION, PRIORS, REALCARS, ROLLOUTS),
     "held_out": (REALCARS,),
     "effects": (REALCARS,),
+    "curves": (ROLLOUTS,),
     "keep_events": (REALCARS,),
     "fit": (REALCARS,),
     "car": (REALCAR, READ, REALCARS, ROLLOUTS),

@@ -49,6 +49,7 @@ def run_rollouts(options: BenchOptions) -> int:
 
 
 def _run_here(options: BenchOptions, case: RecordedCase, recordings: Recordings) -> tuple[list[RolloutScore], bool]:
+    from carlab.cars import load_car_file
     from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.studies.rollouts import run_rollout_study
 
@@ -58,6 +59,7 @@ def _run_here(options: BenchOptions, case: RecordedCase, recordings: Recordings)
         study = run_rollout_study(
             case, recordings, rows=options.rows, seeds=options.seeds, first_seed=options.first_seed,
             steps=options.steps, device=options.device,
+            curves_from=load_car_file(options.car).simulator if options.curves else None,
             progress=lambda note, done, total: bar.update(row, completed=done, total=total, note=note),
             stop=interrupts.requested.is_set,
         )  # fmt: skip
@@ -75,6 +77,7 @@ def _jobs(
 
     assert case.rows is not None
     more, contents = recorded_files(files, options.car, case.rows.history)
+    more += ["--curves"] if options.curves else []
 
     def job(rows: Rows, seed: int) -> StudyJob[RolloutScore]:
         label = f"{rows} rows, seed {seed}"
@@ -91,8 +94,9 @@ def _jobs(
             failed,
         )
 
+    counts = checked_counts(case, recordings, options.rows, with_curves=options.curves)
     seeds = range(options.first_seed, options.first_seed + options.seeds)
-    return list(itertools.starmap(job, itertools.product(checked_counts(case, recordings, options.rows), seeds)))
+    return list(itertools.starmap(job, itertools.product(counts, seeds)))
 
 
 def _write(scores: Sequence[RolloutScore], options: BenchOptions) -> None:

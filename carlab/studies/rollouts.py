@@ -1,13 +1,15 @@
 """Calibration of predicted rollouts of a learned car on a held-out recording.
 
 Each car is fitted to a number of random rows of the recordings to fit, or to all rows: then its particles are also
-fitted to rollouts over all windows (``learning.world.rollout_fit``). Its disturbance is estimated from the errors over
-windows of blocks that the car was not fitted to (cross-validation). Two kinds of rollouts are compared: steps with
-independent particles and noise, and one particle with a disturbance for each rollout.
+fitted to rollouts over all windows (``learning.world.rollout_fit``), and its prior simulator may have measured curves,
+which are fitted to the same recordings (``curve_prior``). A car's disturbance is estimated from the errors over windows
+of blocks that the car was not fitted to (cross-validation). Two kinds of rollouts are compared: steps with independent
+particles and noise, and one particle with a disturbance for each rollout.
 """
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -17,11 +19,12 @@ import numpy as np
 import torch
 
 from carlab.core.episode_data import EpisodeData
-from carlab.core.errors import DataError
+from carlab.core.errors import ConfigError, DataError
 from carlab.core.quantities import FloatArray
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.learned import LearnedModel, drive_windows, recorded_windows
 from carlab.prediction.windows import PredictionWindows
+from carlab.studies.curve_prior import kept_parts, with_curves
 from carlab.studies.regression.cases import Data
 from carlab.studies.regression.methods import FitTask
 from carlab.studies.regression.recordings import RecordedCase
@@ -31,6 +34,7 @@ from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import DisturbedCar, RolloutModel
 from learning.world.disturbance_fit import MAX_WINDOWS, RolloutErrors, fit_disturbance, pooled, rollout_errors
 from learning.world.rollout_fit import fit_rollouts
+from sim_backends.car_parameters import SimulatorConfig
 
 ALL_ROWS: Literal["all"] = "all"
 Rows = int | Literal["all"]
@@ -92,6 +96,7 @@ def run_rollout_study(
     first_seed: int = 0,
     steps: int | None = None,
     device: str = "cpu",
+    curves_from: SimulatorConfig | None = None,
     progress: Progress = lambda what, done, total: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[RolloutScore]:
@@ -100,31 +105,26 @@ def run_rollout_study(
     Args:
         case: rows of the recordings, the last one held out.
         recordings: the recordings of the case.
-        rows: numbers of rows of a fit, or ``ALL_ROWS``; by default ``COUNTS``.
+        rows: numbers of rows of a fit, or ``ALL_ROWS``; by default ``COUNTS``, with curves ``ALL_ROWS`` alone.
         seeds: number of repetitions.
         first_seed: the smallest seed.
         steps: of the particles' optimiser; by default those of the regression study.
         device: of the fits; rollouts are sampled on the CPU.
+        curves_from: simulator of the car file, to which measured curves are added as the prior; None: no curves. The
+            curves of a fold are fitted without its blocks.
         progress: called before each fit.
         stop: if it returns true before a fit, the study ends.
 
     Raises:
+        ConfigError: curves with a number of rows: they are fitted to windows, which need whole recordings.
         DataError: too few rows, or a recording without a window in which the car moves.
     """
     assert case.rows is not None
     assert case.held_out is not None
-    counts = checked_counts(case, recordings, rows)
-    fold_of_row = _folds_of_rows(case, recordings)
+    counts = checked_counts(case, recordings, rows, with_curves=curves_from is not None)
     fitted = [episode for recording in recordings[:-1] for episode in recording]
     fit_windows, held_out = (recorded_windows(of, max(HORIZONS_S), STRIDE_S) for of in (fitted, recordings[-1]))
-    dense_windows = recorded_windows(fitted, max(HORIZONS_S), FIT_STRIDE_S)
-
-    def fit(count: Rows, seed: int, held_out_fold: int | None) -> CarDynamics:
-        rows, windows = _without_fold(case, dense_windows, fold_of_row, held_out_fold)
-        if count == ALL_ROWS:
-            return fit_all(case, rows, windows, seed, steps, device)
-        return fit_rows(case, rows, count, seed, steps, device)
-
+    fit = _fit_without_fold(case, fitted, curves_from, steps, device)
     total = len(counts) * seeds * (N_FOLDS + 1)
     for done, (count, seed) in enumerate(itertools.product(counts, range(first_seed, first_seed + seeds))):
         errors: list[RolloutErrors] = []
@@ -138,6 +138,33 @@ def run_rollout_study(
         process = fit_disturbance(pooled(errors))
         yield from _scores(case, car, DisturbedCar(car, process), held_out, count, seed)
     progress("", total, total)
+
+
+def _fit_without_fold(
+    case: RecordedCase,
+    episodes: Sequence[EpisodeData],
+    curves_from: SimulatorConfig | None,
+    steps: int | None,
+    device: str,
+) -> Callable[[Rows, int, int | None], CarDynamics]:
+    """A fit to a number of rows of the episodes with a seed, without the blocks of a fold (None: to all blocks).
+
+    Curves of a fold are fitted once, for all seeds.
+    """
+    fold_of_row = _folds_of_rows(case, episodes[0].period_s)
+    dense_windows = recorded_windows(episodes, max(HORIZONS_S), FIT_STRIDE_S)
+
+    @functools.cache
+    def case_of(fold: int | None) -> RecordedCase:
+        return case if curves_from is None else with_curves(case, _episodes_without_fold(episodes, fold), curves_from)
+
+    def fit(count: Rows, seed: int, held_out_fold: int | None) -> CarDynamics:
+        rows, windows = _without_fold(case, dense_windows, fold_of_row, held_out_fold)
+        if count == ALL_ROWS:
+            return fit_all(case_of(held_out_fold), rows, windows, seed, steps, device)
+        return fit_rows(case, rows, count, seed, steps, device)
+
+    return fit
 
 
 def _scores(
@@ -163,12 +190,34 @@ def _without_fold(
     return case.rows.take(fold_of_row != fold), windows.take((_folds_of(windows) != fold).all(axis=0))
 
 
+def _episodes_without_fold(episodes: Sequence[EpisodeData], fold: int | None) -> list[EpisodeData]:
+    """Parts of episodes without the blocks of a fold; whole episodes for None."""
+    if fold is None:
+        return list(episodes)
+    parts: list[EpisodeData] = []
+    for number, episode in enumerate(episodes):
+        t_s = episode.period_s * np.arange(episode.ticks, dtype=np.float64)
+        parts += kept_parts(episode, folds(np.full(episode.ticks, number), t_s) != fold)
+    return parts
+
+
 def checked_counts(
-    case: RecordedCase, recordings: Sequence[Sequence[EpisodeData]], rows: Sequence[Rows]
+    case: RecordedCase,
+    recordings: Sequence[Sequence[EpisodeData]],
+    rows: Sequence[Rows],
+    *,
+    with_curves: bool = False,
 ) -> tuple[Rows, ...]:
-    """Numbers of rows, by default ``COUNTS``. Raises DataError if a fold has fewer rows."""
-    counts = tuple(rows) or COUNTS
-    fold_of_row = _folds_of_rows(case, recordings)
+    """Numbers of rows, by default ``COUNTS``, with curves ``ALL_ROWS``.
+
+    Raises:
+        ConfigError: curves with a number of rows.
+        DataError: a fold has fewer rows.
+    """
+    counts = tuple(rows) or ((ALL_ROWS,) if with_curves else COUNTS)
+    if with_curves and any(count != ALL_ROWS for count in counts):
+        raise ConfigError("Measured curves are fitted to whole recordings, not to random rows; use --rows all.")
+    fold_of_row = _folds_of_rows(case, recordings[0][0].period_s)
     smallest = min(int((fold_of_row != fold).sum()) for fold in range(N_FOLDS))
     largest = max((count for count in counts if count != ALL_ROWS), default=0)
     if largest > smallest:
@@ -176,9 +225,9 @@ def checked_counts(
     return counts
 
 
-def _folds_of_rows(case: RecordedCase, recordings: Sequence[Sequence[EpisodeData]]) -> np.ndarray:
+def _folds_of_rows(case: RecordedCase, period_s: float) -> np.ndarray:
     assert case.rows is not None
-    return folds(case.rows.episode, case.rows.tick * _period_s(recordings))
+    return folds(case.rows.episode, case.rows.tick * period_s)
 
 
 def fit_rows(
@@ -267,10 +316,6 @@ def scores_from_json(content: Mapping[str, Any]) -> list[RolloutScore]:
 def _one_step_nll(car: CarDynamics, rows: Transitions) -> float:
     inputs, outputs = (torch.from_numpy(v).float() for v in (rows.inputs, rows.targets))
     return negative_log_likelihood(car.predict(inputs).smoothed(), outputs)
-
-
-def _period_s(recordings: Sequence[Sequence[EpisodeData]]) -> float:
-    return recordings[0][0].period_s
 
 
 __all__ = [

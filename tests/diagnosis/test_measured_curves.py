@@ -9,6 +9,7 @@ import pytest
 
 from carlab.cars import load_car_file
 from carlab.diagnosis.curves.curve_fit import fit_curves
+from carlab.diagnosis.curves.simulator_with_curves import simulator_with_curves
 from carlab.diagnosis.curves.support import curve_findings, driving_time_s
 from carlab.diagnosis.diagnose import diagnose
 from carlab.diagnosis.evidence import Texts
@@ -19,6 +20,8 @@ from carlab.diagnosis.report.sentences import effect_sentence, separating_drive,
 from carlab.diagnosis.report.write import write_report
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.settings import DEFAULT, CurveSettings
+from carlab.prediction.errors import prediction_errors
+from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import cut_windows, tracks_of
 from sim_backends import EFFECTS, SimulatorConfig, registered
 from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter, confusable_effects
@@ -236,3 +239,20 @@ def test_verdict_states_the_error_with_measured_curves(outcome):
         in verdict_sentence(outcome.diagnosis)
     )
     assert "measured curve" not in verdict_sentence(replace(outcome.diagnosis, curves=()))
+
+
+def test_simulator_with_curves_predicts_a_drive_that_it_was_not_fitted_to(drives):
+    fit, unseen = drives
+    found = simulator_with_curves([fit], CAR, settings=SETTINGS)
+    windows = cut_windows(tracks_of([unseen]), 1.0, 0.5)
+    rms = {}
+    for name, config in (("car file", CAR), ("curves", found)):
+        error = prediction_errors(SimulatorModel(config).predict(windows), windows)[:, -1]
+        rms[name] = float(np.sqrt(np.mean(error[:, 0] ** 2 + error[:, 1] ** 2)))
+    assert rms["curves"] < 0.35 * rms["car file"]
+    assert "drive_map" in found.effects
+
+
+def test_simulator_without_missing_physics_has_no_curves():
+    found = simulator_with_curves([drive(CAR, 40.0, 5)], CAR, settings=SETTINGS)
+    assert not any(curve.id in found.effects for curve in CURVES)

@@ -1,0 +1,62 @@
+"""A simulator with measured curves from recordings, without a report: for priors of learned cars."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from carlab.core.episode_data import EpisodeData
+from carlab.diagnosis.curves.curve_fit import fit_curves
+from carlab.diagnosis.curves.support import without_extrapolation
+from carlab.diagnosis.identification.held_out_errors import noise_floor
+from carlab.diagnosis.identification.measurement_noise import estimate_noise
+from carlab.diagnosis.identification.velocity_window import with_initial_states
+from carlab.diagnosis.recording_faults import find as data_faults_of
+from carlab.diagnosis.recordings import split_recordings
+from carlab.diagnosis.selection.problem import RunControl, SearchProblem
+from carlab.diagnosis.selection.search import search
+from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
+from carlab.diagnosis.state_alignment import with_known_latency
+from sim_backends.car_parameters import SimulatorConfig
+
+EFFECTS_WITH_CURVES = ("command_delay",)
+"""Effects of the catalogue that are searched before the curves; most others are parts of a curve."""
+
+
+def simulator_with_curves(
+    episodes: Sequence[EpisodeData], nominal: SimulatorConfig, *, settings: DiagnosisSettings = DEFAULT
+) -> SimulatorConfig:
+    """Fit base parameters, a command delay and measured curves to recordings, as ``diagnose`` with ``curves`` does.
+
+    Nothing is held out, and windows with events are left out.
+
+    Args:
+        episodes: recordings.
+        nominal: the simulator of the car file.
+        settings: settings of the diagnosis.
+
+    Returns:
+        The simulator with its curves. Without a curve that unseen blocks need: with the refitted parameters and the
+        delay.
+
+    Raises:
+        Inconclusive: too little driving, speed or variation of the commands.
+    """
+    nominal = with_known_latency(nominal, episodes)
+    repaired, _, _ = data_faults_of.check(episodes, (), nominal)
+    # The second argument is scored by a diagnosis; the fit does not use it.
+    recordings = split_recordings(repaired, repaired, settings.windows.default_held_out_share, nominal, settings)
+    (windows,) = with_initial_states((recordings.fit_windows,), nominal, settings.identification)
+    noise = estimate_noise(recordings.fit_tracks, windows.curvature_bias, settings=settings.identification)
+    floor = np.sqrt(np.mean(noise_floor(windows, noise, nominal, settings.identification)[1:] ** 2, axis=0))
+    problem = SearchProblem(nominal, windows, floor, noise.measured, {}, EFFECTS_WITH_CURVES, settings)
+    control = RunControl()
+    found = search(problem, control)
+    measured = fit_curves(problem, found, control)
+    if measured is None:
+        return found.best.config
+    return without_extrapolation(measured, recordings.fit_tracks, settings.curves).fit.config
+
+
+__all__ = ["EFFECTS_WITH_CURVES", "simulator_with_curves"]
