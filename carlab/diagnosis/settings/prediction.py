@@ -84,8 +84,8 @@ class IdentificationSettings:
     """Minimum number of samples of the regression of the velocity window."""
     joint_max_noise_ratio: float = 1.2
     """Maximum variance of the errors with the best initial states, over that of the measurement noise, for a joint fit
-    of parameters and initial states. Development cases have 0.8 to 0.95 with the true effects, and 1.4 to 2.1 without an
-    effect of excess 2 or 3."""
+    of parameters and initial states. Development cases have 0.8 to 0.95 with the true effects, and mostly 1.3 to 2.2
+    without an effect of excess 2 or 3 (docs/decisions/0023)."""
 
 
 @dataclass(frozen=True, slots=True)
