@@ -25,7 +25,6 @@ NOISE = 3e-4 * np.array([1.0, 1.0, 2.0, 20.0, 20.0, 40.0])
     ("true", "expected"),
     [
         ({"steering_lag": "time_constant", "motor_lag": "time_constant"}, {"steering_lag", "motor_lag"}),
-        ({"steering_lag": "time_constant", "throttle_delay": "delay"}, {"steering_lag", "throttle_delay"}),
         ({"steering_delay": "delay", "throttle_delay": "delay"}, {DELAY}),
     ],
 )
