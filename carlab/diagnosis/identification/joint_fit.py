@@ -131,12 +131,15 @@ def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) ->
 
     Each block is left out by one Gauss-Newton step (the estimator CR3 of Bell and McCaffrey 2002). A few blocks, such
     as those with slides, determine some parameters. The usual sandwich ignores how strongly a fit follows such blocks,
-    and is too small.
+    and is too small. Errors of a single block count as independent.
     """
     jacobian = at.projected()[0]
     normal = _normal(jacobian, at)[0] + precision
-    left_out = []
+    independent = np.linalg.pinv(normal)
     blocks = np.unique(block)
+    if len(blocks) == 1:
+        return independent, np.ones(len(independent))
+    left_out = []
     for each in blocks:
         own = block == each
         part = replace(at, white=at.white[own], weights=at.weights[own])
@@ -144,7 +147,7 @@ def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) ->
         left_out.append(np.linalg.lstsq(normal - normal_of_block, gradient, rcond=None)[0])
     changes = np.array(left_out)
     covariance = (len(blocks) - 1) / len(blocks) * changes.T @ changes
-    return covariance, np.diag(covariance) / np.maximum(np.diag(np.linalg.pinv(normal)), 1e-30)
+    return covariance, np.diag(covariance) / np.maximum(np.diag(independent), 1e-30)
 
 
 @dataclass(frozen=True, slots=True)
