@@ -135,7 +135,7 @@ def _covariance(at: _Linearisation, block: IndexArray, precision: FloatArray) ->
     """
     jacobian = at.projected()[0]
     normal = _normal(jacobian, at)[0] + precision
-    independent = np.linalg.pinv(normal)
+    independent = np.asarray(np.linalg.pinv(normal), dtype=np.float64)
     blocks = np.unique(block)
     if len(blocks) == 1:
         return independent, np.ones(len(independent))
