@@ -2,7 +2,8 @@
 
 A lag of the steering and a lag of the motor of similar size resemble one delay of both commands. The forward selection
 adds one effect at a time, so it finds the delay first. The delay then hides the two lags, or stays beside one of them.
-Here all effects of delays and lags are replaced together by each set with at most one of them for each command.
+Here all effects of delays and lags are replaced together by each set with at most one of them for each command. A delay
+or lag of each command is also compared with a delay of both and a further delay or lag of one command.
 """
 
 from __future__ import annotations
@@ -44,14 +45,14 @@ class _Replacement:
 def replace_shared_delays(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> EliminationResult:
-    """Replace effects that delay both commands by effects of single commands that predict unseen blocks better."""
-    for name in eliminated.model.effects:
+    """Replace delays and lags by other sets of delays and lags that predict unseen blocks better."""
+    for name in (name for name, effect in EFFECTS.items() if effect.split_into):
         model = eliminated.model
-        sets = _sets(problem, model, name)
-        if not sets or control.stop():
+        exchanges = (_splits if name in model.effects else _merges)(problem, model, name)
+        if not exchanges or control.stop():
             continue
         control.progress(f"comparing {name} with delays and lags of single commands", 0.94)
-        arguments = [(problem.without_refits(), model, name, new) for new in sets]
+        arguments = [(problem.without_refits(), model, *exchange) for exchange in exchanges]
         fitted = [each for each in control.workers.map(_fitted, arguments, stop=control.stop) if each is not None]
         own_loss = unseen_loss(problem, model.fit, model.scale) if fitted else np.zeros(0)
         passing = [each for each in fitted if _passes(problem, model, each, own_loss, control)]
@@ -63,57 +64,73 @@ def replace_shared_delays(
     return eliminated
 
 
-def _sets(problem: SearchProblem, model: Model, name: str) -> list[tuple[str, ...]]:
-    """Sets of candidates, at most one from each group, that may replace the effect; none if it is not in the model.
+Exchange = tuple[frozenset[str], dict[str, float]]
+"""Accepted effects, and the effects that may replace them with the lags [s] from which their fit starts."""
+
+
+def _splits(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
+    """Sets of candidates, at most one from each group, in place of an accepted effect and those of its groups.
 
     A single effect in place of a single effect is left to the forward selection, which has compared them.
     """
     groups = EFFECTS[name].split_into
-    if name not in model.effects or not groups:
+    lags = _group_lags_s(model, name)
+    old = frozenset({name}.union(*groups)).intersection(model.effects)
+    if len(old) == 1 and min(lags) <= 0.0:
         return []
-    is_alone = len(_old(model, name)) == 1
-    if is_alone and _lag_s(model, name) <= 0.0:
-        return []
-    fewest = len(groups) if is_alone else 1
-    chosen = itertools.product(*([None, *(e for e in group if problem.is_candidate(e))] for group in groups))
-    sets = [tuple(effect for effect in each if effect is not None) for each in chosen]
-    return [each for each in sets if len(each) >= fewest]
+    options = [
+        [(e, max(lag, 0.0)) for e in group if problem.is_candidate(e)] for group, lag in zip(groups, lags, strict=True)
+    ]
+    sets = [
+        dict(each for each in chosen if each is not None)
+        for chosen in itertools.product(*([None, *each] for each in options))
+    ]
+    return [(old, new) for new in sets if len(new) >= (len(groups) if len(old) == 1 else 1)]
 
 
-def _old(model: Model, name: str) -> frozenset[str]:
-    """The effect, and the effects of its groups that are in the model."""
-    return frozenset({name}.union(*EFFECTS[name].split_into)).intersection(model.effects)
+def _merges(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
+    """The effect with one of the longer lag's group, in place of one accepted effect of each group."""
+    groups = EFFECTS[name].split_into
+    old = [[e for e in group if e in model.effects] for group in groups]
+    has_other = any(other.split_into for other in map(EFFECTS.__getitem__, model.effects))
+    if has_other or not problem.is_candidate(name) or any(len(each) != 1 for each in old):
+        return []
+    lags = _group_lags_s(model, name)
+    common, longest = min(lags), max(lags)
+    longer = groups[lags.index(longest)]
+    replaced = frozenset(itertools.chain(*old))
+    return [(replaced, {name: common, e: longest - common}) for e in longer if problem.is_candidate(e)]
+
+
+def _group_lags_s(model: Model, name: str) -> list[float]:
+    """Sum of the effect's own delay and of the delays and lags of each group [s], relative to the car file."""
+    return [sum(_lag_s(model, e) for e in (name, *group) if e in model.effects) for group in EFFECTS[name].split_into]
 
 
 def _lag_s(model: Model, name: str) -> float:
-    """Delay or time constant of an effect [s], relative to the car file."""
+    """Delay or time constant of an accepted effect [s], relative to the car file."""
     parameter = f"effects.{name}.{EFFECTS[name].lag_parameter}"
     return next(
         float(f.value(z)) - f.origin for f, z in zip(model.fit.free, model.fit.z, strict=True) if f.name == parameter
     )
 
 
-def _fitted(problem: SearchProblem, model: Model, name: str, new: tuple[str, ...]) -> _Replacement | None:
-    """Fit ``new`` in place of all effects that it replaces; None if it fits significantly worse, or not as required."""
-    old = _old(model, name)
+def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict[str, float]) -> _Replacement | None:
+    """Fit ``new`` effects in place of ``old`` ones; None if the fit is significantly worse, or not as required."""
     effects = (*(e for e in model.effects if e not in old), *new)
     known = {f.name: float(z) for f, z in zip(model.fit.free, model.fit.z, strict=True)}
-    starts = {f"effects.{e}.{EFFECTS[e].lag_parameter}": _total_lag_s(model, name, e) for e in new}
+    lags = {f"effects.{e}.{EFFECTS[e].lag_parameter}": lag for e, lag in new.items()}
     free = problem.free_parameters(effects)
-    start = np.array([f.coordinate(starts[f.name]) if f.name in starts else known.get(f.name, 0.0) for f in free])
+    start = np.array([
+        f.coordinate(f.origin + lags[f.name]) if f.name in lags else known.get(f.name, 0.0) for f in free
+    ])  # fmt: skip
     fitter, settings = problem.fitter(model.scale), problem.settings.selection
     fit = fitter.fit(problem.config_with(effects), free, start)
     with_covariance = fitter.with_covariance(fit)
     chi2 = 2.0 * (model.fit.cost - fit.cost) / max(design_effect_of(with_covariance, e) for e in new)
     if chi2 < (settings.accept_chi2_min if len(new) > len(old) else -settings.accept_chi2_min):
         return None
-    return _Replacement(old, new, fit, chi2, unseen_loss(problem, fit, model.scale))
-
-
-def _total_lag_s(model: Model, name: str, effect: str) -> float:
-    """Delay of both commands and lags of the command that the effect acts on [s], at least 0."""
-    group = next(group for group in EFFECTS[name].split_into if effect in group)
-    return max(_lag_s(model, name) + sum(_lag_s(model, e) for e in group if e in model.effects), 0.0)
+    return _Replacement(old, tuple(new), fit, chi2, unseen_loss(problem, fit, model.scale))
 
 
 def _passes(
