@@ -19,9 +19,12 @@ from carlab.diagnosis.selection.search import search
 from carlab.diagnosis.settings import DEFAULT, DiagnosisSettings
 from carlab.diagnosis.state_alignment import with_known_latency
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.effects import CATALOGUE, DelayEffect
 
-EFFECTS_WITH_CURVES = ("command_delay",)
-"""Effects of the catalogue that are searched before the curves; most others are parts of a curve."""
+EFFECTS_WITH_CURVES = tuple(
+    name for name, effect in CATALOGUE.items() if isinstance(effect, DelayEffect) and effect.fitted_with_curves
+)
+"""Effects that are searched before the curves (the command delay); most others are parts of a curve."""
 
 
 def simulator_with_curves(
