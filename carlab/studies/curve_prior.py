@@ -35,9 +35,12 @@ def with_curves(case: RecordedCase, episodes: Sequence[EpisodeData], nominal: Si
     return replace(case, prior=replace(given, config=fitted, ranges={}))
 
 
-def kept_parts(episode: EpisodeData, kept: NDArray[np.bool_]) -> list[EpisodeData]:
-    """The unbroken parts of an episode whose commands ``kept`` (T,) selects; each has the state after its last one."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
+def unbroken_parts(episode: EpisodeData, selected: NDArray[np.bool_]) -> list[EpisodeData]:
+    """The parts of an episode without gaps in the commands that ``selected`` (T,) marks.
+
+    Each part has the states before its commands and the state after its last command.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], selected, [False]]).astype(np.int8)))
     return [_part(episode, int(first), int(end)) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
@@ -58,4 +61,4 @@ def _part(episode: EpisodeData, first: int, end: int) -> EpisodeData:
     )
 
 
-__all__ = ["kept_parts", "with_curves"]
+__all__ = ["unbroken_parts", "with_curves"]

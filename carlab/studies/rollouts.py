@@ -24,7 +24,7 @@ from carlab.core.quantities import FloatArray
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.learned import LearnedModel, drive_windows, recorded_windows
 from carlab.prediction.windows import PredictionWindows
-from carlab.studies.curve_prior import kept_parts, with_curves
+from carlab.studies.curve_prior import unbroken_parts, with_curves
 from carlab.studies.regression.cases import Data
 from carlab.studies.regression.methods import FitTask
 from carlab.studies.regression.recordings import RecordedCase
@@ -197,7 +197,7 @@ def _episodes_without_fold(episodes: Sequence[EpisodeData], fold: int | None) ->
     parts: list[EpisodeData] = []
     for number, episode in enumerate(episodes):
         t_s = episode.period_s * np.arange(episode.ticks, dtype=np.float64)
-        parts += kept_parts(episode, folds(np.full(episode.ticks, number), t_s) != fold)
+        parts += unbroken_parts(episode, folds(np.full(episode.ticks, number), t_s) != fold)
     return parts
 
 

@@ -15,7 +15,7 @@ import carlab.studies.rollouts as study
 from carlab.cli import bench_rollouts, run
 from carlab.cli.bench_jobs import StudyJob
 from carlab.core.episode_data import EpisodeData
-from carlab.studies.curve_prior import kept_parts
+from carlab.studies.curve_prior import unbroken_parts
 from carlab.studies.regression.recordings import RecordedCase
 from carlab.studies.rollouts import RolloutScore
 from learning.priors.simulator_model import CarModel
@@ -112,7 +112,7 @@ def test_parts_of_an_episode_have_their_commands_and_the_states_around_them() ->
     extra = {"segment": np.arange(count + 1.0)}
     episode = EpisodeData(times_s, states, commands, commands, np.zeros(count), poses, {"car": "a"}, extra)
     kept = np.array([True, True, False, False, False, True, True, True, False, True])
-    first, second, last = kept_parts(episode, kept)
+    first, second, last = unbroken_parts(episode, kept)
     assert [part.ticks for part in (first, second, last)] == [2, 3, 1]
     assert second.times_s.tolist() == times_s[5:9].tolist()
     assert second.states.tolist() == states[5:9].tolist()
@@ -120,4 +120,4 @@ def test_parts_of_an_episode_have_their_commands_and_the_states_around_them() ->
     assert second.extra["segment"].tolist() == [5.0, 6.0, 7.0, 8.0]
     assert second.poses[:, 0] == pytest.approx(np.arange(0.5, 0.81, 0.05))
     assert last.states.tolist() == states[9:].tolist()
-    assert kept_parts(episode, np.zeros(count, dtype=bool)) == []
+    assert unbroken_parts(episode, np.zeros(count, dtype=bool)) == []

@@ -26,6 +26,8 @@ from sim_backends.car_parameters import SimulatorConfig
 _ITERATIONS, _TOLERANCE = 20, 1e-7
 _DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0)
 """Levenberg-Marquardt dampings that are tried in each iteration, relative to the diagonal."""
+_MAX_STEP = 8.0
+"""Maximum change of a coordinate in an iteration, as in ``fit.Fitter``."""
 _MAX_WHITE = 1e4
 """Bound of a whitened error, as in ``fit.Fitter``."""
 _NORMAL_MEDIAN_SQUARE = 0.4549
@@ -98,7 +100,7 @@ def _iterated(
     diagonal = np.diag(np.diag(normal) + 1e-9)
     gradient = gradient + precision @ z
     steps = [-np.linalg.solve(normal + damping * diagonal, gradient) for damping in _DAMPINGS]
-    trials = z + np.array([*steps, np.zeros(len(z))])
+    trials = z + np.clip([*steps, np.zeros(len(z))], -_MAX_STEP, _MAX_STEP)
     followed = states + np.einsum("skn,pn->psk", following, trials - z) * problem.std
     corrected = followed + at.shift
     losses = [problem.losses(problem.white(trials, each)) for each in (followed, corrected)]

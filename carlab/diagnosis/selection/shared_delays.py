@@ -45,7 +45,7 @@ class _Replacement:
 def replace_shared_delays(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> EliminationResult:
-    """Replace delays and lags by other sets of delays and lags that predict unseen blocks better."""
+    """Replace accepted delays and lags by other delays and lags that predict held-out blocks better."""
     for name in (name for name, effect in EFFECTS.items() if effect.split_into):
         model = eliminated.model
         exchanges = (_splits if name in model.effects else _merges)(problem, model, name)
@@ -89,7 +89,7 @@ def _splits(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
 
 
 def _merges(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
-    """The effect with one of the longer lag's group, in place of one accepted effect of each group."""
+    """The effect, with a delay or lag of the later command, in place of one accepted effect of each command."""
     groups = EFFECTS[name].split_into
     old = [[e for e in group if e in model.effects] for group in groups]
     has_other = any(other.split_into for other in map(EFFECTS.__getitem__, model.effects))
@@ -136,7 +136,7 @@ def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict
 def _passes(
     problem: SearchProblem, model: Model, replacement: _Replacement, own_loss: FloatArray, control: RunControl
 ) -> bool:
-    """Whether the effects are better than those that they replace, or fewer and not worse."""
+    """Whether the new effects replace the old ones, by the conditions of ``_conditions``."""
     gain, error = clustered_gain(own_loss, replacement.loss, problem.windows)
     conditions = _conditions(replacement, gain / error, problem.settings.selection)
     passed = all(condition.holds for condition in conditions)
@@ -147,7 +147,16 @@ def _passes(
 
 
 def _conditions(replacement: _Replacement, z: float, settings: SelectionSettings) -> tuple[Condition, ...]:
-    """More effects must be significantly better, as many must be better, and fewer must not be worse."""
+    """Conditions of a replacement, by the number of its effects.
+
+    An additional effect needs the significance of any accepted effect. An equal number needs a lower loss on held-out
+    blocks. Fewer effects need a loss that is not significantly higher.
+
+    Args:
+        replacement: the new and the old effects.
+        z: fall of the loss on held-out blocks [standard errors].
+        settings: thresholds.
+    """
     if len(replacement.new) > len(replacement.old):
         return (
             Condition("selection.accept_chi2_min", replacement.chi2, settings.accept_chi2_min),
