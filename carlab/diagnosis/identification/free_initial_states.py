@@ -50,7 +50,7 @@ def loss_of_free_initial_states(
         max_error: bound of the whitened errors in the loss.
         settings: settings of the fit.
     """
-    white, jacobian = _linearised(windows, config, free, z, measured_std)
+    white, jacobian = linearised_by_initial_states(windows, config, free, z, measured_std)
     _, error, _ = initial_state_correction(white, jacobian, settings.huber_delta)
     return np.asarray(huber(error.clip(-max_error, max_error), settings.huber_delta).sum(axis=1))
 
@@ -79,7 +79,7 @@ def initial_state_correction(
     return shift, error, np.minimum(1.0, huber_delta / np.maximum(np.abs(error), 1e-12))
 
 
-def _linearised(
+def linearised_by_initial_states(
     windows: PredictionWindows,
     config: SimulatorConfig,
     free: Sequence[FitParameter],
@@ -92,11 +92,13 @@ def _linearised(
     stacked = windows.take(np.tile(np.arange(count), 7))
     values = {f.name: np.tile(np.asarray(f.value(z[:, k])), 7)[None] for k, f in enumerate(free)}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
-        predicted = simulate_windows(replace(stacked, initial_states=moved.reshape(-1, 6)), config, values)
+        predicted = simulate_windows(
+            replace(stacked, initial_states=moved.reshape(-1, 6)), config, values, in_double=True
+        )
         error = prediction_errors(predicted.reshape(7, count, -1, 6), windows)[:, :, 1:]
         white = np.nan_to_num(error / measured_std, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
     white = white.clip(-_MAX_WHITE, _MAX_WHITE).reshape(7, count, -1)
     return white[0], np.moveaxis(white[1:] - white[0], 0, -1)
 
 
-__all__ = ["loss_of_free_initial_states"]
+__all__ = ["initial_state_correction", "linearised_by_initial_states", "loss_of_free_initial_states"]
