@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from carlab.cars import load_car_file
-from carlab.diagnosis.curves.curve_fit import fit_curves
 from carlab.diagnosis.curves.simulator_with_curves import simulator_with_curves
 from carlab.diagnosis.curves.support import curve_findings, driving_time_s
 from carlab.diagnosis.diagnose import diagnose
@@ -18,7 +17,7 @@ from carlab.diagnosis.identification.fit import Fitter, Scale
 from carlab.diagnosis.report.curves import curve_sentences, readings_of_drive
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive, with_unit
 from carlab.diagnosis.report.write import write_report
-from carlab.diagnosis.selection.problem import RunControl, SearchProblem
+from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.settings import DEFAULT, CurveSettings
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import SimulatorModel
@@ -122,16 +121,6 @@ def test_report_and_model_file_contain_the_curves(outcome, tmp_path):
     model = load_car_file(tmp_path / "model.toml").simulator
     assert model.values() == pytest.approx(outcome.model.values())
     assert any(name.startswith("effects.drive_map.") for name in model.parameter_std)
-
-
-def test_car_without_missing_physics_has_no_measured_curves():
-    fit = drive(CAR, 40.0, 5)
-    windows = cut_windows(tracks_of([fit]), 0.8, 0.3).thinned(30)
-    settings = replace(SETTINGS, curves=replace(SETTINGS.curves, first_iterations=3, last_iterations=1))
-    problem = SearchProblem(CAR, windows, np.full(6, 2e-3), np.full(6, 2e-3), {}, (), settings)
-    from carlab.diagnosis.selection.search import search
-
-    assert fit_curves(problem, search(problem, RunControl()), RunControl()) is None
 
 
 def test_penalty_of_a_curve_is_that_of_its_roughness():

@@ -24,6 +24,7 @@ from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 from tests.studies.test_rollouts import write_drive
 
+pytestmark = pytest.mark.usefixtures("few_correlation_times")
 SECONDS = 120.0
 BRAKING = {f"effects.drive_map.value_6_{k}": -1.0 for k in range(11)}
 """One metre per second squared less with the throttle released, at any speed."""

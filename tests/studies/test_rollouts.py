@@ -20,6 +20,8 @@ from learning.world.drive_windows import DriveWindows
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import drive
 
+pytestmark = pytest.mark.usefixtures("few_correlation_times")
+
 
 def write_drive(path: Path, episode: EpisodeData) -> None:
     """Write a recording as CSV."""
