@@ -12,12 +12,18 @@ import torch
 
 from carlab.cars import choose_car
 from carlab.core.episode_data import EpisodeData
+from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign.campaign import prior_simulator
 from carlab.experiment.campaign.figures import predict_windows
+from carlab.experiment.campaign.predicted_return import predicted_figures
+from carlab.experiment.campaign.training_plan import TrainingPlan
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
+from learning.policy.sac_agent import SacAgent, SacSettings
 from learning.posterior.particle_posterior import ParticlePosterior
+from learning.world import model_env
 from learning.world.car_dynamics import CarDynamics
+from learning.world.model_env import Drives
 from sim_backends.car_parameters import SimulatorConfig, preset_names
 
 
@@ -82,3 +88,28 @@ def test_predicted_windows_follow_the_model_and_the_recorded_commands(history: i
         np.testing.assert_allclose(mean[:, 3:], np.tile(episode.states[start, 3:], (31, 1)), atol=1e-4)
     assert predicted.std.max() < 1e-4
     assert predict_windows(car, recording_of(20)).mean.shape == (0, 31, 6)
+
+
+@pytest.mark.parametrize(("episodes", "low", "median"), [(1, 0.0, 58.0), (2, 0.0, 59.0), (3, 50.0, 59.0)])
+def test_weight_of_drawn_cars_falls_with_the_number_of_episodes(
+    episodes: int, low: float, median: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The learned car predicts returns of 50 to 69, each drawn car 0: weights of 1/8, 1/18 and 1/32."""
+
+    class Cars:
+        """Cars whose drives have given returns and end at the goal."""
+
+        def __init__(self, returns: torch.Tensor) -> None:
+            self._returns = returns
+
+        def roll_out(self, act: object, max_ticks: int | None = None) -> Drives:
+            count = len(self._returns)
+            return Drives(self._returns, torch.zeros(count), torch.zeros(count, 13))
+
+    monkeypatch.setattr(model_env, "ModelEnv", lambda *args, **options: Cars(torch.zeros(64)))
+    plan = TrainingPlan(tomli_w.dumps(SimulatorConfig().to_tables()))
+    agent = SacAgent(SacSettings(), 0)
+    recordings = [recording_of(60)] * episodes
+    figures = predicted_figures(plan, agent, Cars(torch.arange(50.0, 70.0)), recordings, SafetyEnvelope(), 0)  # type: ignore[arg-type]
+    assert (figures["predicted_low"], figures["predicted_return"]) == (low, median)
+    assert figures["predicted_high"] == 68.0
