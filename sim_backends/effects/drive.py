@@ -9,6 +9,8 @@ from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParamete
 
 MAX_FORCE_N = 1e9
 MAX_SHARE = 1e6
+TINY = 1e-12
+"""Keeps a root differentiable and a quotient finite."""
 
 
 class BatterySag(DynamicsEffect):
@@ -56,17 +58,24 @@ class BrakeAsymmetry(DynamicsEffect):
 
 
 class MotorSaturation(DynamicsEffect):
-    """Drive force clipped to ``+-force``, before damping."""
+    """``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for the size a of the drive force, with b = ``force``.
+
+    This is the smaller root of ``(1 - roundness) m^2 - (a + b) m + a b = 0``, a non-rectangular hyperbola: for small
+    forces a, for large ones b, and without roundness the smaller of both. It acts before damping.
+    """
 
     id = "motor_saturation"
     represented_by = "drive_map"
     command = "throttle"
     name = "a limit of the motor's force"
     summary = "The motor's drive force is limited."
-    sentence = "the motor's drive force is limited to {force} at any throttle"
+    sentence = "the motor's drive force is limited to {force} at any throttle, with a roundness of {roundness} (0 is a corner)"
     refuted_if = "the limit changes with the grip of the floor, or with the load on the wheels"
     order = 30
-    parameters = (EffectParameter("force", "N", math.inf, 0.0, math.inf, 3.0),)
+    parameters = (
+        EffectParameter("force", "N", math.inf, 0.0, math.inf, 3.0),
+        EffectParameter("roundness", "1", 0.0, 0.0, 1.0, 0.3),
+    )
     confusable = (
         Confusable(
             "traction_limit",
@@ -76,9 +85,11 @@ class MotorSaturation(DynamicsEffect):
     )
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Clip."""
+        """Limit the force."""
         limit = ops.where(values["force"] < MAX_FORCE_N, values["force"], MAX_FORCE_N)
-        forces.drive = ops.clip(forces.drive, -limit, limit)
+        size = ops.abs(forces.drive)
+        root = ops.sqrt((size - limit) * (size - limit) + 4.0 * values["roundness"] * size * limit + TINY)
+        forces.drive = 2.0 * forces.drive * limit / (size + limit + root)
 
 
 class TractionLimit(DynamicsEffect):

@@ -117,7 +117,8 @@ def reference_rates(t, s, d, u, p, e):
     if has("drive_map"):
         drive += m * drive_map_at(e, u, vx)
     if has("motor_saturation"):
-        drive = min(max(drive, -e["motor_saturation"]["force"]), e["motor_saturation"]["force"])
+        limit, shape = e["motor_saturation"]["force"], 1 - e["motor_saturation"].get("roundness", 0)
+        drive = math.copysign(np.roots([shape, -(abs(drive) + limit), abs(drive) * limit]).real.min(), drive)
     if has("drive_change"):
         drive *= 1 + e["drive_change"]["share"]
     demand = drive - p.damping_nspm * vx

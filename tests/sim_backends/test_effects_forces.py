@@ -68,6 +68,13 @@ def test_motor_saturation_and_traction_limit_bound_the_acceleration():
             assert state.vx_mps == pytest.approx(sign * force / P.mass_kg, rel=1e-9)
 
 
+def test_round_saturation_is_the_harmonic_limit_at_roundness_one():
+    """``1 / m = 1 / a + 1 / b``: at full throttle half of the force if the limit is the motor's gain."""
+    effects = {"motor_saturation": {"force": P.drive_gain_n, "roundness": 1.0}}
+    state = drive(config(effects, motor__damping=0.0), (0,) * 6, (0.0, -1.0)).state
+    assert state.vx_mps == pytest.approx(-0.5 * P.drive_gain_n / P.mass_kg, rel=1e-9)
+
+
 def test_brake_gain_applies_while_braking_only():
     cfg = config({"brake_asymmetry": {"gain_ratio": 2.0}}, motor__damping=0.0)
     assert drive(cfg, (0, 0, 0, 3.0, 0, 0), (0.0, -0.2), 0.5).state.vx_mps == pytest.approx(
