@@ -81,19 +81,22 @@ def joint_fit(fitter: Fitter, start: Fit, measured_std: FloatArray) -> Fit | Non
     Returns:
         The simulator with the covariance of its parameters; cost and loss are those with estimated initial states. None
         if the simulator leaves more than noise (``IdentificationSettings.joint_max_noise_ratio``): then free initial
-        states would hide a part of its error.
+        states would hide a part of its error. None, too, if the iterations end at a higher cost than that of ``start``.
     """
     problem = _Problem(fitter, start.config, start.free, measured_std)
-    if not start.free or problem.noise_ratio(start.z) > fitter.settings.joint_max_noise_ratio:
+    shift, noise_ratio = problem.with_free_initial_states(start.z)
+    if not start.free or noise_ratio > fitter.settings.joint_max_noise_ratio:
         return None
     precision = fitter.precision(start.free)
+    at_start = _trial(problem, start.z, fitter.windows.initial_states, shift, precision)
+    # A full first step often raises the cost at first, but reaches the minimum in fewer iterations than damped ones.
     point = _Point(start.z, fitter.windows.initial_states, math.inf)
     for _ in range(_ITERATIONS):
         before = point.cost
         point, predicted_decrease = _iterated(problem, point, precision)
         if min(predicted_decrease, before - point.cost) < _SMALL_DECREASE:
             break
-    return _result(problem, point, precision)
+    return _result(problem, point, precision) if point.cost <= at_start.cost else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,16 +188,17 @@ class _Problem:
     free: tuple[FitParameter, ...]
     std: FloatArray
 
-    def noise_ratio(self, z: FloatArray) -> float:
-        """Robust variance of the errors with the best initial states, over that of the measurement noise.
+    def with_free_initial_states(self, z: FloatArray) -> tuple[FloatArray, float]:
+        """Change of the initial states (S, 6) to the best ones, and the noise ratio with them.
 
-        It is estimated by the median of their squares, and is about 1 if the simulator explains the recordings.
+        The noise ratio is the robust variance of the errors, by the median of their squares, over that of the
+        measurement noise. It is about 1 if the simulator explains the recordings.
         """
         windows = self.fitter.windows
         of_windows = np.tile(z, (len(windows), 1))
         white, jacobian = linearised_by_initial_states(windows, self.config, self.free, of_windows, self.std)
-        _, error, _ = initial_state_correction(white, jacobian, self.fitter.settings.huber_delta)
-        return float(np.median(error**2)) / _NORMAL_MEDIAN_SQUARE
+        shift, error, _ = initial_state_correction(white, jacobian, self.fitter.settings.huber_delta)
+        return shift * self.std, float(np.median(error**2)) / _NORMAL_MEDIAN_SQUARE
 
     def losses(self, white: FloatArray) -> FloatArray:
         """Huber loss of each window (..., S) of whitened errors (..., S, E)."""
