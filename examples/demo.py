@@ -83,7 +83,7 @@ def main() -> None:
     """Learn, drive, diagnose, and print the paths of the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--car", default="emulated", choices=("sim", "emulated", "emulated-can"))
-    parser.add_argument("--updates", type=int, default=12000, help="gradient steps of the policy before an episode")
+    parser.add_argument("--updates", type=int, default=20000, help="gradient steps of the policy before an episode")
     parser.add_argument("--model-steps", type=int, default=None, help="optimiser steps of the learned car")
     parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--effects", nargs="*", default=(), help="try only these effects, which is faster")
