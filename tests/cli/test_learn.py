@@ -23,8 +23,6 @@ import tyro
 import carlab.cars as carlab_cars
 from carlab.api import learning
 from carlab.cli import run
-from carlab.cli.console import progress
-from carlab.cli.learn import Learn
 from carlab.cli.options import CarOptions
 from carlab.recording.mcap.source import read_episode
 from carlab.recording.run_folder import RunDirectory
@@ -326,14 +324,6 @@ def test_interrupted_run_prints_the_command_that_resumes_it(
     assert f"2 of 5 episodes; resume with: carlab learn --resume {folder}" in text
 
 
-def test_missing_ray_is_refused_before_the_run(carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    code, text = carlab("learn", "--ray", "local", "--out", tmp_path / "runs", *TINY)
-    assert code == 2
-    assert "--ray needs Ray, which is not installed; run: pip install 'carlab[ray]'." in text
-    assert list((tmp_path / "runs").iterdir()) == []
-
-
 def test_training_on_ray_gives_the_run_without_ray(
     carlab: Carlab, learned: tuple[int, str, Path], tmp_path: Path
 ) -> None:
@@ -348,19 +338,6 @@ def test_training_on_ray_gives_the_run_without_ray(
             assert all(np.array_equal(found[key], expected[key]) for key in expected)
         one, other = (read_episode(path / "episodes" / f"{name}.mcap") for path in (folder, learned[2]))
         np.testing.assert_array_equal(one.states, other.states)
-
-
-def test_sentence_about_the_link_is_printed_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress() as bar:
-        Learn()._hooks(bar).on_link("The cluster ray://[::1]:10001 answers again.")
-    assert "The cluster ray://[::1]:10001 answers again." in capsys.readouterr().out
-
-
-def test_resume_command_names_the_cluster() -> None:
-    command = Learn(ray="ray://box:10001", ray_wait=30.0)
-    parsed = tyro.cli(Learn, args=shlex.split(command.ray_text()))
-    assert (parsed.ray, parsed.ray_wait) == ("ray://box:10001", 30.0)
-    assert Learn().ray_text() == ""
 
 
 @pytest.mark.parametrize(
