@@ -69,7 +69,7 @@ class MotorSaturation(DynamicsEffect):
     command = "throttle"
     name = "a limit of the motor's force"
     summary = "The motor's drive force is limited."
-    sentence = "the motor's drive force is limited to {force} at any throttle, with a roundness of {roundness} (0 is a corner)"
+    sentence = "the motor's drive force is limited to {force}, with roundness {roundness} (0: a corner)"
     refuted_if = "the limit changes with the grip of the floor, or with the load on the wheels"
     order = 30
     parameters = (

@@ -15,6 +15,7 @@ from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, Scale, clustered_gain, design_effect_of
 from carlab.diagnosis.identification.fit_parameters import effect_parameters
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
+from carlab.diagnosis.selection.delay_groups import confusable_shared_delays
 from carlab.diagnosis.selection.elimination import EliminationResult, delete_each
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit, refit_candidate
@@ -87,10 +88,10 @@ def _fitted_rivals(
     Each has its loss on unseen blocks (S,).
     """
     model = eliminated.model
+    confusable = [(name, other) for name in model.effects for other in problem.confusable.get(name, ())]
     pairs = [
         (name, other)
-        for name in model.effects
-        for other in problem.confusable.get(name, ())
+        for name, other in dict.fromkeys(confusable + confusable_shared_delays(model))
         if other not in model.effects and problem.is_candidate(other)
     ]
     fitted = control.workers.map(

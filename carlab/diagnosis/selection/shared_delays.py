@@ -17,6 +17,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import Fit, clustered_gain, design_effect_of
+from carlab.diagnosis.selection.delay_groups import effect_of_each_command, group_lags_s
 from carlab.diagnosis.selection.elimination import EliminationResult, eliminate
 from carlab.diagnosis.selection.pairwise_tests import unseen_loss
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
@@ -74,7 +75,7 @@ def _splits(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
     A single effect in place of a single effect is left to the forward selection, which has compared them.
     """
     groups = EFFECTS[name].split_into
-    lags = _group_lags_s(model, name)
+    lags = group_lags_s(model, name)
     old = frozenset({name}.union(*groups)).intersection(model.effects)
     if len(old) == 1 and min(lags) <= 0.0:
         return []
@@ -90,29 +91,13 @@ def _splits(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
 
 def _merges(problem: SearchProblem, model: Model, name: str) -> list[Exchange]:
     """The effect, with a delay or lag of the later command, in place of one accepted effect of each command."""
-    groups = EFFECTS[name].split_into
-    old = [[e for e in group if e in model.effects] for group in groups]
-    has_other = any(other.split_into for other in map(EFFECTS.__getitem__, model.effects))
-    if has_other or not problem.is_candidate(name) or any(len(each) != 1 for each in old):
+    old = effect_of_each_command(model, name)
+    if not old or not problem.is_candidate(name):
         return []
-    lags = _group_lags_s(model, name)
+    lags = group_lags_s(model, name)
     common, longest = min(lags), max(lags)
-    longer = groups[lags.index(longest)]
-    replaced = frozenset(itertools.chain(*old))
-    return [(replaced, {name: common, e: longest - common}) for e in longer if problem.is_candidate(e)]
-
-
-def _group_lags_s(model: Model, name: str) -> list[float]:
-    """Sum of the effect's own delay and of the delays and lags of each group [s], relative to the car file."""
-    return [sum(_lag_s(model, e) for e in (name, *group) if e in model.effects) for group in EFFECTS[name].split_into]
-
-
-def _lag_s(model: Model, name: str) -> float:
-    """Delay or time constant of an accepted effect [s], relative to the car file."""
-    parameter = f"effects.{name}.{EFFECTS[name].lag_parameter}"
-    return next(
-        float(f.value(z)) - f.origin for f, z in zip(model.fit.free, model.fit.z, strict=True) if f.name == parameter
-    )
+    longer = EFFECTS[name].split_into[lags.index(longest)]
+    return [(frozenset(old), {name: common, e: longest - common}) for e in longer if problem.is_candidate(e)]
 
 
 def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict[str, float]) -> _Replacement | None:
