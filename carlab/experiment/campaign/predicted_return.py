@@ -2,7 +2,7 @@
 
 The prediction mixes two kinds of cars: the learned car, and simulated cars drawn from the prior with plausible unknown
 effects, of which those that fit the recordings best are used. Before the first recording both have equal weights. The
-learned car knows the recordings better, so the weight of the drawn cars falls with their number.
+learned car fits the recordings better, so the weight of the drawn cars falls with the number of recordings.
 """
 
 from __future__ import annotations
