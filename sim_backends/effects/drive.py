@@ -60,7 +60,7 @@ class BrakeAsymmetry(DynamicsEffect):
 class MotorSaturation(DynamicsEffect):
     """``2 a b / (a + b + sqrt((a - b)^2 + 4 roundness a b))`` for the size a of the drive force, with b = ``force``.
 
-    This is the smaller root of ``(1 - roundness) m^2 - (a + b) m + a b = 0``, a non-rectangular hyperbola: for small
+    This is the smaller root m of ``(1 - roundness) m^2 - (a + b) m + a b = 0``, a non-rectangular hyperbola: for small
     forces a, for large ones b, and without roundness the smaller of both. It acts before damping.
     """
 
@@ -69,7 +69,7 @@ class MotorSaturation(DynamicsEffect):
     command = "throttle"
     name = "a limit of the motor's force"
     summary = "The motor's drive force is limited."
-    sentence = "the motor's drive force is limited to {force}, with roundness {roundness} (0: a corner)"
+    sentence = "the motor's drive force is limited to {force}, with roundness {roundness} (0: a sharp limit)"
     refuted_if = "the limit changes with the grip of the floor, or with the load on the wheels"
     order = 30
     parameters = (

@@ -84,8 +84,10 @@ def joint_fit(fitter: Fitter, start: Fit, measured_std: FloatArray) -> Fit | Non
         states would hide a part of its error. None, too, if the iterations end at a higher cost than that of ``start``.
     """
     problem = _Problem(fitter, start.config, start.free, measured_std)
+    if not start.free:
+        return None
     shift, noise_ratio = problem.with_free_initial_states(start.z)
-    if not start.free or noise_ratio > fitter.settings.joint_max_noise_ratio:
+    if noise_ratio > fitter.settings.joint_max_noise_ratio:
         return None
     precision = fitter.precision(start.free)
     at_start = _trial(problem, start.z, fitter.windows.initial_states, shift, precision)
@@ -131,7 +133,7 @@ def _iterated(problem: _Problem, point: _Point, precision: FloatArray) -> tuple[
 
 
 def _trial(problem: _Problem, z: FloatArray, states: FloatArray, shift: FloatArray, precision: FloatArray) -> _Point:
-    """The point with parameters ``z``; each window has the better one of its initial state and that with ``shift``."""
+    """The point with parameters ``z``. ``shift`` is added to the initial state of each window whose loss it lowers."""
     choices = np.stack([states, states + shift])
     losses = problem.losses(problem.white(np.stack([z, z]), choices))
     best = losses.argmin(axis=0)
