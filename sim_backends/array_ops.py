@@ -10,7 +10,6 @@ import math
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
-from numpy.lib import introspect
 
 Value: TypeAlias = Any
 """A float, a NumPy array or a torch tensor, shape () or (cars,)."""
@@ -134,13 +133,6 @@ class NumpyOps:
         """``c - a * b`` with one temporary."""
         product = a * b
         return np.subtract(c, product, out=product) if isinstance(product, np.ndarray) else c - product
-
-
-def has_wide_vectors(dtype: np.dtype) -> bool:
-    """Whether NumPy vectorises ``arctan2`` of this type on this processor (SIMD)."""
-    found = introspect.opt_func_info(func_name="^arctan2$").get("arctan2", {})
-    target = found.get(dtype.char * 3, {}).get("current", "baseline")
-    return not str(target).startswith("baseline")
 
 
 FLOATS: Ops = FloatOps()

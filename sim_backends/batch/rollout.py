@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
-from sim_backends.array_ops import ARRAYS, Ops, Value, has_wide_vectors
+from sim_backends.array_ops import Ops, Value
 from sim_backends.batch.inputs import (
     Past,
     check_shapes,
@@ -26,6 +26,7 @@ from sim_backends.batch.inputs import (
 )
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
+from sim_backends.compiled.simd import ROWS
 from sim_backends.compiled.stepper import CompiledStepper
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
 from sim_backends.dynamics.integrate import MAX_STEP_S, Stepper, integrate_held
@@ -36,8 +37,6 @@ from sim_backends.measurement import MeasurementModel, filter_step
 CARS_AT_ONCE = 4096
 """Cars per chunk on a CPU without a gradient."""
 _COMPILED_TYPES = (torch.float32, torch.float64)
-FEW_CARS = 512
-"""Number of cars up to which NumPy is faster on every processor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +101,7 @@ def rollout(
     may_compile = engine == "fastest" and start.device.type == "cpu" and start.dtype in _COMPILED_TYPES
     if needs_gradient:
         return _Batch(config, start, commands, past, given, t0_s, max_step_s, None, may_compile).run(measured)
-    arrays = ARRAYS if may_compile and _arrays_are_faster(start) else None
+    arrays = ROWS if may_compile else None
     cars_at_once = CARS_AT_ONCE if start.device.type == "cpu" else max(cars, 1)
     parts = []
     with torch.no_grad():
@@ -338,11 +337,6 @@ class _Batch:
             torch.where(index >= 0, torch.gather(row, 0, index.clamp_min(0)), early)
             for row, early in zip(captured.unbind(dim=1), earlier, strict=True)
         )
-
-
-def _arrays_are_faster(start: torch.Tensor) -> bool:
-    """Whether NumPy is faster than torch: for few cars (less overhead), and for float32 with SIMD ``arctan2``."""
-    return len(start) <= FEW_CARS or (start.dtype == torch.float32 and has_wide_vectors(np.dtype(np.float32)))
 
 
 def _either(which: bool | torch.Tensor, yes: torch.Tensor, no: torch.Tensor) -> torch.Tensor:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sim_backends.array_ops import Ops, Value
 from sim_backends.car_parameters import ModelKind
+from sim_backends.compiled.simd import FUNCTIONS
 from sim_backends.compiled.tracing import Node, Tracer, fold, gradients
 from sim_backends.dynamics.integrate import rk4_step
 from sim_backends.dynamics.single_track import Actuation, SingleTrack
@@ -302,6 +303,6 @@ class _Writer:
                 copies.append(f"o{k}[...] = {self._names[o.index]}")
         lines = [*unpack, *self._lines, *copies]
         source = "def step(i, b, o, c):\n" + "".join(f"    {line}\n" for line in lines)
-        scope: dict[str, Any] = {name: getattr(np, name) for name in self._functions}
+        scope: dict[str, Any] = {name: FUNCTIONS.get(name) or getattr(np, name) for name in self._functions}
         exec(compile(source, "<compiled step>", "exec"), scope)
         return GeneratedFunction(cast(Step, scope["step"]), self.buffers, tuple(self.constants))

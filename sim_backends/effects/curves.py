@@ -7,6 +7,7 @@ recording; their roughness is penalised (``MeasuredCurve.roughness``; penalised 
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -182,7 +183,8 @@ def weights(ops: Ops, x: Value, knots: Sequence[float]) -> list[Value]:
     return [1.0 - shares[0], *(a - b for a, b in itertools.pairwise(shares)), shares[-1]]
 
 
-def _name(place: Sequence[int]) -> str:
+@functools.cache
+def _name(place: tuple[int, ...]) -> str:
     return "_".join(("value", *map(str, place)))
 
 

@@ -105,16 +105,16 @@ def test_batch_equals_single_rollouts_for_each_chunk_size(monkeypatch):
     assert torch.allclose(rollout(config, start, commands).states, together, atol=1e-13)
 
 
-def test_numpy_and_torch_engines_agree(monkeypatch):
+def test_compiled_step_agrees_with_operators():
     config = SimulatorConfig(
         kind="blend", effects={name: {p.name: p.typical for p in e.parameters} for name, e in EFFECTS.items()}
     )
     start, commands = some(7, 12)
     mu = torch.linspace(0.3, 0.5, 7, dtype=torch.float64)
-    results = []
-    for few in (512, 0):
-        monkeypatch.setattr("sim_backends.batch.rollout.FEW_CARS", few)
-        results.append(rollout(config, start, commands, values={"tyre.front.mu": mu}, measured=True))
+    results = [
+        rollout(config, start, commands, values={"tyre.front.mu": mu}, measured=True, engine=engine)
+        for engine in ("fastest", "operators")
+    ]
     for name in ("states", "measured"):
         assert torch.allclose(getattr(results[0], name), getattr(results[1], name), atol=1e-11)
 
