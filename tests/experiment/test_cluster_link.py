@@ -73,7 +73,8 @@ def process_group(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
 @contextlib.contextmanager
 def cluster_without_ray(tmp_path: Path) -> Iterator[Cluster]:
     port = free_port()
-    settings = LinkSettings(wait_s=16.0, lost_wait_s=12.0, message_s=2.0, reconnect_s=6.0, pause_s=0.5)
+    # A new process of the link imports for 4 s on an idle core, and several times as long beside other tests.
+    settings = LinkSettings(wait_s=40.0, lost_wait_s=30.0, message_s=2.0, reconnect_s=10.0, pause_s=0.5)
     with process_group([sys.executable, SERVER, "serve", str(port)]):
         wait_for_port(port)
         with contextlib.closing(TcpLink(port)) as network:

@@ -118,7 +118,7 @@ def test_independent_client_receives_the_frames(
     between = [n for n in list(sent) if numbers[0] <= n <= numbers[-1]]
     assert len(numbers) > 0.95 * len(between)
     # The client needs 0.1 s or more to connect, and the server skips frames on a busy machine.
-    assert 100.0 < len(numbers) / elapsed_s < 260.0
+    assert 50.0 < len(numbers) / elapsed_s < 260.0
 
     for frame in frames:
         check_frame(frame, sent[frame.prefix.frame_number], server)
