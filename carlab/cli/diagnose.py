@@ -118,7 +118,7 @@ class Diagnose:
         return 0
 
     def _print(self, diagnosis: Diagnosis) -> None:
-        from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences
+        from carlab.diagnosis.report.curves import ceiling_sentence, curve_sentences, curves_advice
         from carlab.diagnosis.report.drift import drift_sentences
         from carlab.diagnosis.report.events import diagnosed_event_sentences
 
@@ -133,4 +133,6 @@ class Diagnose:
         for sentence in diagnosed_event_sentences(diagnosis):
             console.print(f"  {sentence}", markup=False)
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
+        if not self.curves and (advice := curves_advice(diagnosis)):
+            console.print(advice, markup=False)
         console.print(f"Read {self.out / 'report.html'}; drive the diagnosed car with --car {self.out / 'model.toml'}.")

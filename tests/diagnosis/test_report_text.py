@@ -19,6 +19,7 @@ from carlab.diagnosis.findings import (
     Unexplained,
     Where,
 )
+from carlab.diagnosis.report.curves import curves_advice
 from carlab.diagnosis.report.sentences import (
     confidence_words,
     drive_command,
@@ -213,6 +214,18 @@ def test_error_above_the_noise_is_stated(verdict: str, which: str) -> None:
     assert far.held_out[which].score > 3.0
     assert "the simulator lacks physics that the diagnosis does not find" in verdict_sentence(far)
     assert "lacks physics" not in verdict_sentence(near)
+
+
+@pytest.mark.parametrize(("verdict", "share", "is_advised"), [
+    ("mismatch", 0.37, True),
+    ("unexplained", 0.7, True),
+    ("mismatch", 0.05, False),
+    ("inconclusive", 0.7, False),
+])  # fmt: skip
+def test_curves_are_advised_for_a_relevant_residual(verdict: str, share: float, is_advised: bool) -> None:
+    unexplained = Unexplained(share, ("vx",), "everywhere alike", "", "")
+    assert ("--curves" in curves_advice(replace(diagnosis(verdict), unexplained=unexplained))) == is_advised
+    assert curves_advice(diagnosis(verdict)) == ""
 
 
 def test_next_drive_separates_the_strongest_set() -> None:

@@ -28,6 +28,19 @@ def curve_sentences(diagnosis: Diagnosis) -> list[str]:
     return [sentence for sentence in made if sentence]
 
 
+def curves_advice(diagnosis: Diagnosis) -> str:
+    """Advice to measure curves if a diagnosis without them leaves a relevant residual; else empty."""
+    rest = diagnosis.unexplained
+    if rest is None or rest.share < DEFAULT.curves.min_unexplained_share or diagnosis.curves:
+        return ""
+    if diagnosis.verdict not in ("mismatch", "unexplained"):
+        return ""
+    return (
+        "Measured curves of drive force, steering and tyres may explain a part of the rest: add --curves. "
+        "--ceiling shows how much of it can be predicted at all."
+    )
+
+
 def ceiling_sentence(diagnosis: Diagnosis) -> str:
     """How much of the excess is explained, can be explained and cannot; empty without networks."""
     ceiling = diagnosis.ceiling
@@ -143,4 +156,4 @@ def _chart(curve: CurveFinding, row: tuple[int, ...], span: tuple[float, float],
     return Figure(chart.render(), "")
 
 
-__all__ = ["ceiling_sentence", "curve_charts", "curve_sentences", "readings_of_drive"]
+__all__ = ["ceiling_sentence", "curve_charts", "curve_sentences", "curves_advice", "readings_of_drive"]
