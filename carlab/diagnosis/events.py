@@ -96,6 +96,8 @@ def find_events(episode: EpisodeData, config: SimulatorConfig, settings: EventSe
     if episode.ticks < 2 or episode.period_s > settings.max_period_s:
         return []
     stretches = [_Stretch.of(episode, rows) for rows in unbroken_rows(episode)]
+    if not stretches:
+        return []
     impacts = _impact_rows(stretches, config.parameters, settings)
     found = []
     for stretch, impact in zip(stretches, impacts, strict=True):

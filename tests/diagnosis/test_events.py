@@ -95,6 +95,13 @@ def test_a_slow_recording_has_no_events() -> None:
     assert find_events(slow, driven.config) == []
 
 
+def test_recording_without_a_whole_row_has_no_events() -> None:
+    driven = event_drive(1, "blow")
+    empty = driven.episode.states.copy()
+    empty[:, 0] = math.nan
+    assert find_events(replace(driven.episode, states=empty), driven.config) == []
+
+
 def test_grip_limits_are_those_of_both_axles() -> None:
     car = CarParameters(
         mass_kg=2.0, yaw_inertia_kgm2=0.05, front_axle_m=0.1, rear_axle_m=0.2, front_mu=0.5, rear_mu=0.8

@@ -11,6 +11,7 @@ from carlab.recording.audit.audit import Severity
 from carlab.recording.column_mapping import CANONICAL, DART, ETH
 from carlab.recording.csv.export import write_csv
 from carlab.recording.csv.foreign import import_csv
+from carlab.recording.faults.pose import rows_off_path
 from carlab.recording.pose_velocity import pose_jumps
 
 _spec = importlib.util.spec_from_file_location("foreign_drive", Path(__file__).with_name("foreign_drive.py"))
@@ -49,6 +50,22 @@ def test_clean_recording_has_no_warning(clean, tmp_path):
     assert throttle.evidence["delay_s"] == pytest.approx(foreign.DELAY_S, abs=0.03)
     assert json.loads(json.dumps(report.to_dict()))["schema"] == "carlab.audit/1"
     assert len(report.rows()) == len(report.findings)
+
+
+@pytest.mark.parametrize("rate_hz", [30, 100, 120])
+@pytest.mark.parametrize("count", range(1, 13))
+def test_rows_off_the_path_are_single_rows_or_left_to_the_jumps(rate_hz, count):
+    """One wrong row is found; a run of wrong rows is a pair of jumps, whatever its length."""
+    t_s = np.arange(20 * rate_hz) / rate_hz
+    circle = np.column_stack([2.0 * np.cos(t_s), 2.0 * np.sin(t_s), t_s + 0.5 * np.pi])
+    pose = circle + 3e-4 * np.random.default_rng(count).normal(size=circle.shape)
+    pose[300 : 300 + count, 0] += 0.5
+    found = np.flatnonzero(rows_off_path(t_s, pose))
+    if count == 1:
+        assert found.tolist() == [300]
+    else:
+        assert set(found) <= set(range(296, 304 + count))
+        assert {300, 300 + count} <= set(pose_jumps(t_s, *pose.T).tolist())
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ class EpisodeRepair:
         if np.ptp(self.segment) > 0:
             extra["segment"] = self.segment
         poses = self.episode.poses
-        if len(poses) == len(self.times_s):
+        if len(poses) == len(self.episode.times_s):
             poses = np.column_stack([self.times_s, self.states[:, :3]])
         ticks = self.rows[:-1]
         return replace(

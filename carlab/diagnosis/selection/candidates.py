@@ -111,13 +111,9 @@ def acceptance(problem: SearchProblem, candidate: Candidate) -> tuple[tuple[Cond
 
 def is_accepted(problem: SearchProblem, candidate: Candidate) -> bool:
     """Whether the candidate is accepted as the next effect."""
-    settings = problem.settings.selection
-    if not candidate.is_tested or candidate.unseen_gain < settings.accept_unseen_ratio * candidate.gain:
+    if not candidate.is_tested:
         return False
-    share = candidate.unseen_gain / problem.perfect_loss()
-    strong = candidate.chi2 > problem.required_chi2(candidate.effect) and share > settings.accept_unseen_share
-    steady = candidate.standard_errors > settings.steady_z_min and share > settings.steady_unseen_share
-    return strong or steady
+    return any(all(c.holds for c in conditions) for conditions in acceptance(problem, candidate))
 
 
 def accepted(

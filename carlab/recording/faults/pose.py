@@ -25,7 +25,8 @@ def stale_rows(t_s: FloatArray, pose: FloatArray) -> BoolArray:
 def rows_off_path(t_s: FloatArray, pose: FloatArray) -> BoolArray:
     """Rows (N,) whose pose (N, 3) is far from a local cubic through the neighbours. The worst row is removed first.
 
-    No row is returned if more than a share ``outlier_share`` would be.
+    No row is returned if more than a share ``outlier_share`` would be, or if a run of them leaves too few neighbours:
+    its ends are jumps of the pose.
     """
     reach, rows = LIMITS.outlier_neighbours, len(pose)
     pose = pose.copy()
@@ -52,6 +53,8 @@ def rows_off_path(t_s: FloatArray, pose: FloatArray) -> BoolArray:
         row = int(inner[worst])
         off_path[row] = True
         good = [k for k in range(row - 2 * reach, row + 2 * reach + 1) if 0 <= k < rows and not off_path[k]]
+        if len(good) < 4:
+            return np.zeros(rows, dtype=bool)
         design = np.vander((np.array(good) - row) / reach, min(3, len(good) - 2) + 1, increasing=True)
         pose[row] = np.linalg.lstsq(design, pose[good], rcond=None)[0][0]
         near = np.flatnonzero(np.abs(inner - row) <= reach)
