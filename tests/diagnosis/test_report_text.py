@@ -279,6 +279,16 @@ def test_remedy_of_a_search_that_was_cut_short_fits_its_cause(stopped_by: str, r
     assert ("--budget" in sentence) == (stopped_by == "budget")
 
 
+def test_search_that_was_cut_short_has_not_excluded_the_catalogue() -> None:
+    unexplained = Unexplained(0.7, ("vx",), "speed > 1 m/s", "even in steering", "a_x = -1 |d|")
+    cut = replace(diagnosis("unexplained"), unexplained=unexplained, search=SearchExtent(False, "budget", 20.0))
+    sentence = verdict_sentence(cut)
+    assert sentence.startswith("The search for effects did not finish")
+    assert "no effect of the catalogue" not in sentence
+    assert "even in steering" not in sentence
+    assert next_drive(cut) == ("", "Diagnose these recordings again with a longer time limit, before another drive.")
+
+
 def test_terms_of_a_class_are_numbered() -> None:
     terms = [ChosenTerm(term, channel, 1.0, 1.0) for term, channel in zip(TERMS[:2], (0, 1), strict=True)]
     one, two = (f"{c.term.statement}; acts on {name}" for c, name in zip(terms, ("vx", "vy"), strict=True))

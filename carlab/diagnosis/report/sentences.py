@@ -186,7 +186,7 @@ def _with_search(diagnosis: Diagnosis) -> str:
     limit_s = diagnosis.search.budget_s
     if diagnosis.search.stopped_by == "budget" and limit_s is not None:
         why = f"was cut short by the time limit of {with_unit(limit_s, 's')}"
-        remedy = "With --budget inf it runs to its end."
+        remedy = "With --budget inf (Python: budget_s=math.inf) it runs to its end."
     else:
         why, remedy = "was stopped by the user", "Diagnose again for a complete search."
     return f" The search for effects {why}, so it may have missed some. {remedy}"
@@ -304,11 +304,16 @@ def _data(diagnosis: Diagnosis) -> str:
 def _unexplained(diagnosis: Diagnosis) -> str:
     rest = diagnosis.unexplained
     text = "The simulator lacks physics that no effect of the catalogue explains"
+    if not diagnosis.search.is_complete:
+        text = "The search for effects did not finish, and it has not found what the simulator lacks"
     if rest is None:
         return text + "."
     where = listed([CHANNEL_WORDS.get(c, c) for c in rest.channels])
     shows = f" The error appears in {where}" if where else " The error appears"
-    return f"{text}.{shows}, {regime_words(rest.regime)}. Class of the missing physics: {rest.kind or 'unknown'}."
+    place = f"{text}.{shows}, {regime_words(rest.regime)}."
+    if not diagnosis.search.is_complete:
+        return place
+    return f"{place} Class of the missing physics: {rest.kind or 'unknown'}."
 
 
 def _inconclusive(diagnosis: Diagnosis) -> str:
@@ -339,6 +344,8 @@ def next_drive(diagnosis: Diagnosis) -> tuple[str, str]:
         drive = next((m for m in MANOEUVRES if m in advice), "steering_steps")
         own = advice if advice != diagnosis.sentence else ""
         return drive, own or "Diagnose this drive together with these recordings, which lack excitation."
+    if diagnosis.verdict == "unexplained" and not diagnosis.search.is_complete:
+        return "", "Diagnose these recordings again with a longer time limit, before another drive."
     if diagnosis.unexplained is not None and diagnosis.unexplained.share >= DEFAULT.evidence.unexplained_share_min:
         channels = diagnosis.unexplained.channels
         along = bool(channels) and channels[0] in ("x", "vx")
