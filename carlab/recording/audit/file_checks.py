@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -16,6 +17,10 @@ from carlab.recording.pose_velocity import BoolArray, IndexArray
 
 MAX_NUMBER = 1e12
 """Larger numbers in SI units are markers of missing values or corrupt data."""
+MAX_STAMP = 1e20
+"""The same for stamps, whose unit may not be declared yet: nanoseconds since 1970 are 1.8e18."""
+MIN_PULSE = 500.0
+"""Smallest command that is a pulse width in microseconds; the pulses of servos are 500 to 2500 long."""
 MAX_PERIOD_S = 2.0
 """Longest plausible time between two rows; a longer one has another unit (milliseconds, nanoseconds)."""
 MAX_COMMAND = 1.05
@@ -37,7 +42,7 @@ def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> t
         else (Severity.ERROR, "leave those rows out with --missing drop, or repair the file", "--missing drop")
     )
     for channel, column in values.items():
-        bad = ~np.isfinite(column) | (np.abs(column) > MAX_NUMBER)
+        bad = ~np.isfinite(column) | (np.abs(column) > (MAX_STAMP if channel == "t" else MAX_NUMBER))
         bad[-1] &= channel not in COMMAND_CHANNELS
         if not bad.any():
             continue
@@ -61,11 +66,19 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
     step = np.diff(t_s)
     repeated, back = int(np.sum(step == 0)), int(np.sum(step < 0))
     k = int(np.flatnonzero(step <= 0)[0])
+    lost, rows = int((~advances).sum()), len(t_s)
     severity, treatment, option = (
-        (Severity.REPAIRED, f"{(~advances).sum()} rows were left out", None)
+        (Severity.REPAIRED, f"{lost} of {rows} rows were left out", None)
         if mapping.stamps == "drop"
         else (Severity.ERROR, "leave such rows out with --stamps drop, or sort or cut the file", "--stamps drop")
     )
+    if lost > repeated + 10 * back and mapping.stamps != "drop":  # the clock starts again: a second drive
+        row = int(np.argmin(step)) + 2
+        treatment = (
+            f"the clock starts again in row {row}, so cut the file in front of it and import both parts (--stamps drop "
+            f"would leave out {lost} of {rows} rows)"
+        )
+        option = None
     sentence = (
         f"Time does not increase: {repeated} stamps repeat and {back} go back, first from {t_s[k]:.6g} s in row "
         f"{k + 1} to {t_s[k + 1]:.6g} s in row {k + 2}; {treatment}."
@@ -228,10 +241,17 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
         beyond = np.abs(column) > 1.0 + 1e-6
         if beyond.any():
             severity = Severity.ERROR if largest > MAX_COMMAND else Severity.WARNING
-            option = f"--{channel}-scale {1 / _full_scale(channel, largest):.3g}"
+            option: str | None = f"--{channel}-scale {_rounded_down(1.0 / _full_scale(channel, largest))}"
+            remedy = f"say what full command is, for example {option}"
+            if float(column.min()) >= MIN_PULSE:
+                option = None
+                remedy = (
+                    "these are pulse widths in microseconds: replace them in the file by (pulse - centre) / range, for "
+                    "example (pulse - 1500) / 500"
+                )
             sentence = (
                 f"Column '{name}' ({channel}) reaches {largest:.4g} where commands lie in [-1, 1], first in row "
-                f"{np.argmax(beyond) + 1}; say what full command is, for example {option}."
+                f"{np.argmax(beyond) + 1}; {remedy}."
             )
             evidence = {"largest": largest}
             findings.append(Finding.at(beyond, "command_range", channel, severity, sentence, evidence, option))
@@ -244,6 +264,12 @@ def check_command_range(values: Mapping[str, FloatArray], mapping: ColumnMapping
 def _full_scale(channel: str, largest: float) -> float:
     """A plausible full command in the unit of a column: 100 for a throttle in per cent, else the largest command."""
     return 100.0 if channel == "throttle" and MAX_COMMAND < largest <= 100.0 else largest
+
+
+def _rounded_down(value: float) -> str:
+    """A positive number with three significant digits, not above the value."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return f"{math.floor(value / step + 1e-9) * step:.3g}"
 
 
 def check_gate(throttle: FloatArray, gate: FloatArray, name: str) -> list[Finding]:
