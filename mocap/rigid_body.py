@@ -235,9 +235,9 @@ def select_body(models: Sequence[Description], config: MocapConfig) -> RigidBody
     if not bodies:
         remedy = "it streams none: create one in Motive and switch Rigid Bodies on in the Data Streaming pane."
     elif len(chosen) > 1:
-        remedy = f"several have that name: set body_id in [hardware.mocap] to one of {available}."
+        remedy = f"several have that name: set body_id in [hardware.mocap] (listen: --body-id) to one of {available}."
     else:
-        remedy = f"set body in [hardware.mocap] to one of {available}."
+        remedy = f"set body in [hardware.mocap] (listen: --body) to one of {available}."
     raise NotReadyError("No motion capture", [f"the server has no rigid body {wanted}; {remedy}"])
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from carlab.api.arguments import above_zero, at_least
 from carlab.api.runs import (
     RunHooks,
+    collecting,
     followed_by,
     has_screen,
     html_picture,
@@ -22,7 +23,7 @@ from carlab.api.runs import (
     write_result,
 )
 from carlab.api.tasks import given_task, load_checked
-from carlab.core.errors import ConfigError, NotReadyError
+from carlab.core.errors import ConfigError, DataError, NotReadyError
 from carlab.core.manoeuvres import MANOEUVRES
 
 if TYPE_CHECKING:
@@ -143,7 +144,14 @@ def drive(
 
             view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
-        results = _drive(choice, driver, chosen_task, max_throttle, run, episodes, hooks, options)
+        results: list[EpisodeResult] = []
+        try:
+            _drive(choice, driver, chosen_task, max_throttle, run, episodes, collecting(hooks, results), options)
+        except DataError as error:
+            if not results:
+                raise
+            _write_results(run, results, picture)
+            raise DataError(f"{error} {run.path} has the {len(results)} episodes before, see result.json.") from error
     _write_results(run, results, picture)
     return DriveRun(run.path, tuple(results))
 
@@ -255,8 +263,9 @@ def _write_results(run: RunDirectory, results: Sequence[EpisodeResult], picture:
 
     if results:
         write_result(run, results)
-    if results and picture:
-        save_summary([read_episode(r.path) for r in results if r.path.exists()], run.path / PICTURE_FILE)
+    episodes = [read_episode(r.path) for r in results if r.path.exists()] if picture else []
+    if episodes:
+        save_summary(episodes, run.path / PICTURE_FILE)
 
 
 def _policy_names() -> tuple[str, ...]:

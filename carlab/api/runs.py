@@ -13,7 +13,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ParamSpec
 
@@ -218,6 +218,16 @@ def followed_by(first: Callable[P, None], second: Callable[P, None]) -> Callable
         second(*args, **kwargs)
 
     return both
+
+
+def collecting(hooks: RunHooks, results: list[EpisodeResult]) -> RunHooks:
+    """The hooks; each finished episode is also appended to ``results``."""
+
+    def on_result(result: EpisodeResult) -> None:
+        results.append(result)
+        hooks.on_result(result)
+
+    return replace(hooks, on_result=on_result)
 
 
 def write_result(run: RunDirectory, results: Sequence[EpisodeResult]) -> None:

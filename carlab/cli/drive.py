@@ -155,10 +155,12 @@ class Drive:
         for r in results:
             if r.reason.is_safety_stop:
                 fail(f"Episode {r.episode}: {r.reason.value} {r.data.metadata['end_detail']}".rstrip())
-        first = results[0].path
-        shown = " (summary.png shows it)" if self.picture else ""
-        console.print(f"Recorded in {run.folder}{shown}. View an episode with:", soft_wrap=True, markup=False)
-        console.print(f"  carlab view {shlex.quote(str(first))}", soft_wrap=True, markup=False)
+        complete = [r.path for r in results if r.path.exists()]
+        shown = " (summary.png shows it)" if self.picture and complete else ""
+        ending = " View an episode with:" if complete else " No episode is complete."
+        console.print(f"Recorded in {run.folder}{shown}.{ending}", soft_wrap=True, markup=False)
+        if complete:
+            console.print(f"  carlab view {shlex.quote(str(complete[0]))}", soft_wrap=True, markup=False)
         last = results[-1].reason
         if last is EndReason.STOP_REQUESTED:
             return EXIT_INTERRUPTED

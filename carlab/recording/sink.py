@@ -18,6 +18,7 @@ PARTIAL_SUFFIX = ".partial"
 DISK_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 MIN_FREE_BYTES = 20_000_000
 """Minimum free space of the disk for a new recording [bytes]."""
+TOO_LITTLE_SPACE = f"less than {MIN_FREE_BYTES / 1e6:.0f} MB are free"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ def claim(path: Path) -> Path:
         raise FileExistsError(errno.EEXIST, "is already there", str(path))
     make_folder(path.parent)
     if shutil.disk_usage(path.parent).free < MIN_FREE_BYTES:
-        raise OSError(errno.ENOSPC, "less than 20 MB are free", str(path))
+        raise OSError(errno.ENOSPC, TOO_LITTLE_SPACE, str(path))
     return partial_path(path)
 
 
@@ -62,7 +63,8 @@ def describe_os_error(error: OSError, path: Path | str) -> str:
     """One sentence with the remedy for a file that could not be written."""
     if error.errno in DISK_FULL:
         space = f"free some space{_disk_of(Path(path))}"
-        return f"{path} could not be written because the disk is full; {space} and start again."
+        why = TOO_LITTLE_SPACE if error.strerror == TOO_LITTLE_SPACE else "the disk is full"
+        return f"{path} could not be written because {why}; {space} and start again."
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return f"{path} may not be written; check the permissions of its folder or choose another folder."
     if isinstance(error, FileExistsError):

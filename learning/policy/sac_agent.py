@@ -210,7 +210,8 @@ class SacAgent:
             agent._sac.load_learned_state(agent._sac.checked_state(arrays))
         except DataError as error:
             raise DataError(
-                f"The policy in {folder} cannot be read ({error}); remove the folder to train again."
+                f"The policy in {folder} cannot be read ({error}); use an earlier model of the run, or remove the "
+                "folder to train again."
             ) from error
         return agent
 

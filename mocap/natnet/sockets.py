@@ -54,7 +54,7 @@ def udp_socket(address: str, port: int, *, shared: bool = False) -> socket.socke
         sock.close()
         place = f"{address or 'any interface'}:{port}"
         remedy = {
-            errno.EADDRINUSE: "close the program that uses it or set another port.",
+            errno.EADDRINUSE: "close the program that uses it, or set another port ([hardware.mocap], --command-port).",
             errno.EADDRNOTAVAIL: "no interface of this computer has that address: check local_interface.",
         }.get(error.errno or 0, "choose another address or port.")
         raise not_ready(f"UDP {place} cannot be used ({error.strerror}); {remedy}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import logging
 import os
 from pathlib import Path
@@ -20,7 +21,7 @@ from carlab.experiment.campaign.campaign import Campaign
 from carlab.experiment.campaign.training import model_folder
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.experiment.episodes.scripted_policies import NeutralPolicy
-from carlab.experiment.episodes.session import Session, SessionHooks
+from carlab.experiment.episodes.session import EpisodeResult, Session, SessionHooks
 from carlab.recording.mcap.sink import McapSink
 from carlab.recording.run_folder import RunDirectory
 from drivers.emulators.command_log import CommandLog
@@ -109,6 +110,40 @@ def test_command_log_keeps_its_entries_when_the_disk_is_full(tmp_path: Path) -> 
         log.add(float(k), "current", 1.0)
     log.close()
     assert len(log.entries("current")) == 20_000
+
+
+def test_results_before_a_lack_of_space_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The space ends after two of three episodes: both are in result.json, and the error names the limit."""
+    import carlab
+
+    driven: list[int] = []
+
+    def on_result(result: EpisodeResult) -> None:
+        driven.append(result.episode)
+        if len(driven) == 2:
+            monkeypatch.setattr("carlab.recording.sink.MIN_FREE_BYTES", 10**18)
+
+    with pytest.raises(DataError, match=r"less than 20 MB are free; free some space .* has the 2 episodes before"):
+        carlab.drive(
+            "sim", policy="neutral", episodes=3, ticks=5, out=tmp_path, rerun=False,
+            hooks=carlab.RunHooks(on_result=on_result),
+        )  # fmt: skip
+    (run,) = tmp_path.iterdir()
+    assert [row["episode"] for row in json.loads((run / "result.json").read_text())["episodes"]] == [1, 2]
+    assert (run / "summary.png").stat().st_size > 0
+
+
+def test_unfinished_recording_has_no_picture_and_its_own_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from carlab.cli import run
+
+    fill_disk(monkeypatch, Tick)
+    assert run(["drive", "--policy", "neutral", "--ticks", "300", "--out", str(tmp_path), "--no-rerun"]) == 1
+    text = " ".join("".join(capfd.readouterr()).split())
+    assert "the disk is full; free some space" in text
+    assert "No episode is complete." in text
+    assert "carlab view" not in text
 
 
 def test_full_disk_error_of_a_command_names_the_disk_and_no_cable(
