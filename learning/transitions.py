@@ -1,8 +1,8 @@
 """One-step transitions of a car, independent of its position and heading.
 
 Position and heading enter the motion of a car only through exact kinematics. Therefore the inputs of a model are
-body-frame velocities and the last commands; it predicts the change of pose and velocities in the body frame at the
-step's start.
+body-frame velocities and the last commands. It predicts the change of the pose in the body frame at the step's start,
+and the changes of the body-frame velocities, each in the body frame of its own time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 
 OUTPUTS = ("ahead_m", "left_m", "yaw_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
-"""Changes over one step: of position and velocities along the body axes at the step's start, of yaw, of yaw rate."""
+"""Changes over one step: of the position along the body axes at the step's start, of yaw, of the body-frame velocities
+(each along the body axes of its own time), of yaw rate."""
 MAX_STEP_PERIODS = 1.5
 """Maximum duration of a step; a longer step spans missing rows and is dropped."""
 MAX_POSE_JITTER_PERIODS = 0.75

@@ -154,6 +154,14 @@ def test_stamps_since_1970_have_their_unit_proposed(
     assert "has no number" not in text
 
 
+def test_declared_unit_that_gives_rows_half_a_minute_apart_is_a_warning(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    data[:, 0] *= 1e3
+    code, text = carlab("import", write(path, data), "--t-unit", "s", "--out", tmp_path / "a.mcap")
+    assert code == 0, text
+    assert "s apart in the unit s; check the unit" in text
+
+
 def test_clock_that_starts_again_is_cut_and_not_dropped(carlab: Carlab, tmp_path: Path) -> None:
     path, data = canonical_csv(tmp_path)
     half = len(data) // 2

@@ -286,7 +286,7 @@ class TestRefusal:
         kept = np.ones(len(EVEN), dtype=bool)
         kept[400:430] = False
         columns = {name: column[kept] for name, column in clean.items()}
-        self.refuse(tmp_path, columns, "1 gaps", "after row 400", "1.033 s", "--gaps split")
+        self.refuse(tmp_path, columns, "1 gap in time", "after row 400", "1.033 s", "--gaps split")
         imported = import_csv(tmp_path / "run.csv", mapping=CANONICAL.with_options(gaps="split"))
         first, second = imported.episodes
         assert (first.ticks, second.ticks) == (399, 469)

@@ -89,19 +89,24 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
 
 def check_stamps(t_s: FloatArray, mapping: ColumnMapping) -> list[Finding]:
     """Gaps, jitter and a clock that was constructed afterwards. ``t_s`` (N,) increases."""
-    if (unit := _check_time_unit(t_s, mapping)) is not None:
+    unit = _check_time_unit(t_s, mapping)
+    if unit is not None and unit.severity is Severity.ERROR:
         return [unit]
     gaps = gap_rows(t_s)
-    findings = [_gap_finding(t_s, gaps, mapping)] if len(gaps) else []
+    findings = [] if unit is None else [unit]
+    findings += [_gap_finding(t_s, gaps, mapping)] if len(gaps) else []
     return findings + (_check_even_stamps(t_s) or _check_jitter(t_s, gaps))
 
 
 def _check_time_unit(t_s: FloatArray, mapping: ColumnMapping) -> Finding | None:
-    """Stamps that are too far apart to control a car but plausible in another unit, if no unit is declared."""
+    """Stamps that are too far apart to control a car; an error if another unit is plausible and none is declared."""
     source = mapping.columns.get("t")
     median_s = float(np.median(np.diff(t_s)))
-    if source is None or source.unit is not None or median_s <= MAX_PERIOD_S:
+    if source is None or median_s <= MAX_PERIOD_S:
         return None
+    if source.unit is not None:
+        sentence = f"Column '{source.name}': rows are {median_s:.4g} s apart in the unit {source.unit}; check the unit."
+        return Finding("wrong_unit", "t", Severity.WARNING, sentence, evidence={"median_s": median_s})
     unit = next((u for u, factor in UNITS["t"].items() if median_s * factor <= MAX_PERIOD_S), None)
     if unit is None:
         return None
@@ -117,14 +122,15 @@ def _check_time_unit(t_s: FloatArray, mapping: ColumnMapping) -> Finding | None:
 def _gap_finding(t_s: FloatArray, gaps: IndexArray, mapping: ColumnMapping) -> Finding:
     step = np.diff(t_s)
     median, longest = float(np.median(step)), float(step[gaps - 1].max())
+    counted = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
     severity, treatment = {
         "error": (Severity.ERROR, "split the recording there with --gaps split, or import it whole with --gaps keep"),
         "split": (Severity.REPAIRED, "the recording was split there"),
         "keep": (Severity.WARNING, "kept as one episode; the command before each gap is held across it"),
     }[mapping.gaps]
     sentence = (
-        f"{len(gaps)} gaps in time, the first after row {gaps[0]} ({step[gaps[0] - 1]:.3f} s where rows are "
-        f"{median:.4f} s apart), the longest {longest:.3f} s; {treatment}."
+        f"{counted} in time, the first after row {gaps[0]} ({step[gaps[0] - 1]:.3f} s where rows are {median:.4f} s "
+        f"apart), the longest {longest:.3f} s; {treatment}."
     )
     option = "--gaps split" if mapping.gaps == "error" else None
     return Finding.at(gaps, "dropouts", "t", severity, sentence, {"median_s": median, "longest_s": longest}, option)
