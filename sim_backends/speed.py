@@ -60,7 +60,8 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
 
     A car-step is one control period of the default car (1/30 s) in four Runge-Kutta steps of at most 10 ms, which is
     ``16`` evaluations of the model. ``plain_numpy_loop`` is the straightforward NumPy form; ``plain_python_loop`` is
-    the fastest that Python alone does (floats and ``math``: the plant of the simulated car).
+    the fastest that Python alone does (floats and ``math``: the plant of the simulated car). ``torch_operators`` is the
+    same batch without the compiled step.
 
     ``needed_bytes_per_car_step`` must move between memory and core (commands in, states out), ``operand_bytes`` is what
     NumPy's operations read and write; each is also given as a share of what the core can copy in memory. A share of
@@ -74,6 +75,8 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
             rollout(config, start, commands)
             seconds = _best_s(lambda s=start, c=commands: rollout(config, s, c), repeats)  # type: ignore[misc]
             found[f"batched_{count}_cars_car_steps_per_s"] = count * TICKS / seconds
+        seconds = _best_s(lambda: rollout(config, start, commands, engine="operators"), repeats)
+        found["torch_operators_car_steps_per_s"] = cars * TICKS / seconds
         plain_start, plain_commands = (v.double().numpy() for v in _drive(plain_cars))
         seconds = _best_s(lambda: rollout_one_by_one(config, plain_start, plain_commands), max(2, repeats // 2))
         found["plain_numpy_loop_car_steps_per_s"] = plain_cars * TICKS / seconds
@@ -88,6 +91,7 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
         **found,
         "ratio_to_plain_numpy_loop": fast / found["plain_numpy_loop_car_steps_per_s"],
         "ratio_to_plain_python_loop": fast / found["plain_python_loop_car_steps_per_s"],
+        "ratio_to_torch_operators": fast / found["torch_operators_car_steps_per_s"],
         "ratio_of_one_car": found["batched_1_cars_car_steps_per_s"] / found["plain_numpy_loop_car_steps_per_s"],
         "copy_bandwidth_bytes_per_s": bandwidth,
         "needed_bytes_per_car_step": needed,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -144,14 +144,8 @@ def drive(
 
             view = stack.enter_context(LiveView(LiveSettings(run.path, episodes, False, connect)))
             hooks = replace(hooks, on_document=followed_by(hooks.on_document, view.emit))
-        results: list[EpisodeResult] = []
-        try:
+        with _results_kept_after_an_error(run, picture) as results:
             _drive(choice, driver, chosen_task, max_throttle, run, episodes, collecting(hooks, results), options)
-        except DataError as error:
-            if not results:
-                raise
-            _write_results(run, results, picture)
-            raise DataError(f"{error} {run.path} has the {len(results)} episodes before, see result.json.") from error
     _write_results(run, results, picture)
     return DriveRun(run.path, tuple(results))
 
@@ -256,6 +250,18 @@ def _drive(
             hooks=session_hooks, **options,
         )  # fmt: skip
         return session.drive(episodes)
+
+
+@contextlib.contextmanager
+def _results_kept_after_an_error(run: RunDirectory, picture: bool) -> Iterator[list[EpisodeResult]]:
+    """A list of results; those before a DataError are written, and its message names their place."""
+    results: list[EpisodeResult] = []
+    try:
+        yield results
+    except DataError as error:
+        _write_results(run, results, picture)
+        place = f" {run.path} has the {len(results)} episodes before, see result.json." if results else ""
+        raise DataError(f"{error}{place}") from error
 
 
 def _write_results(run: RunDirectory, results: Sequence[EpisodeResult], picture: bool) -> None:
