@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sim_backends.array_ops import NumpyOps, Ops, Value
 
 Row = NDArray[np.floating[Any]]
-MIN_CARS = {"arctan": 768, "arctan2": 384, "hypot": 1280}
+MIN_LENGTH = {"arctan": 768, "arctan2": 384, "hypot": 1280}
 """Length of a row from which torch is faster: where the times of float32 are equal on one core with AVX2 (torch 2.13,
 NumPy 2.4: 9, 10 and 12 microseconds)."""
 
@@ -33,8 +33,9 @@ def has_simd(function: str, dtype: np.dtype[Any]) -> bool:
     return not str(target).startswith("baseline")
 
 
-def _is_long_row(function: str, x: Value) -> bool:
-    if not isinstance(x, np.ndarray) or x.ndim != 1 or len(x) < MIN_CARS[function]:
+def _is_for_torch(function: str, x: Value) -> bool:
+    """Whether torch computes the function of ``x`` faster than NumPy, and can read its memory."""
+    if not isinstance(x, np.ndarray) or x.ndim != 1 or len(x) < MIN_LENGTH[function]:
         return False
     return x.flags.c_contiguous and x.flags.writeable and not has_simd(function, x.dtype)
 
@@ -43,7 +44,7 @@ def _unary(function: str, of_tensor: Callable[..., torch.Tensor]) -> Callable[..
     of_array = getattr(np, function)
 
     def call(x: Value, out: Row | None = None) -> Value:
-        if not _is_long_row(function, x):
+        if not _is_for_torch(function, x):
             return of_array(x, out)
         if out is None:
             return of_tensor(torch.from_numpy(x)).numpy()
@@ -57,7 +58,7 @@ def _binary(function: str, of_tensors: Callable[..., torch.Tensor]) -> Callable[
     of_arrays = getattr(np, function)
 
     def call(a: Value, b: Value, out: Row | None = None) -> Value:
-        if not (_is_long_row(function, a) and _is_long_row(function, b)):
+        if not (_is_for_torch(function, a) and _is_for_torch(function, b)):
             return of_arrays(a, b, out)
         if out is None:
             return of_tensors(torch.from_numpy(a), torch.from_numpy(b)).numpy()

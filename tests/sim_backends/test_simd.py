@@ -62,7 +62,7 @@ def test_operations_of_rows_equal_those_of_arrays():
 
 
 def test_long_batches_equal_operators_of_torch():
-    """A batch that is longer than ``MIN_CARS`` uses the functions of this module in the compiled step."""
+    """A batch that is longer than ``MIN_LENGTH`` uses the functions of this module in the compiled step."""
     rng = np.random.default_rng(0)
     start = torch.tensor(rng.normal([0.0, 0.0, 0.0, 2.0, 0.0, 0.0], 0.3, (LENGTH, 6)))
     commands = torch.tensor(rng.uniform(-0.5, 0.5, (LENGTH, 5, 2)))

@@ -310,10 +310,10 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         return text + "."
     where = listed([CHANNEL_WORDS.get(c, c) for c in rest.channels])
     shows = f" The error appears in {where}" if where else " The error appears"
-    place = f"{text}.{shows}, {regime_words(rest.regime)}."
+    sentence = f"{text}.{shows}, {regime_words(rest.regime)}."
     if not diagnosis.search.is_complete:
-        return place
-    return f"{place} Class of the missing physics: {rest.kind or 'unknown'}."
+        return sentence
+    return f"{sentence} Class of the missing physics: {rest.kind or 'unknown'}."
 
 
 def _inconclusive(diagnosis: Diagnosis) -> str:

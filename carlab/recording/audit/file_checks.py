@@ -20,7 +20,9 @@ MAX_NUMBER = 1e12
 MAX_STAMP = 1e20
 """The same for stamps, whose unit may not be declared yet: nanoseconds since 1970 are 1.8e18."""
 MIN_PULSE = 500.0
-"""Smallest command that is a pulse width in microseconds; the pulses of servos are 500 to 2500 long."""
+"""Minimum pulse width [us] of a servo: a column of larger commands has pulse widths. The maximum is about 2500."""
+MAX_ROWS_OF_A_STEP_BACK = 10
+"""Rows that a corrected clock repeats for each step back; with more, the clock starts again: a second drive."""
 MAX_PERIOD_S = 2.0
 """Longest plausible time between two rows; a longer one has another unit (milliseconds, nanoseconds)."""
 MAX_COMMAND = 1.05
@@ -72,7 +74,7 @@ def check_order(t_s: FloatArray, mapping: ColumnMapping) -> tuple[list[Finding],
         if mapping.stamps == "drop"
         else (Severity.ERROR, "leave such rows out with --stamps drop, or sort or cut the file", "--stamps drop")
     )
-    if lost > repeated + 10 * back and mapping.stamps != "drop":  # the clock starts again: a second drive
+    if lost > repeated + MAX_ROWS_OF_A_STEP_BACK * back and mapping.stamps != "drop":
         row = int(np.argmin(step)) + 2
         treatment = (
             f"the clock starts again in row {row}, so cut the file in front of it and import both parts (--stamps drop "
