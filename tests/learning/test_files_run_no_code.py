@@ -68,7 +68,7 @@ def test_payload_in_a_model_file_does_not_run(
     folder = tmp_path / "models" / "0001"
     folder.mkdir(parents=True)
     write(folder / name, Payload(created_folder))
-    with pytest.raises(DataError, match=r"; remove .* to train again\.$") as error:
+    with pytest.raises(DataError, match=r"\bremove .* to train again\.$") as error:
         load_car(folder / name) if name == "dynamics.pt" else SacAgent.load(folder, SacSettings(), 0)
     assert not created_folder.exists()
     assert "\n" not in str(error.value)

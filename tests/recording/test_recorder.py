@@ -192,7 +192,7 @@ def test_disk_without_space_is_reported_when_the_recorder_opens(tmp_path, monkey
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr("carlab.recording.sink.shutil.disk_usage", lambda path: usage._replace(free=1_000_000))
     for sink in (McapSink(tmp_path / "0001.mcap"), RerunSink(tmp_path / "0001.rrd")):
-        with pytest.raises(DataError, match="disk is full; free some space"), Recorder([sink]):
+        with pytest.raises(DataError, match="less than 20 MB are free; free some space"), Recorder([sink]):
             pass
     assert list(tmp_path.iterdir()) == []
 
