@@ -111,7 +111,8 @@ class MeasurementModel:
         Args:
             trajectory: True states, one for each tick.
             period_s: From one tick to the next [s].
-            window_s2: Variance [s2] of the window over which velocities were differentiated.
+            window_s2: Variance [s2] of the window over which velocities were differentiated; not used for fewer than
+                three ticks.
             velocities_before: Unfiltered measured velocities (vx, vy, yaw rate) at the ticks before the trajectory,
                 from the first of which the filter starts settled.
             filtered: Output of the filter at the first tick, instead.
@@ -120,10 +121,14 @@ class MeasurementModel:
         wanted = range(len(trajectory)) if ticks is None else ticks
         observed = functools.cache(lambda k: self.observe(trajectory[k]))
 
+        last = len(trajectory) - 1
+
         def shown(k: int) -> State:
-            if window_s2 <= 0.0 or k in (0, len(trajectory) - 1):
+            if window_s2 <= 0.0 or last < 2:
                 return observed(k)
-            return windowed(self._ops, (observed(k - 1), observed(k), observed(k + 1)), period_s, window_s2)
+            inner = min(max(k, 1), last - 1)
+            around = observed(inner - 1), observed(inner), observed(inner + 1)
+            return windowed(self._ops, observed(k), around, period_s, window_s2)
 
         if self.velocity_time_constant_s is None:
             return [shown(k) for k in wanted]
@@ -156,14 +161,19 @@ def filter_velocities(
     return outputs
 
 
-def windowed(ops: Ops, around: tuple[State, State, State], period_s: Value, variance_s2: float) -> State:
-    """The middle one of three states, its velocities averaged over a symmetric window with a variance [s2].
+def windowed(ops: Ops, state: State, around: tuple[State, State, State], period_s: Value, variance_s2: float) -> State:
+    """A state, its velocities averaged over a symmetric window with a variance [s2].
 
-    The average is ``v + variance / 2 d2v/dt2``, to fourth order.
+    The average is ``v + variance / 2 d2v/dt2``, to fourth order. ``around`` are three states at even ticks, the middle
+    one ``state`` itself, or its neighbour at an end of a trajectory, where the average is to third order.
     """
-    now = around[1]
     curvature = velocity_curvature(ops, *around, period_s)
-    return (*now[:3], *(v + 0.5 * variance_s2 * c for v, c in zip(now[3:6], curvature, strict=True)))
+    if state is not around[1]:
+        turn = state[2] - around[1][2]
+        cos, sin = ops.cos(turn), ops.sin(turn)
+        along, across, turning = curvature
+        curvature = (cos * along + sin * across, cos * across - sin * along, turning)
+    return (*state[:3], *(v + 0.5 * variance_s2 * c for v, c in zip(state[3:6], curvature, strict=True)))
 
 
 def velocity_curvature(ops: Ops, before: State, now: State, after: State, period_s: Value) -> State:

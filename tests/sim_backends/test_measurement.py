@@ -117,8 +117,10 @@ def test_window_is_the_mean_of_world_velocities_over_a_box():
     expected = np.column_stack(body(mean, yaw))
     assert np.allclose([s[3:] for s in found[1:-1]], expected[1:-1], atol=2e-8)
     assert np.abs(expected - [s[3:] for s in states]).max() > 5e-5
-    assert found[0] == states[0]
-    assert found[-1] == states[-1]
+    for end in (0, -1):  # with d2v/dt2 of the neighbour, one tick away
+        assert found[end][:3] == states[end][:3]
+        error, without = (np.abs(np.array(s[end][3:]) - expected[end]).max() for s in (found, states))
+        assert error < 0.2 * without
 
 
 def test_latency_is_that_of_the_car_file_or_of_an_effect():
