@@ -19,6 +19,12 @@ from numpy.typing import NDArray
 from sim_backends.array_ops import NumpyOps, Ops, Value
 
 Row = NDArray[np.floating[Any]]
+OF_TENSORS: dict[str, Callable[..., torch.Tensor]] = {
+    "arctan": torch.atan,
+    "arctan2": torch.atan2,
+    "hypot": torch.hypot,
+}
+"""The functions of torch by the names in NumPy."""
 MIN_LENGTH = {"arctan": 768, "arctan2": 384, "hypot": 1280}
 """Length of a row from which torch is faster: where the times of float32 are equal on one core with AVX2 (torch 2.13,
 NumPy 2.4: 9, 10 and 12 microseconds)."""
@@ -33,15 +39,21 @@ def has_simd(function: str, dtype: np.dtype[Any]) -> bool:
     return not str(target).startswith("baseline")
 
 
+@functools.lru_cache(maxsize=1024)
+def faster_in_torch(length: int, dtype: np.dtype[Any]) -> frozenset[str]:
+    """Functions that torch computes faster than NumPy, for rows of this length and type."""
+    return frozenset(f for f, shortest in MIN_LENGTH.items() if length >= shortest and not has_simd(f, dtype))
+
+
 def _is_for_torch(function: str, x: Value) -> bool:
     """Whether torch computes the function of ``x`` faster than NumPy, and can read its memory."""
-    if not isinstance(x, np.ndarray) or x.ndim != 1 or len(x) < MIN_LENGTH[function]:
+    if not isinstance(x, np.ndarray) or x.ndim != 1 or function not in faster_in_torch(len(x), x.dtype):
         return False
-    return x.flags.c_contiguous and x.flags.writeable and not has_simd(function, x.dtype)
+    return x.flags.c_contiguous and x.flags.writeable
 
 
-def _unary(function: str, of_tensor: Callable[..., torch.Tensor]) -> Callable[..., Value]:
-    of_array = getattr(np, function)
+def _unary(function: str) -> Callable[..., Value]:
+    of_array, of_tensor = getattr(np, function), OF_TENSORS[function]
 
     def call(x: Value, out: Row | None = None) -> Value:
         if not _is_for_torch(function, x):
@@ -54,8 +66,8 @@ def _unary(function: str, of_tensor: Callable[..., torch.Tensor]) -> Callable[..
     return call
 
 
-def _binary(function: str, of_tensors: Callable[..., torch.Tensor]) -> Callable[..., Value]:
-    of_arrays = getattr(np, function)
+def _binary(function: str) -> Callable[..., Value]:
+    of_arrays, of_tensors = getattr(np, function), OF_TENSORS[function]
 
     def call(a: Value, b: Value, out: Row | None = None) -> Value:
         if not (_is_for_torch(function, a) and _is_for_torch(function, b)):
@@ -68,13 +80,13 @@ def _binary(function: str, of_tensors: Callable[..., torch.Tensor]) -> Callable[
     return call
 
 
-arctan = _unary("arctan", torch.atan)
+arctan = _unary("arctan")
 """``numpy.arctan``."""
-arctan2 = _binary("arctan2", torch.atan2)
+arctan2 = _binary("arctan2")
 """``numpy.arctan2``."""
-hypot = _binary("hypot", torch.hypot)
+hypot = _binary("hypot")
 """``numpy.hypot``."""
-FUNCTIONS: dict[str, Callable[..., Value]] = {"arctan": arctan, "arctan2": arctan2, "hypot": hypot}
+OF_ROWS: dict[str, Callable[..., Value]] = {"arctan": arctan, "arctan2": arctan2, "hypot": hypot}
 """The functions of this module by their names in NumPy."""
 
 
@@ -93,4 +105,4 @@ class RowOps(NumpyOps):
 
 ROWS: Ops = RowOps()
 
-__all__ = ["FUNCTIONS", "ROWS", "arctan", "arctan2", "has_simd", "hypot"]
+__all__ = ["OF_ROWS", "OF_TENSORS", "ROWS", "arctan", "arctan2", "faster_in_torch", "has_simd", "hypot"]

@@ -13,6 +13,7 @@ from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.compiled import simd
 from sim_backends.compiled.simd import ROWS
+from sim_backends.compiled.step import compile_step
 
 LENGTH = 2000
 SPECIAL = [0.0, -0.0, 1e-30, -1e30, math.inf, -math.inf, math.nan]
@@ -23,6 +24,11 @@ REFERENCES = {"arctan": math.atan, "arctan2": math.atan2, "hypot": math.hypot}
 def library(request, monkeypatch):
     """Let NumPy have SIMD code or not, whatever the processor is."""
     monkeypatch.setattr(simd, "has_simd", lambda function, dtype: request.param)
+    simd.faster_in_torch.cache_clear()
+    compile_step.cache_clear()
+    yield
+    simd.faster_in_torch.cache_clear()
+    compile_step.cache_clear()
 
 
 def row(dtype: type, seed: int) -> np.ndarray:
