@@ -17,7 +17,7 @@ from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.array_ops import ARRAYS
 from sim_backends.batch.inputs import with_effects_of_values
-from sim_backends.batch.rollout import rollout
+from sim_backends.batch.rollout import Engine, rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.measurement import (
@@ -102,6 +102,7 @@ def simulate_windows(
     max_step_s: float = MAX_STEP_S,
     ticks: IndexArray | None = None,
     in_double: bool = False,
+    engine: Engine = "fastest",
 ) -> FloatArray:
     """Predict windows by a simulator with P parameter sets.
 
@@ -113,6 +114,7 @@ def simulate_windows(
         max_step_s: maximum integration step.
         ticks: indices (U,) of the ticks to return; all K + 1 by default.
         in_double: simulate with 64 instead of 32 bits, which takes twice as long.
+        engine: of the rollouts.
 
     Returns:
         Predicted measurements (P, S, K + 1 or U, 6): x, y, yaw in the recording's frame, vx, vy, yaw rate.
@@ -143,6 +145,7 @@ def simulate_windows(
         values={name: tensor(np.broadcast_to(v, (sets, count)).reshape(-1)) for name, v in inner.items()},
         t0_s=tensor(np.tile(windows.t0_s, sets)),
         max_step_s=max_step_s,
+        engine=engine,
     ).states
     rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
     measured = measurement.measure(

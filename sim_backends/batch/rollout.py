@@ -37,6 +37,7 @@ from sim_backends.measurement import MeasurementModel, filter_step
 CARS_AT_ONCE = 4096
 """Cars per chunk on a CPU without a gradient."""
 _COMPILED_TYPES = (torch.float32, torch.float64)
+Engine = Literal["fastest", "operators"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ def rollout(
     t0_s: Number = 0.0,
     measured: bool = False,
     max_step_s: float = MAX_STEP_S,
-    engine: Literal["fastest", "operators"] = "fastest",
+    engine: Engine = "fastest",
 ) -> Rollout:
     """Simulate N cars from their initial states with commands at control ticks.
 

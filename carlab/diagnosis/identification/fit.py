@@ -7,14 +7,15 @@ outliers. Base parameters have weak priors; parameters of effects have only boun
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
+from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
+from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
@@ -108,11 +109,39 @@ class Fitter:
         if len(z) > self.settings.max_batch_sets:
             parts = np.array_split(z, math.ceil(len(z) / self.settings.max_batch_sets))
             return np.concatenate([self.white(config, free, part) for part in parts])
-        values = {f.name: f.value(z[:, k]) for k, f in enumerate(free)}
+        return self._white(self.windows, config, {f.name: f.value(z[:, k]) for k, f in enumerate(free)})
+
+    def _white(
+        self, windows: PredictionWindows, config: SimulatorConfig, values: Mapping[str, FloatArray]
+    ) -> FloatArray:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
-            predicted = simulate_windows(self.windows, config, values, ticks=self.scale.steps)
-            white = prediction_errors(predicted, self.windows, self.scale.steps) / self.scale.sigma
+            predicted = simulate_windows(windows, config, values, ticks=self.scale.steps)
+            white = prediction_errors(predicted, windows, self.scale.steps) / self.scale.sigma
         return np.asarray(np.nan_to_num(white, nan=1e4, posinf=1e4, neginf=-1e4).clip(-1e4, 1e4))
+
+    def jacobian(
+        self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray, white: FloatArray
+    ) -> FloatArray:
+        """Derivatives (n, S, U, 6) of the whitened errors ``white`` (S, U, 6) at coordinates z (n,), by differences.
+
+        Only windows that a parameter may influence are simulated for it. Delays change the integration grid of their
+        batch, so they have batches of their own.
+        """
+        influences = influencing_parameters(self.windows, config, values_at(free, z))
+        steps = difference_steps(free)
+        jacobian = np.zeros((len(free), *white.shape))
+        is_delay = np.array([f.is_delay for f in free])
+        for group in (np.flatnonzero(~is_delay), np.flatnonzero(is_delay)):
+            batches = math.ceil(influences[group].sum() / (len(self.windows) * self.settings.max_batch_sets))
+            for batch in np.array_split(group, batches) if batches else ():
+                row, window = np.nonzero(influences[batch])
+                values = values_at(free, z)
+                for k, which in enumerate(batch):
+                    moved = z[which] + steps[which] * (row == k)
+                    values[free[which].name] = np.atleast_2d(free[which].value(moved))
+                changed = self._white(self.windows.take(window), config, values)[0]
+                jacobian[batch[row], window] = (changed - white[window]) / steps[batch[row], None, None]
+        return jacobian
 
     def precision(self, free: Sequence[FitParameter]) -> FloatArray:
         """Precision (n, n) of the Gaussian prior of z; measured curves have a penalty on their roughness."""
@@ -166,13 +195,11 @@ class Fitter:
             return Fit(config, (), z, float(loss.sum()), loss)
         free = tuple(free)
         precision = self.precision(free)
-        steps = difference_steps(free)
         white = self.white(config, free, z[None])[0]
         cost = float(self.huber(white).sum() + self.prior(free, z[None])[0])
         damping = 1e-2
         for _ in range(iterations):
-            moved = self.white(config, free, z + np.diag(steps))
-            jacobian = (moved - white[None]) / steps[:, None, None, None]
+            jacobian = self.jacobian(config, free, z, white)
             flat, residual = jacobian.reshape(count, -1), white.reshape(-1)
             weight = np.minimum(1.0, self.settings.huber_delta / np.maximum(np.abs(residual), 1e-12))
             normal = (flat * weight) @ flat.T + precision
@@ -265,9 +292,8 @@ class Fitter:
 
     def linearised(self, fit: Fit) -> tuple[FloatArray, FloatArray]:
         """Jacobian (n, S, U, 6) of the whitened errors (S, U, 6) at a fit."""
-        steps = difference_steps(fit.free)
-        whites = self.white(fit.config, fit.free, np.vstack([fit.z, fit.z + np.diag(steps)]))
-        return (whites[1:] - whites[0]) / steps[:, None, None, None], whites[0]
+        white = self.white(fit.config, fit.free, fit.z[None])[0]
+        return self.jacobian(fit.config, fit.free, fit.z, white), white
 
     def _normal(self, fit: Fit, jacobian: FloatArray, white: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gauss-Newton matrix (n, n) with the prior, and each window's score (n, S)."""

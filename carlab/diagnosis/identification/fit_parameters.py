@@ -51,7 +51,7 @@ class FitParameter:
         logarithmic: whether the value is ``origin * exp(size * z)``.
         prior_z: prior standard deviation of z about 0.
         choice: whether the value is the index of a discrete option.
-        difference_step: step of z for finite differences.
+        is_delay: whether the value is a delay or a latency.
     """
 
     name: str
@@ -62,7 +62,12 @@ class FitParameter:
     logarithmic: bool = False
     prior_z: float = math.inf
     choice: bool = False
-    difference_step: float = DIFFERENCE_STEP
+    is_delay: bool = False
+
+    @property
+    def difference_step(self) -> float:
+        """Step of z for finite differences."""
+        return DELAY_DIFFERENCE_STEP if self.is_delay else DIFFERENCE_STEP
 
     def value(self, z: FloatArray) -> FloatArray:
         """Values at coordinates z."""
@@ -102,7 +107,7 @@ def base_parameters(
         found.append(
             FitParameter(
                 LATENCY, values[LATENCY], settings.latency_std_s, 0.0, settings.max_latency_s, prior_z=1.0,
-                difference_step=DELAY_DIFFERENCE_STEP,
+                is_delay=True,
             )
         )  # fmt: skip
     return tuple(found)
@@ -124,15 +129,19 @@ def effect_parameters(effect_id: str, config: SimulatorConfig) -> tuple[FitParam
             low = max(p.low + MIN_POSITIVE_SHARE * size * p.positive, origin - 20.0 * size)
             if p.reduces:
                 low = max(low, -values[p.reduces])
-            step = DELAY_DIFFERENCE_STEP if p.is_delay else DIFFERENCE_STEP
             high = min(p.high, origin + 20.0 * size)
-            found.append(FitParameter(name, origin, size, low, high, difference_step=step))
+            found.append(FitParameter(name, origin, size, low, high, is_delay=p.is_delay))
     return tuple(found)
 
 
 def difference_steps(free: Sequence[FitParameter]) -> FloatArray:
     """Steps (n,) of the coordinates for finite differences."""
     return np.array([f.difference_step for f in free])
+
+
+def values_at(free: Sequence[FitParameter], z: FloatArray) -> dict[str, FloatArray]:
+    """Values (1,) by dotted name at coordinates z (n,)."""
+    return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
 
 
 def with_effect(config: SimulatorConfig, effect_id: str) -> SimulatorConfig:

@@ -8,7 +8,7 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Fit, Fitter, Scale
-from carlab.diagnosis.identification.fit_parameters import FitParameter
+from carlab.diagnosis.identification.fit_parameters import FitParameter, values_at
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.screening import ScreeningResult
 from carlab.prediction.errors import prediction_errors
@@ -87,7 +87,7 @@ def fit_with_scale(
     settings, identification = problem.settings.selection, problem.settings.identification
     windows, floor = problem.windows, problem.floor
     scale = Scale.of(
-        prediction_errors(simulate_windows(windows, config, _values(free, start)), windows)[0],
+        prediction_errors(simulate_windows(windows, config, values_at(free, start)), windows)[0],
         floor,
         settings=identification,
     )
@@ -109,10 +109,6 @@ def fit_base(problem: SearchProblem) -> Model:
     """Fit the base parameters alone."""
     free = problem.free_parameters(())
     return fit_with_scale(problem, (), problem.nominal, free, problem.nominal_coordinates(free))
-
-
-def _values(free: Sequence[FitParameter], z: FloatArray) -> dict[str, FloatArray]:
-    return {f.name: np.atleast_1d(f.value(np.asarray(v))) for f, v in zip(free, z, strict=True)}
 
 
 __all__ = ["fit_base", "fit_with_scale", "refit", "refit_candidate", "refit_without_each"]
