@@ -124,11 +124,6 @@ class LabelledMarker(NamedTuple):
     params: int
     residual_m: float
 
-    @property
-    def is_occluded(self) -> bool:
-        """Whether no camera saw the marker; then its position is the model's."""
-        return bool(self.params & 1)
-
 
 class Asset(NamedTuple):
     """A trained marker set in a frame (bitstream 4.1)."""

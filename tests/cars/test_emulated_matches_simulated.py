@@ -16,7 +16,7 @@ from carlab.cars.latency import (
     LatencyParts,
     measure_latency,
 )
-from carlab.core.angles import difference
+from carlab.core.angles import wrap
 from carlab.core.car import Car
 from carlab.core.episode_data import EpisodeData
 from carlab.core.policy import Policy
@@ -70,7 +70,7 @@ def test_same_policy_ends_at_the_same_state(emulated: EmulatedCar, latency: Late
         assert emulated_episode.ticks == simulated_episode.ticks == 100, emulated_episode.metadata
         end, expected = emulated_episode.states[-1], simulated_episode.states[-1]
         distances_m.append(math.hypot(*(end[:2] - expected[:2])))
-        yaw_differences_rad.append(abs(difference(end[2], expected[2])))
+        yaw_differences_rad.append(abs(wrap(end[2] - expected[2])))
     print("difference [m]", np.round(distances_m, 4), "[rad]", np.round(yaw_differences_rad, 4))
     assert np.median(distances_m) <= 0.05
     assert np.median(yaw_differences_rad) <= 0.05

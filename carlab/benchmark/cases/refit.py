@@ -47,7 +47,6 @@ class Refit:
     values: dict[str, float]
     nominal_score: float
     score: float
-    fit_score: float
     channels: tuple[float, ...]
 
     @property
@@ -165,7 +164,7 @@ def refit(fit: Windows, held_out: Windows, nominal: BaseCar, iterations: int = 1
     values = dict(zip(names, (centre * np.exp(logs)).tolist(), strict=True))
     channels = channel_scores(held_out, values)
     total = float(np.sqrt((channels**2).mean()))
-    return Refit(values, score(held_out, nominal.free()), total, score(fit, values), tuple(channels.tolist()))
+    return Refit(values, score(held_out, nominal.free()), total, tuple(channels.tolist()))
 
 
 def _linearise(

@@ -7,7 +7,6 @@ several effects together, tests them against confusable effects, and scores them
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
@@ -31,8 +30,6 @@ from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import HISTORY_S, PredictionWindows, cut_windows, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
-
-log = logging.getLogger(__name__)
 
 SCHEMA = "carlab.light_diagnosis/1"
 UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")

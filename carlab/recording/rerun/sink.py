@@ -31,7 +31,6 @@ from carlab.recording.sink import Item, Sink, claim, describe_os_error, partial_
 
 APPLICATION = "carlab"
 _FLUSH_TIMEOUT_S = 10.0
-_ROWS_BEFORE_FLUSH = 512
 
 
 class RerunSink(Sink):
