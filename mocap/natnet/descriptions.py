@@ -8,6 +8,8 @@ from struct import error as StructError
 
 from carlab.core.errors import ProtocolError
 from mocap.natnet.models import (
+    BITSTREAM_3_0,
+    BITSTREAM_4_1,
     NEWEST_BITSTREAM,
     SERVED_BITSTREAMS,
     AssetDescription,
@@ -23,18 +25,14 @@ from mocap.natnet.models import (
     UnknownDescription,
     check_readable,
 )
-from mocap.natnet.reader import INT32, Reader, encode_text
+from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_text
 
-VECTOR = Struct("<3f")
 BODY = Struct("<ii3f")
 PLATE = Struct("<ff3f144f12f")
 POSE = Struct("<3f4f")
 ASSET_MARKER = Struct("<i3ffh")
-PAIR = Struct("<ii")
 
-_BITSTREAM_3_0 = BitstreamVersion(3, 0)
 _BITSTREAM_4_0 = BitstreamVersion(4, 0)
-_BITSTREAM_4_1 = BitstreamVersion(4, 1)
 
 
 def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Description, ...]:
@@ -48,7 +46,7 @@ def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Descrip
     """
     check_readable(version)
     reader = Reader(payload, f"NatNet model definitions read as bitstream {version}")
-    sized = version >= _BITSTREAM_4_1
+    sized = version >= BITSTREAM_4_1
     descriptions: list[Description] = []
     for index in range(reader.count(5)):
         reader.section = f"description {index}"
@@ -86,7 +84,7 @@ def _read_body(reader: Reader, version: BitstreamVersion) -> RigidBodyDescriptio
     positions: tuple[tuple[float, ...], ...] = ()
     labels: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
-    if version >= _BITSTREAM_3_0:
+    if version >= BITSTREAM_3_0:
         markers = reader.count(VECTOR.size + INT32.size)
         positions = tuple(reader.records(VECTOR, markers))
         labels = tuple([label for (label,) in reader.records(INT32, markers)])
@@ -171,7 +169,7 @@ def encode_model_def(descriptions: Sequence[Description], version: BitstreamVers
             kind, body = _encode(description, version)
         except StructError as error:
             raise ProtocolError(f"{description} holds a number that does not fit its field: {error}.") from error
-        parts.append(PAIR.pack(kind, len(body)) if version >= _BITSTREAM_4_1 else INT32.pack(kind))
+        parts.append(PAIR.pack(kind, len(body)) if version >= BITSTREAM_4_1 else INT32.pack(kind))
         parts.append(body)
     return b"".join(parts)
 
@@ -202,7 +200,7 @@ def _encode(item: Description, version: BitstreamVersion) -> tuple[int, bytes]:
             )
             return 6, encode_text(item.name) + PAIR.pack(item.asset_type, item.id) + bodies + markers
         case UnknownDescription():
-            if version < _BITSTREAM_4_1:
+            if version < BITSTREAM_4_1:
                 raise ProtocolError(f"Bitstream {version} cannot carry a description of unknown type {item.type_id}.")
             return item.type_id, item.data
 

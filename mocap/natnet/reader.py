@@ -9,6 +9,8 @@ from typing import Any
 from carlab.core.errors import ProtocolError
 
 INT32 = Struct("<i")
+PAIR = Struct("<ii")
+VECTOR = Struct("<3f")
 UINT16_PAIR = Struct("<HH")
 
 

@@ -49,6 +49,17 @@ class Scale:
         return error[..., self.steps, :] / self.sigma
 
 
+MAX_STEP = 8.0
+"""Maximum change of a coordinate in an iteration."""
+_MAX_WHITE = 1e4
+
+
+def bounded(white: FloatArray) -> FloatArray:
+    """Whitened errors of which none is infinite or NaN, as those of a diverged simulation are."""
+    finite = np.nan_to_num(white, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
+    return finite.clip(-_MAX_WHITE, _MAX_WHITE)
+
+
 def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
     """Huber's loss, element by element."""
     size = np.abs(white)
@@ -112,7 +123,7 @@ class Fitter:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
             predicted = simulate_windows(self.windows, config, values, ticks=self.scale.steps)
             white = prediction_errors(predicted, self.windows, self.scale.steps) / self.scale.sigma
-        return np.asarray(np.nan_to_num(white, nan=1e4, posinf=1e4, neginf=-1e4).clip(-1e4, 1e4))
+        return bounded(white)
 
     def precision(self, free: Sequence[FitParameter]) -> FloatArray:
         """Precision (n, n) of the Gaussian prior of z; measured curves have a penalty on their roughness."""
@@ -184,7 +195,7 @@ class Fitter:
                 for value in dampings:
                     matrix = normal + value * np.diag(np.diag(normal) + 1e-9)
                     trials.append(z - np.linalg.solve(matrix, gradient))
-                tried = np.clip(np.array(trials), z - 8.0, z + 8.0)
+                tried = np.clip(np.array(trials), z - MAX_STEP, z + MAX_STEP)
                 whites = self.white(config, free, tried)
                 costs = self.huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
                 best = int(np.argmin(costs))

@@ -15,7 +15,7 @@ import numpy as np
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
@@ -32,7 +32,6 @@ from carlab.prediction.windows import HISTORY_S, PredictionWindows, cut_windows,
 from sim_backends.car_parameters import SimulatorConfig
 
 SCHEMA = "carlab.light_diagnosis/1"
-UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 JSON_KEYS = {"windows": "shots", "with_refit": "beside_numbers", "ties_with_first": "like_the_first"}
 """Keys of the file format that differ from the attributes."""
 Verdict = Literal["explains", "left", "undecided"]
@@ -214,7 +213,8 @@ def _blocks_above(final: FloatArray, windows: PredictionWindows, score_max: floa
 def _channels(final: FloatArray, floor: FloatArray) -> tuple[ChannelError, ...]:
     rms = np.sqrt(np.mean(final**2, axis=0))
     return tuple(
-        ChannelError(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), UNITS[k]) for k in np.argsort(-rms)
+        ChannelError(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), STATE_UNITS[k])
+        for k in np.argsort(-rms)
     )
 
 

@@ -22,7 +22,7 @@ import rerun.blueprint as rrb
 from carlab.core.angles import align_unwrapped
 from carlab.core.documents import EpisodeStarted
 from carlab.core.episode_data import EpisodeData
-from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.recording.rerun import blueprint as look
 from carlab.recording.rerun.columns import Color
 from carlab.recording.rerun.document_stream import DocumentStream
@@ -36,7 +36,6 @@ STATES = "states"
 LEARNING = "learning"
 TABLE = "learning/table"
 CHECK = "check"
-UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 # Points of the viridis map (van der Walt and Smith, 2015): dark for the first episode, bright for the last.
 _VIRIDIS = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], dtype=np.float64)
 
@@ -223,7 +222,7 @@ def _predicted_tab(logged: look.Logged) -> rrb.Container | None:
             logged,
             plot_legend=rrb.PlotLegend(visible=name == STATE_NAMES[0]),
         )
-        for name, unit in zip(STATE_NAMES, UNITS, strict=True)
+        for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)
     ]
     halves = [look.stack(rrb.Vertical, [(view, 1) for view in half]) for half in (views[:3], views[3:])]
     return look.stack(rrb.Horizontal, [(half, 1) for half in halves], "Predicted against driven")
