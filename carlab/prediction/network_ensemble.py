@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from carlab.core.errors import DataError
+from carlab.core.planar import to_world
 from carlab.core.quantities import FloatArray
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel
@@ -278,8 +279,7 @@ def _paths(model: NetworkEnsemble, inputs: _Inputs) -> torch.Tensor:
         after = now + change + step_s * model.output_std * _network(model.weights, features)
         mean = 0.5 * (now + after)
         yaw = pose[..., 2] + 0.5 * step_s * mean[..., 2]
-        cos, sin = torch.cos(yaw), torch.sin(yaw)
-        rate = torch.stack([cos * mean[..., 0] - sin * mean[..., 1], sin * mean[..., 0] + cos * mean[..., 1]], dim=-1)
+        rate = torch.stack(to_world(mean[..., 0], mean[..., 1], yaw), dim=-1)
         pose = pose + step_s * torch.cat([rate, mean[..., 2:]], dim=-1)
         now = after
         recent = [*recent[1:], now]

@@ -31,12 +31,6 @@ def correlation(a: FloatArray, b: FloatArray) -> float:
     return float(np.corrcoef(a, b)[0, 1])
 
 
-def wrapped(angle_rad: FloatArray) -> FloatArray:
-    """Angle in [-pi, pi)."""
-    result: FloatArray = (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
-    return result
-
-
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
     """Starts and ends (exclusive) of the runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
