@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from struct import Struct
 from struct import error as StructError
 
@@ -25,7 +25,7 @@ from mocap.natnet.models import (
     UnknownDescription,
     check_readable,
 )
-from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_text
+from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_counted, encode_text
 
 BODY = Struct("<ii3f")
 PLATE = Struct("<ff3f144f12f")
@@ -181,7 +181,7 @@ def _encode(item: Description, version: BitstreamVersion) -> tuple[int, bytes]:
         case RigidBodyDescription():
             return 1, _encode_body(item, version)
         case SkeletonDescription():
-            bones = _counted(_encode_body(bone, version) for bone in item.bones)
+            bones = encode_counted(_encode_body(bone, version) for bone in item.bones)
             return 2, encode_text(item.name) + INT32.pack(item.id) + bones
         case ForcePlateDescription():
             numbers = PLATE.pack(item.width_m, item.length_m, *item.origin_m, *item.calibration, *item.corners_m)
@@ -194,8 +194,8 @@ def _encode(item: Description, version: BitstreamVersion) -> tuple[int, bytes]:
         case CameraDescription():
             return 5, encode_text(item.name) + POSE.pack(*item.position_m, *item.quaternion)
         case AssetDescription():
-            bodies = _counted(_encode_body(body, version) for body in item.rigid_bodies)
-            markers = _counted(
+            bodies = encode_counted(_encode_body(body, version) for body in item.rigid_bodies)
+            markers = encode_counted(
                 encode_text(m.name) + ASSET_MARKER.pack(m.id, *m.position_m, m.size_m, m.params) for m in item.markers
             )
             return 6, encode_text(item.name) + PAIR.pack(item.asset_type, item.id) + bodies + markers
@@ -219,10 +219,5 @@ def _encode_body(body: RigidBodyDescription, version: BitstreamVersion) -> bytes
     return b"".join(parts)
 
 
-def _counted(chunks: Iterable[bytes]) -> bytes:
-    parts = list(chunks)
-    return INT32.pack(len(parts)) + b"".join(parts)
-
-
 def _texts(names: Sequence[str]) -> bytes:
-    return _counted(encode_text(name) for name in names)
+    return encode_counted(encode_text(name) for name in names)

@@ -7,7 +7,7 @@ clock stamps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from struct import Struct
 from struct import error as StructError
 from typing import Any, TypeVar
@@ -29,7 +29,7 @@ from mocap.natnet.models import (
     Skeleton,
     check_readable,
 )
-from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_text
+from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_counted, encode_text
 
 _T = TypeVar("_T")
 
@@ -232,23 +232,20 @@ def _section(items: tuple[_T, ...], encode: Callable[[_T], bytes], sized: bool) 
     return (PAIR.pack(len(items), len(body)) if sized else INT32.pack(len(items))) + body
 
 
-def _counted(chunks: Iterable[bytes]) -> bytes:
-    parts = list(chunks)
-    return INT32.pack(len(parts)) + b"".join(parts)
-
-
 def _encode_marker_set(markers: MarkerSet) -> bytes:
-    return encode_text(markers.name) + _counted(VECTOR.pack(*p) for p in markers.positions_m)
+    return encode_text(markers.name) + encode_counted(VECTOR.pack(*p) for p in markers.positions_m)
 
 
 def _encode_skeleton(skeleton: Skeleton) -> bytes:
-    return INT32.pack(skeleton.id) + _counted(BODY.pack(*bone) for bone in skeleton.bones)
+    return INT32.pack(skeleton.id) + encode_counted(BODY.pack(*bone) for bone in skeleton.bones)
 
 
 def _encode_asset(asset: Asset) -> bytes:
-    bodies = _counted(BODY.pack(*body) for body in asset.rigid_bodies)
-    return INT32.pack(asset.id) + bodies + _counted(MARKER.pack(*marker) for marker in asset.markers)
+    bodies = encode_counted(BODY.pack(*body) for body in asset.rigid_bodies)
+    return INT32.pack(asset.id) + bodies + encode_counted(MARKER.pack(*marker) for marker in asset.markers)
 
 
 def _encode_analog(source: AnalogSource) -> bytes:
-    return INT32.pack(source.id) + _counted(_counted(FLOAT.pack(v) for v in channel) for channel in source.channels)
+    return INT32.pack(source.id) + encode_counted(
+        encode_counted(FLOAT.pack(v) for v in channel) for channel in source.channels
+    )

@@ -8,7 +8,7 @@ state, against the noisy recording.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,6 +38,10 @@ class Windows:
     def floor(self) -> FloatArray:
         """Noise floor of the six channels."""
         return np.asarray(np.sqrt((self.floor_errors**2).mean(axis=0)), dtype=np.float64)
+
+    def with_floor(self, floor: FloatArray) -> Windows:
+        """The windows with a given noise floor (6,)."""
+        return replace(self, floor_errors=np.repeat(floor[None], len(self.starts), axis=0))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
+from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.errors import prediction_errors
@@ -41,7 +42,7 @@ class Scale:
         """Robust spread of errors (S, K + 1, 6) of the best model so far, at least the floor (6,)."""
         last = error.shape[1] - 1
         steps = np.unique(np.linspace(last / settings.loss_steps, last, settings.loss_steps).round().astype(int))
-        spread = 1.4826 * np.median(np.abs(error[:, steps]), axis=0)
+        spread = STD_OVER_MAD * np.median(np.abs(error[:, steps]), axis=0)
         return cls(steps, np.maximum(share * spread, floor))
 
     def white(self, error: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from carlab.core.documents import EpisodeStarted
 from carlab.core.episode_data import EpisodeData
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.recording.rerun import blueprint as look
-from carlab.recording.rerun.columns import Color
+from carlab.recording.rerun.columns import Color, yaw_quaternion
 from carlab.recording.rerun.document_stream import DocumentStream
 from carlab.recording.sink import Item
 
@@ -112,11 +112,10 @@ class RunRecording:
         strips = [np.column_stack([path, np.full(len(path), 0.01)]) for path in (mean[:, :2], [*band, band[0]])]
         radii = rr.Radius.ui_points([2.0, 0.8])
         self._stream.log(PREDICTED, rr.LineStrips3D(strips, radii=radii, colors=look.ORANGE))
-        half_rad = 0.5 * float(mean[-1, 2])
         car = rr.Boxes3D(
             half_sizes=[[0.5 * size for size in look.CAR_SIZE_M]],
             centers=[[float(mean[-1, 0]), float(mean[-1, 1]), 0.5 * look.CAR_SIZE_M[2]]],
-            quaternions=[rr.Quaternion(xyzw=[0.0, 0.0, math.sin(half_rad), math.cos(half_rad)])],
+            quaternions=[rr.Quaternion(xyzw=yaw_quaternion(mean[-1, 2]))],
             colors=look.ORANGE,
             fill_mode=rr.components.FillMode.MajorWireframe,
         )
