@@ -15,6 +15,7 @@ import numpy as np
 from carlab.core.angles import wrap
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 
 OUTPUTS = ("ahead_m", "left_m", "yaw_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
@@ -88,10 +89,8 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
         past = np.stack([episode.sent[rows - back] for back in range(history, -1, -1)], axis=1)
         given = np.hstack([states[rows, 3:], past.reshape(len(rows), -1)])
         change = states[rows + 1] - states[rows]
-        sin, cos = np.sin(states[rows, 2]), np.cos(states[rows, 2])
         moved = np.stack([
-            cos * change[:, 0] + sin * change[:, 1],
-            cos * change[:, 1] - sin * change[:, 0],
+            *to_body(change[:, 0], change[:, 1], states[rows, 2]),
             wrap(change[:, 2]),
             *change[:, 3:].T,
         ], axis=1)  # fmt: skip

@@ -13,12 +13,12 @@ from carlab.core.errors import ConfigError
 from carlab.core.tables import check_keys, number
 from sim_backends.effects import EFFECTS, DelayEffect, MeasuredCurve
 from sim_backends.effects.base import GRAVITY_MPS2, MODEL_KINDS, ModelKind
+from sim_backends.measurement import LATENCY
 from sim_backends.registry import REGISTRY, ParameterInfo, section
 
 TABLES = ("vehicle", "tyre", "motor", "steering", "timing", "model", "mocap", "effects")
 """Tables of a car file with the simulator's parameters, without ``[hardware]``."""
 
-LATENCY = "mocap.latency"
 
 _FIELD_OF = {info.name: info.field for info in REGISTRY.values() if info.field}
 
@@ -298,6 +298,7 @@ def _number(entry: Any, where: str) -> tuple[float, tuple[float, float] | None, 
 
 __all__ = [
     "GRAVITY_MPS2",
+    "LATENCY",
     "TABLES",
     "CarParameters",
     "MocapParameters",

@@ -121,14 +121,6 @@ class Plant:
                 self._remember()
         return self.state
 
-    def pose_at(self, t_s: float) -> Pose:
-        """True pose at ``t_s``: by simulation, or within the last second by cubic interpolation.
-
-        For an earlier time (or before ``reset``) it is the oldest stored pose.
-        """
-        x, y, yaw = self._true_at(t_s)[:3]
-        return Pose(x, y, wrap(yaw))
-
     def measured_pose(self, t_s: float) -> Pose:
         """Pose of the tracked point at ``t_s`` with the observation effects (marker offset) but no noise or latency."""
         state = self._measurement.observe(self._true_at(t_s)[:6])

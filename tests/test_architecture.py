@@ -110,6 +110,17 @@ def test_importing_carlab_loads_fewer_than_40_modules() -> None:
     assert "numpy" not in loaded
 
 
+def test_core_imports_numpy_array_api_compat_and_the_standard_library_only() -> None:
+    imported = {
+        name.split(".")[0]
+        for path in (ROOT / "carlab" / "core").glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names])
+    }
+    assert imported - sys.stdlib_module_names == {"carlab", "numpy", "array_api_compat"}
+
+
 def test_only_the_command_line_prints() -> None:
     printing = {
         str(path.relative_to(ROOT))

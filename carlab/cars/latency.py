@@ -24,20 +24,6 @@ class LatencyParts:
 
     parts: Mapping[str, FloatArray]
 
-    def mean_s(self, *names: str) -> float:
-        """Sum of the means of parts [s]; parts without samples count as zero."""
-        return float(sum(self.parts[name].mean() for name in names if name in self.parts))
-
-    @property
-    def command_s(self) -> float:
-        """Mean time from the command call to the decoded command in the firmware [s]."""
-        return self.mean_s(COMMAND_TO_WIRE, WIRE_TO_FIRMWARE)
-
-    @property
-    def pose_s(self) -> float:
-        """Mean time from exposure to arrival on the host [s]."""
-        return self.mean_s(EXPOSURE_TO_ARRIVAL)
-
     def rows(self) -> list[tuple[str, float, float, float, int]]:
         """For each part: name, median, 99th percentile and maximum [ms], and count."""
         table = []

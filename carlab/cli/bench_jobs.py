@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from carlab.cli.console import progress
-from carlab.jobs.child_jobs import PYTHON, ChildJob, JobEnd
+from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd
 from carlab.jobs.child_processes import ONE_THREAD, side_by_side
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
 
 Result = TypeVar("Result")
-CARLAB = (PYTHON, "-m", "carlab")
 DATA, CAR, FIGURES = "data", "car.toml", "figures.json"
 """Names in the folder of a job: recordings, car file, and the figures that it writes."""
 SPEED_PERIOD_S = 86400.0
@@ -144,4 +143,4 @@ def read_figures(end: JobEnd) -> dict[str, object]:
     return content
 
 
-__all__ = ["CARLAB", "DATA", "StudyJob", "bench_job", "read_figures", "recorded_files", "run_jobs", "uses_jobs"]
+__all__ = ["DATA", "StudyJob", "bench_job", "read_figures", "recorded_files", "run_jobs", "uses_jobs"]

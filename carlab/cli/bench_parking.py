@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from carlab.cli.bench_jobs import CARLAB, StudyJob, run_jobs, uses_jobs
+from carlab.cli.bench_jobs import StudyJob, run_jobs, uses_jobs
 from carlab.cli.bench_output import command, write_figures
 from carlab.cli.console import console, fail, table
 from carlab.cli.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED
 from carlab.core.errors import ConfigError
-from carlab.jobs.child_jobs import ChildJob, JobEnd, read_files, write_files
+from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd, read_files, write_files
 from carlab.jobs.child_processes import ONE_THREAD
 
 if TYPE_CHECKING:

@@ -303,6 +303,6 @@ def _diagnose_command() -> tuple[str, ...]:
 
 
 def _carlab_command() -> tuple[str, ...]:
-    from carlab.benchmark.real.runner import CARLAB
+    from carlab.jobs.child_jobs import CARLAB
 
     return CARLAB

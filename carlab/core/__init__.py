@@ -1,1 +1,1 @@
-"""Interfaces and quantities for all packages; depends on NumPy and the standard library only."""
+"""Interfaces and quantities for all packages; depends on NumPy, array-api-compat and the standard library only."""

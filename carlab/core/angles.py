@@ -16,16 +16,6 @@ def wrap(angle_rad: Any) -> Any:
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def difference(a_rad: Any, b_rad: Any) -> Any:
-    """Smallest signed angle from ``b_rad`` to ``a_rad``."""
-    return wrap(a_rad - b_rad)
-
-
-def circular_mean(angles_rad: FloatArray) -> float:
-    """Direction of the mean unit vector of NumPy angles, shape (n,)."""
-    return float(np.arctan2(np.mean(np.sin(angles_rad)), np.mean(np.cos(angles_rad))))
-
-
 def align_unwrapped(measured_rad: FloatArray, starts: ArrayLike, predicted_rad: FloatArray) -> tuple[FloatArray, ...]:
     """Unwrap a measured angle (n,), and shift predictions (B, N) by multiples of 2 pi to match it at their starts.
 

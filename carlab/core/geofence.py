@@ -29,15 +29,15 @@ def as_polygon(corners_m: Polygon, where: str) -> tuple[tuple[float, float], ...
     return tuple((float(a), float(b)) for a, b in points)
 
 
-def contains(corners_m: Polygon, x_m: float, y_m: float) -> bool:
-    """Whether the point lies inside the polygon (even-odd rule)."""
-    inside = False
+def contains(corners_m: Polygon, x_m: Any, y_m: Any) -> Any:
+    """Whether points lie inside the polygon (even-odd rule); floats, or arrays of NumPy or torch."""
+    inside: Any = False
     previous_x, previous_y = corners_m[-1]
     for corner_x, corner_y in corners_m:
-        if (corner_y > y_m) != (previous_y > y_m):
+        if corner_y != previous_y:
+            spans = (corner_y > y_m) != (previous_y > y_m)
             crossing_x = corner_x + (y_m - corner_y) / (previous_y - corner_y) * (previous_x - corner_x)
-            if x_m < crossing_x:
-                inside = not inside
+            inside = (spans & (x_m < crossing_x)) ^ inside
         previous_x, previous_y = corner_x, corner_y
     return inside
 
@@ -95,15 +95,12 @@ def can_stop_inside_batch(
     edge = corners - before
     to = before - places_m[:, None]  # (n, edges, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
-        crossing = places_m[:, :1] - edge[:, 0] / edge[:, 1] * to[:, :, 1] + to[:, :, 0]
-        spans = (corners[:, 1] > places_m[:, 1:]) != (before[:, 1] > places_m[:, 1:])
-        inside = np.sum(spans & (places_m[:, :1] < crossing), axis=1) % 2 == 1
         direction = np.stack([np.cos(course_rad), np.sin(course_rad)], axis=1)[:, None]
         cross = _cross(direction, edge)
         along, on_edge = _cross(to, edge) / cross, _cross(to, direction) / cross
     met = (np.abs(cross) > 1e-12) & (along >= 0.0) & (on_edge >= -1e-9) & (on_edge <= 1.0 + 1e-9)
     free = np.where(met, along, np.inf).min(axis=1)
-    found: NDArray[np.bool_] = inside & (needed_m < free) & (free < np.inf)
+    found: NDArray[np.bool_] = contains(corners_m, *places_m.T) & (needed_m < free) & (free < np.inf)
     return found
 
 

@@ -1,9 +1,10 @@
-"""Read JSON files that a person may have edited."""
+"""JSON: files that a person may have edited, and data for files."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,4 +46,18 @@ def _integer(text: str) -> int:
     return value
 
 
-__all__ = ["read_json"]
+def plain(value: Any, names: Mapping[str, str] | None = None) -> Any:
+    """Data for a JSON file: tuples become lists, and numbers that are not finite become null.
+
+    Args:
+        value: mappings, lists and tuples of texts and numbers.
+        names: names in the file of keys of ``value`` that differ.
+    """
+    if isinstance(value, Mapping):
+        return {(names or {}).get(str(k), str(k)): plain(v, names) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v, names) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+__all__ = ["plain", "read_json"]

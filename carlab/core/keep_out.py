@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
+
+from carlab.core.geofence import contains
 
 Corners = tuple[tuple[float, float], ...]
 _OUTLINE_POINTS = 32
@@ -42,17 +43,7 @@ class Polygon:
 
     def contains(self, positions_m: Any) -> Any:
         """Whether positions (..., 2) lie inside by the even-odd rule, booleans (...,)."""
-        xp = array_namespace(positions_m)
-        x, y = positions_m[..., 0], positions_m[..., 1]
-        inside = xp.zeros_like(x, dtype=xp.bool)
-        previous_x, previous_y = self.outline_m[-1]
-        for corner_x, corner_y in self.outline_m:
-            if corner_y != previous_y:
-                spans = (y < corner_y) != (y < previous_y)
-                crossing_x = corner_x + (y - corner_y) / (previous_y - corner_y) * (previous_x - corner_x)
-                inside = inside ^ (spans & (x < crossing_x))
-            previous_x, previous_y = corner_x, corner_y
-        return inside
+        return contains(self.outline_m, positions_m[..., 0], positions_m[..., 1])
 
 
 KeepOut = Disc | Polygon

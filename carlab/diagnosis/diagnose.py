@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -44,8 +43,6 @@ from carlab.prediction.predict import ConstantVelocity, PredictiveModel, Simulat
 from carlab.prediction.windows import PredictionWindows, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
-
-log = logging.getLogger(__name__)
 
 Progress = Callable[[str, float], None]
 SEARCH_PROGRESS = (0.05, 0.75)

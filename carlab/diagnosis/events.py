@@ -21,9 +21,7 @@ from carlab.diagnosis.settings import DEFAULT, EventSettings
 from carlab.prediction.windows import EVENT_COLUMN, body_states, unbroken_rows
 from carlab.recording.faults.robust import robust_std, runs
 from carlab.recording.pose_velocity import BoolArray
-from sim_backends.car_parameters import CarParameters, SimulatorConfig
-
-GRAVITY_MPS2 = 9.81
+from sim_backends.car_parameters import GRAVITY_MPS2, CarParameters, SimulatorConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from carlab.core.json_files import plain
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import Decision
@@ -289,22 +289,12 @@ class Diagnosis:
             "seed": self.seed,
             "seconds": self.seconds,
         }
-        return dict(_plain(made))
+        return dict(plain(made))
 
 
 def _drift_table(drift: Drift) -> dict[str, Any]:
-    plain = asdict(replace(drift, t_s=np.zeros(0), mean=np.zeros(0), std=np.zeros(0)))
-    return plain | {name: getattr(drift, name).tolist() for name in ("t_s", "mean", "std")}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    table = asdict(replace(drift, t_s=np.zeros(0), mean=np.zeros(0), std=np.zeros(0)))
+    return table | {name: getattr(drift, name).tolist() for name in ("t_s", "mean", "std")}
 
 
 @dataclass(frozen=True, slots=True)

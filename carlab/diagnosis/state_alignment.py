@@ -13,7 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from carlab.core.angles import wrap
 from carlab.core.episode_data import EpisodeData
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.core.state_estimator import MIN_SAMPLES, fit_velocity
 from carlab.recording.episode_builder import POSE_AGE, VELOCITY_DELAY
@@ -47,7 +49,7 @@ def align_states(episode: EpisodeData, latency_s: float) -> EpisodeData:
     poses = np.column_stack([poses[:, :3], np.unwrap(poses[:, 3])])
     states = _quadratic(poses, episode.times_s - latency_s)
     states[:, 3:] += _filter_offset(episode, poses)
-    states[:, 2] = (states[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    states[:, 2] = wrap(states[:, 2])
     seen = np.flatnonzero(np.isfinite(states).all(axis=1))
     if len(seen) < MIN_SAMPLES:
         return episode
@@ -107,8 +109,7 @@ def _quadratic(poses: FloatArray, at_s: FloatArray) -> FloatArray:
         value, slope = (np.linalg.pinv(design) @ poses[window, 1:])[:2]
         x, y, yaw = value
         vx, vy, rate = slope / scale
-        sin, cos = np.sin(yaw), np.cos(yaw)
-        states[k] = (x, y, yaw, cos * vx + sin * vy, cos * vy - sin * vx, rate)
+        states[k] = (x, y, yaw, *to_body(vx, vy, yaw), rate)
     return states
 
 

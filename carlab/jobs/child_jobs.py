@@ -17,6 +17,7 @@ from carlab.jobs.child_processes import ChildEnd, run_child
 
 PYTHON = "python"
 """Program of a job that stands for the Python interpreter of the machine that runs it."""
+CARLAB = (PYTHON, "-m", "carlab")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +120,7 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 __all__ = [
+    "CARLAB",
     "PYTHON",
     "ChildJob",
     "Executor",

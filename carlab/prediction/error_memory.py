@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from carlab.core.errors import DataError
+from carlab.core.planar import to_world
 from carlab.core.quantities import FloatArray
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.errors import prediction_errors
@@ -117,8 +118,6 @@ def _weights(
 def _in_world(errors: FloatArray, windows: PredictionWindows) -> FloatArray:
     """Errors (S, K + 1, 6) in the body frame of each window's initial state with x and y in the recording's frame."""
     yaw = windows.initial_states[:, 2, None]
-    sin, cos = np.sin(yaw), np.cos(yaw)
     turned = errors.copy()
-    turned[..., 0] = cos * errors[..., 0] - sin * errors[..., 1]
-    turned[..., 1] = sin * errors[..., 0] + cos * errors[..., 1]
+    turned[..., 0], turned[..., 1] = to_world(errors[..., 0], errors[..., 1], yaw)
     return turned

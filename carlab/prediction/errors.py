@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from carlab.core.planar import to_body
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.prediction.predict import PredictiveModel
 from carlab.prediction.windows import IndexArray, PredictionWindows
@@ -42,10 +43,7 @@ def prediction_errors(predicted: FloatArray, windows: PredictionWindows, ticks: 
     """
     error = predicted - (windows.measured if ticks is None else windows.measured[:, ticks])
     yaw = windows.initial_states[:, 2, None]
-    sin, cos = np.sin(yaw), np.cos(yaw)
-    dx, dy = error[..., 0].copy(), error[..., 1].copy()
-    error[..., 0] = cos * dx + sin * dy
-    error[..., 1] = cos * dy - sin * dx
+    error[..., 0], error[..., 1] = to_body(error[..., 0], error[..., 1], yaw)
     return error
 
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import savgol_coeffs
 
+from carlab.core.planar import to_world
 from carlab.core.quantities import FloatArray
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import MIN_QUINTIC_WIDTH, PredictionWindows, body_states, smoothing_width
@@ -89,8 +90,6 @@ def _local_polynomial(pose: FloatArray, width: int, order: int, period_s: float)
 
 def _rotated(states: FloatArray, angle: FloatArray) -> FloatArray:
     """Differences of states (S, 6) with x, y rotated by ``angle`` (S,)."""
-    sin, cos = np.sin(angle), np.cos(angle)
     out = states.copy()
-    out[:, 0] = cos * states[:, 0] - sin * states[:, 1]
-    out[:, 1] = sin * states[:, 0] + cos * states[:, 1]
+    out[:, 0], out[:, 1] = to_world(states[:, 0], states[:, 1], angle)
     return out

@@ -11,6 +11,7 @@ import torch
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.observation import decode_state, encode
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.prediction.initial_states import as_recorded
 from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
@@ -124,10 +125,9 @@ def drive_windows(windows: PredictionWindows, history: int) -> DriveWindows:
         DataError: the windows have fewer past commands.
     """
     start = windows.initial_states[:, None]
-    sin, cos = np.sin(start[..., 2]), np.cos(start[..., 2])
     motion = windows.measured[:, 1:].copy()
     dx, dy = motion[..., 0] - start[..., 0], motion[..., 1] - start[..., 1]
-    motion[..., 0], motion[..., 1] = cos * dx + sin * dy, cos * dy - sin * dx
+    motion[..., 0], motion[..., 1] = to_body(dx, dy, start[..., 2])
     motion[..., 2] -= start[..., 2]
     arrays = (windows.initial_states[:, 3:], past_commands(windows, history), windows.commands, motion)
     velocities, past, commands, motions = (torch.from_numpy(np.ascontiguousarray(a)).float() for a in arrays)

@@ -21,7 +21,9 @@ import numpy as np
 import torch
 
 from carlab.core.errors import DataError
+from carlab.core.planar import to_world
 from carlab.core.quantities import FloatArray
+from carlab.core.robust import STD_OVER_MAD
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel
 from carlab.prediction.windows import PredictionWindows, Track, cut_windows
@@ -218,7 +220,7 @@ class _Training:
             error_std, rate_std = _simulated_std(windows, simulated)
             input_mean = np.concatenate([input_mean, np.zeros(6)])
             input_std = np.concatenate([input_std, error_std, rate_std])
-        unit = np.maximum(1.4826 * np.median(np.abs(rate), axis=(0, 1)), 1e-2)
+        unit = np.maximum(STD_OVER_MAD * np.median(np.abs(rate), axis=(0, 1)), 1e-2)
         mean, std, output = (torch.from_numpy(v).float().to(self.device) for v in (input_mean, input_std, unit))
         rows = settings.velocity_rows
         return NetworkEnsemble(tuple(weights), windows.period_s, past, rows, mean, std, output, self.simulator)
@@ -278,8 +280,7 @@ def _paths(model: NetworkEnsemble, inputs: _Inputs) -> torch.Tensor:
         after = now + change + step_s * model.output_std * _network(model.weights, features)
         mean = 0.5 * (now + after)
         yaw = pose[..., 2] + 0.5 * step_s * mean[..., 2]
-        cos, sin = torch.cos(yaw), torch.sin(yaw)
-        rate = torch.stack([cos * mean[..., 0] - sin * mean[..., 1], sin * mean[..., 0] + cos * mean[..., 1]], dim=-1)
+        rate = torch.stack(to_world(mean[..., 0], mean[..., 1], yaw), dim=-1)
         pose = pose + step_s * torch.cat([rate, mean[..., 2:]], dim=-1)
         now = after
         recent = [*recent[1:], now]
@@ -329,7 +330,7 @@ def _target(windows: PredictionWindows, device: torch.device) -> torch.Tensor:
 def _scale(windows: PredictionWindows, device: torch.device) -> torch.Tensor:
     """Median error (K + 1, 6) of the constant-velocity baseline, at least a tenth of that of its last step."""
     error = np.abs(prediction_errors(ConstantVelocity().predict(windows), windows))
-    spread = 1.4826 * np.median(error, axis=0)
+    spread = STD_OVER_MAD * np.median(error, axis=0)
     return torch.from_numpy(np.maximum(spread, np.maximum(0.1 * spread[-1], 1e-4))).float().to(device)
 
 

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from carlab.core.planar import arc
 from carlab.core.quantities import FloatArray
 from carlab.prediction.windows import IndexArray, PredictionWindows
 from sim_backends.array_ops import ARRAYS
@@ -60,9 +61,7 @@ class ConstantVelocity:
         """As ``PredictiveModel``, from the initial state of each window."""
         time_s = windows.period_s * np.arange(windows.steps + 1)
         x, y, yaw, vx, vy, yaw_rate = (column[:, None] for column in windows.initial_states.T)
-        turn = yaw_rate * time_s
-        along, across = np.sinc(turn / np.pi), np.sin(turn / 2) * np.sinc(turn / (2 * np.pi))
-        ahead, left = time_s * (along * vx - across * vy), time_s * (across * vx + along * vy)
+        ahead, left, turn = arc(vx, vy, yaw_rate, time_s)
         cos, sin = np.cos(yaw), np.sin(yaw)
         columns = (x + cos * ahead - sin * left, y + sin * ahead + cos * left, yaw + turn, vx, vy, yaw_rate)
         return np.stack(np.broadcast_arrays(*columns), axis=-1)

@@ -18,6 +18,7 @@ from scipy.signal import savgol_filter
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 
 IndexArray = NDArray[np.int64]
@@ -253,9 +254,7 @@ def _smoothed(states: FloatArray, width: int, order: int, period_s: float) -> Fl
 
 def body_states(pose: FloatArray, rate: FloatArray) -> FloatArray:
     """States (n, 6) of poses (n, 3) and their rates in the world (n, 3)."""
-    sin, cos = np.sin(pose[:, 2]), np.cos(pose[:, 2])
-    forward, left = cos * rate[:, 0] + sin * rate[:, 1], cos * rate[:, 1] - sin * rate[:, 0]
-    return np.column_stack([pose, forward, left, rate[:, 2]])
+    return np.column_stack([pose, *to_body(rate[:, 0], rate[:, 1], pose[:, 2]), rate[:, 2]])
 
 
 def _cell_means(t: FloatArray, held: FloatArray, grid: FloatArray, period_s: float) -> FloatArray:

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from carlab.core.angles import wrap
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -47,7 +49,7 @@ def pose_jumps(t_s: FloatArray, x_m: FloatArray, y_m: FloatArray, yaw_rad: Float
     """Row indices k, shape (J,), at which the step from row k - 1 to k exceeds the motion of a car."""
     dt = np.diff(t_s)
     safe = np.where(dt > 0, dt, np.nan)
-    steps = np.stack([np.diff(x_m), np.diff(y_m), _unwrap_steps(yaw_rad)])
+    steps = np.stack([np.diff(x_m), np.diff(y_m), wrap(np.diff(yaw_rad))])
     around = _median_of_neighbours(steps / safe)
     miss = np.abs(steps - around * dt)
     far = np.hypot(miss[0], miss[1]) > _JUMP_M + 0.5 * _JUMP_ACCELERATION * dt**2
@@ -68,9 +70,8 @@ def pose_motion(
         rows = segment == number
         yaw[rows] = np.unwrap(yaw_rad[rows])
         rates[:, rows] = _local_slopes(t_s[rows], np.stack([x_m[rows], y_m[rows], yaw[rows]]), half)
-    c, s = np.cos(yaw), np.sin(yaw)
     vx_world, vy_world, yaw_rate = rates
-    return PoseMotion(yaw, vx_world, vy_world, c * vx_world + s * vy_world, c * vy_world - s * vx_world, yaw_rate, half)
+    return PoseMotion(yaw, vx_world, vy_world, *to_body(vx_world, vy_world, yaw), yaw_rate, half)
 
 
 def _local_slopes(t_s: FloatArray, values: FloatArray, half: int) -> FloatArray:
@@ -90,11 +91,6 @@ def _local_slopes(t_s: FloatArray, values: FloatArray, half: int) -> FloatArray:
     weights = np.linalg.pinv(design)[:, 1]
     slopes: FloatArray = np.einsum("nw,cnw->cn", weights, windows - values[:, :, None]) / scale[:, 0]
     return slopes
-
-
-def _unwrap_steps(yaw_rad: FloatArray) -> FloatArray:
-    wrapped: FloatArray = (np.diff(yaw_rad) + np.pi) % (2 * np.pi) - np.pi
-    return wrapped
 
 
 def _median_of_neighbours(rates: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from carlab.core.errors import ConfigError, DataError
-from carlab.core.json_files import read_json
+from carlab.core.json_files import plain, read_json
 from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.report import CURVE_FILE
@@ -161,14 +161,6 @@ def summarised(curves: Sequence[Curve]) -> list[MethodFigures]:
 
 def as_json(curves: Sequence[Curve], command: str) -> dict[str, Any]:
     """All figures and the command of the study; numbers that are not finite become null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, Mapping):
-            return {k: plain(v) for k, v in value.items()}
-        if isinstance(value, (list, tuple)):
-            return [plain(v) for v in value]
-        return None if isinstance(value, float) and not np.isfinite(value) else value
-
     runs = [
         {
             "method": c.method, "seed": c.seed, "updates": c.updates, "reality": c.reality,

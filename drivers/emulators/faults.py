@@ -5,9 +5,6 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, field
 
-from carlab.core.errors import ActuatorFaultError
-from drivers.links.link import CanFrame, FrameLink, LinkStatistics
-
 
 @dataclass(slots=True)
 class WireFaults:
@@ -42,38 +39,3 @@ class WireFaults:
             broken[self._random.randrange(len(broken))] ^= 1 << self._random.randrange(8)
             return bytes(broken)
         return data
-
-
-class FaultyFrameLink:
-    """A frame link whose writes and reads raise ActuatorFaultError while ``failure`` is set, like an unplugged bus."""
-
-    def __init__(self, link: FrameLink) -> None:
-        self.link = link
-        self.failure: str | None = None
-        self.statistics: LinkStatistics = link.statistics
-
-    def open(self) -> None:
-        """Open the link."""
-        self.link.open()
-
-    def write(self, frame: CanFrame) -> None:
-        """Write, or raise the failure."""
-        self._fail()
-        self.link.write(frame)
-
-    def read(self) -> list[CanFrame]:
-        """Read, or raise the failure."""
-        self._fail()
-        return self.link.read()
-
-    def fileno(self) -> int | None:
-        """The link's descriptor."""
-        return self.link.fileno()
-
-    def close(self) -> None:
-        """Close the link."""
-        self.link.close()
-
-    def _fail(self) -> None:
-        if self.failure is not None:
-            raise ActuatorFaultError(self.failure)

@@ -110,20 +110,10 @@ def set_current_brake(controller_id: int, current_a: float) -> CanFrame:
     return _simple(Packet.SET_CURRENT_BRAKE, controller_id, "current_a", current_a)
 
 
-def set_rpm(controller_id: int, erpm: float) -> CanFrame:
-    """Frame that sets the speed in electrical revolutions per minute."""
-    return _simple(Packet.SET_RPM, controller_id, "erpm", erpm)
-
-
 def set_servo_position(controller_id: int, host_id: int, position: float) -> CanFrame:
     """Frame that sets the servo position in [0, 1], as a short buffer without reply (there is no simple message)."""
     (frame,) = encode_payload(controller_id, host_id, vesc_payloads.set_servo_position(position), ReplyMode.NO_REPLY)
     return frame
-
-
-def ping(controller_id: int, host_id: int) -> CanFrame:
-    """Frame that requests a PONG from a controller."""
-    return CanFrame(_identifier(Packet.PING, controller_id), bytes((host_id,)))
 
 
 def pong(host_id: int, controller_id: int, hardware_type: int = 0) -> CanFrame:

@@ -90,11 +90,6 @@ def set_current_brake(current_a: float) -> bytes:
     return _set_int32(Command.SET_CURRENT_BRAKE, current_a, CURRENT_SCALE, "brake current")
 
 
-def set_rpm(erpm: float) -> bytes:
-    """SET_RPM in electrical revolutions per minute (mechanical times pole pairs)."""
-    return _set_int32(Command.SET_RPM, erpm, 1.0, "erpm")
-
-
 def set_servo_position(position: float) -> bytes:
     """SET_SERVO_POS in [0, 1], 0.001 resolution. The servo has no time-out and does not reset the motor's."""
     if not 0.0 <= position <= 1.0:
@@ -115,13 +110,6 @@ def get_values_selective(mask: int = CONTROL_MASK) -> bytes:
 def get_firmware_version() -> bytes:
     """FW_VERSION request; its id is 0 in every firmware."""
     return bytes((Command.FW_VERSION,))
-
-
-def forward_can(controller_id: int, payload: bytes) -> bytes:
-    """FORWARD_CAN: ``payload`` for another controller on the CAN bus of this controller."""
-    if not 0 <= controller_id <= 254:
-        raise ProtocolError(f"controller id {controller_id} is outside 0 ... 254.")
-    return bytes((Command.FORWARD_CAN, controller_id)) + payload
 
 
 @dataclass(frozen=True, slots=True)

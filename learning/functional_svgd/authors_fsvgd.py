@@ -21,6 +21,7 @@ from torch import Tensor
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.observation import STATE_FEATURES, decode_history, encode, push_action
+from carlab.core.planar import to_body, to_world
 from learning.evaluation import calibration_error, negative_log_likelihood
 from learning.functional_svgd.fsvgd import (
     FsvgdSettings,
@@ -89,7 +90,7 @@ class WorldDynamics:
         now = in_world(features)
         after = now + self._draws(_inputs(now, features, action), generator)
         yaw = torch.atan2(after[:, 2:3], after[:, 3:4])
-        ahead, left = _in_body(after[:, 4], after[:, 5], yaw[:, 0])
+        ahead, left = to_body(after[:, 4], after[:, 5], yaw[:, 0])
         state = torch.cat([after[:, :2], yaw, ahead[:, None], left[:, None], after[:, 6:7]], dim=1)
         next_features: Tensor = encode(state, push_action(decode_history(features), action))
         return next_features
@@ -188,11 +189,11 @@ def _prior(inputs: Tensor, units: Normaliser, simulator: CarModel | None, genera
 def simulated_changes(simulator: CarModel, inputs: Tensor, parameters: Tensor) -> Tensor:
     """Changes (P, N, 7) in the world frame of a simulator at inputs (N, 7 + 2 (H + 1)) for parameters (P, K)."""
     yaw = torch.atan2(inputs[:, 2], inputs[:, 3])
-    ahead, left = _in_body(inputs[:, 4], inputs[:, 5], yaw)
+    ahead, left = to_body(inputs[:, 4], inputs[:, 5], yaw)
     body = torch.cat([ahead[:, None], left[:, None], inputs[:, 6:]], dim=1)
     dx, dy, turn, d_ahead, d_left, d_rate = simulator(body, parameters).unbind(dim=2)
-    x, y = _in_body(dx, dy, -yaw)
-    velocity_x, velocity_y = _in_body(ahead + d_ahead, left + d_left, -(yaw + turn))
+    x, y = to_world(dx, dy, yaw)
+    velocity_x, velocity_y = to_world(ahead + d_ahead, left + d_left, yaw + turn)
     heading = torch.sin(yaw + turn) - inputs[:, 2], torch.cos(yaw + turn) - inputs[:, 3]
     return torch.stack([x, y, *heading, velocity_x - inputs[:, 4], velocity_y - inputs[:, 5], d_rate], dim=2)
 
@@ -211,12 +212,6 @@ def _domain_points(history: int, generator: torch.Generator) -> Tensor:
 
 def _inputs(now: Tensor, features: Tensor, action: Tensor) -> Tensor:
     return torch.cat([now, features[:, STATE_FEATURES:], action], dim=1)
-
-
-def _in_body(x: Tensor, y: Tensor, yaw: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of a world vector along the axes of a body at some yaw."""
-    sin, cos = yaw.sin(), yaw.cos()
-    return cos * x + sin * y, cos * y - sin * x
 
 
 __all__ = ["WorldDynamics", "authors_settings", "fit_authors_fsvgd", "in_world", "simulated_changes", "world_rows"]

@@ -31,6 +31,7 @@ from learning.posterior.discrepancy import (
 from learning.posterior.function_posterior import FunctionPosterior, simulate
 from learning.posterior.parameter_posterior import posterior_parameters
 from learning.priors.domain_models import MAX_PLAUSIBLE_OUTPUT, NO_FINITE_OUTPUT, DomainModel, draw_parameters
+from learning.priors.function_prior import moments
 
 PARAMETER_DRAWS = 128
 """Draws of the parameters given data."""
@@ -370,10 +371,7 @@ def _residual(problem: _Problem, parameters: Tensor | None, normaliser: Normalis
     if problem.model is None or parameters is None:
         return _Residual(targets, None, inputs)
     simulated = simulate(problem.model, problem.inputs, parameters, normaliser)
-    simulated = simulated[_plausible(simulated)]
-    mean = simulated.mean(dim=0)
-    deviation = (simulated - mean).permute(2, 0, 1)
-    covariance = deviation.transpose(1, 2) @ deviation / len(simulated)
+    mean, covariance = moments(simulated[_plausible(simulated)])
     return _Residual(targets - mean, covariance, torch.cat([inputs, mean], dim=1))
 
 

@@ -14,6 +14,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from carlab.core.planar import to_body, to_world
+
 Range = tuple[float, float]
 MAX_PLAUSIBLE_OUTPUT = 1e6
 """Bound of plausible outputs, in normalised units or in SI units of a car; larger outputs are numerical failures."""
@@ -208,9 +210,7 @@ class KinematicCar:
         yaw = torch.atan2(inputs[:, 2], inputs[:, 3])[None] + offset
         throttle = inputs[None, :, 8].clamp(-1.0, 1.0)
         tangent = torch.tan(lock * inputs[None, :, 7].clamp(-1.0, 1.0))
-        sin, cos = torch.sin(yaw), torch.cos(yaw)
-        ahead = inputs[None, :, 4] * cos + inputs[None, :, 5] * sin
-        left = inputs[None, :, 5] * cos - inputs[None, :, 4] * sin
+        ahead, left = to_body(inputs[None, :, 4], inputs[None, :, 5], yaw)
         rate = inputs[None, :, 6].expand_as(ahead)
         x, y = (inputs[None, :, k].expand_as(ahead) for k in (0, 1))
         step = self.period_s / self.substeps
@@ -223,13 +223,12 @@ class KinematicCar:
             new_left = rear * rolling_rate + decay * (left - rear * rolling_rate)
             mid_yaw = yaw + 0.25 * step * (rate + new_rate)
             mean_left = 0.5 * (left + new_left)
-            x = x + step * (mean_ahead * torch.cos(mid_yaw) - mean_left * torch.sin(mid_yaw))
-            y = y + step * (mean_ahead * torch.sin(mid_yaw) + mean_left * torch.cos(mid_yaw))
+            mean_vx, mean_vy = to_world(mean_ahead, mean_left, mid_yaw)
+            x, y = x + step * mean_vx, y + step * mean_vy
             yaw = yaw + 0.5 * step * (rate + new_rate)
             ahead, left, rate = next_ahead, new_left, new_rate
         measured_yaw = yaw - offset
-        velocity_x = ahead * torch.cos(yaw) - left * torch.sin(yaw)
-        velocity_y = ahead * torch.sin(yaw) + left * torch.cos(yaw)
+        velocity_x, velocity_y = to_world(ahead, left, yaw)
         heading = torch.sin(measured_yaw), torch.cos(measured_yaw)
         after = torch.stack([x, y, *heading, velocity_x, velocity_y, rate], dim=-1)
         return after - inputs[None, :, :7]

@@ -83,12 +83,17 @@ def simulator_marginal(
         discrepancy: its covariance; None: no discrepancy.
         jitter: variance added to each value.
     """
-    mean = draws.mean(dim=0)
-    deviation = (draws - mean).permute(2, 0, 1)  # (O, P, N)
-    covariance = deviation.transpose(1, 2) @ deviation / len(draws)
+    mean, covariance = moments(draws)
     if discrepancy is not None:
         covariance = covariance + discrepancy(inputs)
     return _factored(mean, covariance, jitter)
+
+
+def moments(draws: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean (N, O) and covariances (O, N, N) of draws (P, N, O)."""
+    mean = draws.mean(dim=0)
+    deviation = (draws - mean).permute(2, 0, 1)  # (O, P, N)
+    return mean, deviation.transpose(1, 2) @ deviation / len(draws)
 
 
 def _factored(mean: Tensor, covariance: Tensor, jitter: float) -> Marginal:
@@ -96,4 +101,4 @@ def _factored(mean: Tensor, covariance: Tensor, jitter: float) -> Marginal:
     return Marginal(mean, torch.linalg.cholesky(covariance + jitter * eye))
 
 
-__all__ = ["JITTER", "Marginal", "RbfCovariance", "gaussian_process", "simulator_marginal"]
+__all__ = ["JITTER", "Marginal", "RbfCovariance", "gaussian_process", "moments", "simulator_marginal"]

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from carlab.core.planar import to_world
+
 
 @dataclass(frozen=True, slots=True)
 class DriveWindows:
@@ -75,8 +77,7 @@ def roll_out(windows: DriveWindows, change: Callable[[Tensor, int], Tensor]) -> 
         velocities = velocities + changes[-1][:, 3:]
     ahead, left, turn, *_ = torch.stack(changes, dim=-1).unbind(dim=1)
     yaw = turn.cumsum(dim=1)
-    sin, cos = torch.sin(yaw - turn), torch.cos(yaw - turn)
-    x, y = (cos * ahead - sin * left).cumsum(dim=1), (sin * ahead + cos * left).cumsum(dim=1)
+    x, y = (v.cumsum(dim=1) for v in to_world(ahead, left, yaw - turn))
     gained = torch.stack(changes, dim=1)[..., 3:].cumsum(dim=1)
     return torch.cat([torch.stack([x, y, yaw], dim=-1), start[:, None] + gained], dim=-1)
 

@@ -16,7 +16,7 @@ from learning.transitions import transitions_of
 
 CANDIDATE_LENGTHS = (0, 1, 2, 3, 4, 6, 8)
 MIN_GAIN_NATS = 0.1
-"""Minimum gain in leave-one-out log-likelihood per row for one more command."""
+"""Minimum gain in leave-one-out log-likelihood per row for one more command; times sqrt(k) for k more commands."""
 MIN_ROWS, MAX_ROWS = 60, 240
 STUDENT_DOF = 4.0
 

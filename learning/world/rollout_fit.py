@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from carlab.core.errors import DataError, DivergedError
+from carlab.core.robust import STD_OVER_MAD
 from learning.networks.adam import Adam
 from learning.networks.particles import Layers
 from learning.posterior.draws import with_raw_outputs
@@ -150,7 +151,7 @@ class _Problem:
             layers = posterior.network.split(posterior.parameters)
             paths = self._paths(_Functions.of(posterior, layers), chosen.expand(particles, -1))
         error = paths.mean(dim=0) - self.windows.motion[chosen].to(paths)
-        unit = 1.4826 * error.abs().median(dim=0).values
+        unit = STD_OVER_MAD * error.abs().median(dim=0).values
         return torch.maximum(unit, self.settings.min_unit_share * unit[-1]).clamp_min(1e-6)
 
     def gradient(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from struct import Struct
 from struct import error as StructError
 
 from carlab.core.errors import ProtocolError
 from mocap.natnet.models import (
+    BITSTREAM_3_0,
+    BITSTREAM_4_1,
     NEWEST_BITSTREAM,
     SERVED_BITSTREAMS,
     AssetDescription,
@@ -23,18 +25,14 @@ from mocap.natnet.models import (
     UnknownDescription,
     check_readable,
 )
-from mocap.natnet.reader import INT32, Reader, encode_text
+from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_counted, encode_text
 
-VECTOR = Struct("<3f")
 BODY = Struct("<ii3f")
 PLATE = Struct("<ff3f144f12f")
 POSE = Struct("<3f4f")
 ASSET_MARKER = Struct("<i3ffh")
-PAIR = Struct("<ii")
 
-_BITSTREAM_3_0 = BitstreamVersion(3, 0)
 _BITSTREAM_4_0 = BitstreamVersion(4, 0)
-_BITSTREAM_4_1 = BitstreamVersion(4, 1)
 
 
 def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Description, ...]:
@@ -48,7 +46,7 @@ def decode_model_def(payload: bytes, version: BitstreamVersion) -> tuple[Descrip
     """
     check_readable(version)
     reader = Reader(payload, f"NatNet model definitions read as bitstream {version}")
-    sized = version >= _BITSTREAM_4_1
+    sized = version >= BITSTREAM_4_1
     descriptions: list[Description] = []
     for index in range(reader.count(5)):
         reader.section = f"description {index}"
@@ -86,7 +84,7 @@ def _read_body(reader: Reader, version: BitstreamVersion) -> RigidBodyDescriptio
     positions: tuple[tuple[float, ...], ...] = ()
     labels: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
-    if version >= _BITSTREAM_3_0:
+    if version >= BITSTREAM_3_0:
         markers = reader.count(VECTOR.size + INT32.size)
         positions = tuple(reader.records(VECTOR, markers))
         labels = tuple([label for (label,) in reader.records(INT32, markers)])
@@ -171,7 +169,7 @@ def encode_model_def(descriptions: Sequence[Description], version: BitstreamVers
             kind, body = _encode(description, version)
         except StructError as error:
             raise ProtocolError(f"{description} holds a number that does not fit its field: {error}.") from error
-        parts.append(PAIR.pack(kind, len(body)) if version >= _BITSTREAM_4_1 else INT32.pack(kind))
+        parts.append(PAIR.pack(kind, len(body)) if version >= BITSTREAM_4_1 else INT32.pack(kind))
         parts.append(body)
     return b"".join(parts)
 
@@ -183,7 +181,7 @@ def _encode(item: Description, version: BitstreamVersion) -> tuple[int, bytes]:
         case RigidBodyDescription():
             return 1, _encode_body(item, version)
         case SkeletonDescription():
-            bones = _counted(_encode_body(bone, version) for bone in item.bones)
+            bones = encode_counted(_encode_body(bone, version) for bone in item.bones)
             return 2, encode_text(item.name) + INT32.pack(item.id) + bones
         case ForcePlateDescription():
             numbers = PLATE.pack(item.width_m, item.length_m, *item.origin_m, *item.calibration, *item.corners_m)
@@ -196,13 +194,13 @@ def _encode(item: Description, version: BitstreamVersion) -> tuple[int, bytes]:
         case CameraDescription():
             return 5, encode_text(item.name) + POSE.pack(*item.position_m, *item.quaternion)
         case AssetDescription():
-            bodies = _counted(_encode_body(body, version) for body in item.rigid_bodies)
-            markers = _counted(
+            bodies = encode_counted(_encode_body(body, version) for body in item.rigid_bodies)
+            markers = encode_counted(
                 encode_text(m.name) + ASSET_MARKER.pack(m.id, *m.position_m, m.size_m, m.params) for m in item.markers
             )
             return 6, encode_text(item.name) + PAIR.pack(item.asset_type, item.id) + bodies + markers
         case UnknownDescription():
-            if version < _BITSTREAM_4_1:
+            if version < BITSTREAM_4_1:
                 raise ProtocolError(f"Bitstream {version} cannot carry a description of unknown type {item.type_id}.")
             return item.type_id, item.data
 
@@ -221,10 +219,5 @@ def _encode_body(body: RigidBodyDescription, version: BitstreamVersion) -> bytes
     return b"".join(parts)
 
 
-def _counted(chunks: Iterable[bytes]) -> bytes:
-    parts = list(chunks)
-    return INT32.pack(len(parts)) + b"".join(parts)
-
-
 def _texts(names: Sequence[str]) -> bytes:
-    return _counted(encode_text(name) for name in names)
+    return encode_counted(encode_text(name) for name in names)

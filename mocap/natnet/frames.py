@@ -7,13 +7,15 @@ clock stamps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from struct import Struct
 from struct import error as StructError
 from typing import Any, TypeVar
 
 from carlab.core.errors import ProtocolError
 from mocap.natnet.models import (
+    BITSTREAM_3_0,
+    BITSTREAM_4_1,
     NEWEST_BITSTREAM,
     OLDEST_BITSTREAM,
     SERVED_BITSTREAMS,
@@ -27,25 +29,21 @@ from mocap.natnet.models import (
     Skeleton,
     check_readable,
 )
-from mocap.natnet.reader import INT32, Reader, encode_text
+from mocap.natnet.reader import INT32, PAIR, VECTOR, Reader, encode_counted, encode_text
 
 _T = TypeVar("_T")
 
-VECTOR = Struct("<3f")
 BODY = Struct("<i7ffh")
 BODY_HEAD = Struct("<i7f")
 BODY_TAIL = Struct("<fh")
 MARKER = Struct("<i3ffhf")
 MARKER_2 = Struct("<i3ffh")
 FLOAT = Struct("<f")
-PAIR = Struct("<ii")
 TRAILER_26 = Struct("<fIIfhi")
 TRAILER_27 = Struct("<fIIdhi")
 TRAILER_30 = Struct("<IIdQQQhi")
 TRAILER_41 = Struct("<IIdQQQIIhi")
 
-_BITSTREAM_3_0 = BitstreamVersion(3, 0)
-_BITSTREAM_4_1 = BitstreamVersion(4, 1)
 # One version for each distinct layout, to identify the version of an unreadable frame.
 _LAYOUTS = tuple(BitstreamVersion(*v) for v in ((4, 1), (3, 0), (2, 11), (2, 9), (2, 7), (2, 6)))
 _LAYOUT_NAMES = {
@@ -69,7 +67,7 @@ def decode_frame(payload: bytes, version: BitstreamVersion) -> Frame:
         ProtocolError: Unsupported version, or invalid bytes; names the byte and the section.
     """
     check_readable(version)
-    sized = version >= _BITSTREAM_4_1
+    sized = version >= BITSTREAM_4_1
     reader = Reader(payload, f"NatNet frame read as bitstream {version}", sized=sized)
     head = reader.section_count
     frame_number = reader.integer()
@@ -77,7 +75,7 @@ def decode_frame(payload: bytes, version: BitstreamVersion) -> Frame:
     marker_sets = tuple([_marker_set(reader) for _ in range(number)]) if number else ()
     number = head("other markers", VECTOR.size)
     other_markers = tuple(reader.records(VECTOR, number)) if number else ()
-    modern = version >= _BITSTREAM_3_0
+    modern = version >= BITSTREAM_3_0
     bodies = _bodies if modern else _bodies_2
     number = head("rigid bodies", BODY.size)
     rigid_bodies = bodies(reader, number) if number else ()
@@ -117,9 +115,9 @@ def _labelled(reader: Reader, number: int, modern: bool) -> tuple[LabelledMarker
 def _trailer(reader: Reader, version: BitstreamVersion) -> tuple[Any, ...]:
     """Time code to flags, in the order of ``Frame``'s last fields; zero for fields that the version lacks."""
     mid = received = transmit = precision_s = fraction = 0
-    if version >= _BITSTREAM_4_1:
+    if version >= BITSTREAM_4_1:
         code, sub, time_s, mid, received, transmit, precision_s, fraction, params, end = reader.take(TRAILER_41)
-    elif version >= _BITSTREAM_3_0:
+    elif version >= BITSTREAM_3_0:
         code, sub, time_s, mid, received, transmit, params, end = reader.take(TRAILER_30)
     else:
         _, code, sub, time_s, params, end = reader.take(TRAILER_27 if version >= (2, 7) else TRAILER_26)
@@ -201,7 +199,7 @@ def encode_frame(frame: Frame, version: BitstreamVersion = NEWEST_BITSTREAM) -> 
     if version not in SERVED_BITSTREAMS:
         served = ", ".join(map(str, SERVED_BITSTREAMS))
         raise ProtocolError(f"Frames of bitstream {version} cannot be written; choose one of {served}.")
-    sized = version >= _BITSTREAM_4_1
+    sized = version >= BITSTREAM_4_1
     if frame.assets and not sized:
         raise ProtocolError(f"Bitstream {version} has no assets; write this frame as 4.1.")
     try:
@@ -234,23 +232,20 @@ def _section(items: tuple[_T, ...], encode: Callable[[_T], bytes], sized: bool) 
     return (PAIR.pack(len(items), len(body)) if sized else INT32.pack(len(items))) + body
 
 
-def _counted(chunks: Iterable[bytes]) -> bytes:
-    parts = list(chunks)
-    return INT32.pack(len(parts)) + b"".join(parts)
-
-
 def _encode_marker_set(markers: MarkerSet) -> bytes:
-    return encode_text(markers.name) + _counted(VECTOR.pack(*p) for p in markers.positions_m)
+    return encode_text(markers.name) + encode_counted(VECTOR.pack(*p) for p in markers.positions_m)
 
 
 def _encode_skeleton(skeleton: Skeleton) -> bytes:
-    return INT32.pack(skeleton.id) + _counted(BODY.pack(*bone) for bone in skeleton.bones)
+    return INT32.pack(skeleton.id) + encode_counted(BODY.pack(*bone) for bone in skeleton.bones)
 
 
 def _encode_asset(asset: Asset) -> bytes:
-    bodies = _counted(BODY.pack(*body) for body in asset.rigid_bodies)
-    return INT32.pack(asset.id) + bodies + _counted(MARKER.pack(*marker) for marker in asset.markers)
+    bodies = encode_counted(BODY.pack(*body) for body in asset.rigid_bodies)
+    return INT32.pack(asset.id) + bodies + encode_counted(MARKER.pack(*marker) for marker in asset.markers)
 
 
 def _encode_analog(source: AnalogSource) -> bytes:
-    return INT32.pack(source.id) + _counted(_counted(FLOAT.pack(v) for v in channel) for channel in source.channels)
+    return INT32.pack(source.id) + encode_counted(
+        encode_counted(FLOAT.pack(v) for v in channel) for channel in source.channels
+    )

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from struct import Struct
-from struct import error as StructError
 from typing import NamedTuple
 
 from carlab.core.errors import ProtocolError
-from mocap.natnet.models import BitstreamVersion, MessageId
+from mocap.natnet.models import BitstreamVersion
 from mocap.natnet.reader import UINT16_PAIR
 
 HEADER_BYTES = 4
@@ -181,22 +180,9 @@ class Response(NamedTuple):
 
     def as_int(self) -> int:
         """The answer as int32. Raises ProtocolError."""
-        return int(self._number(_INT))
-
-    def as_float(self) -> float:
-        """The answer as float32. Raises ProtocolError."""
-        return float(self._number(_FLOAT))
-
-    def as_text(self) -> str:
-        """The answer as text, up to the first NUL."""
-        return _text(self.data)
-
-    def _number(self, layout: Struct) -> float:
-        try:
-            value: float = layout.unpack(self.data)[0]
-        except StructError:
-            raise ProtocolError(f"NatNet response of {len(self.data)} bytes is no number of 4 bytes.") from None
-        return value
+        if len(self.data) != _INT.size:
+            raise ProtocolError(f"NatNet response of {len(self.data)} bytes is no number of 4 bytes.")
+        return int(_INT.unpack(self.data)[0])
 
 
 def encode_response(value: int | float | str) -> bytes:
@@ -231,11 +217,3 @@ def _fixed(layout: Struct, payload: bytes, what: str) -> tuple[int, ...]:
     if len(payload) != layout.size:
         raise ProtocolError(f"NatNet {what} ends at byte {len(payload)}, in its stamps, and not at byte {layout.size}.")
     return layout.unpack(payload)
-
-
-def message_name(message_id: int) -> str:
-    """Name of a message for log lines."""
-    try:
-        return MessageId(message_id).name
-    except ValueError:
-        return f"message {message_id}"

@@ -55,7 +55,8 @@ class BitstreamVersion(NamedTuple):
 
 
 OLDEST_BITSTREAM = BitstreamVersion(2, 6)
-NEWEST_BITSTREAM = BitstreamVersion(4, 1)
+BITSTREAM_3_0, BITSTREAM_4_1 = BitstreamVersion(3, 0), BitstreamVersion(4, 1)
+NEWEST_BITSTREAM = BITSTREAM_4_1
 SERVED_BITSTREAMS = tuple(BitstreamVersion(*v) for v in ((3, 0), (3, 1), (4, 0), (4, 1)))
 """Versions that can be encoded and decoded; 2.6 to 2.11 can only be decoded."""
 
@@ -123,11 +124,6 @@ class LabelledMarker(NamedTuple):
     size_m: float
     params: int
     residual_m: float
-
-    @property
-    def is_occluded(self) -> bool:
-        """Whether no camera saw the marker; then its position is the model's."""
-        return bool(self.params & 1)
 
 
 class Asset(NamedTuple):

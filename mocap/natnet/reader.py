@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from struct import Struct
 from typing import Any
 
 from carlab.core.errors import ProtocolError
 
 INT32 = Struct("<i")
+PAIR = Struct("<ii")
+VECTOR = Struct("<3f")
 UINT16_PAIR = Struct("<HH")
 
 
@@ -104,3 +106,9 @@ def encode_text(text: str) -> bytes:
     if "\0" in text:
         raise ProtocolError(f"The name {text!r} contains a NUL, which would end it on the wire; choose another name.")
     return text.encode("utf-8") + b"\0"
+
+
+def encode_counted(chunks: Iterable[bytes]) -> bytes:
+    """Encode the number of entries, and the entries."""
+    parts = list(chunks)
+    return INT32.pack(len(parts)) + b"".join(parts)

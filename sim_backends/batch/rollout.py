@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 
+from carlab.core.planar import arc
 from sim_backends.array_ops import Ops, Value
 from sim_backends.batch.inputs import (
     Past,
@@ -323,10 +324,7 @@ class _Batch:
         tick = torch.arange(self.ticks + 1, device=like.device)[:, None]
         x, y, yaw, vx, vy, yaw_rate = self.rows
         dt = tick.to(like.dtype) * self.period_s - self._row(latency_s, like)
-        turn = yaw_rate * dt
-        along = torch.sinc(turn / torch.pi)
-        across = torch.sin(0.5 * turn) * torch.sinc(0.5 * turn / torch.pi)
-        forward, left = dt * (along * vx - across * vy), dt * (across * vx + along * vy)
+        forward, left, turn = arc(vx, vy, yaw_rate, dt)
         sin, cos = torch.sin(yaw), torch.cos(yaw)
         earlier: tuple[torch.Tensor, ...] = (x + cos * forward - sin * left, y + sin * forward + cos * left, yaw + turn)
         earlier += tuple(v.expand_as(dt) for v in (vx, vy, yaw_rate))

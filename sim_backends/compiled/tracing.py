@@ -14,8 +14,6 @@ from typing import Any, cast
 
 from sim_backends.array_ops import Ops
 
-Argument = "Node | float"
-
 
 @dataclass(eq=False, slots=True)
 class Node:

@@ -53,13 +53,6 @@ class ActuatorChain:
                 signals[effect.command] = effect.apply(self._ops, signals[effect.command], values)
         return signals["steering"], signals["throttle"]
 
-    def held(self, commands: tuple[Value, Value]) -> tuple[Value, Value]:
-        """Wheel angle [rad] and throttle [1] of a chain without memory."""
-        signals = {"steering": self._max_angle * commands[0], "throttle": commands[1]}
-        for effect, values in self._links:
-            signals[effect.command] = effect.apply(self._ops, signals[effect.command], values)
-        return signals["steering"], signals["throttle"]
-
     def step(
         self, commands: tuple[Value, Value], memory: ActuatorState, step_s: Value
     ) -> tuple[tuple[Triple, Triple], ActuatorState]:

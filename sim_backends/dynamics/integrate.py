@@ -109,7 +109,7 @@ def integrate_held(
     """
     advance = functools.partial(rk4_step, model) if stepper is None else stepper
     if not chain.has_memory:
-        held = model.actuation(*chain.held(commands))
+        held = model.actuation(*chain.settled_output(commands))
         for i in range(steps):
             state = advance(t_s + i * step_s, state, step_s, held, held, held)
         return state, memory

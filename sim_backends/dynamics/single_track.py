@@ -17,10 +17,8 @@ from typing import NamedTuple
 from sim_backends.array_ops import Ops, Value
 from sim_backends.car_parameters import GRAVITY_MPS2, ModelKind
 from sim_backends.dynamics.effect_hooks import EffectHooks
-from sim_backends.effects.base import Forces, StiffStep
+from sim_backends.effects.base import SLIP_FLOOR_MPS, Forces, StiffStep
 
-SLIP_FLOOR_MPS = 0.3
-"""Minimum speed in the denominator of the slip angle [m/s]."""
 RELAXATION_S = 0.05
 """Time constant with which the kinematic car's side speed and yaw rate settle [s]."""
 BLEND_FROM_MPS, BLEND_OVER_MPS = 0.3, 0.2

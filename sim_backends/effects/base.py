@@ -21,6 +21,8 @@ from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.inverse import newton_inverse
 
 GRAVITY_MPS2 = 9.81
+SLIP_FLOOR_MPS = 0.3
+"""Minimum speed in the denominator of a slip or a slip angle [m/s]."""
 
 Parameters = Mapping[str, Value]
 Triple = tuple[Value, Value, Value]

@@ -20,6 +20,7 @@ import numpy as np
 from carlab.core.quantities import FloatArray
 from sim_backends.array_ops import Ops, Value
 from sim_backends.effects.base import (
+    SLIP_FLOOR_MPS,
     ActuatorEffect,
     DynamicsEffect,
     Effect,
@@ -27,9 +28,6 @@ from sim_backends.effects.base import (
     Forces,
     Parameters,
 )
-
-SLIP_FLOOR_MPS = 0.3
-"""Minimum speed in the denominator of a slip angle [m/s], as in the base model."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,18 @@ from __future__ import annotations
 import math
 
 from sim_backends.array_ops import Ops, Value
-from sim_backends.effects.base import Confusable, DynamicsEffect, EffectParameter, Forces, Parameters, StepStart
+from sim_backends.effects.base import (
+    SLIP_FLOOR_MPS,
+    Confusable,
+    DynamicsEffect,
+    EffectParameter,
+    Forces,
+    Parameters,
+    StepStart,
+)
 
 WHEEL_RADIUS_M = 0.033
 """Radius of a wheel of a 1:10 touring car; the catalogue has no parameter for it. Inertia scales with its square."""
-SLIP_FLOOR_MPS = 0.3
-"""Minimum speed in the denominator of the slip, as for the slip angle [m/s]."""
 MIN_INERTIA_KGM2 = 1e-9
 """Inertias below this value are inactive: the wheels transmit the drive force, as in the base model [kg m2]."""
 SUBSTEPS = 4

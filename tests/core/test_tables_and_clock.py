@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import circmean
 
-from carlab.core.angles import align_unwrapped, circular_mean, difference, wrap
+from carlab.core.angles import align_unwrapped, wrap
 from carlab.core.clock import MonotonicClock, Pacer, SimulatedClock
 from carlab.core.errors import ConfigError
 from carlab.core.tables import from_table
@@ -90,15 +89,6 @@ def test_wrap_keeps_the_direction(angle: float) -> None:
     assert -math.pi <= wrapped <= math.pi
     assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
     assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
-
-
-def test_difference_is_the_smallest_angle() -> None:
-    assert difference(-3.1, 3.1) == pytest.approx(2 * math.pi - 6.2)
-
-
-def test_circular_mean_agrees_with_scipy(rng: np.random.Generator) -> None:
-    angles = rng.normal(math.pi, 0.4, 500)
-    assert circular_mean(angles) == pytest.approx(circmean(angles, high=math.pi, low=-math.pi), abs=1e-9)
 
 
 def test_predictions_are_unwrapped_onto_the_measured_angle():

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from impacts import Blow, Lift
 
 from carlab.benchmark.world.base_car import BaseCar
-from carlab.benchmark.world.impacts import Blow, Lift
 from carlab.benchmark.world.physics import Instant, World
 from carlab.benchmark.world.simulation import drive
 from carlab.core.episode_data import EpisodeData

@@ -17,6 +17,7 @@ from typing import Any
 import can
 import pytest
 from can.interfaces.virtual import VirtualBus
+from faulty_frame_link import FaultyFrameLink
 
 from carlab.core.errors import ActuatorFaultError, NotReadyError
 from carlab.core.quantities import Action
@@ -25,7 +26,7 @@ from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig
 from drivers.emulators.can_firmware import CanFirmware
 from drivers.emulators.command_log import CommandLog, read_log
-from drivers.emulators.faults import FaultyFrameLink, WireFaults
+from drivers.emulators.faults import WireFaults
 from drivers.emulators.vesc_firmware import VescFirmware
 from drivers.links.can_link import CanLink
 from drivers.links.link import CanFrame
@@ -135,7 +136,7 @@ def test_ping_is_answered() -> None:
     with CanFirmware(VescFirmware(CommandLog()), "virtual", channel, status_rate_hz=0.0):
         link = CanLink("virtual", channel)
         link.open()
-        link.write(vesc_can_codec.ping(23, 42))
+        link.write(CanFrame(0x1117, b"\x2a"))
         replies: list[CanFrame] = []
         until(lambda: bool(replies.extend(link.read()) or replies))
         assert replies == [CanFrame(0x122A, b"\x17\x00")]

@@ -4,12 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from impacts import Blow, Lift
 
 from carlab.benchmark.effects.catalogue import Draw
 from carlab.benchmark.effects.forms import all_forms
 from carlab.benchmark.world.base_car import BaseCar, draw_nominal
 from carlab.benchmark.world.driver import HumanDriver, Track
-from carlab.benchmark.world.impacts import Blow, Lift
 from carlab.benchmark.world.measurement import Noise, record
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import drive

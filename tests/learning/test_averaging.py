@@ -10,10 +10,11 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from carlab.studies.regression.cases import CASES
-from carlab.studies.regression.methods import PRIOR_FUNCTION, FitTask
+from carlab.studies.regression.methods import FitTask
 from learning.evaluation import Mixture, WeightedMixture, calibration_error, negative_log_likelihood
 from learning.posterior import averaging
 from learning.posterior.averaging import average, averaging_weights, held_out_log_densities
+from learning.world.car_fit import PRIOR_FUNCTION
 
 
 class Gaussian:

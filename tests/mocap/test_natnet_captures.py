@@ -10,15 +10,14 @@ from natnet.data_descriptions import DataDescriptions
 from natnet.data_frame import DataFrame
 from natnet.packet_buffer import PacketBuffer
 from natnet.version import Version
+from natnet_datagrams import decode_datagram
 from scipy.spatial.transform import Rotation
 
 from mocap.natnet.codec import (
     BitstreamVersion,
     Connect,
-    EchoResponse,
     Frame,
     ServerInfo,
-    decode_datagram,
     decode_frame,
     encode_connect,
     encode_frame,
@@ -86,9 +85,8 @@ def test_connect_and_discovery_are_decoded_and_encoded(captures: dict[str, bytes
 def test_echo_request_and_response_are_decoded(captures: dict[str, bytes]) -> None:
     _, stamp = decode_datagram(captures["echorequest"], V3)
     _, echo = decode_datagram(captures["echoresponse"], V3)
-    assert isinstance(echo, EchoResponse)
-    assert echo.stamp == stamp == 278554190
-    assert echo.server_ticks == 0x149CDE48504
+    assert stamp == 278554190
+    assert echo == (stamp, 0x149CDE48504)
 
 
 def test_frame_has_the_known_values(captures: dict[str, bytes]) -> None:
@@ -140,7 +138,7 @@ def test_occluded_marker_is_decoded(captures: dict[str, bytes]) -> None:
     frame = frame_of(captures, "occluded")
     assert frame.frame_number == 269007
     assert [s.name for s in frame.marker_sets] == ["FakeTree", "all"]
-    assert [m.is_occluded for m in frame.labelled_markers] == [True, False, False, False]
+    assert [m.params & 1 for m in frame.labelled_markers] == [1, 0, 0, 0]
 
 
 def test_encoding_reproduces_the_captured_bytes(captures: dict[str, bytes]) -> None:

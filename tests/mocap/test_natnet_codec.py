@@ -11,13 +11,13 @@ from natnet.data_descriptions import DataDescriptions
 from natnet.data_frame import DataFrame
 from natnet.packet_buffer import PacketBuffer
 from natnet.version import Version
+from natnet_datagrams import decode_datagram
 
 from carlab.core.errors import ProtocolError
 from mocap.natnet.codec import (
     BitstreamVersion,
     Frame,
     decode_connect,
-    decode_datagram,
     decode_frame,
     decode_model_def,
     decode_server_info,

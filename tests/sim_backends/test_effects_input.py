@@ -34,11 +34,11 @@ def angles(effects, commands, step_s=0.01, start=0.0):
 
 
 def angle(effects, steering):
-    return chain(effects).held((steering, 0.0))[0]
+    return chain(effects).settled_output((steering, 0.0))[0]
 
 
 def throttle(effects, command):
-    return chain(effects).held((0.0, command))[1]
+    return chain(effects).settled_output((0.0, command))[1]
 
 
 def test_rate_limit_takes_the_time_of_its_ramp():

@@ -111,7 +111,7 @@ def prepare(fit: Table, hold: Table, nominal: BaseCar, floor: Mapping[str, float
     """Clean the columns, refit the base model, and cut both recordings into short steps."""
     floors = np.array([floor[name] for name in ("x", "y", "yaw", "vx", "vy", "yaw_rate")])
     recordings = [clean(table, nominal, floors) for table in (fit, hold)]
-    windows = [with_floor(cut_windows(r, nominal), floors) for r in recordings]
+    windows = [cut_windows(r, nominal).with_floor(floors) for r in recordings]
     fitted = refit(windows[0], windows[1], nominal)
     car = nominal.with_free(fitted.values)
     cut = [short_steps(r, car) for r in recordings]
@@ -154,12 +154,6 @@ def clean(table: Table, car: BaseCar, floors: FloatArray) -> Recording:
     last = np.clip(np.searchsorted(t, even + 1e-6, side="right") - 1, 0, len(t) - 1)
     commands = np.stack([np.nan_to_num(table[name])[last] for name in ("steering", "throttle")], axis=1)
     return Recording(even - even[0], measured, commands, np.zeros_like(measured))
-
-
-def with_floor(windows: Windows, floors: FloatArray) -> Windows:
-    """Windows whose noise floor is given."""
-    even = np.repeat(floors[None], len(windows.starts), axis=0)
-    return Windows(windows.car, windows.steps_s, windows.starts, windows.commands, windows.recorded, even)
 
 
 def short_steps(recording: Recording, car: BaseCar) -> tuple[Steps, FloatArray]:

@@ -8,7 +8,7 @@ state, against the noisy recording.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,10 @@ class Windows:
         """Noise floor of the six channels."""
         return np.asarray(np.sqrt((self.floor_errors**2).mean(axis=0)), dtype=np.float64)
 
+    def with_floor(self, floor: FloatArray) -> Windows:
+        """The windows with a given noise floor (6,)."""
+        return replace(self, floor_errors=np.repeat(floor[None], len(self.starts), axis=0))
+
 
 @dataclass(frozen=True)
 class Refit:
@@ -47,7 +51,6 @@ class Refit:
     values: dict[str, float]
     nominal_score: float
     score: float
-    fit_score: float
     channels: tuple[float, ...]
 
     @property
@@ -165,7 +168,7 @@ def refit(fit: Windows, held_out: Windows, nominal: BaseCar, iterations: int = 1
     values = dict(zip(names, (centre * np.exp(logs)).tolist(), strict=True))
     channels = channel_scores(held_out, values)
     total = float(np.sqrt((channels**2).mean()))
-    return Refit(values, score(held_out, nominal.free()), total, score(fit, values), tuple(channels.tolist()))
+    return Refit(values, score(held_out, nominal.free()), total, tuple(channels.tolist()))
 
 
 def _linearise(

@@ -127,7 +127,7 @@ def _window_losses(name: str, nominal: BaseCar, recordings: list[Recording], flo
 
     def cut(value: float) -> list[Windows]:
         windows = [cut_windows(r, nominal, every_s=1.0, changes=[build(value, nominal)]) for r in recordings]
-        return [_with_floor(s, floor) for s in windows]
+        return [s.with_floor(floor) for s in windows]
 
     def cost(value: float) -> float:
         windows = cut(value)
@@ -142,11 +142,6 @@ def _window_losses(name: str, nominal: BaseCar, recordings: list[Recording], flo
     ends = roll(nominal, values, windows[1].starts, windows[1].commands, windows[1].steps_s)
     errors = in_start_frame(ends - windows[1].recorded, windows[1].starts) / floor
     return np.asarray(0.5 * (errors**2).sum(axis=1), dtype=np.float64)
-
-
-def _with_floor(windows: Windows, floor: FloatArray) -> Windows:
-    even = np.repeat(floor[None], len(windows.starts), axis=0)
-    return Windows(windows.car, windows.steps_s, windows.starts, windows.commands, windows.recorded, even)
 
 
 def _recording(table: Mapping[str, FloatArray]) -> Recording:

@@ -35,11 +35,10 @@ from carlab.benchmark.real.cases import (
 )
 from carlab.benchmark.real.kinds import FULL_LOCK, KINDS
 from carlab.core.errors import ConfigError, DataError
-from carlab.jobs.child_jobs import PYTHON, ChildJob
+from carlab.jobs.child_jobs import CARLAB, ChildJob
 from carlab.jobs.child_processes import ChildEnd
 
 OTHER, CAR, MODEL = "other_{}.csv", "car.toml", "model.toml"
-CARLAB = (PYTHON, "-m", "carlab")
 ONE_PROCESS = ("--jobs", "1")
 REFERENCE_OPTIONS = ("--effects", "command_delay", "--curves", *ONE_PROCESS)
 CONCEALABLE_EFFECTS = tuple(sorted({name for kind in KINDS for name in kind.names if "." not in name}))

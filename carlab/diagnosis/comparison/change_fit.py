@@ -9,15 +9,14 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.comparison.error_model import ErrorModel
-from carlab.diagnosis.identification.fit import Fitter
+from carlab.diagnosis.identification.fit import MAX_STEP, Fitter
 from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.settings import ComparisonSettings
 from sim_backends.car_parameters import SimulatorConfig
 
 DAMPINGS = (0.0, 0.1, 1.0, 10.0, 100.0)
 CHANGE_DIFFERENCE_STEP = 0.3
-"""Step of the Jacobian, in coordinates; for the reason see ``identification.fit.DELAY_DIFFERENCE_STEP``."""
-MAX_STEP = 8.0
+"""Step of the Jacobian, in coordinates; for the reason see ``fit_parameters.DELAY_DIFFERENCE_STEP``."""
 
 
 @dataclass(frozen=True, slots=True)

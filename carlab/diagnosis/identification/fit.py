@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from carlab.core.quantities import FloatArray
+from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
@@ -42,12 +43,23 @@ class Scale:
         """Robust spread of errors (S, K + 1, 6) of the best model so far, at least the floor (6,)."""
         last = error.shape[1] - 1
         steps = np.unique(np.linspace(last / settings.loss_steps, last, settings.loss_steps).round().astype(int))
-        spread = 1.4826 * np.median(np.abs(error[:, steps]), axis=0)
+        spread = STD_OVER_MAD * np.median(np.abs(error[:, steps]), axis=0)
         return cls(steps, np.maximum(share * spread, floor))
 
     def white(self, error: FloatArray) -> FloatArray:
         """Whitened errors (..., U, 6) of errors (..., K + 1, 6)."""
         return error[..., self.steps, :] / self.sigma
+
+
+MAX_STEP = 8.0
+"""Maximum change of a coordinate in an iteration."""
+_MAX_WHITE = 1e4
+
+
+def bounded(white: FloatArray) -> FloatArray:
+    """Whitened errors of which none is infinite or NaN, as those of a diverged simulation are."""
+    finite = np.nan_to_num(white, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
+    return finite.clip(-_MAX_WHITE, _MAX_WHITE)
 
 
 def huber(white: FloatArray, delta: float = DEFAULT.identification.huber_delta) -> FloatArray:
@@ -117,7 +129,7 @@ class Fitter:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
             predicted = simulate_windows(windows, config, values, ticks=self.scale.steps)
             white = prediction_errors(predicted, windows, self.scale.steps) / self.scale.sigma
-        return np.asarray(np.nan_to_num(white, nan=1e4, posinf=1e4, neginf=-1e4).clip(-1e4, 1e4))
+        return bounded(white)
 
     def jacobian(
         self, config: SimulatorConfig, free: Sequence[FitParameter], z: FloatArray, white: FloatArray
@@ -211,7 +223,7 @@ class Fitter:
                 for value in dampings:
                     matrix = normal + value * np.diag(np.diag(normal) + 1e-9)
                     trials.append(z - np.linalg.solve(matrix, gradient))
-                tried = np.clip(np.array(trials), z - 8.0, z + 8.0)
+                tried = np.clip(np.array(trials), z - MAX_STEP, z + MAX_STEP)
                 whites = self.white(config, free, tried)
                 costs = self.huber(whites).sum(axis=(1, 2, 3)) + self.prior(free, tried)
                 best = int(np.argmin(costs))

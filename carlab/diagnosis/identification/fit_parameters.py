@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -152,8 +152,3 @@ def with_effect(config: SimulatorConfig, effect_id: str) -> SimulatorConfig:
         identity = p.typical if p.identity is None else p.identity
         given[p.name] = min(50.0 * p.typical, p.high) if math.isinf(identity) else identity
     return replace(config, effects={**config.effects, effect_id: given})
-
-
-def describe(values: Mapping[str, float]) -> str:
-    """Format values in one line for the log."""
-    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import huber
+from carlab.diagnosis.identification.fit import bounded, huber
 from carlab.diagnosis.identification.fit_parameters import FitParameter
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.errors import prediction_errors
@@ -25,8 +25,6 @@ from sim_backends.car_parameters import SimulatorConfig
 
 _REWEIGHTINGS = 6
 """Iterations of reweighted least squares; the loss of windows of the proof changes by less than 1e-3 after four."""
-_MAX_WHITE = 1e4
-"""Bound of a whitened error, as in ``fit.Fitter``."""
 
 
 def loss_of_free_initial_states(
@@ -96,8 +94,7 @@ def linearised_by_initial_states(
             replace(stacked, initial_states=moved.reshape(-1, 6)), config, values, in_double=True
         )
         error = prediction_errors(predicted.reshape(7, count, -1, 6), windows)[:, :, 1:]
-        white = np.nan_to_num(error / measured_std, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
-    white = white.clip(-_MAX_WHITE, _MAX_WHITE).reshape(7, count, -1)
+        white = bounded(error / measured_std).reshape(7, count, -1)
     return white[0], np.moveaxis(white[1:] - white[0], 0, -1)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.core.recording_noise import RecordingNoise, StateStd
+from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.identification.fit import clustered_gain, huber
 from carlab.diagnosis.identification.measurement_noise import Noise
@@ -84,7 +85,7 @@ class HeldOut:
 
     def gain(self, without: FloatArray, with_it: FloatArray) -> tuple[float, float]:
         """Held-out gain in Huber log-likelihood from errors (S, 6) to errors (S, 6), and its clustered error."""
-        scale = np.maximum(1.4826 * np.median(np.abs(with_it), axis=0), self.floor)
+        scale = np.maximum(STD_OVER_MAD * np.median(np.abs(with_it), axis=0), self.floor)
         before, after = (huber(e / scale, self.huber_delta).sum(axis=1) for e in (without, with_it))
         return clustered_gain(before, after, self.windows)
 

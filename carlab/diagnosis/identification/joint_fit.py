@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.identification.fit import Fit, Fitter, huber
+from carlab.diagnosis.identification.fit import MAX_STEP, Fit, Fitter, bounded, huber
 from carlab.diagnosis.identification.fit_parameters import FitParameter, difference_steps
 from carlab.diagnosis.identification.free_initial_states import (
     initial_state_correction,
@@ -36,9 +36,6 @@ _DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0)
 """Levenberg-Marquardt dampings, relative to the diagonal; the first that lowers the cost is used."""
 _STATE_STEP = 0.05
 """Difference of the initial states for derivatives, in standard deviations of the noise."""
-_MAX_STEP = 8.0
-"""Maximum change of a coordinate in an iteration, as in ``fit.Fitter``."""
-_MAX_WHITE = 1e4
 """Bound of a whitened error, as in ``fit.Fitter``."""
 _NORMAL_MEDIAN_SQUARE = 0.4549
 """Median of the square of a standard normal variable."""
@@ -124,7 +121,7 @@ def _iterated(problem: _Problem, point: _Point, precision: FloatArray) -> tuple[
     diagonal = np.diag(np.diag(normal) + 1e-9)
     steps = [-np.linalg.solve(normal + damping * diagonal, gradient) for damping in _DAMPINGS]
     for step in (*steps, np.zeros(len(gradient))):
-        change = step.clip(-_MAX_STEP, _MAX_STEP)
+        change = step.clip(-MAX_STEP, MAX_STEP)
         followed = point.states + np.einsum("skn,n->sk", following, change) * problem.std
         trial = _trial(problem, point.z + change, followed, at.shift, precision)
         if trial.cost < point.cost:
@@ -215,8 +212,7 @@ class _Problem:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation is clipped below
             predicted = simulate_windows(stacked, self.config, values, in_double=True).reshape(sets, count, -1, 6)
             white = prediction_errors(predicted, windows)[:, :, 1:] / self.std
-        white = np.nan_to_num(white, nan=_MAX_WHITE, posinf=_MAX_WHITE, neginf=-_MAX_WHITE)
-        return np.asarray(white.clip(-_MAX_WHITE, _MAX_WHITE).reshape(sets, count, -1))
+        return bounded(white).reshape(sets, count, -1)
 
     def linearised(self, z: FloatArray, states: FloatArray) -> _Linearisation:
         """Errors at the best initial states near ``states`` (S, 6), and derivatives."""

@@ -16,6 +16,7 @@ from scipy.signal import freqz, savgol_coeffs, welch
 
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise, StateStd
+from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
 from carlab.prediction.windows import MIN_QUINTIC_WIDTH, Track, smoothing_width
 
@@ -88,7 +89,7 @@ def _deviation(
     residual: FloatArray, period_s: float, width: int, *, velocity: bool, settings: IdentificationSettings
 ) -> float:
     """Standard deviation of the noise whose residual (n,) of a local cubic over ``width`` samples is ``residual``."""
-    spread = 1.4826 * float(np.median(np.abs(residual)))
+    spread = STD_OVER_MAD * float(np.median(np.abs(residual)))
     if spread == 0.0:
         return 0.0
     limit = settings.noise_max_z * spread

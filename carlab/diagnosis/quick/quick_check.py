@@ -7,8 +7,7 @@ several effects together, tests them against confusable effects, and scores them
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -16,7 +15,8 @@ import numpy as np
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
-from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.json_files import plain
+from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.diagnosis.identification.fit import Fitter
 from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
@@ -32,10 +32,7 @@ from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import HISTORY_S, PredictionWindows, cut_windows, tracks_of
 from sim_backends.car_parameters import SimulatorConfig
 
-log = logging.getLogger(__name__)
-
 SCHEMA = "carlab.light_diagnosis/1"
-UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 JSON_KEYS = {"windows": "shots", "with_refit": "beside_numbers", "ties_with_first": "like_the_first"}
 """Keys of the file format that differ from the attributes."""
 Verdict = Literal["explains", "left", "undecided"]
@@ -90,8 +87,7 @@ class QuickCheck:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for a file; numbers that are not finite become null."""
-        plain: Any = _plain({"schema": SCHEMA, **asdict(self), "excess": self.excess})
-        return dict(plain)
+        return dict(plain({"schema": SCHEMA, **asdict(self), "excess": self.excess}, JSON_KEYS))
 
 
 def quick_check(
@@ -217,18 +213,9 @@ def _blocks_above(final: FloatArray, windows: PredictionWindows, score_max: floa
 def _channels(final: FloatArray, floor: FloatArray) -> tuple[ChannelError, ...]:
     rms = np.sqrt(np.mean(final**2, axis=0))
     return tuple(
-        ChannelError(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), UNITS[k]) for k in np.argsort(-rms)
+        ChannelError(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), STATE_UNITS[k])
+        for k in np.argsort(-rms)
     )
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, Mapping):
-        return {JSON_KEYS.get(str(k), str(k)): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
 
 
 __all__ = ["SCHEMA", "ChannelError", "QuickCheck", "Verdict", "held_out_loss", "quick_check"]

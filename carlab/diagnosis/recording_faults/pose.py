@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
+from carlab.core.angles import wrap
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair
 from carlab.recording.column_mapping import UNITS
 from carlab.recording.faults.fault import Fault
 from carlab.recording.faults.heading import heading_faults
 from carlab.recording.faults.pose import rows_off_path, stale_rows
-from carlab.recording.faults.robust import runs, wrapped
+from carlab.recording.faults.robust import runs
 from carlab.recording.faults.stamps import gap_rows
 from carlab.recording.pose_velocity import BoolArray
 
@@ -143,7 +144,7 @@ def _interpolate(repair: EpisodeRepair, bad: BoolArray, *, columns: int) -> str:
         span = t_s[good] - t_s[first]
         scale = max(float(np.abs(span).max()), 1e-9)
         values = states[good, :columns]
-        values[:, 2] = np.unwrap(wrapped(values[:, 2]))
+        values[:, 2] = np.unwrap(wrap(values[:, 2]))
         fitted = np.linalg.lstsq(np.vander(span / scale, 4, increasing=True), values, rcond=None)[0]
         design = np.vander((t_s[first:last] - t_s[first]) / scale, 4, increasing=True)
         states[first:last, :columns] = design @ fitted

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from carlab.core.planar import to_body
 from carlab.diagnosis.recording_faults.episode_repair import EpisodeRepair
 from carlab.recording.audit.audit import Channels
 from carlab.recording.column_mapping import POSE_CHANNELS, VELOCITY_CHANNELS
@@ -67,9 +68,8 @@ def _check_frame(repair: EpisodeRepair, motion: PoseMotion) -> None:
     fault = wrong_velocity_frame(repair.times_s, repair.states[:, 3:5].T, motion, "body")
     if fault is None:
         return
-    c, s = np.cos(motion.yaw_unwrapped), np.sin(motion.yaw_unwrapped)
-    vx, vy = repair.states[:, 3:5].T.copy()
-    repair.states[:, 3], repair.states[:, 4] = c * vx + s * vy, c * vy - s * vx
+    vx, vy = repair.states[:, 3:5].T
+    repair.states[:, 3], repair.states[:, 4] = to_body(vx, vy, motion.yaw_unwrapped)
     repair.repaired(fault, "the velocities were rotated by the yaw")
 
 

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from carlab.core.angles import wrap
-from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.diagnosis.findings import EffectFinding, Exhibits, Trace
 from carlab.diagnosis.report.sentences import CHANNEL_WORDS, number, percent, unit_text
 from carlab.diagnosis.report.svg import Chart, bar_rows, padded
@@ -29,7 +29,6 @@ LABELS = {
     "noise_floor": "noise floor",
     "recorded": "recorded",
 }
-UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 RESTART_FALL = 0.3
 """A restart lowers the position error below this share of that of the row before."""
 
@@ -130,7 +129,7 @@ def overlay(trace: Trace, stretch: tuple[float, float], effects: Sequence[Effect
             (float(trace.times_s[rows[0]]), float(trace.times_s[rows[-1]]) + 1e-9),
             padded(values, 0.1, 1e-3),
             (420, 300),
-            ("time [s]", f"{CHANNEL_WORDS[STATE_NAMES[k]]} [{UNITS[k]}]"),
+            ("time [s]", f"{CHANNEL_WORDS[STATE_NAMES[k]]} [{STATE_UNITS[k]}]"),
         )
         chart.line(trace.times_s[rows], seen[:, k], "recorded")
         for model in models:

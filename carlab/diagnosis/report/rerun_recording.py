@@ -27,7 +27,7 @@ from carlab.diagnosis.report.figures import LABELS, MODELS, residual, restarts
 from carlab.diagnosis.report.sentences import number, verdict_sentence
 from carlab.recording.atomic_files import rerun_file
 from carlab.recording.rerun import blueprint
-from carlab.recording.rerun.columns import Columns, entity_part
+from carlab.recording.rerun.columns import Columns, entity_part, yaw_quaternion
 
 VERDICT = "verdict"
 COLORS = {
@@ -121,10 +121,8 @@ def _send_car(
         return
     indexes = columns.indexes(times_s[rows], rows.tolist())
     places = np.column_stack([states[rows, :2], np.zeros(len(rows))])
-    half_rad = 0.5 * states[rows, 2]
-    zeros = np.zeros(len(rows))
-    turns = np.column_stack([zeros, zeros, np.sin(half_rad), np.cos(half_rad)])
-    stream.send_columns(car, indexes, rr.Transform3D.columns(translation=places, quaternion=turns))
+    turns = rr.Transform3D.columns(translation=places, quaternion=yaw_quaternion(states[rows, 2]))
+    stream.send_columns(car, indexes, turns)
     starts = np.vstack([places[:1], places[:-1]])
     restarted = np.isin(rows, begins)
     starts[restarted] = places[restarted]

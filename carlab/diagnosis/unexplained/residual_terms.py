@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.identification.fit import Scale
 from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
@@ -155,7 +156,7 @@ def responses(
     impulses = settings.impulse_sizes
     every = max(windows.steps // settings.impulses, 1)
     begins = np.arange(every // 2, windows.steps, every)
-    sin, cos = np.sin(windows.initial_states[:, 2]), np.cos(windows.initial_states[:, 2])
+    yaw = windows.initial_states[:, 2, None]
     matrix = np.zeros((3, len(begins), len(windows), len(scale.steps), 6))
     for j, begin in enumerate(begins):
         outs = []
@@ -167,9 +168,7 @@ def responses(
         later = scale.steps > begin
         for which in range(3):
             change = (outs[1 + which] - outs[0])[:, scale.steps[later] - begin] / impulses[which]
-            dx, dy = change[..., 0].copy(), change[..., 1].copy()
-            change[..., 0] = cos[:, None] * dx + sin[:, None] * dy
-            change[..., 1] = cos[:, None] * dy - sin[:, None] * dx
+            change[..., 0], change[..., 1] = to_body(change[..., 0], change[..., 1], yaw)
             matrix[which, j][:, later] = change / scale.sigma[later]
     matrix = np.nan_to_num(matrix.clip(-1e3, 1e3))
     return Responses(matrix, features(windows, predicted, config, begins), every * windows.period_s)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import gamma
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
 from carlab.prediction.windows import Track
 
@@ -60,7 +61,7 @@ def find_vibration(tracks: Sequence[Track], settings: UnexplainedSettings = DEFA
     power, strength, by_time = (np.zeros((6, n)) for n in (len(PERIODS_PER_M), len(PERIODS_PER_M), len(FREQUENCIES_HZ)))
     blocks = 0
     for track in tracks:
-        spread = 1.4826 * np.median(np.abs(track.residual), axis=0)
+        spread = STD_OVER_MAD * np.median(np.abs(track.residual), axis=0)
         residual = np.clip(track.residual, -settings.vibration_max_z * spread, settings.vibration_max_z * spread)
         distance_m = np.cumsum(track.speed) * track.sampled_s
         length = max(round(settings.vibration_block_s / track.sampled_s), 2)

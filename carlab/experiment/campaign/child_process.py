@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
+from typing import Any
 
+from carlab.core.errors import CarlabError
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.1
 _IMPORTED_ONCE = (
     "carlab.diagnosis.quick.quick_check",
     "carlab.experiment.campaign.training",
@@ -14,6 +23,14 @@ _IMPORTED_ONCE = (
     "learning.world.model_env",
     "torch._dynamo",  # torch imports it when the first optimiser is created
 )
+
+
+class ChildError(Exception):
+    """A child process ``failed`` with an expected error, ``crashed`` with another one, or ``died`` (exit code)."""
+
+    def __init__(self, end: str, text: str) -> None:
+        super().__init__(text)
+        self.end = end
 
 
 def child_context() -> ForkServerContext:
@@ -26,4 +43,85 @@ def child_context() -> ForkServerContext:
     return context
 
 
-__all__ = ["child_context"]
+def run_in_child(
+    name: str,
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    stop: Callable[[], bool],
+    *,
+    on_report: Callable[..., None] | None = None,
+    expected: tuple[type[Exception], ...] = (CarlabError,),
+) -> Any:
+    """Call a function in another process, and wait for it.
+
+    Args:
+        name: of the process.
+        function: a function of a module.
+        arguments: of the function; with ``on_report`` it gets one more, which it calls to report.
+        stop: polled; once true, the process is terminated.
+        on_report: called with the arguments of each report.
+        expected: errors with a complete message.
+
+    Returns:
+        The result; None if ``stop`` ended it.
+
+    Raises:
+        ChildError: the function raised an error, or the process died.
+    """
+    context = child_context()
+    receiver, sender = context.Pipe(duplex=False)
+    call = (sender, name, function, arguments, on_report is not None, expected)
+    child = context.Process(target=_call, args=call, daemon=True, name=name)
+    child.start()
+    sender.close()
+    try:
+        while not stop():
+            if receiver.poll(POLL_S):
+                kind, content = receiver.recv()
+                if kind == "done":
+                    return content
+                if kind != "report":
+                    raise ChildError(kind, content)
+                assert on_report is not None
+                on_report(*content)
+        return None
+    except EOFError:
+        child.join()
+        raise ChildError("died", f"exit code {child.exitcode}") from None
+    finally:
+        if child.is_alive():
+            child.terminate()
+        child.join()
+        receiver.close()
+
+
+def _call(
+    pipe: Connection,
+    name: str,
+    function: Callable[..., Any],
+    arguments: tuple[Any, ...],
+    reports: bool,
+    expected: tuple[type[Exception], ...],
+) -> None:
+    import signal
+
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles ^C and terminates this process.
+    torch.set_num_threads(1)
+    if reports:
+        arguments = (*arguments, lambda *what: pipe.send(("report", what)))
+    try:
+        pipe.send(("done", function(*arguments)))
+    except BrokenPipeError:
+        pass
+    except expected as error:
+        pipe.send(("failed", str(error)))
+    except (Exception, SystemExit) as error:
+        log.exception("The %s failed", name)
+        pipe.send(("crashed", f"{type(error).__name__}: {error}"))
+    finally:
+        pipe.close()
+
+
+__all__ = ["ChildError", "child_context", "run_in_child"]

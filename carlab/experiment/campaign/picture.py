@@ -13,12 +13,11 @@ import numpy as np
 from carlab.core.angles import align_unwrapped
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import episode_features
-from carlab.core.quantities import STATE_NAMES
+from carlab.core.quantities import STATE_NAMES, STATE_UNITS
 from carlab.core.task import Task
 from carlab.experiment.campaign.figures import EpisodeFigures, WindowPredictions
 
 CAR_M = (0.3, 0.16)
-UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 CHARACTERS_PER_LINE = 210
 
 
@@ -153,7 +152,7 @@ def _state(axis: Any, which: int, episode: EpisodeData, predictions: WindowPredi
         axis.plot(at_s, window_mean, color="tab:orange", linewidth=1.2)
         low, high = window_mean - 2.0 * window_std, window_mean + 2.0 * window_std
         axis.fill_between(at_s, low, high, color="tab:orange", alpha=0.25, linewidth=0)
-    axis.set_title(f"{STATE_NAMES[which].replace('_', ' ')} [{UNITS[which]}]", fontsize=9)
+    axis.set_title(f"{STATE_NAMES[which].replace('_', ' ')} [{STATE_UNITS[which]}]", fontsize=9)
     axis.set_xlabel("t [s]", fontsize=8)
     axis.tick_params(labelsize=7)
     axis.grid(alpha=0.3)

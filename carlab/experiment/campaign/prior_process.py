@@ -7,7 +7,6 @@ unchanged; the run continues.
 from __future__ import annotations
 
 import json
-import logging
 import math
 import tomllib
 from collections.abc import Callable, Sequence
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.json_files import read_json
-from carlab.experiment.campaign.child_process import child_context
+from carlab.experiment.campaign.child_process import ChildError, run_in_child
 from carlab.experiment.campaign.prior_repair import (
     PARAMETERS,
     Correction,
@@ -36,15 +35,12 @@ if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
     from carlab.diagnosis.findings import Diagnosis
 
-log = logging.getLogger(__name__)
-
 REPAIR_FILE = "repair.json"
 DIAGNOSIS_BUDGET_S = 60.0
 """Time limit of a diagnosis between two episodes [s]."""
 EPISODES_BETWEEN_DIAGNOSES = 3
 HELD_OUT_EVERY = 3
 """Every third episode is held out from a diagnosis."""
-POLL_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,26 +84,14 @@ def run_repair_subprocess(request: RepairRequest, stop: Callable[[], bool] = lam
     Raises:
         DataError: the file cannot be written.
     """
-    context = child_context()
-    receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_child, args=(sender, request), daemon=True, name="repair of the prior")
-    child.start()
-    sender.close()
     try:
-        while not stop():
-            if receiver.poll(POLL_S):
-                break
-        else:
-            return None
-        version: PriorVersion = receiver.recv()
-    except EOFError:
-        child.join()
-        version = _failed(request, f"its process died (exit code {child.exitcode})")
-    finally:
-        if child.is_alive() and stop():
-            child.terminate()
-        child.join()
-        receiver.close()
+        version: PriorVersion | None = run_in_child(
+            "repair of the prior", repair, (request,), stop, expected=(CarlabError, OSError, ValueError)
+        )
+    except ChildError as error:
+        version = _failed(request, f"its process died ({error})" if error.end == "died" else str(error))
+    if version is None:
+        return None
     write_text(request.folder / REPAIR_FILE, json.dumps(version.to_dict(), indent=2) + "\n")
     return version
 
@@ -210,24 +194,6 @@ def _valid(std: dict[str, float], values: dict[str, float]) -> dict[str, float]:
         for name, s in std.items()
         if name in values and not REGISTRY[name].choices and 0.0 < s < math.inf and math.isfinite(values[name])
     }
-
-
-def _child(pipe: Any, request: RepairRequest) -> None:
-    import signal
-
-    import torch
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles ^C and terminates this process.
-    torch.set_num_threads(1)
-    try:
-        version = repair(request)
-    except (CarlabError, OSError, ValueError) as error:
-        version = _failed(request, str(error))
-    except Exception as error:
-        log.exception("The repair of the prior failed")
-        version = _failed(request, f"{type(error).__name__}: {error}")
-    pipe.send(version)
-    pipe.close()
 
 
 def _failed(request: RepairRequest, reason: str) -> PriorVersion:

@@ -15,9 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from carlab.core.errors import CarlabError
-from carlab.core.json_files import read_json
-from carlab.experiment.campaign.child_process import child_context
+from carlab.experiment.campaign.child_process import ChildError, run_in_child
 from carlab.recording.run_folder import RunDirectory
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -25,7 +23,6 @@ log = logging.getLogger(__name__)
 
 CHECK_FILE = "diagnosis.json"
 SIMULATOR_FILE = "simulator.toml"
-POLL_S = 0.1
 MIN_DIAGNOSIS_EPISODES = 4
 """Minimum number of recordings of a full diagnosis, which fits to some and validates on the others."""
 
@@ -69,22 +66,20 @@ def run_check_subprocess(
     number = len(recordings)
     path = check_path(run, number)
     text = tomli_w.dumps(simulator.to_tables())
-    context = child_context()
-    child = context.Process(target=_child, args=(path, run.path, recordings, text), daemon=True, name="quick check")
     try:
         (run.path / SIMULATOR_FILE).write_text(text, encoding="utf-8")
-        child.start()
-        while child.is_alive():
-            if stop():
-                child.terminate()
-                child.join()
-                return None
-            child.join(POLL_S)
-        return QuickCheck.from_dict(read_json(path))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        code = f"exit code {child.exitcode}" if child.exitcode else str(error)
-        log.warning("The quick check of episode %d failed: %s", number, error)
-        return QuickCheck.from_dict(_saved(path, number, _failed(f"its process failed ({code})")))
+        result = run_in_child("quick check", _check, (run.path, recordings, text), stop)
+    except (ChildError, OSError) as error:
+        if isinstance(error, ChildError) and error.end != "died":
+            result = _failed(str(error))
+        else:
+            log.warning("The quick check of episode %d failed: %s", number, error)
+            result = _failed(f"its process failed ({error})")
+    return None if result is None else QuickCheck.from_dict(_saved(path, number, result))
+
+
+def _check(run: Path, recordings: list[Path], simulator_toml: str) -> dict[str, Any]:
+    return check(run, recordings, SimulatorConfig.from_tables(tomllib.loads(simulator_toml)))
 
 
 def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict[str, Any]:
@@ -112,23 +107,6 @@ def check(run: Path, recordings: list[Path], simulator: SimulatorConfig) -> dict
 def next_step(run: Path) -> str:
     """The command of the full diagnosis of a run."""
     return f"carlab diagnose {run} --car {run / SIMULATOR_FILE} --out {run / 'diagnosis'}"
-
-
-def _child(path: Path, run: Path, recordings: list[Path], simulator_toml: str) -> None:
-    import signal
-
-    import torch
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles ^C and terminates this process.
-    torch.set_num_threads(1)
-    try:
-        result = check(run, recordings, SimulatorConfig.from_tables(tomllib.loads(simulator_toml)))
-    except CarlabError as error:
-        result = _failed(str(error))
-    except Exception as error:
-        log.exception("The quick check failed")
-        result = _failed(f"{type(error).__name__}: {error}")
-    _saved(path, len(recordings), result)
 
 
 def _failed(reason: str) -> dict[str, Any]:

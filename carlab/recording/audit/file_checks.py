@@ -7,11 +7,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from carlab.core.angles import wrap
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.report import Finding, Severity
 from carlab.recording.column_mapping import COMMAND_CHANNELS, POSE_CHANNELS, UNITS, ColumnMapping
 from carlab.recording.faults.pose import frozen_rows, stale_rows
-from carlab.recording.faults.robust import LAGS_S, correlation, fit_column, wrapped
+from carlab.recording.faults.robust import LAGS_S, correlation, fit_column
 from carlab.recording.faults.stamps import gap_rows
 from carlab.recording.pose_velocity import BoolArray, IndexArray
 
@@ -225,7 +226,7 @@ def check_jumps(
     if not len(jumps):
         return []
     step = float(np.hypot(np.diff(values["x"]), np.diff(values["y"]))[jumps - 1].max())
-    turn = float(np.abs(wrapped(np.diff(values["yaw"])))[jumps - 1].max())
+    turn = float(np.abs(wrap(np.diff(values["yaw"])))[jumps - 1].max())
     severity, treatment, option = (
         (Severity.REPAIRED, "The recording was split there", None)
         if mapping.gaps == "split"

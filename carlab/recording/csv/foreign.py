@@ -12,6 +12,7 @@ import numpy as np
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
+from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.audit import Channels, audit_channels, check_heading
 from carlab.recording.audit.file_checks import check_jumps, check_missing, check_order, check_stamps
@@ -214,9 +215,7 @@ def _states(channels: Channels, mapping: ColumnMapping, spikes: BoolArray) -> tu
         vx, vy = values["vx"], values["vy"]
         sources.append(f"vx, vy: columns in the {mapping.velocity_frame} frame")
         if mapping.velocity_frame == "world":
-            delayed_yaw = np.interp(t_s - lag, t_s, motion.yaw_unwrapped)
-            c, s = np.cos(delayed_yaw), np.sin(delayed_yaw)
-            vx, vy = c * vx + s * vy, c * vy - s * vx
+            vx, vy = to_body(vx, vy, np.interp(t_s - lag, t_s, motion.yaw_unwrapped))
             sources[-1] += f", rotated by the yaw of {lag * 1e3:.1f} ms before"
     else:
         sources.append(f"vx, vy: {motion.method()}")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from carlab.core.quantities import FloatArray
+from carlab.core.robust import STD_OVER_MAD
 from carlab.recording.faults.commands import LAGS_S, CommandResponse
 from carlab.recording.faults.robust import parabola_minimum
 from carlab.recording.faults.settings import LIMITS
@@ -81,7 +82,7 @@ def _slope(lags: WindowLags, rows: np.ndarray) -> tuple[float, float] | None:
             return None
         slope, offset = np.polyfit(t[keep], lag[keep], 1)
         error = np.abs(lag - offset - slope * t)
-        limit = max(3.0 * 1.4826 * float(np.median(error)), 0.004)
+        limit = max(3.0 * STD_OVER_MAD * float(np.median(error)), 0.004)
         if np.array_equal(keep, error <= limit):
             break
         keep = error <= limit

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from carlab.core.angles import wrap
 from carlab.core.quantities import FloatArray
 from carlab.recording.faults.fault import Fault
-from carlab.recording.faults.robust import wrapped
 from carlab.recording.faults.settings import LIMITS
 
 
@@ -43,7 +43,7 @@ def heading_faults(t_s: FloatArray, values: Mapping[str, FloatArray]) -> list[Fa
             "be checked"
         )
         return [*faults, Fault("too_little_motion", "yaw", observation)]
-    path = _Course(course, values["yaw"][reach:-reach][moving], wrapped(turn[moving]) / distance[moving])
+    path = _Course(course, values["yaw"][reach:-reach][moving], wrap(turn[moving]) / distance[moving])
     return faults + _yaw_faults(path)
 
 
@@ -101,7 +101,7 @@ def _offset(path: _Course, mean: float) -> float:
 
     Fits course - yaw = offset + ahead * (signed path curvature) by the rows less than 45 degrees from ``mean``.
     """
-    away = wrapped(path.course - path.yaw - mean)
+    away = wrap(path.course - path.yaw - mean)
     forward = np.where(np.abs(away) < np.pi / 2, 1.0, -1.0)
     away = (away + np.pi / 2) % np.pi - np.pi / 2
     near = np.abs(away) < np.pi / 4

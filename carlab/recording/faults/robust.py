@@ -10,6 +10,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from carlab.core.quantities import FloatArray
+from carlab.core.robust import STD_OVER_MAD
 from carlab.recording.pose_velocity import BoolArray
 
 LAGS_S = np.arange(-0.05, 0.3001, 0.01)
@@ -21,7 +22,7 @@ KEPT_SHARE = 0.95
 
 def robust_std(values: FloatArray) -> float:
     """Standard deviation by the median of absolute deviations; 0 for an empty array."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
+    return STD_OVER_MAD * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
 
 
 def correlation(a: FloatArray, b: FloatArray) -> float:
@@ -29,12 +30,6 @@ def correlation(a: FloatArray, b: FloatArray) -> float:
     if len(a) < 3 or np.std(a) < 1e-9 or np.std(b) < 1e-9:
         return 0.0
     return float(np.corrcoef(a, b)[0, 1])
-
-
-def wrapped(angle_rad: FloatArray) -> FloatArray:
-    """Angle in [-pi, pi)."""
-    result: FloatArray = (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
-    return result
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 
@@ -125,10 +124,8 @@ class Columns:
         color: Color | None = None,
     ) -> FloatArray:
         places = np.column_stack([states[:, :2], np.zeros(len(states))])
-        half_rad = 0.5 * states[:, 2]
-        zeros = np.zeros(len(states))
-        turns = np.column_stack([zeros, zeros, np.sin(half_rad), np.cos(half_rad)])
-        self._stream.send_columns(car, indexes, rr.Transform3D.columns(translation=places, quaternion=turns))
+        turns = rr.Transform3D.columns(translation=places, quaternion=yaw_quaternion(states[:, 2]))
+        self._stream.send_columns(car, indexes, turns)
         # One segment of the trail per row, from the previous position: the view shows all segments up to its time.
         starts = np.vstack([places[:1] if previous is None else previous, places[:-1]])
         strips = list(np.stack([starts, places], axis=1))
@@ -146,6 +143,13 @@ class Columns:
             columns = columns.partition(np.full(len(numbers), numbers.shape[1]))
         self._stream.send_columns(path, indexes, columns)
         self._logged.add(path)
+
+
+def yaw_quaternion(yaw_rad: FloatArray | float) -> FloatArray:
+    """Quaternions (..., 4) in the order x, y, z, w of rotations about z by angles (...,)."""
+    half_rad = 0.5 * np.asarray(yaw_rad)
+    zero = np.zeros_like(half_rad)
+    return np.stack([zero, zero, np.sin(half_rad), np.cos(half_rad)], axis=-1)
 
 
 def closed(points_m: Sequence[tuple[float, float]]) -> list[tuple[float, float, float]]:
@@ -169,7 +173,7 @@ def log_surroundings(
         stream.log(look.PATH, line, static=True)
     if goal is not None:
         length_m, width_m, height_m = look.CAR_SIZE_M
-        turn = rr.Quaternion(xyzw=[0.0, 0.0, math.sin(0.5 * goal[2]), math.cos(0.5 * goal[2])])
+        turn = rr.Quaternion(xyzw=yaw_quaternion(goal[2]))
         stream.log(look.GOAL, rr.Transform3D(translation=[goal[0], goal[1], 0.0], quaternion=turn), static=True)
         half = [[0.5 * length_m, 0.5 * width_m, 0.01 * height_m]]
         box = rr.Boxes3D(half_sizes=half, radii=rr.Radius.ui_points(1.5), colors=look.GREEN)

@@ -22,9 +22,9 @@ import rerun.blueprint as rrb
 from carlab.core.angles import align_unwrapped
 from carlab.core.documents import EpisodeStarted
 from carlab.core.episode_data import EpisodeData
-from carlab.core.quantities import STATE_NAMES, FloatArray
+from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.recording.rerun import blueprint as look
-from carlab.recording.rerun.columns import Color
+from carlab.recording.rerun.columns import Color, yaw_quaternion
 from carlab.recording.rerun.document_stream import DocumentStream
 from carlab.recording.sink import Item
 
@@ -36,7 +36,6 @@ STATES = "states"
 LEARNING = "learning"
 TABLE = "learning/table"
 CHECK = "check"
-UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 # Points of the viridis map (van der Walt and Smith, 2015): dark for the first episode, bright for the last.
 _VIRIDIS = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], dtype=np.float64)
 
@@ -113,11 +112,10 @@ class RunRecording:
         strips = [np.column_stack([path, np.full(len(path), 0.01)]) for path in (mean[:, :2], [*band, band[0]])]
         radii = rr.Radius.ui_points([2.0, 0.8])
         self._stream.log(PREDICTED, rr.LineStrips3D(strips, radii=radii, colors=look.ORANGE))
-        half_rad = 0.5 * float(mean[-1, 2])
         car = rr.Boxes3D(
             half_sizes=[[0.5 * size for size in look.CAR_SIZE_M]],
             centers=[[float(mean[-1, 0]), float(mean[-1, 1]), 0.5 * look.CAR_SIZE_M[2]]],
-            quaternions=[rr.Quaternion(xyzw=[0.0, 0.0, math.sin(half_rad), math.cos(half_rad)])],
+            quaternions=[rr.Quaternion(xyzw=yaw_quaternion(mean[-1, 2]))],
             colors=look.ORANGE,
             fill_mode=rr.components.FillMode.MajorWireframe,
         )
@@ -223,7 +221,7 @@ def _predicted_tab(logged: look.Logged) -> rrb.Container | None:
             logged,
             plot_legend=rrb.PlotLegend(visible=name == STATE_NAMES[0]),
         )
-        for name, unit in zip(STATE_NAMES, UNITS, strict=True)
+        for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)
     ]
     halves = [look.stack(rrb.Vertical, [(view, 1) for view in half]) for half in (views[:3], views[3:])]
     return look.stack(rrb.Horizontal, [(half, 1) for half in halves], "Predicted against driven")

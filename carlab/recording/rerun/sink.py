@@ -22,6 +22,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.core.outcome import EndReason
 from carlab.core.quantities import FloatArray
+from carlab.recording.atomic_files import APPLICATION
 from carlab.recording.episode_builder import documents_from_episode
 from carlab.recording.pipe_file import PipeFile
 from carlab.recording.rerun import blueprint as look
@@ -29,9 +30,7 @@ from carlab.recording.rerun.columns import entity_part
 from carlab.recording.rerun.document_stream import DocumentStream
 from carlab.recording.sink import Item, Sink, claim, describe_os_error, partial_path
 
-APPLICATION = "carlab"
 _FLUSH_TIMEOUT_S = 10.0
-_ROWS_BEFORE_FLUSH = 512
 
 
 class RerunSink(Sink):

@@ -31,9 +31,8 @@ from learning.posterior.particle_posterior import ParticlePosterior
 from learning.posterior.residuals import fit_residuals
 from learning.priors.domain_models import DomainModel, draw_parameters
 from learning.priors.function_prior import RbfCovariance
+from learning.world.car_fit import PRIOR_FUNCTION
 
-PRIOR_FUNCTION = 1.0
-"""Prior size of a function without a simulator, in units of the outputs."""
 MIN_DISCREPANCY = 0.03
 """Prior size of GreyBox's residual for a case without discrepancy, in units of the outputs."""
 HIDDEN, STEPS = (64, 64), 12_000

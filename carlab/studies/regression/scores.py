@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from carlab.core.json_files import plain
+
 FIGURES = ("nll", "rmse", "calibration", "seconds")
 
 
@@ -90,17 +92,13 @@ def summarised(scores: Sequence[Score]) -> list[Row]:
 
 def as_json(scores: Sequence[Score], command: str, device: str = "cpu") -> dict[str, object]:
     """All scores, their summary, the command of the study and the name of the device; null for a non-finite number."""
-
-    def plain(row: Row | Score) -> dict[str, object]:
-        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(row).items()}
-
     return {
         "schema": "carlab.regression/1",
         "command": command,
         "device": device,
         "torch_threads": torch.get_num_threads(),
-        "rows": [plain(row) for row in summarised(scores)],
-        "scores": [plain(score) for score in scores],
+        "rows": [plain(asdict(row)) for row in summarised(scores)],
+        "scores": [plain(asdict(score)) for score in scores],
     }
 
 

@@ -1,0 +1,35 @@
+"""Decoding of any NatNet datagram."""
+
+from typing import Any
+
+from mocap.natnet.codec import (
+    BitstreamVersion,
+    MessageId,
+    Response,
+    decode_connect,
+    decode_echo_request,
+    decode_echo_response,
+    decode_frame,
+    decode_model_def,
+    decode_server_info,
+    decode_text,
+    split_message,
+)
+
+
+def decode_datagram(datagram: bytes, version: BitstreamVersion, *, lenient: bool = False) -> tuple[int, Any]:
+    """Decode a datagram to its message id and content; the content is None if its payload has no meaning."""
+    message_id, payload = split_message(datagram, lenient=lenient)
+    decoders = {
+        MessageId.FRAMEOFDATA: lambda data: decode_frame(data, version),
+        MessageId.MODELDEF: lambda data: decode_model_def(data, version),
+        MessageId.CONNECT: decode_connect,
+        MessageId.DISCOVERY: decode_connect,
+        MessageId.SERVERINFO: decode_server_info,
+        MessageId.REQUEST: decode_text,
+        MessageId.MESSAGESTRING: decode_text,
+        MessageId.RESPONSE: Response,
+        MessageId.ECHOREQUEST: decode_echo_request,
+        MessageId.ECHORESPONSE: decode_echo_response,
+    }
+    return message_id, decoders[message_id](payload) if message_id in decoders else None
