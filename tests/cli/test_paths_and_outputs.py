@@ -230,13 +230,6 @@ def test_comments_before_the_header_are_skipped(carlab: Carlab, drive_csv: Path,
     assert carlab("import", commented, "--out", tmp_path / "a.mcap")[0] == 0
 
 
-def test_decimal_comma_is_named(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
-    drive_csv.write_text(drive_csv.read_text().replace(",", ";").replace(".", ","), encoding="utf-8")
-    code, text = carlab("import", drive_csv, "--out", tmp_path / "a.mcap")
-    assert code == 1
-    assert "which is not a number; write numbers with a decimal point." in text
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
