@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext
 
 _IMPORTED_ONCE = (
@@ -19,11 +23,25 @@ _IMPORTED_ONCE = (
 def child_context() -> ForkServerContext:
     """Context of child processes that compute between two drives; each begins without the 3 s of these imports.
 
-    Unlike a fork of this process, a fork of the server has none of its threads, ports and files.
+    Unlike a fork of this process, a fork of the server has none of its threads, ports and files. ^C reaches neither the
+    server nor its forks, because a traceback of the imports would hide the message of this process.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(_IMPORTED_ONCE))
+    resource_tracker.ensure_running()  # Its first start unblocks SIGINT, which the server would inherit.
+    with interrupts_blocked():
+        forkserver.ensure_running()
     return context
 
 
-__all__ = ["child_context"]
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT in processes that are started in this block; here it arrives after the block."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+__all__ = ["child_context", "interrupts_blocked"]
