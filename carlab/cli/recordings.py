@@ -28,7 +28,7 @@ def print_recording(recording: Recording) -> Recording:
         print_findings(recording.audit)
     if recording.is_recovered:
         ticks = recording.episode.ticks
-        console.print(f"[yellow]{recording.path} was never finished; {ticks} complete ticks were recovered.[/yellow]")
+        console.print(f"{recording.path} was never finished; {ticks} complete ticks were recovered.", style="yellow")
     return recording
 
 

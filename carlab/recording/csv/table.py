@@ -68,7 +68,7 @@ def read_csv(path: Path | str) -> CsvTable:
     try:
         lines = [row for row in csv.reader(io.StringIO(text, newline=""), delimiter=delimiter) if row]
     except csv.Error as error:
-        raise DataError(f"{path.name} is not a CSV file: {error}.") from error
+        raise DataError(f"{path.name} is not a CSV file ({error}); export it as CSV with one header line.") from error
     if not lines:
         raise DataError(f"{path.name} is empty; a recording has a header and at least two rows.")
     header = tuple(name.strip().lstrip("\ufeff") for name in lines[0])
