@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from carlab.cli.console import console
 from tests.cli.test_bad_input import canonical_csv, write
 
 Carlab = Callable[..., tuple[int, str]]
@@ -52,3 +53,29 @@ def test_binary_like_table_names_the_remedy(carlab: Carlab, tmp_path: Path) -> N
     code, text = carlab("import", tmp_path / "a.csv")
     assert code == 1
     assert "export it as CSV with one header line." in text
+
+
+@pytest.mark.parametrize(("width", "is_whole"), [(60, True), (100, False)])
+def test_findings_are_paragraphs_in_a_narrow_terminal(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, is_whole: bool
+) -> None:
+    """A table of five columns leaves 14 characters for the sentence, whose words stand between those of other cells."""
+    monkeypatch.setattr(console, "_width", width)
+    path, data = canonical_csv(tmp_path, rows=60)
+    data[:, 8] = 0.3
+    code, text = carlab("import", write(path, data))
+    assert code == 0, text
+    paragraph = "warning: constant_command of throttle, 59 rows Column 'throttle' (throttle) is 0.3 throughout:"
+    assert (paragraph in text) is is_whole, text
+
+
+@pytest.mark.parametrize("content", [b'{"plan": 3}', b"[1", b"\xff"])
+def test_damaged_settings_of_a_run_name_the_remedy(carlab: Carlab, tmp_path: Path, content: bytes) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "campaign.json").write_bytes(content)
+    code, text = carlab("drive", "--policy", run, "--out", tmp_path / "runs")
+    assert code == 1
+    assert "campaign.json: " in text
+    assert text.endswith("restore the file, or name the folder of another run.")
+    assert not (tmp_path / "runs").exists()
