@@ -81,8 +81,7 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
         if count <= history:
             continue
         states = episode.states
-        steps = np.diff(episode.times_s)
-        whole = (steps > 0) & (steps < MAX_STEP_PERIODS * np.median(steps))
+        whole = whole_steps(episode)
         rows = np.arange(history, count)
         # Each command of the history must also have been held for one period.
         good = np.array([whole[k - history : k + 1].all() for k in rows], dtype=bool)
@@ -109,6 +108,13 @@ def transitions_of(episodes: Sequence[EpisodeData], history: int) -> Transitions
     return Transitions(
         np.concatenate(inputs), np.concatenate(targets), np.concatenate(origin), np.concatenate(ticks), history
     )
+
+
+def whole_steps(episode: EpisodeData) -> np.ndarray:
+    """Mask (T,) of the steps that last about one period; the others span a gap in time."""
+    steps_s = np.diff(episode.times_s)
+    whole: np.ndarray = (steps_s > 0) & (steps_s < MAX_STEP_PERIODS * np.median(steps_s))
+    return whole
 
 
 def _between_consecutive_poses(episode: EpisodeData) -> np.ndarray:

@@ -44,7 +44,9 @@ class MocapConfig:
 
     def __post_init__(self) -> None:
         if not self.server_address.strip():
-            raise ConfigError("'server_address' in [hardware.mocap] is empty; name the computer that runs Motive.")
+            raise ConfigError(
+                "'server_address' in [hardware.mocap] (listen: --server) is empty; name the computer that runs Motive."
+            )
         for name, choices in (("mode", ("unicast", "multicast")), ("up_axis", ("y", "z"))):
             if getattr(self, name) not in choices:
                 raise ConfigError(
@@ -52,23 +54,28 @@ class MocapConfig:
                 )
         if not all(map(math.isfinite, (self.yaw_offset_rad, *self.pivot_in_base_link_m))):
             raise ConfigError("'yaw_offset_rad' and 'pivot_in_base_link_m' in [hardware.mocap] must be finite numbers.")
-        for name, low in (("command_port", 1), ("data_port", 0)):
+        for name, low, option in (("command_port", 1, " (listen: --command-port)"), ("data_port", 0, "")):
             port = getattr(self, name)
             if not low <= port <= 65535:
-                raise ConfigError(f"'{name}' in [hardware.mocap] is {port}; a port is a number up to 65535.")
+                raise ConfigError(
+                    f"'{name}' in [hardware.mocap]{option} is {port}; a port is a number from {low} to 65535."
+                )
         if not self.timeout_s > 0.0:
             raise ConfigError(f"'timeout_s' in [hardware.mocap] is {self.timeout_s}; it must be above zero.")
         if self.body and self.body_id is not None:
-            raise ConfigError("[hardware.mocap] has both 'body' and 'body_id'; keep one of them.")
+            raise ConfigError(
+                "[hardware.mocap] has both 'body' and 'body_id' (listen: --body, --body-id); keep one of them."
+            )
         if self.multicast_group:
             check_multicast_group(self.multicast_group, "'multicast_group' in [hardware.mocap]")
         try:
             version = BitstreamVersion.parse(self.bitstream)
         except ProtocolError as error:
-            raise ConfigError(f"'bitstream' in [hardware.mocap]: {error}") from error
+            raise ConfigError(f"'bitstream' in [hardware.mocap] (listen: --bitstream): {error}") from error
         if not OLDEST_BITSTREAM <= version <= NEWEST_BITSTREAM:
             raise ConfigError(
-                f"'bitstream' in [hardware.mocap] is {version}; carlab reads {OLDEST_BITSTREAM} to {NEWEST_BITSTREAM}."
+                f"'bitstream' in [hardware.mocap] (listen: --bitstream) is {version}; "
+                f"carlab reads {OLDEST_BITSTREAM} to {NEWEST_BITSTREAM}."
             )
 
     @property

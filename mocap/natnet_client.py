@@ -123,7 +123,8 @@ class NatNetClient:
         if info.clock_hz and info.is_multicast == unicast:
             found = "multicast" if info.is_multicast else "unicast"
             raise not_ready(
-                f'{info.name} streams by {found}; set mode = "{found}" in [hardware.mocap], or change Motive.'
+                f'{info.name} streams by {found}; set mode = "{found}" in [hardware.mocap] (listen: --mode {found}), '
+                "or change Motive."
             )
         self._agree_on_bitstream(info, wanted)
         if not unicast:

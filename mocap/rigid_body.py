@@ -76,7 +76,8 @@ class RigidBodyPoseSource:
         if numbers["foreign"]:
             return (
                 f"datagrams come from {self._client.foreign_address} and none from the server's own address: set "
-                "server_address in [hardware.mocap] to the Local Interface in Motive's Data Streaming pane."
+                "server_address in [hardware.mocap] (listen: --server) to the Local Interface in Motive's Data "
+                "Streaming pane."
             )
         return (
             f"the server answers, but no frame came within {self.config.timeout_s:g} s: is Motive live (or playing a "
@@ -125,12 +126,12 @@ class RigidBodyPoseSource:
                 found.append(
                     f"the body '{self._body_name}' is tilted by more than {math.degrees(TILT_LIMIT_RAD):.0f} degrees "
                     f'in {self._tilted} of {self._tracked} frames: up_axis = "{other}" may be right in '
-                    "[hardware.mocap], or the body was not level when it was created in Motive."
+                    "[hardware.mocap] (listen: --up-axis), or the body was not level when it was created in Motive."
                 )
             elif self._tracked and spans_m[2] > HEIGHT_LIMIT_M and min(spans_m[:2]) < 0.1 * spans_m[2]:
                 found.append(
                     f"the body '{self._body_name}' moves vertically by {spans_m[2]:.2f} m and hardly horizontally: "
-                    f'up_axis = "{other}" may be right in [hardware.mocap].'
+                    f'up_axis = "{other}" may be right in [hardware.mocap] (listen: --up-axis).'
                 )
             if self._body is None and self._is_open:
                 found.append("the server no longer has the body; define it again in Motive under the same name.")

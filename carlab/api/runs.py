@@ -83,7 +83,7 @@ class RunHooks:
 def new_run(
     out: Path | str, name: str, choice: CarChoice, hooks: RunHooks, keep: str = "episodes"
 ) -> Iterator[RunDirectory]:
-    """Create a run folder with the program's log; remove it finally if its subfolder ``keep`` is empty."""
+    """Create a run folder with the program's log; remove it finally if its subfolder ``keep`` is empty or missing."""
     from carlab.recording.run_folder import RunDirectory
 
     _refuse_second_execution()
@@ -92,7 +92,7 @@ def new_run(
         with _logged(run, choice, hooks):
             yield run
     finally:
-        if not any((run.path / keep).iterdir()):
+        if not any((run.path / keep).glob("*")):
             shutil.rmtree(run.path, ignore_errors=True)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from importlib import resources
@@ -14,6 +13,7 @@ from carlab.core.geofence import as_polygon
 from carlab.core.recording_noise import RecordingNoise
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.tables import check_keys, from_table, number
+from carlab.core.toml_files import read_toml
 from carlab.core.track import Track, track_from_table
 from drivers.calibration import ActuatorCalibration
 from drivers.config import ActuatorConfig, HardwareConfig
@@ -78,13 +78,7 @@ def load_car_file(path: Path) -> CarFile:
             f"There is no car file '{path}'; name an existing TOML file or one of the presets: "
             f"{', '.join(preset_names())}."
         )
-    try:
-        text = path.read_text(encoding="utf-8")
-        tables = tomllib.loads(text)
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not a text file; name a car file in TOML.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML ({error}); correct it.") from error
+    text, tables = read_toml(path, "a car file")
     if not tables:
         raise ConfigError(f"{path} is empty; a car file has at least one table such as [vehicle].")
     check_keys(tables, (*TABLES, "hardware", "recording_noise", "track"), str(path))

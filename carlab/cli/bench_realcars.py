@@ -54,7 +54,7 @@ def run_realcars(options: BenchOptions) -> int:
     ]  # fmt: skip
     table(f"Prediction errors, fitted to {', '.join(fit)}", columns, rows)
     for sentence in diagnosed_event_sentences(report.diagnosis):
-        console.print(sentence, markup=False)
+        console.print(sentence)
     if options.out is not None:
         write_figures(options.out, as_json(errors, command(), {"fit": fit, "held_out": held_out}))
         console.print(f"{options.out}; the report of the diagnosis is in {options.out.with_suffix('')}.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from rich.text import Text
 from tyro.conf import OmitArgPrefixes
 
 from carlab.api.runs import RunHooks
@@ -58,7 +59,7 @@ class Check:
             table("Latency [ms]", ["part", "p50", "p99", "max", "samples"], lines)
         for problem in result.problems:
             fail(problem)
-        console.print("[green]Ready.[/green]" if result.is_ready else "[red]Not ready.[/red]")
+        console.print(Text("Ready.", "green") if result.is_ready else Text("Not ready.", "red"))
         return 0 if result.is_ready else NotReadyError.exit_code
 
 

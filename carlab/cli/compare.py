@@ -58,6 +58,6 @@ class Compare:
             )
         console.print(found.sentence)
         for change in found.changes:
-            console.print(f"  {change.sentence}", markup=False)
+            console.print(f"  {change.sentence}")
         console.print(f"Read {self.out / 'compare.json'}.")
         return 0

@@ -24,7 +24,8 @@ PACKAGES = ("carlab", "drivers", "learning", "mocap", "sim_backends")
 
 def _console(*, stderr: bool) -> Console:
     terminal = (sys.stderr if stderr else sys.stdout).isatty()
-    return Console(stderr=stderr, highlight=False, width=None if terminal else FILE_WIDTH_CHARS)
+    # Without markup: a file name such as drive[v2].mcap would lose its brackets.
+    return Console(stderr=stderr, highlight=False, markup=False, width=None if terminal else FILE_WIDTH_CHARS)
 
 
 console = _console(stderr=False)
@@ -49,7 +50,7 @@ def banner(reality: Reality, car: str, *, moves: bool = True) -> None:
 
 def fail(message: str) -> None:
     """Print an error message."""
-    error_console.print("[bold red]carlab:[/bold red]", Text(message), soft_wrap=True)
+    error_console.print(Text("carlab:", "bold red"), Text(message), soft_wrap=True)
 
 
 def table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *, numeric: bool = True) -> None:

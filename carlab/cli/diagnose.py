@@ -124,15 +124,15 @@ class Diagnose:
 
         if diagnosis.data_faults:
             faults = dict.fromkeys(f"{fault.id.replace('_', ' ')} ({fault.channel})" for fault in diagnosis.data_faults)
-            console.print(f"Faults of the recordings (listed in the report): {', '.join(faults)}.", markup=False)
+            console.print(f"Faults of the recordings (listed in the report): {', '.join(faults)}.")
         console.print(diagnosis.sentence)
         for effect in diagnosis.effects:
-            console.print(f"  {effect.sentence}", markup=False)
+            console.print(f"  {effect.sentence}")
         for sentence in (*curve_sentences(diagnosis), ceiling_sentence(diagnosis), *drift_sentences(diagnosis)):
-            console.print(f"  {sentence}" if sentence else "", markup=False, end="\n" if sentence else "")
+            console.print(f"  {sentence}" if sentence else "", end="\n" if sentence else "")
         for sentence in diagnosed_event_sentences(diagnosis):
-            console.print(f"  {sentence}", markup=False)
+            console.print(f"  {sentence}")
         print_errors(f"Error after {diagnosis.horizon_s:.1f} s", "held out", diagnosis.held_out)
         if not self.curves and (advice := curves_advice(diagnosis)):
-            console.print(advice, markup=False)
+            console.print(advice)
         console.print(f"Read {self.out / 'report.html'}; drive the diagnosed car with --car {self.out / 'model.toml'}.")

@@ -158,9 +158,9 @@ class Drive:
         complete = [r.path for r in results if r.path.exists()]
         shown = " (summary.png shows it)" if self.picture and complete else ""
         ending = " View an episode with:" if complete else " No episode is complete."
-        console.print(f"Recorded in {run.folder}{shown}.{ending}", soft_wrap=True, markup=False)
+        console.print(f"Recorded in {run.folder}{shown}.{ending}", soft_wrap=True)
         if complete:
-            console.print(f"  carlab view {shlex.quote(str(complete[0]))}", soft_wrap=True, markup=False)
+            console.print(f"  carlab view {shlex.quote(str(complete[0]))}", soft_wrap=True)
         last = results[-1].reason
         if last is EndReason.STOP_REQUESTED:
             return EXIT_INTERRUPTED

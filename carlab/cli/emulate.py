@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from rich.text import Text
+
 from carlab.cli.console import console
 from carlab.core.errors import ConfigError, NotReadyError
 
@@ -74,7 +76,7 @@ class Emulate:
         )
         with Interrupts() as interrupts, World(config) as world:
             addresses = world.addresses
-            console.print("[bold]EMULATED[/bold]  Car file for a program on this host:")
+            console.print(Text("EMULATED", "bold"), " Car file for a program on this host:")
             # Printed without rich's mark-up, which would interpret the square brackets of TOML.
             lines = ["[hardware.actuator]"]
             if self.actuator == "serial":
@@ -83,7 +85,7 @@ class Emulate:
                 lines += ['kind = "vesc_can"', 'interface = "udp_multicast"', f'channel = "{addresses["can_channel"]}"']
             lines += ["[hardware.mocap]", 'server_address = "127.0.0.1"', 'local_interface = "127.0.0.1"']
             lines += [f'mode = "{self.mode}"', f"command_port = {addresses['command_port']}", f'body = "{config.body}"']
-            console.print("\n".join(lines), markup=False, soft_wrap=True)
+            console.print("\n".join(lines), soft_wrap=True)
             console.print("^C ends it.")
             while not interrupts.requested.wait(0.2):
                 pass

@@ -13,9 +13,10 @@ from carlab.api.recordings import is_csv, required_file, resolved_mapping
 from carlab.cli.console import console
 from carlab.cli.options import new_file
 from carlab.cli.recordings import print_findings
-from carlab.core.errors import ConfigError
+from carlab.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    from carlab.recording.audit.report import AuditReport
     from carlab.recording.column_mapping import ColumnMapping
 
 Sign = Literal[1, -1]
@@ -40,7 +41,8 @@ class Import:
     """TOML file with the columns: tables [columns.x] with name, unit, sign, scale."""
 
     report: Path | None = None
-    """Also write the findings as JSON."""
+    """Also write the findings as JSON, with the reason if the import is refused. The report of a refused import is
+    replaced."""
 
     velocity_frame: Literal["body", "world"] | None = None
     """Frame of the velocity columns."""
@@ -144,6 +146,7 @@ class Import:
 
     def run(self) -> int:
         """Import the CSV, print the findings, write the recording."""
+        from carlab.recording.audit.report import AuditReport, RefusedError
         from carlab.recording.csv.foreign import import_csv
         from carlab.recording.mcap.sink import write_episode
 
@@ -153,13 +156,17 @@ class Import:
         stem = self.recording.name.removesuffix(".gz").removesuffix(".csv")
         out = self.out if self.out is not None else self.recording.with_name(f"{stem}.mcap")
         new_file(out, "--out", ".mcap")
-        if self.report is not None:
+        if self.report is not None and not _is_report_of_refusal(self.report):
             new_file(self.report, "--report", ".json")
-        imported = import_csv(self.recording, mapping=self._mapping())
+        try:
+            imported = import_csv(self.recording, mapping=self._mapping())
+        except DataError as error:
+            found = error.all_findings if isinstance(error, RefusedError) else ()
+            self._write_report(AuditReport(self.recording.name, "", found, refusal=str(error)))
+            raise
         console.print(imported.announcement)
         print_findings(imported.report)
-        if self.report is not None:
-            self.report.write_text(json.dumps(imported.report.to_dict(), indent=2) + "\n", encoding="utf-8")
+        self._write_report(imported.report)
         many = len(imported.episodes) > 1
         for index, episode in enumerate(imported.episodes, start=1):
             path = out.with_name(f"{out.stem}-{index}{out.suffix}") if many else out
@@ -175,7 +182,25 @@ class Import:
             console.print(f"{path}: {episode.ticks} commands, {seconds:.1f} s")
         return 0
 
+    def _write_report(self, report: AuditReport) -> None:
+        from carlab.recording.atomic_files import write_text
+
+        if self.report is not None:
+            self.report.parent.mkdir(parents=True, exist_ok=True)
+            write_text(self.report, json.dumps(report.to_dict(), indent=2) + "\n")
+
     def _mapping(self) -> ColumnMapping | None:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         options = {name: value for name, value in values.items() if name not in OTHER_OPTIONS}
         return resolved_mapping(self.recording, self.mapping, options)
+
+
+def _is_report_of_refusal(path: Path) -> bool:
+    """Whether a file is the report of a refused import, which the next import may replace."""
+    from carlab.recording.audit.report import AUDIT_SCHEMA
+
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and content.get("schema") == AUDIT_SCHEMA and content.get("refusal") is not None

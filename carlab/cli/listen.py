@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from rich.text import Text
+
 from carlab.api.arguments import above_zero
 from carlab.cli.console import console, table
 from carlab.core.errors import ConfigError
@@ -79,14 +81,14 @@ class Listen:
             while not interrupts.requested.is_set() and clock.now_s() < end_s:
                 sample = source.wait_for(sequence, 0.5)
                 if sample is None:
-                    console.print("[yellow]no frame for half a second[/yellow]")
+                    console.print("no frame for half a second", style="yellow")
                     continue
                 sequence = sample.sequence
                 age_ms = (sample.t_receive_s - sample.t_capture_s) * 1e3
-                warning = "" if sample.tracked else "  [yellow]not tracked[/yellow]"
                 console.print(
                     f"frame {sample.sequence:8d}  x {sample.x_m:+8.4f} m  y {sample.y_m:+8.4f} m  "
-                    f"yaw {sample.yaw_rad:+7.4f} rad  latency {age_ms:5.1f} ms{warning}"
+                    f"yaw {sample.yaw_rad:+7.4f} rad  latency {age_ms:5.1f} ms",
+                    Text("" if sample.tracked else " not tracked", "yellow"),
                 )
                 clock.sleep_until(min(clock.now_s() + 0.25, end_s))
             statistics = source.statistics()

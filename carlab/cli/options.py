@@ -69,11 +69,17 @@ class TaskOptions:
 
 
 def new_file(path: Path, option: str, suffix: str) -> Path:
-    """Return a path for a new file. Raises ConfigError for another suffix, DataError if the file exists."""
+    """Return a path for a new file, before the work begins; its folder may be missing.
+
+    Raises:
+        ConfigError: the name has another suffix.
+        DataError: the file exists, or cannot be created.
+    """
     if path.suffix != suffix:
         raise ConfigError(f"{option} {path}: name a file that ends in {suffix}.")
     if path.exists():
         raise DataError(f"{path} exists already; remove it or choose another {option}.")
+    _check_folder(path.parent, f"{option} {path}")
     return path
 
 
@@ -83,12 +89,17 @@ def report_folder(folder: Path) -> Path:
     Raises:
         DataError: it cannot be created or written.
     """
+    _check_folder(folder, f"--out {folder}")
+    return folder
+
+
+def _check_folder(folder: Path, where: str) -> None:
+    """Check that files can be written into a folder, which may be missing. Raises DataError that begins ``where``."""
     existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     if not existing.is_dir():
-        raise DataError(f"--out {folder}: {existing} is a file; choose another folder.")
+        raise DataError(f"{where}: {existing} is a file; choose another folder.")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise DataError(f"--out {folder}: {existing} is not writable; choose another folder or change its permissions.")
-    return folder
+        raise DataError(f"{where}: {existing} is not writable; choose another folder or change its permissions.")
 
 
 def json_file(path: Path, option: str) -> Path:

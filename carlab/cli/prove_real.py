@@ -61,7 +61,7 @@ def tables_in(folder: Path | None) -> dict[str, dict[str, FloatArray]]:
         try:
             whole = table_of(load(path).episode)
         except DataError as error:
-            console.print(f"{path.name} is left out: {error}", markup=False)
+            console.print(f"{path.name} is left out: {error}")
             continue
         columns = np.stack([whole[name] for name in COLUMNS])
         columns = columns[:, np.isfinite(columns).all(axis=0)]

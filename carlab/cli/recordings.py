@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from carlab.recording.audit.report import AuditReport
 
 
+MIN_TABLE_CHARS = 80
+"""Width of the terminal below which findings are printed as paragraphs."""
+
+
 def load_episodes(path: Path) -> Sequence[EpisodeData]:
     """Read an MCAP recording (one episode) or a CSV (one or several), and print what was found in it."""
     return print_recording(load(path)).episodes
@@ -28,12 +32,12 @@ def print_recording(recording: Recording) -> Recording:
         print_findings(recording.audit)
     if recording.is_recovered:
         ticks = recording.episode.ticks
-        console.print(f"[yellow]{recording.path} was never finished; {ticks} complete ticks were recovered.[/yellow]")
+        console.print(f"{recording.path} was never finished; {ticks} complete ticks were recovered.", style="yellow")
     return recording
 
 
 def print_findings(report: AuditReport) -> None:
-    """Print an audit as a table, the gravest first."""
+    """Print an audit, the gravest finding first: as a table, or as paragraphs in a narrow terminal."""
     if report.findings:
         rows = [
             [
@@ -45,12 +49,15 @@ def print_findings(report: AuditReport) -> None:
             ]
             for severity, identity, channel, count, sentence, option in report.rows()
         ]
-        table(
-            f"What was found in {report.source}",
-            ["severity", "finding", "channel", "rows", "what and remedy"],
-            rows,
-            numeric=False,
-        )
+        title = f"What was found in {report.source}"
+        if console.width < MIN_TABLE_CHARS:
+            console.print(f"\n{title}")
+            for severity, identity, channel, count, sentence in rows:
+                in_rows = f", {count} rows" if count else ""
+                console.print(f"{severity}: {identity} of {channel}{in_rows}\n{sentence}")
+            return
+        columns = ["severity", "finding", "channel", "rows", "what and remedy"]
+        table(title, columns, rows, numeric=False)
 
 
 def print_errors(title: str, first_column: str, errors: Mapping[str, FitErrors]) -> None:

@@ -112,9 +112,9 @@ class Replay:
             keep_events=self.keep_events,
         )
         for note in found.material.notes:
-            console.print(note, markup=False)
+            console.print(note)
         for fault in (*found.material.faults, *found.score.faults):
-            console.print(f"{fault.channel}: {fault.action}", markup=False)
+            console.print(f"{fault.channel}: {fault.action}")
         for part in (found.score.whole, found.score.last):
             if part is None:
                 console.print("The last part is too short to be scored by itself.")
@@ -123,7 +123,7 @@ class Replay:
         self._print_channels(found)
         errors = (found.summary[MODEL], found.summary_with_events[MODEL]) if found.events.held_out_windows else ()
         for sentence in event_sentences(found.events, *errors):
-            console.print(sentence, markup=False)
+            console.print(sentence)
         if self.adapt:
             self._print_changes(found)
         if self.save is not None:
@@ -141,7 +141,6 @@ class Replay:
             console.print(
                 "The noise of the adaptation was chosen on this recording; carlab diagnose --adapt chooses it on the "
                 "fitted recordings and writes it into model.toml.",
-                markup=False,
             )
 
     def _print_channels(self, found: PredictionErrors) -> None:

@@ -7,19 +7,23 @@ import subprocess
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
-from carlab.api.recordings import is_run_folder, required_file, save_run
+from carlab.api.recordings import is_run_folder, load, required_file, save_run
 from carlab.api.runs import viewer_program
 from carlab.cli.console import console
 from carlab.cli.options import new_file
 from carlab.cli.recordings import load_episodes
 from carlab.core.errors import ConfigError, NotReadyError
 
+if TYPE_CHECKING:
+    from carlab.core.episode_data import EpisodeData
+
 REPORT_FILE = "report.rrd"
+PAGE_FILE = "report.html"
 PICTURE_FILE = "summary.png"
 
 
@@ -64,7 +68,6 @@ class View:
 
     def _source(self) -> _Source:
         path = self.recording
-        summary: Callable[[Path], Path] | None = None
         if path.is_dir():
             if is_run_folder(path):
                 return _Source(path.name, lambda rrd: save_run(path, rrd), lambda png: save_run(path, png))
@@ -72,14 +75,12 @@ class View:
                 raise ConfigError(
                     f"{path} is not the folder of a run or of a diagnosis; name such a folder, or a recording."
                 )
-            if (path / PICTURE_FILE).is_file():
-                summary = partial(shutil.copyfile, path / PICTURE_FILE)
             path /= REPORT_FILE
         if required_file(path).suffix == ".rrd":
             from carlab.recording.rerun.viewer import check_rerun_file
 
             check_rerun_file(path)
-            return _Source(path.stem, lambda rrd: path, summary)
+            return _Source(path.stem, lambda rrd: path, _plot_beside(path))
         episodes = load_episodes(path)
         if len(episodes) > 1:
             console.print(f"Showing the longest of {len(episodes)} episodes.")
@@ -92,13 +93,7 @@ class View:
             episode_to_rrd(episode, rrd, path.name)
             return rrd
 
-        def draw(png: Path) -> Path:
-            from carlab.recording.picture import save_summary
-
-            save_summary([episode], png)
-            return png
-
-        return _Source(path.stem, write_rrd, draw)
+        return _Source(path.stem, write_rrd, lambda png: _plot(episode, png))
 
     def _picture(self, source: _Source, rrd: Path, path: Path) -> None:
         from carlab.recording.rerun.screenshot import save_screenshot
@@ -107,7 +102,7 @@ class View:
             save_screenshot(rrd, path)
         except NotReadyError as error:
             if source.draw is None:
-                raise
+                raise NotReadyError(f"{error}, or {_other_way(self.recording)}") from error
             console.print(f"{error}\nDrawing a plot instead.")
             path.parent.mkdir(parents=True, exist_ok=True)
             source.draw(path)
@@ -133,3 +128,28 @@ class _Source:
     name: str
     rrd: Callable[[Path], Path]
     draw: Callable[[Path], Path] | None
+
+
+def _plot(episode: EpisodeData, png: Path) -> Path:
+    from carlab.recording.picture import save_summary
+
+    save_summary([episode], png)
+    return png
+
+
+def _plot_beside(rrd: Path) -> Callable[[Path], Path] | None:
+    """How to draw an .rrd without the viewer: the picture of its diagnosis, or a plot of its MCAP recording."""
+    picture, recording = rrd.with_name(PICTURE_FILE), rrd.with_suffix(".mcap")
+    if rrd.name == REPORT_FILE and picture.is_file():
+        return lambda png: Path(shutil.copyfile(picture, png))
+    if recording.is_file():
+        return lambda png: _plot(load(recording).episode, png)
+    return None
+
+
+def _other_way(path: Path) -> str:
+    """What to do where an .rrd or the folder of a diagnosis cannot be drawn."""
+    page = (path if path.is_dir() else path.parent) / PAGE_FILE
+    if page.is_file():
+        return f"open {page} in a browser, which has the same figures."
+    return "name the .mcap recording, which is plotted without the viewer."

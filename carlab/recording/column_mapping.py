@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any, Literal
 
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.tables import check_keys, from_table
+from carlab.core.toml_files import read_toml
 
 CHANNELS = ("t", "x", "y", "yaw", "vx", "vy", "yaw_rate", "steering", "throttle")
 POSE_CHANNELS = ("x", "y", "yaw")
@@ -138,12 +138,7 @@ def load_mapping(path: Path | str) -> ColumnMapping:
     Raises ConfigError for a file that is not TOML, an unknown key or an unknown unit.
     """
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"Cannot read the mapping {path}: {error.strerror}; check the path.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}.") from error
+    _, table = read_toml(path, "a mapping")
     columns = table.pop("columns", None)
     if not isinstance(columns, dict) or not columns:
         raise ConfigError(f'{path} names no columns; add tables such as [columns.x] with name = "pos_x".')

@@ -5,7 +5,7 @@ runs/2026-11-21_134500_<name>/
     environment.json     program, git, packages, host, start
     episodes/0001.mcap   one recording per episode, also as 0001.rrd
     episodes/stopped/    episodes of a learning run that a person ended; they are driven again
-    models/  policy/     learned models and policies
+    models/0001/         learned models and policies of a learning run
     log.jsonl            the program's log, one JSON object per line
     result.json          the result of the run
 """
@@ -50,7 +50,7 @@ class RunDirectory:
     def create(
         cls, root: Path | str, name: str, *, config_toml: str = "", metadata: Mapping[str, str] | None = None
     ) -> Self:
-        """Create ``root/<date>_<time>_<name>`` with its folders, configuration and environment.
+        """Create ``root/<date>_<time>_<name>`` with the folder of its episodes, its configuration and environment.
 
         Args:
             root: Folder of all runs, usually ``runs``.
@@ -73,8 +73,7 @@ class RunDirectory:
                 number += 1
                 path = base.with_name(f"{base.name}-{number}")
             run = cls(path)
-            for folder in (run.episodes, run.models, run.policy):
-                folder.mkdir()
+            run.episodes.mkdir()
             (path / "config.toml").write_text(config_toml, encoding="utf-8")
             run.write_json("environment.json", {**environment(), **(metadata or {})})
         except OSError as error:
@@ -91,8 +90,7 @@ class RunDirectory:
             )
         run = cls(path)
         try:
-            for folder in (run.episodes, run.models, run.policy):
-                folder.mkdir(exist_ok=True)
+            run.episodes.mkdir(exist_ok=True)
         except OSError as error:
             raise DataError(describe_os_error(error, path)) from error
         return run
@@ -109,13 +107,8 @@ class RunDirectory:
 
     @property
     def models(self) -> Path:
-        """Folder of the dynamics models."""
+        """Folder of the models and policies of a learning run; it is missing before the first one is written."""
         return self.path / "models"
-
-    @property
-    def policy(self) -> Path:
-        """Folder of the policies."""
-        return self.path / "policy"
 
     @property
     def config_toml(self) -> str:

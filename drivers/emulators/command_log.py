@@ -45,6 +45,8 @@ class CommandLog:
         if self.path is not None and self._file is None:
             try:
                 self._file = self.path.open("a", encoding="utf-8")
+            except FileNotFoundError:
+                return  # The run ended before its first episode, and its folder was removed.
             except OSError as error:
                 self._give_up_file(error)
 

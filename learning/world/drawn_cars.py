@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from carlab.core.angles import wrap
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import decode_history, decode_state, encode, push_action
 from learning.priors.simulator_model import CarModel, known_ranges
+from learning.transitions import whole_steps
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import LATENCY, SimulatorConfig
 from sim_backends.effects import CATALOGUE, Effect
@@ -167,11 +169,19 @@ def select_cars(cars: DrawnCars, episodes: Sequence[EpisodeData], count: int) ->
 
 
 def _windows(episodes: Sequence[EpisodeData]) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
-    """Initial states (S, 6), past commands (S, H, 2), commands (S, T, 2) and final states (S, 6) of windows."""
+    """Initial states (S, 6), past commands (S, H, 2), commands (S, T, 2) and final states (S, 6) of windows.
+
+    No window and no history spans a gap in time, and no window spans a jump of the poses (``segment`` of an imported
+    recording changes).
+    """
     rows = []
     for episode in episodes:
+        whole = whole_steps(episode)
+        segment = episode.extra.get("segment", np.zeros(episode.ticks + 1))
         for first in range(HISTORY, episode.ticks - WINDOW_TICKS + 1, WINDOW_TICKS // 2):
             last = first + WINDOW_TICKS
+            if not whole[first - HISTORY : last].all() or np.ptp(segment[first : last + 1]) > 0:
+                continue
             parts = (
                 episode.states[first], episode.sent[first - HISTORY : first], episode.sent[first:last],
                 episode.states[last],

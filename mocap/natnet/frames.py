@@ -147,7 +147,7 @@ def explain_frame_error(payload: bytes, version: BitstreamVersion, error: Protoc
     return ProtocolError(
         f"The frames are of NatNet bitstream {fits}, not {version} as the server announced (carlab reads "
         f"{OLDEST_BITSTREAM} to {NEWEST_BITSTREAM}); restart streaming in Motive's Data Streaming pane, or set its "
-        f'Transmission Type to Unicast and bitstream = "{oldest}" in [hardware.mocap].'
+        f'Transmission Type to Unicast and bitstream = "{oldest}" in [hardware.mocap] (listen: --bitstream).'
     )
 
 

@@ -55,7 +55,8 @@ def udp_socket(address: str, port: int, *, shared: bool = False) -> socket.socke
         place = f"{address or 'any interface'}:{port}"
         remedy = {
             errno.EADDRINUSE: "close the program that uses it, or set another port ([hardware.mocap], --command-port).",
-            errno.EADDRNOTAVAIL: "no interface of this computer has that address: check local_interface.",
+            errno.EADDRNOTAVAIL: "no interface of this computer has that address: "
+            "check local_interface (listen: --interface).",
         }.get(error.errno or 0, "choose another address or port.")
         raise not_ready(f"UDP {place} cannot be used ({error.strerror}); {remedy}") from error
     return sock
@@ -71,6 +72,7 @@ def multicast_receiver(group: str, port: int, interface: str) -> socket.socket:
     except OSError as error:
         sock.close()
         raise not_ready(
-            f"group {group} cannot be joined on interface {interface} ({error}); check local_interface."
+            f"group {group} cannot be joined on interface {interface} ({error}); "
+            "check local_interface (listen: --interface)."
         ) from error
     return sock

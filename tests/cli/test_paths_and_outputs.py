@@ -230,13 +230,6 @@ def test_comments_before_the_header_are_skipped(carlab: Carlab, drive_csv: Path,
     assert carlab("import", commented, "--out", tmp_path / "a.mcap")[0] == 0
 
 
-def test_decimal_comma_is_named(carlab: Carlab, drive_csv: Path, tmp_path: Path) -> None:
-    drive_csv.write_text(drive_csv.read_text().replace(",", ";").replace(".", ","), encoding="utf-8")
-    code, text = carlab("import", drive_csv, "--out", tmp_path / "a.mcap")
-    assert code == 1
-    assert "which is not a number; write numbers with a decimal point." in text
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -280,6 +273,47 @@ def test_existing_findings_are_not_replaced(carlab: Carlab, drive_csv: Path, tmp
     assert "findings.json exists already; remove it or choose another --report." in text
     assert findings.read_text() == "mine"
     assert not (tmp_path / "a.mcap").exists()
+
+
+def test_report_of_a_refused_import_is_written_with_the_reason(carlab: Carlab, tmp_path: Path) -> None:
+    path, data = canonical_csv(tmp_path)
+    data[:, 8] *= 100.0
+    write(path, data)
+    report = tmp_path / "reports" / "audit.json"
+    code, text = carlab("import", path, "--report", report)
+    assert code == 1
+    content = json.loads(report.read_text())
+    assert " ".join(content["refusal"].split()) in text
+    (error,) = [finding for finding in content["findings"] if finding["severity"] == "error"]
+    assert error["channel"] == "throttle"
+    assert error["option"] == "--throttle-scale 0.01"
+    code, text = carlab("import", path, "--throttle-scale", "0.01", "--report", report)
+    assert code == 0, text
+    assert json.loads(report.read_text())["refusal"] is None
+    code, text = carlab("import", path, "--out", tmp_path / "b.mcap", "--report", report)
+    assert code == 1
+    assert "audit.json exists already" in text, "the report of a finished import is kept"
+
+
+def test_report_of_a_file_that_is_no_recording_has_the_reason(carlab: Carlab, tmp_path: Path) -> None:
+    (tmp_path / "drive.csv").write_text("time,x,y\n0,0,0\n1,1,1\n", encoding="utf-8")
+    assert carlab("import", tmp_path / "drive.csv", "--report", tmp_path / "audit.json")[0] == 1
+    content = json.loads((tmp_path / "audit.json").read_text())
+    assert "drive.csv has no column t" in content["refusal"]
+    assert content["findings"] == []
+
+
+@pytest.mark.parametrize("option", ["--out", "--report"])
+def test_output_below_a_file_is_refused_before_the_import(
+    carlab: Carlab, drive_csv: Path, tmp_path: Path, option: str
+) -> None:
+    outputs = {"--out": tmp_path / "a.mcap", "--report": tmp_path / "a.json"}
+    (tmp_path / "file").touch()
+    outputs[option] = tmp_path / "file" / outputs[option].name
+    code, text = carlab("import", drive_csv, *(word for pair in outputs.items() for word in pair))
+    assert code == 1
+    assert f"{option} {outputs[option]}: {tmp_path / 'file'} is a file; choose another folder." in text
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "drive.csv"}
 
 
 @pytest.mark.parametrize("verb", ["diagnose", "replay", "view"])

@@ -50,3 +50,33 @@ def test_file_that_is_no_rerun_recording_is_refused_and_not_copied(
     assert code == 1
     assert "some.rrd is not a rerun recording" in text
     assert not (tmp_path / "copy.rrd").exists()
+
+
+def test_rerun_file_is_plotted_from_its_recording_without_a_vulkan_driver(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carlab.recording.rerun.screenshot.has_vulkan_driver", lambda: False)
+    assert carlab("drive", "--ticks", "5", "--out", tmp_path, "--no-picture")[0] == 0
+    (episode,) = tmp_path.glob("*/episodes/0001.rrd")
+    code, text = carlab("view", episode, "--screenshot", tmp_path / "a.png")
+    assert code == 0, text
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    episode.with_suffix(".mcap").unlink()
+    code, text = carlab("view", episode, "--screenshot", tmp_path / "b.png")
+    assert code == 3
+    assert "apt-get install mesa-vulkan-drivers libvulkan1', or name the .mcap recording" in text
+
+
+def test_report_of_a_diagnosis_has_its_summary_or_page_as_picture(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carlab.recording.rerun.screenshot.has_vulkan_driver", lambda: False)
+    (tmp_path / "report.rrd").write_bytes(b"RRF2 the report")
+    (tmp_path / "report.html").write_text("the figures", encoding="utf-8")
+    for opened in (tmp_path, tmp_path / "report.rrd"):
+        code, text = carlab("view", opened, "--screenshot", tmp_path / "a.png")
+        assert code == 3
+        assert f"or open {tmp_path / 'report.html'} in a browser, which has the same figures." in text
+    (tmp_path / "summary.png").write_bytes(b"the summary")
+    assert carlab("view", tmp_path / "report.rrd", "--screenshot", tmp_path / "a.png")[0] == 0
+    assert (tmp_path / "a.png").read_bytes() == b"the summary"

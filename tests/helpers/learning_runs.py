@@ -32,7 +32,7 @@ def tiny_plan(choice: CarChoice, **changes: Any) -> TrainingPlan:
 
 def names(run: RunDirectory) -> list[str]:
     """Models and recordings of a run."""
-    return sorted(str(p.relative_to(run.path)) for f in (run.models, run.episodes) for p in f.iterdir())
+    return sorted(str(p.relative_to(run.path)) for f in (run.models, run.episodes) for p in f.glob("*"))
 
 
 def drive(folder: Path, ticks: int, start: CarState | None = None, episodes: int = 1) -> RunDirectory:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import decode_history, decode_state, encode
 from learning.world.disturbance import start_rollouts
-from learning.world.drawn_cars import HISTORY, DrawnCars, draw_cars, select_cars
+from learning.world.drawn_cars import HISTORY, WINDOW_TICKS, DrawnCars, draw_cars, select_cars
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -70,3 +71,19 @@ def test_recordings_select_cars_like_the_true_one() -> None:
     mean_gain, prior_mean_gain = (float(c.values["motor.drive_gain"].mean()) for c in (selected, cars))
     assert abs(mean_gain - 5.0) < 0.6 * abs(prior_mean_gain - 5.0)
     assert len(select_cars(cars, [], 16)) == 16, "without recordings all cars are equally plausible"
+
+
+@pytest.mark.parametrize("at", ["window", "history", "segment"])
+def test_windows_do_not_span_a_gap(at: str) -> None:
+    """A recording of one window is useless with a gap in it: the car drives on where nothing is recorded."""
+    true = replace(CAR, priors={}).with_values({"motor.drive_gain": 5.0})
+    cars = draw_cars(CAR, 64, torch.Generator().manual_seed(1))
+    whole = recorded(true, ticks=HISTORY + WINDOW_TICKS)
+    chosen = select_cars(cars, [whole], 8).values["motor.drive_gain"]
+    assert not torch.equal(chosen, cars.values["motor.drive_gain"][:8]), "the whole recording selects"
+    cut = HISTORY // 2 if at == "history" else HISTORY + WINDOW_TICKS // 2
+    times_s = whole.times_s + np.where(np.arange(len(whole.times_s)) >= cut, 0.5, 0.0)
+    segment = (np.arange(len(times_s)) >= cut).astype(np.float64)
+    broken = replace(whole, extra={"segment": segment}) if at == "segment" else replace(whole, times_s=times_s)
+    selected = select_cars(cars, [broken], 8)
+    assert torch.equal(selected.values["motor.drive_gain"], cars.values["motor.drive_gain"][:8])

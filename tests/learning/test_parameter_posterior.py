@@ -12,6 +12,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.networks.normaliser import Normaliser
+from learning.posterior import parameter_posterior
 from learning.posterior.parameter_posterior import posterior_parameters
 from learning.priors.domain_models import uniform
 
@@ -101,6 +102,22 @@ def test_linear_simulator_has_the_conjugate_posterior(rows, noise):
     white = np.linalg.solve(root, (draws - mean).T)
     assert np.allclose(white.mean(axis=1), 0.0, atol=0.1)
     assert np.allclose(np.cov(white), np.eye(3), atol=0.15)
+
+
+def test_tempering_ends_at_the_posterior_however_many_steps_it_takes(monkeypatch, caplog):
+    """With this effective sample size it takes more than 60 steps, at which the draws are 2.5 times too wide."""
+    monkeypatch.setattr(parameter_posterior, "MIN_EFFECTIVE_SHARE", 0.95)
+    x, y, covariance = linear_data(100, 0.003)
+    factor = torch.linalg.cholesky(torch.tensor(covariance))
+    draws = posterior_parameters(Linear(), x, y, factor, UNITS, 500, generator()).double().numpy()
+    mean, exact = conjugate(x, y, covariance)
+    white = np.linalg.solve(np.linalg.cholesky(exact), (draws - mean).T)
+    assert np.allclose(np.cov(white), np.eye(3), atol=0.3)
+    assert not caplog.records
+    monkeypatch.setattr(parameter_posterior, "MAX_TEMPERING_STEPS", 60)
+    posterior_parameters(Linear(), x, y, factor, UNITS, 500, generator())
+    (warning,) = caplog.messages
+    assert "is too wide: after 60 tempering steps" in warning
 
 
 def test_draws_are_mostly_distinct():

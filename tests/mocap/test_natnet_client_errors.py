@@ -34,9 +34,9 @@ def test_missing_connection_is_reported_with_the_reason(serve: Serve, configure:
     assert f"127.0.0.1:{silent_server.command_port}" in text
     assert "Motive" in text
     text = reason(configure(serve(mode="multicast"), mode="unicast"))
-    assert 'mode = "multicast"' in text
+    assert 'set mode = "multicast" in [hardware.mocap] (listen: --mode multicast)' in text
     text = reason(configure(serve(mode="unicast"), mode="multicast"))
-    assert 'mode = "unicast"' in text
+    assert 'set mode = "unicast" in [hardware.mocap] (listen: --mode unicast)' in text
     newer_server = serve(mode="multicast", faults=ServerFaults(no_frames=True))
     newer_server.version = V42
     text = reason(configure(newer_server))

@@ -16,7 +16,7 @@ def test_new_run_has_its_folders_configuration_and_environment(tmp_path):
         tmp_path / "runs", "Parking in the lab!", config_toml="seed = 3\n", metadata={"note": "n"}
     )
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d{6}_Parking-in-the-lab", run.path.name)
-    assert {p.name for p in run.path.iterdir()} == {"config.toml", "environment.json", "episodes", "models", "policy"}
+    assert {p.name for p in run.path.iterdir()} == {"config.toml", "environment.json", "episodes"}
     assert run.config_toml == "seed = 3\n"
     environment_file = json.loads((run.path / "environment.json").read_text())
     assert environment_file["note"] == "n"

@@ -81,11 +81,15 @@ def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, tracks: tuple[
 
 
 def recorded_forces(track: Track, config: SimulatorConfig) -> Forces:
-    """State, delayed commands and longitudinal force of a recording, as inputs of curves."""
+    """State, delayed commands and longitudinal force of a recording, as inputs of curves.
+
+    The first command is held before the recording begins, because earlier commands are unknown.
+    """
     parameters = config.parameters
     vx, vy, yaw_rate = track.smooth[:, 3:].T
+    rows = np.arange(len(vx))
     commands = [
-        np.roll(column, round(delay_s / track.period_s))
+        column[np.clip(rows - round(delay_s / track.period_s), 0, len(rows) - 1)]
         for column, delay_s in zip(track.commands.T, config.delays_s(), strict=True)
     ]
     angle = parameters.max_angle_rad * commands[0]

@@ -333,7 +333,10 @@ def saved_plan(folder: Path) -> TrainingPlan:
         SimulatorConfig.from_tables(tomllib.loads(plan.prior_toml))
         return plan
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{folder} is not the folder of a run of carlab learn ({CAMPAIGN_FILE}: {error}).") from error
+        raise DataError(
+            f"{folder} is not the folder of a run of carlab learn ({CAMPAIGN_FILE}: {error}); restore the file, "
+            "or name the folder of another run."
+        ) from error
 
 
 def resumed_campaign(run: RunDirectory, choice: CarChoice, hooks: CampaignHooks, device: str | None = None) -> Campaign:

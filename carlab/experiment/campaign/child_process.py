@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from typing import Any
@@ -36,11 +39,25 @@ class ChildError(Exception):
 def child_context() -> ForkServerContext:
     """Context of child processes that compute between two drives; each begins without the 3 s of these imports.
 
-    Unlike a fork of this process, a fork of the server has none of its threads, ports and files.
+    Unlike a fork of this process, a fork of the server has none of its threads, ports and files. ^C reaches neither the
+    server nor its forks, because a traceback of the imports would hide the message of this process.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(list(_IMPORTED_ONCE))
+    resource_tracker.ensure_running()  # Its first start unblocks SIGINT, which the server would inherit.
+    with interrupts_blocked():
+        forkserver.ensure_running()
     return context
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT in processes that are started in this block; here it arrives after the block."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def run_in_child(
@@ -103,11 +120,8 @@ def _call(
     reports: bool,
     expected: tuple[type[Exception], ...],
 ) -> None:
-    import signal
-
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles ^C and terminates this process.
     torch.set_num_threads(1)
     if reports:
         arguments = (*arguments, lambda *what: pipe.send(("report", what)))
@@ -124,4 +138,4 @@ def _call(
         pipe.close()
 
 
-__all__ = ["ChildError", "child_context", "run_in_child"]
+__all__ = ["ChildError", "child_context", "interrupts_blocked", "run_in_child"]

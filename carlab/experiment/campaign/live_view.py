@@ -10,7 +10,6 @@ import logging
 import multiprocessing
 import os
 import queue
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Self
 from carlab.core.clock import MonotonicClock
 from carlab.core.documents import Document, EpisodeStarted, Tick
 from carlab.core.errors import CarlabError
+from carlab.experiment.campaign.child_process import interrupts_blocked
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.quick_check import QuickCheck
 from carlab.experiment.campaign.run_recording import TICKS_BETWEEN_PATHS, LearnedDriver, add_windows
@@ -92,7 +92,8 @@ class LiveView:
             self._queue.put_nowait(Activity(name, done, total))
 
     def __enter__(self) -> Self:
-        self._process.start()
+        with interrupts_blocked():  # The process of the run handles ^C.
+            self._process.start()
         return self
 
     def __exit__(
@@ -115,7 +116,6 @@ def show(settings: LiveSettings, messages: Queue[Any]) -> None:
     import rerun as rr
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The process of the run handles ^C.
     torch.set_num_threads(1)
     if hasattr(os, "nice"):
         os.nice(NICENESS)

@@ -10,7 +10,7 @@ import numpy as np
 from carlab.core.angles import wrap
 from carlab.core.quantities import FloatArray
 from carlab.recording.audit.report import Finding, Severity
-from carlab.recording.column_mapping import COMMAND_CHANNELS, POSE_CHANNELS, UNITS, ColumnMapping
+from carlab.recording.column_mapping import COMMAND_CHANNELS, POSE_CHANNELS, UNITS, VELOCITY_CHANNELS, ColumnMapping
 from carlab.recording.faults.pose import frozen_rows, stale_rows
 from carlab.recording.faults.robust import LAGS_S, correlation, fit_column
 from carlab.recording.faults.stamps import gap_rows
@@ -51,6 +51,11 @@ def check_missing(values: Mapping[str, FloatArray], mapping: ColumnMapping) -> t
             continue
         whole &= ~bad
         name = mapping.columns[channel].name if channel in mapping.columns else channel
+        if bad.all():
+            remedy = "remove it from the file" if channel in VELOCITY_CHANNELS else "repair the file"
+            sentence = f"Column '{name}' has no number in any row; {remedy}."
+            findings.append(Finding.at(bad, "not_a_number", channel, Severity.ERROR, sentence, {"share": 1.0}))
+            continue
         sentence = (
             f"Column '{name}' has no number in {bad.sum()} of {rows} rows, the first in row {np.argmax(bad) + 1}; "
             f"{treatment}."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,8 @@ from carlab.core.errors import DataError
 from carlab.recording.faults.fault import Fault
 from carlab.recording.pose_velocity import BoolArray, IndexArray
 
+AUDIT_SCHEMA = "carlab.audit/1"
+"""Name and version of the report's JSON."""
 MAX_ROWS = 60
 """Maximum number of rows that a finding lists."""
 
@@ -75,11 +77,15 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """All findings about one recording, in the order of the checks."""
+    """All findings about one recording, in the order of the checks.
+
+    ``refusal`` is the reason why the recording was not imported; None if it was imported.
+    """
 
     source: str
     layout: str
     findings: tuple[Finding, ...]
+    refusal: str | None = None
 
     def of(self, identity: str, channel: str | None = None) -> tuple[Finding, ...]:
         """Findings with this id, and this channel if one is given."""
@@ -98,9 +104,10 @@ class AuditReport:
     def to_dict(self) -> dict[str, object]:
         """The report as plain data for JSON."""
         return {
-            "schema": "carlab.audit/1",
+            "schema": AUDIT_SCHEMA,
             "source": self.source,
             "layout": self.layout,
+            "refusal": self.refusal,
             "findings": [
                 {
                     "id": f.id,
@@ -118,10 +125,16 @@ class AuditReport:
 
 
 class RefusedError(DataError):
-    """A file that cannot be imported as declared; ``findings`` are those of severity ERROR."""
+    """A file that cannot be imported as declared.
+
+    Attributes:
+        all_findings: all findings up to the refusal.
+        findings: those of severity ERROR.
+    """
 
     def __init__(self, source: str, findings: Sequence[Finding]) -> None:
-        self.findings = tuple(findings)
+        self.all_findings = tuple(findings)
+        self.findings = tuple(f for f in findings if f.severity is Severity.ERROR)
         if len(self.findings) == 1:
             super().__init__(f"{source}: {self.findings[0].sentence}")
         else:
@@ -129,8 +142,7 @@ class RefusedError(DataError):
             super().__init__(f"{source} has {len(self.findings)} faults:{faults}")
 
 
-def raise_errors(source: str, findings: Iterable[Finding]) -> None:
+def raise_errors(source: str, findings: Sequence[Finding]) -> None:
     """Raise one RefusedError with the sentence of every finding that is an ERROR."""
-    errors = [f for f in findings if f.severity is Severity.ERROR]
-    if errors:
-        raise RefusedError(source, errors)
+    if any(f.severity is Severity.ERROR for f in findings):
+        raise RefusedError(source, findings)

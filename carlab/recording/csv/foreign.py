@@ -72,6 +72,8 @@ def import_csv(path: Path | str, *, mapping: ColumnMapping | None = None) -> Imp
     table = read_csv(path)
     source = table.path.name
     mapping, layout_note = _layout(table, mapping)
+    if table.has_decimal_commas:
+        layout_note += ", numbers with decimal commas"
     values, extra, findings = _usable_rows(table, mapping)
     origin_s = float(values["t"][0])
     t_s = values["t"] - origin_s

@@ -13,6 +13,7 @@ import numpy as np
 
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
+from carlab.recording.csv.decimal_commas import has_decimal_comma, with_decimal_points
 
 _MISSING = frozenset({"", "none", "null", "na", "n/a"})
 
@@ -22,12 +23,14 @@ class CsvTable:
     """Numeric columns by name, each (N,), with NaN for empty cells. Row k of the arrays is data row k + 1.
 
     ``texts`` holds row and content of the first cell that is not a number, for each column with such a cell.
+    ``has_decimal_commas`` states whether numbers were read as 0,5.
     """
 
     path: Path
     header: tuple[str, ...]
     columns: dict[str, FloatArray]
     texts: dict[str, tuple[int, str]]
+    has_decimal_commas: bool = False
 
     @property
     def rows(self) -> int:
@@ -38,8 +41,12 @@ class CsvTable:
         """Return a numeric column (N,). Raises DataError if it holds text."""
         if name in self.texts:
             row, cell = self.texts[name]
-            has_decimal_comma = _is_number(cell.replace(",", ".", 1))
-            remedy = "write numbers with a decimal point" if has_decimal_comma else "correct or empty that cell"
+            is_ambiguous = "," in cell and _is_number(cell.replace(".", "").replace(",", ""))
+            remedy = (
+                "write all numbers with a decimal point and without separators of thousands"
+                if is_ambiguous
+                else "correct or empty that cell"
+            )
             raise DataError(
                 f"Row {row} of column '{name}' in {self.path.name} holds {cell!r}, which is not a number; {remedy}."
             )
@@ -50,7 +57,8 @@ def read_csv(path: Path | str) -> CsvTable:
     """Read a file with one header line, separated by commas, semicolons or tabs; ``.gz`` is decompressed.
 
     Lines before the header that begin with ``#`` are skipped. The header may begin with ``#``, as numpy.savetxt writes.
-    Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Raises DataError if the file is missing, empty,
+    Empty cells, ``nan``, ``none``, ``null`` and ``na`` become NaN. Numbers have a decimal point, or all have a decimal
+    comma; where that is ambiguous, their columns are texts. Raises DataError if the file is missing, empty,
     truncated or not text, or if a row has another number of cells than the header.
     """
     path = Path(path)
@@ -60,36 +68,56 @@ def read_csv(path: Path | str) -> CsvTable:
     try:
         lines = [row for row in csv.reader(io.StringIO(text, newline=""), delimiter=delimiter) if row]
     except csv.Error as error:
-        raise DataError(f"{path.name} is not a CSV file: {error}.") from error
+        raise DataError(f"{path.name} is not a CSV file ({error}); export it as CSV with one header line.") from error
     if not lines:
         raise DataError(f"{path.name} is empty; a recording has a header and at least two rows.")
     header = tuple(name.strip().lstrip("\ufeff") for name in lines[0])
-    if all(_is_number(cell) for cell in header):
+    if all(_is_number(cell) or has_decimal_comma(cell) for cell in header):
         raise DataError(f"{path.name} begins with numbers; add a header line with the column names.")
     duplicates = sorted({name for name in header if header.count(name) > 1})
     if duplicates:
         raise DataError(f"{path.name} has two columns named '{duplicates[0]}'; rename one in the header.")
     for number, row in enumerate(lines[1:], start=1):
         if len(row) != len(header):
+            cause = "the file may be truncated there; "
+            if len(row) > len(header) and delimiter == ",":
+                cause = "if its numbers have decimal commas, separate the columns by semicolons; else "
             raise DataError(
-                f"Row {number} of {path.name} has {len(row)} cells where the header has {len(header)}; "
-                "the file may be truncated there; correct or remove that row."
+                f"Row {number} of {path.name} has {len(row)} cells where the header has {len(header)}; {cause}"
+                "correct or remove that row."
             )
     if len(lines) < 3:
         raise DataError(f"{path.name} has {len(lines) - 1} rows; a recording needs at least two.")
-    columns, texts = {}, {}
-    for index, name in enumerate(header):
-        cells = ["nan" if row[index].strip().lower() in _MISSING else row[index] for row in lines[1:]]
-        try:
-            columns[name] = np.array(cells, dtype=np.float64)
-        except ValueError:
-            first_text = next(k for k, cell in enumerate(cells) if not _is_number(cell))
-            texts[name] = (first_text + 1, cells[first_text])
-    return CsvTable(path, header, columns, texts)
+    cells = {
+        name: ["nan" if row[index].strip().lower() in _MISSING else row[index] for row in lines[1:]]
+        for index, name in enumerate(header)
+    }
+    columns = {name: numbers for name, column in cells.items() if (numbers := _numbers(column)) is not None}
+    texts = {name: column for name, column in cells.items() if name not in columns}
+    converted = with_decimal_points(texts, (cells[name] for name in columns)) if texts else {}
+    columns |= {name: np.array(column, dtype=np.float64) for name, column in converted.items()}
+    first_texts = {name: _first_text(column) for name, column in texts.items() if name not in converted}
+    return CsvTable(path, header, columns, first_texts, bool(converted))
+
+
+def _numbers(cells: list[str]) -> FloatArray | None:
+    """The numbers of a column (N,); None if a cell is not a number."""
+    try:
+        return np.array(cells, dtype=np.float64)
+    except ValueError:
+        return None
+
+
+def _first_text(cells: list[str]) -> tuple[int, str]:
+    """Row and content of the first cell that is not a number."""
+    index = next(k for k, cell in enumerate(cells) if not _is_number(cell))
+    return index + 1, cells[index]
 
 
 def _without_comments(text: str) -> str:
     """The text from its header on; a header after ``#`` has as many cells as the next line."""
+    if text[:4].lower() == "sep=":  # Excel
+        text = text.partition("\n")[2]
     while text.startswith("#"):
         line, _, rest = text.partition("\n")
         delimiter = max(",;\t", key=line.count)
@@ -109,7 +137,7 @@ def _read_text(path: Path) -> str:
         raise DataError(f"{path.name} is not a complete gzip file ({error}); copy it again.") from error
     except UnicodeDecodeError as error:
         raise DataError(
-            f"{path.name} is not a text file: byte {error.start} is not UTF-8; export it as CSV."
+            f"{path.name} is not a text file: byte {error.start} is not UTF-8; save it as CSV in UTF-8."
         ) from error
     except OSError as error:
         raise DataError(f"Cannot read {path}: {error.strerror}; check the path.") from error

@@ -1,0 +1,81 @@
+"""Unusual names and contents of files that a new user may have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carlab.cli.console import console
+from tests.cli.test_bad_input import canonical_csv, write
+
+Carlab = Callable[..., tuple[int, str]]
+
+
+@pytest.mark.parametrize("name", ["drive[v2].csv", "[red]drive.csv", "Über die Straße 1.csv", "a[/b].csv"])
+def test_name_of_a_file_is_printed_as_it_is(carlab: Carlab, tmp_path: Path, name: str) -> None:
+    """The console library reads brackets as styles; a[/b].csv is a file b].csv in a folder."""
+    path, data = canonical_csv(tmp_path, rows=60)
+    named = tmp_path / name
+    named.parent.mkdir(exist_ok=True)
+    write(path, data).rename(named)
+    code, text = carlab("import", named)
+    assert code == 0, text
+    assert f"{named.with_suffix('.mcap')}: 59 commands" in text
+    code, text = carlab("export", named.with_suffix(".mcap"), "--out", named.with_suffix(".parquet"))
+    assert code == 0, text
+    assert f"{named.with_suffix('.parquet')}: 60 rows" in text
+
+
+@pytest.mark.parametrize(
+    ("column", "message"),
+    [
+        (4, "Column 'vx' has no number in any row; remove it from the file."),
+        (1, "Column 'x' has no number in any row; repair the file."),
+    ],
+)
+def test_column_without_any_number_has_another_remedy_than_dropping_all_rows(
+    carlab: Carlab, tmp_path: Path, column: int, message: str
+) -> None:
+    path, data = canonical_csv(tmp_path, rows=60)
+    data[:, column] = np.nan
+    for options in ((), ("--missing", "drop")):
+        code, text = carlab("import", write(path, data), *options)
+        assert code == 1
+        assert message in text
+        assert "--missing drop" not in text
+
+
+def test_binary_like_table_names_the_remedy(carlab: Carlab, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,x\n" + "0" * 200_000, encoding="utf-8")
+    code, text = carlab("import", tmp_path / "a.csv")
+    assert code == 1
+    assert "export it as CSV with one header line." in text
+
+
+@pytest.mark.parametrize(("width", "is_whole"), [(60, True), (100, False)])
+def test_findings_are_paragraphs_in_a_narrow_terminal(
+    carlab: Carlab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int, is_whole: bool
+) -> None:
+    """A table of five columns leaves 14 characters for the sentence, whose words stand between those of other cells."""
+    monkeypatch.setattr(console, "_width", width)
+    path, data = canonical_csv(tmp_path, rows=60)
+    data[:, 8] = 0.3
+    code, text = carlab("import", write(path, data))
+    assert code == 0, text
+    paragraph = "warning: constant_command of throttle, 59 rows Column 'throttle' (throttle) is 0.3 throughout:"
+    assert (paragraph in text) is is_whole, text
+
+
+@pytest.mark.parametrize("content", [b'{"plan": 3}', b"[1", b"\xff"])
+def test_damaged_settings_of_a_run_name_the_remedy(carlab: Carlab, tmp_path: Path, content: bytes) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "campaign.json").write_bytes(content)
+    code, text = carlab("drive", "--policy", run, "--out", tmp_path / "runs")
+    assert code == 1
+    assert "campaign.json: " in text
+    assert text.endswith("restore the file, or name the folder of another run.")
+    assert not (tmp_path / "runs").exists()
