@@ -1,7 +1,7 @@
 """Drift: what changed in the car since the fitted recordings, from its adaptation to held-out recordings.
 
 An adaptation also follows errors of a wrong simulator. So a drift must be slow, and the slow adaptation must predict
-unseen windows better than the simulator, than the simulator with the mean disturbance of the fitted recordings, and
+held-out windows better than the simulator, than the simulator with the mean disturbance of the fitted recordings, and
 than the simulator whose prediction is corrected by the mean error of fitted windows in similar states.
 """
 
@@ -171,7 +171,7 @@ def _changed(
     slowly_adapted: Callable[[Mask], _SlowAdaptation],
     settings: DriftSettings,
 ) -> Mask:
-    """Which quantities changed: forward selection by the gain on unseen windows."""
+    """Which quantities changed: forward selection by the gain on held-out windows."""
     mask: Mask = (False,) * len(QUANTITIES)
     current = plain[own]
     while not all(mask):

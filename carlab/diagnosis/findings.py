@@ -157,9 +157,9 @@ class Drift:
 
     Attributes:
         recording: number of the recording, from 1.
-        is_drift: whether a slow adaptation predicts unseen windows better by the minimum number of standard errors than
-            the simulator, than the simulator with the mean disturbance of the fitted recordings, and than the simulator
-            corrected by the mean error of fitted windows in similar states.
+        is_drift: whether a slow adaptation predicts held-out windows better, by the minimum number of standard errors,
+            than the simulator, than the simulator with the mean disturbance of the fitted recordings, and than the
+            simulator corrected by the mean error of fitted windows in similar states.
         changes: quantities that changed, largest gain first; empty without a drift, or if no single one is significant.
         time_constant_s: likeliest time constant of the slow adaptation [s].
         model_m, adapted_m, slow_m, similar_states_m: root mean square position errors after the horizon [m] of the
@@ -332,7 +332,7 @@ class Exhibits:
     regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
     correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
                  and the 99 % bound
-    candidates: candidates for the first effect: id, gain on unseen blocks in standard errors, loss with it
+    candidates: candidates for the first effect: id, gain on left-out blocks in standard errors, loss with it
     decisions: accepted and rejected effects with statistics and thresholds
     noise: noise of the recordings, for model.toml
     """

@@ -231,9 +231,9 @@ def test_verdict_states_the_error_with_measured_curves(outcome):
 
 
 def test_simulator_with_curves_predicts_a_drive_that_it_was_not_fitted_to(drives):
-    fit, unseen = drives
+    fit, held_out = drives
     found = simulator_with_curves([fit], CAR, settings=SETTINGS)
-    windows = cut_windows(tracks_of([unseen]), 1.0, 0.5)
+    windows = cut_windows(tracks_of([held_out]), 1.0, 0.5)
     rms = {}
     for name, config in (("car file", CAR), ("curves", found)):
         error = prediction_errors(SimulatorModel(config).predict(windows), windows)[:, -1]
