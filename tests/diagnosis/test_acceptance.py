@@ -39,9 +39,9 @@ def test_strong_candidate_is_accepted(problem: SearchProblem, strong: Candidate)
     "changed",
     [
         pytest.param({"gain": -1.0}, id="fitted windows get worse"),
-        pytest.param({"unseen_gain": -1.0}, id="other blocks get worse"),
-        pytest.param({"unseen_gain": 1e-9}, id="other blocks hardly change"),
-        pytest.param({"chi2": 0.0, "unseen_error": 1e9}, id="not significant"),
+        pytest.param({"left_out_gain": -1.0}, id="other blocks get worse"),
+        pytest.param({"left_out_gain": 1e-9}, id="other blocks hardly change"),
+        pytest.param({"chi2": 0.0, "left_out_gain_error": 1e9}, id="not significant"),
     ],
 )
 def test_rejected_candidate_meets_no_set_of_conditions(

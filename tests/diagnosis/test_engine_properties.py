@@ -155,7 +155,7 @@ def test_rival_physics_replaces_a_spurious_effect(
     assert [e.id for e in without_rivals.effects] == [spurious]
 
 
-def test_effect_without_gain_on_unseen_blocks_is_eliminated(
+def test_effect_without_gain_on_left_out_blocks_is_eliminated(
     drag: tuple[Path, float], windows: PredictionWindows
 ) -> None:
     car = load_car_file(drag[0] / "car.toml").simulator

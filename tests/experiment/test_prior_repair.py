@@ -64,7 +64,7 @@ def left(episodes: int, *causes: dict[str, Any], **others: Any) -> Findings:
     return Findings(episodes, {"verdict": "left", "causes": list(causes)}, **others)
 
 
-def test_effect_with_support_on_unseen_windows_enters_with_its_uncertainty() -> None:
+def test_effect_with_cross_validated_support_enters_with_its_uncertainty() -> None:
     version = repaired(PriorVersion(history=4), CAR, left(1, cause("motor_lag", 0.9, **{LAG: 0.08})))
     (entered,) = version.corrections
     assert (entered.id, entered.values, entered.episodes) == ("motor_lag", {LAG: 0.08}, 1)

@@ -40,7 +40,7 @@ def simulator_with_curves(
         settings: settings of the diagnosis.
 
     Returns:
-        The simulator with its curves. Without a curve that unseen blocks need: with the refitted parameters and the
+        The simulator with its curves. Without a curve that left-out blocks need: with the refitted parameters and the
         delay.
 
     Raises:

@@ -149,7 +149,7 @@ def held_out_loss(
     except DataError:
         return None
     fitter = Fitter(windows, scale_of(windows, floor, settings))
-    return [float(fitter.loss(each, max_error=settings.max_unseen_error).sum()) for each in simulators]
+    return [float(fitter.loss(each, max_error=settings.max_left_out_error).sum()) for each in simulators]
 
 
 def _checked(

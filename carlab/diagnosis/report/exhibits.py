@@ -33,7 +33,7 @@ def exhibits_of(scored: ScoredSearch, recordings: SplitRecordings) -> Exhibits:
         for name in found.effects[: settings.max_correlations]
     }
     candidates = tuple(
-        (c.effect, c.standard_errors if math.isfinite(c.unseen_error) else 0.0, float(c.fit.loss.sum()))
+        (c.effect, c.standard_errors if math.isfinite(c.left_out_gain_error) else 0.0, float(c.fit.loss.sum()))
         for c in found.tried
     )
     ladder = (*score_ladder(scored), ("noise floor", 1.0))

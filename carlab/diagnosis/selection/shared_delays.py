@@ -19,7 +19,7 @@ from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import Fit, clustered_gain, design_effect_of
 from carlab.diagnosis.selection.delay_groups import effect_of_each_command, group_lags_s
 from carlab.diagnosis.selection.elimination import EliminationResult, eliminate
-from carlab.diagnosis.selection.pairwise_tests import unseen_loss
+from carlab.diagnosis.selection.pairwise_tests import left_out_loss
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.settings import SelectionSettings
@@ -33,7 +33,7 @@ class _Replacement:
     """A fit with ``new`` effects in place of ``old`` ones.
 
     chi2   twice its gain over the design effect
-    loss   of each window (S,) on unseen blocks, with free initial states
+    loss   of each window (S,) on left-out blocks, with free initial states
     """
 
     old: frozenset[str]
@@ -55,7 +55,7 @@ def replace_shared_delays(
         control.progress(f"comparing {name} with delays and lags of single commands", 0.94)
         arguments = [(problem.without_refits(), model, *exchange) for exchange in exchanges]
         fitted = [each for each in control.workers.map(_fitted, arguments, stop=control.stop) if each is not None]
-        own_loss = unseen_loss(problem, model.fit, model.scale) if fitted else np.zeros(0)
+        own_loss = left_out_loss(problem, model.fit, model.scale) if fitted else np.zeros(0)
         passing = [each for each in fitted if _passes(problem, model, each, own_loss, control)]
         if passing:
             best = min(passing, key=lambda each: float(each.loss.sum()))
@@ -115,7 +115,7 @@ def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict
     chi2 = 2.0 * (model.fit.cost - fit.cost) / max(design_effect_of(with_covariance, e) for e in new)
     if chi2 < (settings.accept_chi2_min if len(new) > len(old) else -settings.accept_chi2_min):
         return None
-    return _Replacement(old, tuple(new), fit, chi2, unseen_loss(problem, fit, model.scale))
+    return _Replacement(old, tuple(new), fit, chi2, left_out_loss(problem, fit, model.scale))
 
 
 def _passes(

@@ -102,9 +102,9 @@ class CurveSettings:
     """Iterations of the first fit, of the last fit, and with the updated error scale or without one curve."""
     tolerance: float = 1e-3  # relative fall of the cost at which a fit ends
     keep_z_min: float = 0.0
-    """Minimum rise of the loss on unseen blocks without a curve that is kept [standard errors]; 2 is worse on ETH."""
+    """Minimum rise of the loss on left-out blocks without a curve that is kept [standard errors]; 2 is worse on ETH."""
     accept_z_min: float = 3.0
-    """Minimum fall of the loss on unseen blocks with all curves [standard errors]."""
+    """Minimum fall of the loss on left-out blocks with all curves [standard errors]."""
     min_support_s: float = 0.5
     """Minimum driving time [s] near a knot; without it the curve ends there in the report."""
     min_fitted_s: float = 0.05

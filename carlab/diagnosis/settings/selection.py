@@ -33,36 +33,39 @@ class ScreeningSettings:
 
 @dataclass(frozen=True, slots=True)
 class SelectionSettings:
-    """Joint refits, tests on unseen blocks, acceptance, moves, elimination and pairwise tests."""
+    """Joint refits, tests on left-out blocks, acceptance, moves, elimination and pairwise tests.
+
+    ``unseen`` in the name of a setting means left-out blocks; ``decisions.json`` has these names.
+    """
 
     max_refits: int = 10
     """Maximum number of candidates, by screening score, that are refitted together with the base parameters."""
     confusable_leaders: int = 3
     """Number of leading candidates whose confusable effects are refitted as well."""
     folds: int = 6
-    """Number of folds of blocks for the test on unseen blocks."""
+    """Number of folds of blocks for the test on left-out blocks."""
     min_score_share: float = 0.1
     """A candidate is refitted if its screening score is at least this share of the best. Chosen on development
     cases."""
     min_score_chi2: float = 8.0
     """A candidate is refitted if twice its score over the design effect is at least this."""
     min_gain_share: float = 0.3
-    """A refitted candidate is tested on unseen blocks if its gain is at least this share of the best."""
-    max_unseen_error: float = 12.0
-    """Whitened errors on unseen blocks are clipped here [standard deviations], to limit the influence of one spin."""
+    """A refitted candidate is tested on left-out blocks if its gain is at least this share of the best."""
+    max_left_out_error: float = 12.0
+    """Whitened errors on left-out blocks are clipped here [standard deviations], to limit the influence of one spin."""
     accept_chi2_min: float = 25.0
     """Minimum chi2 (twice the gain over the design effect) of an accepted effect with one parameter. Chosen on
     development cases: about 60 candidates are compared."""
     accept_chi2_per_number: float = 8.0
     """Additional chi2 per additional parameter and for an infinite identity value. Chosen on development cases."""
     accept_unseen_share: float = 0.015
-    """Minimum unseen gain of an accepted effect, as a share of the loss of a perfect simulator."""
+    """Minimum gain on left-out blocks of an accepted effect, as a share of the loss of a perfect simulator."""
     accept_unseen_ratio: float = 0.3
-    """Minimum unseen gain of an accepted effect, as a share of its gain on the fitted blocks."""
+    """Minimum gain on left-out blocks of an accepted effect, as a share of its gain on the fitted blocks."""
     steady_z_min: float = 3.0
-    """Alternative: minimum unseen gain [standard errors] together with ``steady_unseen_share``."""
+    """Alternative: minimum gain on left-out blocks [standard errors] together with ``steady_unseen_share``."""
     steady_unseen_share: float = 0.03
-    """Alternative: minimum unseen gain, as a share of the loss of a perfect simulator."""
+    """Alternative: minimum gain on left-out blocks, as a share of the loss of a perfect simulator."""
     keep_chi2_min: float = 16.0
     """Minimum chi2 of an earlier effect after others were added, and minimum chi2 of a swap."""
     swap_score_share: float = 0.7
@@ -90,7 +93,7 @@ class SelectionSettings:
     """Number of windows on which initial points are compared, as many as for screening. Full fits from the best point
     use all windows. With all windows these comparisons took 40 % of a search on the ETH car."""
     keep_z_min: float = 1.2
-    """One of several effects is removed if its removal costs less than this on unseen blocks [standard errors]."""
+    """One of several effects is removed if its removal costs less than this on left-out blocks [standard errors]."""
     min_practical_size: float = 0.2
     """Minimum size of an effect: the change of a channel at the end of the fitted windows by its removal and a refit,
     over the error that remains [noise floors, or robust errors of the simulator where these are larger]. A smaller
@@ -104,15 +107,15 @@ class SelectionSettings:
     concealed friction ellipse of a development case is withdrawn: its removal lowers the score by 13 %, but raises
     the likelihood by 0.6 standard errors only."""
     tie_z: float = 2.0
-    """Another path replaces the greedy path if its loss on unseen blocks is lower by this [standard errors]."""
+    """Another path replaces the greedy path if its loss on left-out blocks is lower by this [standard errors]."""
     rival_z: float = 3.0
-    """Two confusable effects are indistinguishable if their losses on unseen blocks, with free initial states, differ
+    """Two confusable effects are indistinguishable if their losses on left-out blocks, with free initial states, differ
     by less [standard errors]."""
     better_rival_z: float = 1.0
-    """A confusable effect replaces an effect if its loss on unseen blocks, with free initial states, is lower by this
+    """A confusable effect replaces an effect if its loss on left-out blocks, with free initial states, is lower by this
     [standard errors]."""
     split_z_min: float = 2.0
-    """An effect of each command replaces one effect of both commands if the loss on unseen blocks, with free initial
+    """An effect of each command replaces one effect of both commands if the loss on left-out blocks, with free initial
     states, is lower by this [standard errors], and if the gain is that of a further effect (``accept_chi2_min``)."""
     max_set_rivals: int = 2
     """Maximum number of effects in ``indistinguishable_from`` of report.json."""
@@ -156,9 +159,10 @@ class RivalSettings:
     the held-out squared score. On 70 development cases of seeds 0 and 5, concealed effects explain 0.53 of the loss
     or more; five spurious names explain 0.17 to 0.49 of it, and two of these 0.25 and 0.27 of the squared score."""
     curve_z_min: float = 3.0
-    """A steering curve replaces named steering effects that it contains if its loss on unseen blocks, with free initial
-    states, is lower by this [standard errors], and by ``min_curve_share``. On development cases of seeds 60 to 62, it
-    is lower by 3.7 to 8.1 for five random maps of the steering, and by at most 0.9 for concealed effects."""
+    """A steering curve replaces named steering effects that it contains if its loss on left-out blocks, with free
+    initial states, is lower by this [standard errors], and by ``min_curve_share``. On development
+    cases of seeds 60 to 62, it is lower by 3.7 to 8.1 for five random maps of the steering, and by at most 0.9 for
+    concealed effects."""
     min_curve_share: float = 0.1
     """Minimum of this fall, as a share of the fall from the refit to the curve: 0.25 or more for the random maps,
     0.001 or less for the effects."""
