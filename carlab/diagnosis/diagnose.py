@@ -41,7 +41,7 @@ from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.network_ensemble import EnsembleSettings, check_duration, train_ensemble
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
-from carlab.prediction.windows import PredictionWindows, tracks_of
+from carlab.prediction.windows import PredictionWindows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
 
@@ -167,12 +167,12 @@ def _prepare_recordings(
         )
     except Inconclusive as error:
         error.data_faults = faults
-        usable_s = sum(track.duration_s for track in tracks_of(fit))
+        usable_s = sum(segment.duration_s for segment in segments_of(fit))
         if faults and usable_s < settings.min_fit_s and usable_s < settings.unusable_share * recorded_s:
             error.verdict = "data"
         raise
     if request.ceiling or request.discrepancy:
-        check_duration(recordings.fit_tracks, EnsembleSettings())
+        check_duration(recordings.fit_segments, EnsembleSettings())
     recordings, noise = _estimate_noise(recordings, nominal, request.settings.identification)
     return recordings, noise, faults
 
@@ -187,7 +187,7 @@ def _estimate_noise(
     recordings = replace(
         recordings, fit_windows=fit_windows, held_out_windows=held_out_windows, event_windows=event_windows
     )
-    return recordings, estimate_noise(recordings.fit_tracks, fit_windows.curvature_bias, settings=settings)
+    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias, settings=settings)
 
 
 def _search_effects(
@@ -208,9 +208,9 @@ def _search_effects(
     search_control = replace(control, progress=search_progress)
     found = search(problem, search_control)
     control.progress("searching for physics outside the catalogue", 0.8)
-    vibration = find_vibration(recordings.fit_tracks, request.settings.unexplained)
+    vibration = find_vibration(recordings.fit_segments, request.settings.unexplained)
     if vibration is not None:
-        noise = estimate_noise(recordings.fit_tracks, windows.curvature_bias, slowest=True, settings=identification)
+        noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, slowest=True, settings=identification)
     held_out = HeldOut.of(recordings.held_out_windows, noise, nominal, identification)
     if request.effects is None:
         naming = accept_names(problem, found, held_out, vibration, search_control)
@@ -242,7 +242,7 @@ def _assemble_result(
     final_errors = {name: held_out.final_error(each) for name, each in models.items()}
     held_out_errors = {name: held_out.summary(error) for name, error in final_errors.items()}
     held_out_errors["noise_floor"] = held_out.floor_summary()
-    tracks, settings = recordings.fit_tracks, request.settings.curves
+    segments, settings = recordings.fit_segments, request.settings.curves
     diagnosis = Diagnosis(
         verdict=verdict,
         sentence="",
@@ -255,7 +255,7 @@ def _assemble_result(
         recordings=tuple(request.uses),
         seed=request.seed,
         seconds=0.0,
-        curves=() if measured is None else curve_findings(measured, request.nominal, tracks, settings),
+        curves=() if measured is None else curve_findings(measured, request.nominal, segments, settings),
         ceiling=_ceiling(held_out_errors),
         skill=skill_of(
             held_out.windows,
@@ -293,7 +293,7 @@ def _measured_curves(
     if not request.curves or unexplained < settings.min_unexplained_share or control.stop():
         return None
     found = fit_curves(scored.problem, scored.found, control)
-    return None if found is None else without_extrapolation(found, recordings.fit_tracks, settings)
+    return None if found is None else without_extrapolation(found, recordings.fit_segments, settings)
 
 
 def _models(
@@ -316,7 +316,7 @@ def _models(
 
     def trained(simulator: PredictiveModel | None) -> PredictiveModel:
         return train_ensemble(
-            recordings.fit_tracks,
+            recordings.fit_segments,
             simulator=simulator,
             seed=request.seed,
             velocity_window_s2=recordings.fit_windows.velocity_window_s2,
@@ -345,8 +345,8 @@ def _adaptation(
         return None
     control.progress("adapting along the held-out recordings", 0.93)
     config = scored.found.best.config if measured is None else measured.fit.config
-    tracks = recordings.fit_tracks, recordings.held_out_tracks
-    return adapt_to_held_out(config, *tracks, scored.held_out, request.settings.drift)
+    segments = recordings.fit_segments, recordings.held_out_segments
+    return adapt_to_held_out(config, *segments, scored.held_out, request.settings.drift)
 
 
 def _ceiling(errors: Mapping[str, FitErrors]) -> Ceiling | None:

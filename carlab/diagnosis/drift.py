@@ -27,7 +27,7 @@ from carlab.prediction.disturbances import DisturbedModel
 from carlab.prediction.error_memory import state_features
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel
-from carlab.prediction.windows import Track, cut_windows
+from carlab.prediction.windows import RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
 QUANTITIES = (("drive force", "1"), ("steering trim", "rad"), ("grip", "1"), ("force forward", "m/s2"))
@@ -57,39 +57,41 @@ class _SlowAdaptation:
 
 def adapt_to_held_out(
     config: SimulatorConfig,
-    fit_tracks: Sequence[Track],
-    held_out_tracks: Sequence[Track],
+    fit_segments: Sequence[RecordingSegment],
+    held_out_segments: Sequence[RecordingSegment],
     held_out: HeldOut,
     settings: DriftSettings,
 ) -> Adaptation:
     """Adapt a simulator along held-out recordings, and find what changed in the car since the fitted ones.
 
     Args:
-        config: the simulator, fitted to ``fit_tracks``.
-        fit_tracks: fitted recordings; the noise of the filter is chosen on them.
-        held_out_tracks: held-out recordings.
+        config: the simulator, fitted to ``fit_segments``.
+        fit_segments: fitted recordings; the noise of the filter is chosen on them.
+        held_out_segments: held-out recordings.
         held_out: windows of the held-out recordings.
         settings: conditions of a drift.
     """
     whole = AdaptationSettings()
     window_s2 = held_out.windows.velocity_window_s2
-    noise = choose_noise(config, fit_tracks, whole, velocity_window_s2=window_s2)
-    model = adapt(config, held_out_tracks, noise, whole, fitted=fit_tracks, velocity_window_s2=window_s2)
+    noise = choose_noise(config, fit_segments, whole, velocity_window_s2=window_s2)
+    model = adapt(config, held_out_segments, noise, whole, fitted=fit_segments, velocity_window_s2=window_s2)
     times_s = tuple(t for t in whole.time_constants_s if t >= settings.min_time_constant_s)
     slow = replace(whole, time_constants_s=times_s)
 
     @cache
     def slowly_adapted(mask: Mask) -> _SlowAdaptation:
-        made = adapt(config, held_out_tracks, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
+        made = adapt(
+            config, held_out_segments, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2
+        )
         return _SlowAdaptation(made, held_out.final_error(made))
 
     @cache
     def along_fitted(mask: Mask) -> FloatArray:
-        fitted = adapt(config, fit_tracks, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
+        fitted = adapt(config, fit_segments, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
         return fitted.series().mean
 
     plain = held_out.final_error(config)
-    similar = _similar_states(config, fit_tracks, held_out, plain, settings)
+    similar = _similar_states(config, fit_segments, held_out, plain, settings)
     constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0), slow)
     errors = {
         "model": plain,
@@ -252,13 +254,13 @@ class _SimilarStates:
 
 def _similar_states(
     config: SimulatorConfig,
-    fit_tracks: Sequence[Track],
+    fit_segments: Sequence[RecordingSegment],
     held_out: HeldOut,
     errors: FloatArray,
     settings: DriftSettings,
 ) -> _SimilarStates:
     windows = held_out.windows
-    fitted = cut_windows(fit_tracks, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
+    fitted = cut_windows(fit_segments, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
     fitted = replace(fitted, velocity_window_s2=windows.velocity_window_s2)
     fit_errors = final_errors(SimulatorModel(config), fitted)
     fit_states, states = state_features(fitted), state_features(windows)

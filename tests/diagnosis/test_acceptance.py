@@ -8,7 +8,7 @@ import pytest
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.selection.candidates import acceptance, is_accepted
 from carlab.diagnosis.selection.problem import Candidate, SearchProblem
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -17,7 +17,7 @@ CAR = SimulatorConfig(control_period_s=PERIOD_S)
 
 @pytest.fixture(scope="module")
 def problem() -> SearchProblem:
-    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    windows = cut_windows(segments_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     return SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ())
 
 
