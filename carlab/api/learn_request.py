@@ -65,7 +65,7 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
 
     from carlab.core.task_choice import PARKING
     from carlab.experiment.campaign.campaign import PAPER_HISTORY
-    from carlab.experiment.campaign.prior_repair import needed_history
+    from carlab.experiment.campaign.prior_correction import needed_history
     from carlab.experiment.campaign.training_plan import TrainingPlan
     from learning.world.car_fit import PAPER_METHODS
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.live_view import LiveView
-    from carlab.experiment.campaign.prior_repair import PriorVersion
+    from carlab.experiment.campaign.prior_correction import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
     from carlab.experiment.cluster.trainer import ClusterTrainer
     from carlab.experiment.episodes.interrupts import Interrupts
@@ -313,7 +313,7 @@ def _check(request: LearnRequest) -> None:
         raise ConfigError(f"--method {request.method}: choose one of {', '.join(get_args(Method))}.")
     if request.prior == AUTO and request.method != "gp-sim-posterior":
         raise ConfigError(
-            f"--prior auto: its repairs are for --method gp-sim-posterior; {request.method} needs another --prior."
+            f"--prior auto: its corrections are for --method gp-sim-posterior; {request.method} needs another --prior."
         )
 
 
@@ -355,7 +355,7 @@ def _check_as_before(request: LearnRequest, campaign: Campaign, choice: CarChoic
     default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
     saved = {name: getattr(plan, name) for name in PLANNED}
     changed = [n for n in PLANNED if getattr(request, n) not in (default[n], saved[n])]
-    is_same = campaign.repairs_prior == (request.prior == AUTO)
+    is_same = campaign.corrects_prior == (request.prior == AUTO)
     if request.prior != default["prior"] and not (
         is_same and training_plan(request, choice).prior_toml == plan.prior_toml
     ):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from carlab.core.documents import Tick
     from carlab.core.outcome import EndReason
     from carlab.experiment.campaign.figures import EpisodeFigures
-    from carlab.experiment.campaign.prior_repair import PriorVersion
+    from carlab.experiment.campaign.prior_correction import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
 
 STEPS_PERIOD_S = 600.0

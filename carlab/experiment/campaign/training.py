@@ -24,7 +24,7 @@ from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.state_estimator import StateEstimator
 from carlab.experiment.campaign.predicted_return import predicted_figures
-from carlab.experiment.campaign.prior_process import read_version
+from carlab.experiment.campaign.prior_correction_process import read_version
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.prediction.learned import drive_windows, recorded_windows
 from carlab.recording.episode_builder import VELOCITY_DELAY
