@@ -23,14 +23,14 @@ from carlab.diagnosis.evidence import (
     unexplained_share,
     verdict_of,
 )
-from carlab.diagnosis.findings import Ceiling, DataFault, Diagnosis, Exhibits, FitErrors, RecordingUse
+from carlab.diagnosis.findings import Ceiling, DataFault, Diagnosis, FigureData, FitErrors, RecordingUse
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.naming import NamingResult, accept_names, describe_unexplained, residual_of
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
-from carlab.diagnosis.report.exhibits import exhibits_of
+from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
@@ -57,7 +57,7 @@ class Outcome:
     """The diagnosis, the data of its figures, the corrected simulator, and all models with the held-out windows."""
 
     diagnosis: Diagnosis
-    exhibits: Exhibits
+    figure_data: FigureData
     model: SimulatorConfig
     models: Mapping[str, PredictiveModel]
     held_out_windows: PredictionWindows
@@ -147,7 +147,7 @@ def diagnose(
 def _with_run(outcome: Outcome, timer: SearchTimer, decisions: Sequence[Decision]) -> Outcome:
     """The outcome with time, extent and decisions of the search."""
     diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=timer.extent())
-    return replace(outcome, diagnosis=diagnosis, exhibits=replace(outcome.exhibits, decisions=tuple(decisions)))
+    return replace(outcome, diagnosis=diagnosis, figure_data=replace(outcome.figure_data, decisions=tuple(decisions)))
 
 
 def _prepare_recordings(
@@ -267,10 +267,10 @@ def _assemble_result(
         events=recordings.events,
         held_out_with_events=_errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )
-    exhibits = exhibits_of(scored, recordings)
+    figure_data = figure_data_of(scored, recordings)
     noise = replace(held_out.recording_noise, adaptation=None if adaptation is None else adaptation.noise)
-    exhibits = replace(exhibits, noise=noise)
-    return Outcome(diagnosis, exhibits, model or scored.found.best.config, models, held_out.windows)
+    figure_data = replace(figure_data, noise=noise)
+    return Outcome(diagnosis, figure_data, model or scored.found.best.config, models, held_out.windows)
 
 
 def _errors_with_events(

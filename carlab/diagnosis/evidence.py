@@ -93,15 +93,15 @@ def effect_findings(
     return tuple(found)
 
 
-def score_ladder(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
+def scores_by_step(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
     """Held-out scores of the nominal simulator, the refit, each step of the search, and the accepted effects."""
     held_out, found, scores = scored.held_out, scored.found, scored.scores()
-    ladder = [("nominal", scores["nominal"]), ("refit", scores["refit"])]
+    steps = [("nominal", scores["nominal"]), ("refit", scores["refit"])]
     for name, fit in found.history:
-        ladder.append((f"+ {name}", held_out.score(held_out.final_error(fit.config))))
+        steps.append((f"+ {name}", held_out.score(held_out.final_error(fit.config))))
     if found.history and found.history[-1][1] is not found.best:
-        ladder.append(("accepted effects", scores["with_effects"]))
-    return tuple(ladder)
+        steps.append(("accepted effects", scores["with_effects"]))
+    return tuple(steps)
 
 
 def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
@@ -228,7 +228,7 @@ __all__ = [
     "Texts",
     "base_estimates",
     "effect_findings",
-    "score_ladder",
+    "scores_by_step",
     "unexplained_share",
     "verdict_of",
 ]

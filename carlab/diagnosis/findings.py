@@ -325,10 +325,11 @@ class Trace:
 
 
 @dataclass(frozen=True, slots=True)
-class Exhibits:
+class FigureData:
     """Data of the report's figures.
 
-    ladder: scores from nominal over refit and each added effect to the noise floor, with labels
+    traces: held-out recordings with their predictions, and fitted recordings with events
+    scores_by_step: label and held-out score of: nominal, refit, each added effect, noise floor
     regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
     correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
                  and the 99 % bound
@@ -338,7 +339,7 @@ class Exhibits:
     """
 
     traces: tuple[Trace, ...] = ()
-    ladder: tuple[tuple[str, float], ...] = ()
+    scores_by_step: tuple[tuple[str, float], ...] = ()
     regimes: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
     correlation: Mapping[str, tuple[FloatArray, FloatArray, float]] = field(default_factory=dict)
     candidates: tuple[tuple[str, float, float], ...] = ()

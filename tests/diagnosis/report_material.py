@@ -12,7 +12,7 @@ from carlab.diagnosis.findings import (
     EffectFinding,
     Estimate,
     Evidence,
-    Exhibits,
+    FigureData,
     FitErrors,
     RecordingUse,
     Trace,
@@ -109,13 +109,13 @@ def mismatch() -> Diagnosis:
     return Diagnosis("mismatch", "", effects, PARAMETERS, 1.0, held, None, faults, USES, 7, 41.3)
 
 
-def exhibits() -> Exhibits:
+def figure_data() -> FigureData:
     lags = np.arange(12) / 30.0
     curve = 0.46 * np.exp(-((lags - 0.1) ** 2) / 0.006)
     speed, ay = np.linspace(0.4, 2.4, 6), np.linspace(0.1, 6.2, 6)
-    return Exhibits(
+    return FigureData(
         traces=(trace(), replace(trace("recording 2"), marked=((7.0, 8.0),))),
-        ladder=(
+        scores_by_step=(
             ("nominal", 7.42),
             ("refit", 3.86),
             ("+ steering_lag", 1.81),

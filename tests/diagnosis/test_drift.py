@@ -85,13 +85,13 @@ def test_diagnosis_states_the_drift_in_its_report(fitted):
     outcome = diagnose([fitted], [held_out], CONFIG, texts, effects=(), adapt=True)
     errors = outcome.diagnosis.held_out
     assert errors["adapted"].position_m < 0.4 * errors["refit"].position_m
-    assert outcome.exhibits.noise.adaptation is not None
+    assert outcome.figure_data.noise.adaptation is not None
     report = completed(outcome.diagnosis)
     assert "In held-out recording 1 the car differs from the fitted recordings. The drive force is" in report.sentence
     (table,) = report.to_dict()["drift"]
     assert table["changes"][0]["value"] == pytest.approx(-0.3, abs=0.04)
     assert len(table["t_s"]) == len(table["mean"]) == len(table["std"])
-    page = render_page(outcome.diagnosis, outcome.exhibits)
+    page = render_page(outcome.diagnosis, outcome.figure_data)
     assert "Change of the car since the fitted recordings" in page
     without = diagnose([fitted], [held_out], CONFIG, texts, effects=())
     assert without.diagnosis.drift == ()

@@ -162,7 +162,7 @@ def test_diagnosis_lists_events_and_scores_without_and_with_them(hit: EventDrive
     diagnosis = outcome.diagnosis
     report = diagnosis.to_dict()["events"]
     assert len(report["found"]) == len(hit.spans)
-    boundary_s = outcome.exhibits.traces[0].times_s[0]
+    boundary_s = outcome.figure_data.traces[0].times_s[0]
     assert [e["role"] for e in report["found"]] == ["held out" if b > boundary_s else "fit" for b, _ in hit.spans]
     assert report["are_left_out"]
     assert report["fit_windows"] > 0
@@ -170,7 +170,7 @@ def test_diagnosis_lists_events_and_scores_without_and_with_them(hit: EventDrive
     for name, factor in (("nominal", 2.0), ("with_effects", 2.0), ("constant_velocity", 1.0)):
         with_them = report["held_out_with_events"][name]
         assert with_them["position_m"] > factor * diagnosis.held_out[name].position_m
-    assert sum(len(t.events) for t in outcome.exhibits.traces) == len(hit.spans)
+    assert sum(len(t.events) for t in outcome.figure_data.traces) == len(hit.spans)
     assert len(diagnosed_event_sentences(diagnosis)) == 1 + len(hit.spans)
 
 

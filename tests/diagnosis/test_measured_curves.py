@@ -110,7 +110,7 @@ def test_model_does_not_extrapolate_beyond_the_recordings(outcome):
 
 
 def test_report_and_model_file_contain_the_curves(outcome, tmp_path):
-    write_report(outcome.diagnosis, outcome.exhibits, tmp_path, outcome.model)
+    write_report(outcome.diagnosis, outcome.figure_data, tmp_path, outcome.model)
     report = json.loads((tmp_path / "report.json").read_text())
     table = next(c for c in report["curves"] if c["id"] == "drive_map")
     assert np.shape(table["measured"]) == tuple(len(axis["knots"]) for axis in table["axes"])

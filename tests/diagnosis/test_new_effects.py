@@ -145,7 +145,7 @@ def found(_registered: None) -> Outcome:
 @pytest.fixture(scope="module")
 def report(found: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    write_report(found.diagnosis, found.exhibits, folder, found.model)
+    write_report(found.diagnosis, found.figure_data, folder, found.model)
     return folder
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.events import Event
-from carlab.diagnosis.evidence import ScoredSearch, score_ladder
-from carlab.diagnosis.findings import Exhibits, Trace
+from carlab.diagnosis.evidence import ScoredSearch, scores_by_step
+from carlab.diagnosis.findings import FigureData, Trace
 from carlab.diagnosis.recordings import SplitRecordings
 from carlab.diagnosis.settings import ReportSettings
 from carlab.diagnosis.unexplained.description import REGIMES, start_features
@@ -25,7 +25,7 @@ TRACES_TRIED = 6
 """Number of the longest held-out recordings that are searched for traces with motion."""
 
 
-def exhibits_of(scored: ScoredSearch, recordings: SplitRecordings) -> Exhibits:
+def figure_data_of(scored: ScoredSearch, recordings: SplitRecordings) -> FigureData:
     """Data of the figures."""
     settings, found = scored.problem.settings.report, scored.found
     correlation = {
@@ -36,8 +36,8 @@ def exhibits_of(scored: ScoredSearch, recordings: SplitRecordings) -> Exhibits:
         (c.effect, c.standard_errors if math.isfinite(c.left_out_gain_error) else 0.0, float(c.fit.loss.sum()))
         for c in found.tried
     )
-    ladder = (*score_ladder(scored), ("noise floor", 1.0))
-    return Exhibits(_traces(scored, recordings), ladder, _regimes(scored), correlation, candidates)
+    steps = (*scores_by_step(scored), ("noise floor", 1.0))
+    return FigureData(_traces(scored, recordings), steps, _regimes(scored), correlation, candidates)
 
 
 def _regimes(scored: ScoredSearch) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
@@ -135,4 +135,4 @@ def _trace(
     )
 
 
-__all__ = ["exhibits_of"]
+__all__ = ["figure_data_of"]
