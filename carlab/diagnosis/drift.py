@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import AdaptationNoise
-from carlab.diagnosis.findings import Change, Drift
+from carlab.diagnosis.findings import Drift, QuantityChange
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.settings import DEFAULT, DriftSettings
 from carlab.prediction.adaptation import MIN_FEATURE_STD, AdaptiveModel, DisturbanceSeries, adapt, choose_noise
@@ -136,7 +136,7 @@ def _drift_of(
     slow = slowly_adapted(EVERYTHING)
     gains = [_gain_z(held_out_part, errors[name][own], slow.errors[own], settings) for name in BASELINES]
     is_drift = min(gains) >= settings.gain_z_min
-    changes: tuple[Change, ...] = ()
+    changes: tuple[QuantityChange, ...] = ()
     if is_drift and any(mask := _changed(held_out_part, own, errors["model"], slowly_adapted, settings)):
         changes = _changes(slowly_adapted(mask).model.series(), number, mask, along_fitted(mask), settings)
     shown = np.flatnonzero(series.recording == number)
@@ -190,7 +190,7 @@ def _changed(
 
 def _changes(
     series: DisturbanceSeries, number: int, mask: Mask, along_fitted: FloatArray, settings: DriftSettings
-) -> tuple[Change, ...]:
+) -> tuple[QuantityChange, ...]:
     """Significant changes of the quantities in ``mask`` from the fitted recordings, most significant first."""
     own = series.recording == number
     mean, std = series.mean[own], series.std[own]
@@ -201,17 +201,17 @@ def _changes(
         value = float(mean[~first, k].mean()) - before
         spread = float(np.sqrt(np.mean(std[~first, k] ** 2) + np.var(along_fitted[:, k])))
         ends = float(mean[first, k].mean()) - before, float(mean[last, k].mean()) - before
-        found.append(Change(*QUANTITIES[k], value, spread, *ends))
+        found.append(QuantityChange(*QUANTITIES[k], value, spread, *ends))
     kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= settings.change_z_min * c.std]
     return tuple(sorted(kept, key=lambda c: -abs(c.value) / c.std))
 
 
-def changes_along(series: DisturbanceSeries, settings: DriftSettings = DEFAULT.drift) -> tuple[Change, ...]:
+def changes_along(series: DisturbanceSeries, settings: DriftSettings = DEFAULT.drift) -> tuple[QuantityChange, ...]:
     """All quantities along one recording or several, whether significant or not."""
     t_s = series.t_s
     first, last = _ends(t_s, settings)
     return tuple(
-        Change(
+        QuantityChange(
             name,
             unit,
             float(series.mean[:, k].mean()),

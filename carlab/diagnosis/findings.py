@@ -131,7 +131,7 @@ class Skill:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class QuantityChange:
     """A quantity of the car that changed since the fitted recordings.
 
     Attributes:
@@ -175,7 +175,7 @@ class Drift:
 
     recording: int
     is_drift: bool
-    changes: tuple[Change, ...]
+    changes: tuple[QuantityChange, ...]
     time_constant_s: float
     model_m: float
     adapted_m: float
