@@ -87,7 +87,7 @@ def _names(*effects: Effect) -> tuple[str, ...]:
 
 
 DISTURBANCES: tuple[Effect, ...] = (DriveChange(), SteeringTrim(), GripChange(), BodyForce())
-DRIFTING = _names(DriveChange(), SteeringTrim(), GripChange())
+DRIFTING_PARAMETERS = _names(DriveChange(), SteeringTrim(), GripChange())
 """Dotted names of the numbers that drift slowly: drive force [1], steering [rad], grip [1]."""
-PUSHING = _names(BodyForce())
+BODY_FORCE_PARAMETERS = _names(BodyForce())
 """Dotted names of the force forward and left [N], and of the moment [N m]."""

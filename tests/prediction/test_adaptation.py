@@ -9,7 +9,7 @@ from carlab.core.recording_noise import AdaptationNoise
 from carlab.prediction.adaptation import adapt, choose_noise
 from carlab.prediction.adaptation_filter import MeasuredWindows, Processes, run_filter
 from carlab.prediction.adaptation_settings import AdaptationSettings
-from carlab.prediction.disturbances import DISTURBANCES, linearised
+from carlab.prediction.disturbances import DISTURBANCE_NAMES, linearised
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel, simulate_windows
 from carlab.prediction.windows import cut_windows, segments_of
@@ -58,7 +58,7 @@ def test_estimates_follow_a_fading_drive_force_and_steering_trim_within_their_ba
     assert np.sqrt(np.mean(error[late, 1] ** 2)) < 0.006
     for k in range(4):
         z = np.abs(error[late, k]) / series.std[late, k]
-        assert np.mean(z < 2.5) > 0.85, DISTURBANCES[k]
+        assert np.mean(z < 2.5) > 0.85, DISTURBANCE_NAMES[k]
     assert series.std[late, 0].mean() < 0.1  # the band is narrower than the change
 
 
@@ -150,9 +150,11 @@ def test_an_outlier_moves_the_estimate_little():
 def test_jacobian_and_values_of_each_window_equal_single_simulations():
     windows = cut_windows(segments_of([drive(CONFIG, 8.0, 5)]), 0.3, 0.6)
     values = np.linspace(-0.2, 0.2, len(windows))
-    together = simulate_windows(windows, CONFIG, {DISTURBANCES[0]: values[None]})[0]
+    together = simulate_windows(windows, CONFIG, {DISTURBANCE_NAMES[0]: values[None]})[0]
     for k in range(0, len(windows), 4):
-        alone = simulate_windows(windows.take(np.array([k])), CONFIG.with_values({DISTURBANCES[0]: float(values[k])}))
+        alone = simulate_windows(
+            windows.take(np.array([k])), CONFIG.with_values({DISTURBANCE_NAMES[0]: float(values[k])})
+        )
         assert np.allclose(together[k], alone[0, 0], atol=1e-5)
     at = np.zeros((1, len(windows), 4))
     measured = linearised(windows, CONFIG, at, AdaptationSettings())
