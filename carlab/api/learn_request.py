@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 AUTO = "auto"
 RAY_WAIT_S = LinkSettings().wait_s
 BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
-Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
+Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-corrected", "fsvgd"]
 Device = Literal["cpu", "cuda"]
 
 

@@ -26,8 +26,8 @@ from learning.priors.simulator_model import CarModel
 from learning.transitions import OUTPUTS, Transitions
 from learning.world.car_dynamics import CarDynamics
 
-Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
-PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-mended", "fsvgd")
+Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-corrected", "fsvgd"]
+PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd")
 """The paper's algorithms; the others are carlab's."""
 LearnedCar = CarDynamics | WorldDynamics
 FILE_VERSION = 6

@@ -257,7 +257,14 @@ def _fitted(
     if is_papers:
         simulator = None if plan.method == "fsvgd" else model
         return fit_authors_fsvgd(
-            episodes, plan.history, steps, seed, report_step, plan.device, simulator, plan.method == "sim-fsvgd-mended"
+            episodes,
+            plan.history,
+            steps,
+            seed,
+            report_step,
+            plan.device,
+            simulator,
+            plan.method == "sim-fsvgd-corrected",
         )
     settings = CarFitSettings(plan.method, steps, seed=seed)
     earlier = before if isinstance(before, CarDynamics) else None
