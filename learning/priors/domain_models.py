@@ -70,7 +70,7 @@ class Sinusoids:
 
     @property
     def size(self) -> int:
-        """Three."""
+        """Number of parameters."""
         return 3
 
     def parameters(self, normal: Tensor) -> Tensor:
@@ -194,7 +194,7 @@ class KinematicCar:
 
     @property
     def size(self) -> int:
-        """Seven."""
+        """Number of parameters."""
         return 7
 
     def parameters(self, normal: Tensor) -> Tensor:
