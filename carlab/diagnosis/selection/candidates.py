@@ -82,7 +82,7 @@ def _tested(
 def with_left_out_gain(
     problem: SearchProblem, fitter: Fitter, candidate: Candidate, reference: FloatArray
 ) -> Candidate:
-    """The candidate with its chi2 and with its gain over ``reference`` (S,) on blocks that are not fitted."""
+    """The candidate with its chi2 and with its gain over ``reference`` (S,) on left-out blocks."""
     fit = fitter.with_covariance(candidate.fit)
     loss = fitter.leave_fold_out_loss(fit, problem.folds(), problem.settings.selection.max_left_out_error)
     gain, error = clustered_gain(reference, loss, problem.windows)

@@ -1,6 +1,6 @@
 """Pairwise comparison of each accepted effect with its confusable effects on left-out blocks.
 
-The comparison is that of non-nested models (Vuong 1989), with losses on blocks that are not fitted and standard errors
+The comparison is that of non-nested models (Vuong 1989), with losses on left-out blocks and standard errors
 clustered by block. Confusable effects differ little, so the initial states of the windows are free
 (``free_initial_states``).
 """

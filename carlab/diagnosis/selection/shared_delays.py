@@ -46,7 +46,7 @@ class _Replacement:
 def replace_shared_delays(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> EliminationResult:
-    """Replace accepted delays and lags by other delays and lags that predict held-out blocks better."""
+    """Replace accepted delays and lags by other delays and lags that predict left-out blocks better."""
     for name in (name for name, effect in EFFECTS.items() if effect.split_into):
         model = eliminated.model
         exchanges = (_splits if name in model.effects else _merges)(problem, model, name)
@@ -134,12 +134,12 @@ def _passes(
 def _conditions(replacement: _Replacement, z: float, settings: SelectionSettings) -> tuple[Condition, ...]:
     """Conditions of a replacement, by the number of its effects.
 
-    An additional effect needs the significance of any accepted effect. An equal number needs a lower loss on held-out
+    An additional effect needs the significance of any accepted effect. An equal number needs a lower loss on left-out
     blocks. Fewer effects need a loss that is not significantly higher.
 
     Args:
         replacement: the new and the old effects.
-        z: fall of the loss on held-out blocks [standard errors].
+        z: fall of the loss on left-out blocks [standard errors].
         settings: thresholds.
     """
     if len(replacement.new) > len(replacement.old):
