@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
-from carlab.diagnosis.findings import DataFault, EffectFinding, Estimate, Evidence, Verdict, Where
+from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.joint_fit import joint_fit
@@ -141,7 +141,7 @@ def _confidence(scored: ScoredSearch, name: str) -> float:
 
 def _where(
     scored: ScoredSearch, name: str, parameters: Mapping[str, Estimate], error: FloatArray, without: Fit
-) -> Where:
+) -> ErrorLocation:
     """Channels sorted by the fall of their squared score, and regime, lag, time and place of the effect."""
     floor, windows = scored.held_out.floor, scored.problem.windows
     removed = np.mean((error / floor) ** 2, axis=0) - np.mean((scored.errors["with_effects"] / floor) ** 2, axis=0)
@@ -156,7 +156,7 @@ def _where(
     time = (0.0, float(windows.t0_s.max())) if "time" in effect.depends_on else None
     final = prediction_errors(simulate_windows(windows, without.config), windows)[0, :, -1]
     size = np.abs(final[:, STATE_NAMES.index(channels[0])])
-    return Where(channels, worst_regime(start_features(windows), size), lag, time, place)
+    return ErrorLocation(channels, worst_regime(start_features(windows), size), lag, time, place)
 
 
 def estimate(scored: ScoredSearch, name: str) -> Estimate:

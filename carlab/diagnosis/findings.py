@@ -25,7 +25,7 @@ Verdict = Literal["mismatch", "parameters", "none", "data", "unexplained", "inco
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
+class ErrorLocation:
     """Location of an effect's error; ``time`` is (start, end) [s], ``place`` is (x, y, radius) [m]."""
 
     channels: tuple[str, ...]
@@ -58,7 +58,7 @@ class EffectFinding:
     id: str
     confidence: float
     parameters: Mapping[str, Estimate]
-    where: Where
+    where: ErrorLocation
     evidence: Evidence
     sentence: str
     indistinguishable_from: tuple[str, ...] = ()
