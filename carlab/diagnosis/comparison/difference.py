@@ -64,7 +64,7 @@ class Difference:
         return float(np.sqrt(max(self.likelihood_ratio, 0.0) / self.design_effect))
 
     @property
-    def borrowed(self) -> float:
+    def variance_ratio(self) -> float:
         """Variance of the difference over that of the second group's step."""
         first, second = self.information
         return 1.0 + second / first
