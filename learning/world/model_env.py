@@ -117,7 +117,7 @@ class ModelEnv(VecEnv):
         """Start all cars. Their episodes end at different ticks, so that no batch consists of start states."""
         self._start(np.arange(self.num_envs))
         self._ticks = self._rng.integers(self._task.max_ticks, size=self.num_envs)
-        return self._seen()
+        return self._policy_inputs()
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Store the commands (cars, 2)."""
@@ -163,18 +163,18 @@ class ModelEnv(VecEnv):
         self._start(np.arange(self.num_envs), training=False)
         total, cost = torch.zeros(self.num_envs), torch.zeros(self.num_envs)
         ended = torch.zeros(self.num_envs, dtype=torch.bool)
-        last, seen = self._features.cpu().clone(), self._seen()
+        last, inputs = self._features.cpu().clone(), self._policy_inputs()
         with torch.no_grad():
             for _ in range(max_ticks or self._task.max_ticks):
                 before = self._features
-                action = self._gate(before, torch.as_tensor(act(seen)).to(self._device))
+                action = self._gate(before, torch.as_tensor(act(inputs)).to(self._device))
                 after = self._rollouts.step(before, action, self._generator)
                 here = after.cpu()
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
                 cost += torch.where(ended, 0.0, self._task.cost(here))
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
-                self._features, seen = after, policy_inputs(here.numpy())
+                self._features, inputs = after, policy_inputs(here.numpy())
         return Drives(total, cost, last)
 
     @property
@@ -220,7 +220,7 @@ class ModelEnv(VecEnv):
         array: NDArray[np.float32] = start_features.numpy()
         return array
 
-    def _seen(self) -> NDArray[np.float32]:
+    def _policy_inputs(self) -> NDArray[np.float32]:
         return policy_inputs(self._features.cpu().numpy())
 
     def close(self) -> None:
