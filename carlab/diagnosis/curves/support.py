@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_fit import CurveFit
-from carlab.diagnosis.curves.form_fit import read_form
+from carlab.diagnosis.curves.form_fit import identify_form
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.settings import CurveSettings
 from carlab.prediction.windows import RecordingSegment
@@ -44,7 +44,7 @@ def curve_findings(
             std=np.where(driven, std, np.nan),
             support_s=support_s,
         )
-        made.append(replace(finding, form=read_form(finding, covariance, settings)))
+        made.append(replace(finding, form=identify_form(finding, covariance, settings)))
     return tuple(made)
 
 
