@@ -34,7 +34,7 @@ def figure_data_of(scored: ScoredSearch, recordings: SplitRecordings) -> FigureD
     }
     candidates = tuple(
         (c.effect, c.standard_errors if math.isfinite(c.left_out_gain_error) else 0.0, float(c.fit.loss.sum()))
-        for c in found.tried
+        for c in found.first_candidates
     )
     steps = (*scores_by_step(scored), ("noise floor", 1.0))
     return FigureData(_traces(scored, recordings), steps, _regimes(scored), correlation, candidates)

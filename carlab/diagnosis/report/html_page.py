@@ -57,7 +57,7 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "known": bool(diagnosis.effects) and math.isfinite(text.explained_share(diagnosis)),
         "driven": bool(figure_data.traces),
         "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: DEFAULT.report.max_candidates]],
-        "tried": len(figure_data.candidates),
+        "candidate_count": len(figure_data.candidates),
         "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
         "curve_sentences": curve_sentences(diagnosis),
         "ceiling": ceiling_sentence(diagnosis),

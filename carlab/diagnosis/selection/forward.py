@@ -37,15 +37,15 @@ class Choice:
 class Path:
     """Effects added to the base model one after the other.
 
-    model         fit with all effects
-    history       (effect, fit) in the order of acceptance
-    tried         candidates for the first effect of this path
-    alternatives  further accepted candidates of each step, not confusable with the one that was added
+    model             fit with all effects
+    history           (effect, fit) in the order of acceptance
+    first_candidates  candidates for the first effect of this path
+    alternatives      further accepted candidates of each step, not confusable with the one that was added
     """
 
     model: Model
     history: tuple[tuple[str, Fit], ...] = ()
-    tried: tuple[Candidate, ...] = ()
+    first_candidates: tuple[Candidate, ...] = ()
     alternatives: tuple[Choice, ...] = ()
 
 
@@ -58,7 +58,7 @@ def extend(
         count = len(path.model.effects)
         control.progress(f"searching for effect {count + 1}", count / max_effects)
         candidates = next_candidates(problem, path.model, control)
-        path = path if path.history else replace(path, tried=candidates)
+        path = path if path.history else replace(path, first_candidates=candidates)
         chosen = accepted(problem, path.model, candidates, control)
         if control.ends_search() or not chosen:
             break
@@ -106,7 +106,9 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
     model = apply_moves(problem, added, control)
     confusable = problem.confusable.get(leader.effect, ())
     others = tuple(Choice(path, c) for c in chosen[1:] if c.effect not in confusable)
-    return Path(model, (*path.history, (leader.effect, model.fit)), path.tried, (*path.alternatives, *others))
+    return Path(
+        model, (*path.history, (leader.effect, model.fit)), path.first_candidates, (*path.alternatives, *others)
+    )
 
 
 def _labelled(control: RunControl, label: str) -> RunControl:

@@ -138,15 +138,15 @@ class Candidate:
 class SearchResult:
     """Result of a search.
 
-    base      refit without effects
-    best      fit with the accepted effects
-    effects   accepted, the strongest first
-    chi2      chi2 of the removal of each accepted effect from ``best``
-    rivals    effects that left-out blocks do not distinguish from each accepted effect
-    history   (effect, fit) in the order of acceptance
-    tried     candidates for the first effect
-    scale     error scale of ``best``
-    is_complete  whether the search ended by itself and was not cut short
+    base              refit without effects
+    best              fit with the accepted effects
+    effects           accepted, the strongest first
+    chi2              chi2 of the removal of each accepted effect from ``best``
+    rivals            effects that left-out blocks do not distinguish from each accepted effect
+    history           (effect, fit) in the order of acceptance
+    first_candidates  candidates for the first effect
+    scale             error scale of ``best``
+    is_complete       whether the search ended by itself and was not cut short
     """
 
     base: Fit
@@ -155,7 +155,7 @@ class SearchResult:
     chi2: Mapping[str, float]
     rivals: Mapping[str, tuple[str, ...]]
     history: tuple[tuple[str, Fit], ...]
-    tried: tuple[Candidate, ...]
+    first_candidates: tuple[Candidate, ...]
     scale: Scale
     is_complete: bool = True
 

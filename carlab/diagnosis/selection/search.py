@@ -30,7 +30,15 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
     model, pairs = choose_confusable(problem, eliminated, control)
     ordered = tuple(sorted(model.effects, key=lambda e: -pairs.chi2[e]))
     return SearchResult(
-        base.fit, model.fit, ordered, pairs.chi2, pairs.rivals, path.history, greedy.tried, model.scale, is_complete
+        base.fit,
+        model.fit,
+        ordered,
+        pairs.chi2,
+        pairs.rivals,
+        path.history,
+        greedy.first_candidates,
+        model.scale,
+        is_complete,
     )
 
 
