@@ -195,8 +195,8 @@ def _score(
         (fit_windows, windows, event_windows), config, variance_s2=window_s2
     )
     if known is None:
-        shakes = find_vibration(fit_segments) is not None
-        noise = estimate_noise(fit_segments, fit_windows.curvature_bias, slowest=shakes)
+        vibrates = find_vibration(fit_segments) is not None
+        noise = estimate_noise(fit_segments, fit_windows.curvature_bias, slowest=vibrates)
     else:
         noise = Noise.of(known)
     floor = None if known is None else known.floor_after(windows.horizon_s)

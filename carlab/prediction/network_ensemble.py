@@ -5,7 +5,7 @@ velocities at all. Each network maps past commands and the body velocities of th
 is the error of a whole window (simulation error training; Forgione and Piga 2021, "Continuous-time system
 identification with neural networks: Model structures and fitting criteria").
 
-A learned discrepancy is the same ensemble beside a simulator: its networks also see the simulated velocities, and their
+A learned discrepancy is the same ensemble with a simulator: its networks also see the simulated velocities, and their
 output is added to the simulated accelerations (an additive model discrepancy; Kennedy and O'Hagan 2001, "Bayesian
 calibration of computer models").
 """

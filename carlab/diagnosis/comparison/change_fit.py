@@ -16,8 +16,9 @@ from sim_backends.car_parameters import SimulatorConfig
 
 DAMPINGS = (0.0, 0.1, 1.0, 10.0, 100.0)
 CHANGE_DIFFERENCE_STEP = 0.3
-"""Step of the Jacobian, in coordinates; for the reason see ``identification.fit.DELAY_DIFFERENCE_STEP``."""
+"""Step of the Jacobian, in coordinates; for the reason see ``identification.fit_parameters.DELAY_DIFFERENCE_STEP``."""
 MAX_STEP = 8.0
+"""Maximum change of a coordinate in an iteration."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from carlab.diagnosis.settings import ComparisonSettings
 from carlab.prediction.windows import IndexArray
 
 MIN_INFORMATION = 1.0
+"""Minimum information of a group along a secant: the reciprocal variance of its step."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,7 @@ from sim_backends.effects.curves import weights
 def curve_findings(
     found: CurveFit, nominal: SimulatorConfig, segments: tuple[RecordingSegment, ...], settings: CurveSettings
 ) -> tuple[CurveFinding, ...]:
-    """Each measured curve beside that of the car file; knots without data have no value."""
+    """Each measured curve and that of the car file; knots without data have no value."""
     made = []
     for curve_id in found.curves:
         curve = EFFECTS[curve_id]

@@ -18,7 +18,7 @@ from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.dynamics.integrate import MAX_STEP_S
 
-WINDOWS = 64
+MAX_WINDOWS = 64
 HORIZON_S = 1.0
 
 
@@ -37,7 +37,7 @@ def check_integration(
         windows = cut_windows(segments, HORIZON_S, 0.5)
     except DataError:
         return []
-    windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, WINDOWS).round().astype(np.int64)))
+    windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, MAX_WINDOWS).round().astype(np.int64)))
     noise = estimate_noise(segments, windows.curvature_bias).measured
     with np.errstate(all="ignore"):  # a step that is far too coarse overflows
         difference = np.abs(_ends(windows, nominal, max_step_s) - _ends(windows, nominal, 0.25 * max_step_s))
