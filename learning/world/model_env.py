@@ -43,7 +43,7 @@ def policy_spaces(width: int) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     return gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
-class Drives(NamedTuple):
+class RolloutEpisodes(NamedTuple):
     """Episodes in the learned car, on the CPU: returns (N,), constraint costs (N,) and final features (N, 7 + 2 H)."""
 
     returns: Tensor
@@ -150,7 +150,7 @@ class ModelEnv(VecEnv):
 
     def roll_out(
         self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]], max_ticks: int | None = None
-    ) -> Drives:
+    ) -> RolloutEpisodes:
         """Drive one complete episode of every car by a policy, from start states of the task.
 
         Args:
@@ -175,7 +175,7 @@ class ModelEnv(VecEnv):
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
                 self._features, inputs = after, policy_inputs(here.numpy())
-        return Drives(total, cost, last)
+        return RolloutEpisodes(total, cost, last)
 
     @property
     def features(self) -> Tensor:
@@ -255,4 +255,4 @@ class ModelEnv(VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
 
-__all__ = ["FEATURE_UNITS", "Drives", "ModelEnv", "policy_inputs", "policy_spaces"]
+__all__ = ["FEATURE_UNITS", "ModelEnv", "RolloutEpisodes", "policy_inputs", "policy_spaces"]
