@@ -24,7 +24,7 @@ import numpy as np
 from carlab.api.material import read_material
 from carlab.cars import load_car_file
 from carlab.diagnosis.curves.support import recorded_forces
-from carlab.prediction.windows import tracks_of
+from carlab.prediction.windows import segments_of
 from sim_backends.array_ops import ARRAYS
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.single_track import SingleTrack
@@ -33,7 +33,7 @@ from sim_backends.effects.curves import FrontTyreMap, RearTyreMap
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from carlab.prediction.windows import Track
+    from carlab.prediction.windows import RecordingSegment
     from sim_backends import SimulatorConfig
 
     Array = NDArray[np.float64]
@@ -135,11 +135,11 @@ def time_near(recorded: Array, x: Array, period_s: float) -> Array:
     return np.histogram(recorded, edges)[0] * period_s
 
 
-def panels(config: SimulatorConfig, tracks: list[Track]) -> list[Panel]:
+def panels(config: SimulatorConfig, segments: list[RecordingSegment]) -> list[Panel]:
     """The four comparisons: steering, drive force at constant throttles, front and rear tyre."""
-    bench, period_s = Bench(config), tracks[0].period_s
-    forces = [recorded_forces(track, config) for track in tracks]
-    steering = np.concatenate([track.commands[:, 0] for track in tracks])
+    bench, period_s = Bench(config), segments[0].period_s
+    forces = [recorded_forces(segment, config) for segment in segments]
+    steering = np.concatenate([segment.commands[:, 0] for segment in segments])
     throttle, speed = (np.concatenate([getattr(f, name) for f in forces]) for name in ("throttle", "vx"))
     command = np.linspace(-1.0, 1.0, 41)
     made = [
@@ -189,7 +189,7 @@ def main(model: str, *recordings: str) -> None:
     """Draw the picture and print the table for the results page."""
     config = load_car_file(Path(model)).simulator
     material = read_material([Path(name) for name in recordings], "fit", config.mocap.latency_s)
-    found = panels(config, tracks_of(material.episodes))
+    found = panels(config, segments_of(material.episodes))
     draw(found, IMAGE)
     lines = [
         "| curve | driven range | rms difference | rms of the authors' curve about its mean |",

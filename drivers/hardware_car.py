@@ -64,7 +64,7 @@ class HardwareCar(Car):
         self._placed_s = float("-inf")
         self._sequence = -1
         self._newest: PoseSample | None = None
-        self._unseen: deque[PoseSample] = deque(maxlen=MAX_POSES)
+        self._new_poses: deque[PoseSample] = deque(maxlen=MAX_POSES)
 
     def open(self) -> None:
         """Open motion capture and actuator. Raises NotReadyError with the reasons of both."""
@@ -83,7 +83,7 @@ class HardwareCar(Car):
         self._placed_s = float("-inf")
         self._sequence = -1
         self._newest = None
-        self._unseen.clear()
+        self._new_poses.clear()
         self._is_open = True
 
     def observe(self) -> Observation:
@@ -97,8 +97,8 @@ class HardwareCar(Car):
                 "Motion capture has not seen the body yet; check that its markers are visible and its id is right."
             )
         state, delay_s = estimate
-        poses = tuple(self._unseen)
-        self._unseen.clear()
+        poses = tuple(self._new_poses)
+        self._new_poses.clear()
         return Observation(
             state,
             seen.t_capture_s,
@@ -207,7 +207,7 @@ class HardwareCar(Car):
         for sample in self.pose_source.since(self._sequence):
             if sample.t_capture_s > self._placed_s:
                 self.estimator.update(sample)
-            self._unseen.append(sample)
+            self._new_poses.append(sample)
             self._sequence = sample.sequence
             self._newest = sample
 

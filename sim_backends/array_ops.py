@@ -80,7 +80,7 @@ class FloatOps:
 
     @staticmethod
     def where(condition: Value, yes: Value, no: Value) -> Value:
-        """Choose."""
+        """``yes`` where the condition holds, otherwise ``no``."""
         return yes if condition else no
 
     @staticmethod

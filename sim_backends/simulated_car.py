@@ -85,7 +85,7 @@ class SimulatedCar(Car):
         self._open = self._armed = False
         self._fault: str | None = None
         self._fresh_until_s: float | None = None
-        self._unseen: list[PoseSample] = []
+        self._new_poses: list[PoseSample] = []
 
     def open(self) -> None:
         """Put the car at its start; the clock advances until the velocity window is filled."""
@@ -106,7 +106,7 @@ class SimulatedCar(Car):
         self._estimator.reset()
         self._velocities.reset()
         self._sensor.reset(begin_s)
-        self._unseen.clear()
+        self._new_poses.clear()
         self._fresh_until_s = None
         self._take_in(self._sensor.samples_until(arrive_s, _Approach(self.config, state, arrive_s)))
         self._plant.reset(state, arrive_s)
@@ -125,8 +125,8 @@ class SimulatedCar(Car):
         self._require_open()
         self._run_to(self.clock.now_s())
         estimate, newest = self._estimator.estimate(), self._estimator.newest
-        poses = tuple(self._unseen)
-        self._unseen.clear()
+        poses = tuple(self._new_poses)
+        self._new_poses.clear()
         if estimate is None or newest is None:
             raise PoseLostError("No pose has arrived yet; lower [mocap] dropout or wait after open().")
         state, velocity_delay_s = estimate
@@ -221,7 +221,7 @@ class SimulatedCar(Car):
         for sample in samples:
             self._estimator.update(sample)
             self._velocities.update(self._estimator)
-        self._unseen.extend(samples)
+        self._new_poses.extend(samples)
 
 
 class _MeasuredVelocities:

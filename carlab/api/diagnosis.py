@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         Diagnosis,
         EffectFinding,
         Estimate,
-        Exhibits,
+        FigureData,
         FitErrors,
         Verdict,
     )
@@ -37,7 +37,7 @@ class DiagnosisReport:
 
     Attributes:
         diagnosis: the verdict with its evidence as data (schema ``carlab.diagnosis/1``).
-        exhibits: data of the report's pictures.
+        figure_data: data of the report's pictures.
         model: the car file with the identified parameters and effects; ``model.save("model.toml")`` writes it.
         is_conclusive: False if the recordings are not sufficient for a verdict; ``sentence`` states what to record.
         outcome: all models with the held-out prediction windows; None if the recordings are not sufficient.
@@ -45,11 +45,16 @@ class DiagnosisReport:
     """
 
     diagnosis: Diagnosis
-    exhibits: Exhibits = field(repr=False)
+    figure_data: FigureData = field(repr=False)
     model: CarFile = field(repr=False)
     is_conclusive: bool = True
     outcome: Outcome | None = field(default=None, repr=False)
     held_out_names: tuple[str, ...] = ()
+
+    @property
+    def exhibits(self) -> FigureData:
+        """The former name of ``figure_data``."""
+        return self.figure_data
 
     @property
     def verdict(self) -> Verdict:
@@ -90,7 +95,7 @@ class DiagnosisReport:
         """
         from carlab.diagnosis.report.write import write_report
 
-        write_report(self.diagnosis, self.exhibits, Path(folder), self.model.simulator)
+        write_report(self.diagnosis, self.figure_data, Path(folder), self.model.simulator)
         return Path(folder)
 
     def save_decisions(self, folder: Path | str = "diagnosis") -> Path:
@@ -101,7 +106,7 @@ class DiagnosisReport:
         """
         from carlab.diagnosis.report.write import write_decisions
 
-        return write_decisions(self.exhibits, Path(folder))
+        return write_decisions(self.figure_data, Path(folder))
 
     def to_dict(self) -> dict[str, Any]:
         """The content of report.json."""
@@ -111,7 +116,7 @@ class DiagnosisReport:
         """The report as one self-contained HTML page."""
         from carlab.diagnosis.report.html_page import render_page
 
-        return render_page(self.diagnosis, self.exhibits)
+        return render_page(self.diagnosis, self.figure_data)
 
     def _repr_html_(self) -> str:
         page = html.escape(self.to_html(), quote=True)
@@ -209,7 +214,7 @@ def _diagnosed(
     from carlab.diagnosis.diagnose import Inconclusive
     from carlab.diagnosis.diagnose import diagnose as search
     from carlab.diagnosis.evidence import Texts
-    from carlab.diagnosis.findings import Diagnosis, Exhibits
+    from carlab.diagnosis.findings import Diagnosis, FigureData
     from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
     from carlab.diagnosis.report.write import completed
     from sim_backends.effects import confusable_effects
@@ -235,10 +240,10 @@ def _diagnosed(
             causes = ", ".join(sorted({f.id.replace("_", " ") for f in known}))
             why = f"The recording is faulty ({causes}), so no physics can be identified: {why}"
         undecided = Diagnosis(error.verdict, why, (), {}, 1.0, {}, None, tuple(known), uses, seed, 0.0, why)
-        return DiagnosisReport(undecided, Exhibits(), _as_car_file(undecided, file.simulator, file.name), False)
-    model = _as_car_file(outcome.diagnosis, outcome.model, file.name, outcome.exhibits.noise)
+        return DiagnosisReport(undecided, FigureData(), _as_car_file(undecided, file.simulator, file.name), False)
+    model = _as_car_file(outcome.diagnosis, outcome.model, file.name, outcome.figure_data.noise)
     names = tuple(validation.names or fit.names)
-    return DiagnosisReport(completed(outcome.diagnosis), outcome.exhibits, model, True, outcome, names)
+    return DiagnosisReport(completed(outcome.diagnosis), outcome.figure_data, model, True, outcome, names)
 
 
 def _as_car_file(diagnosis: Diagnosis, simulator: Any, name: str, noise: RecordingNoise | None = None) -> CarFile:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 AUTO = "auto"
 RAY_WAIT_S = LinkSettings().wait_s
 BUILT_IN_PRIORS = ("kinematic", "nominal", AUTO)
-Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
+Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-corrected", "fsvgd"]
 Device = Literal["cpu", "cuda"]
 
 
@@ -65,7 +65,7 @@ def training_plan(request: LearnRequest, choice: CarChoice) -> TrainingPlan:
 
     from carlab.core.task_choice import PARKING
     from carlab.experiment.campaign.campaign import PAPER_HISTORY
-    from carlab.experiment.campaign.prior_repair import needed_history
+    from carlab.experiment.campaign.prior_correction import needed_history
     from carlab.experiment.campaign.training_plan import TrainingPlan
     from learning.world.car_fit import PAPER_METHODS
 

@@ -9,7 +9,7 @@ import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 from carlab.api.arguments import above_zero, at_least, whole_number
 from carlab.api.learn_request import AUTO, RAY_WAIT_S, Device, LearnRequest, Method, checked_simulator, training_plan
@@ -27,6 +27,7 @@ from carlab.api.runs import (
 )
 from carlab.api.tasks import given_task, load_checked
 from carlab.core.errors import ConfigError
+from carlab.core.method_names import current_method
 
 if TYPE_CHECKING:
     from carlab.cars import CarChoice, CarFile
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.live_view import LiveView
-    from carlab.experiment.campaign.prior_repair import PriorVersion
+    from carlab.experiment.campaign.prior_correction import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
     from carlab.experiment.cluster.trainer import ClusterTrainer
     from carlab.experiment.episodes.interrupts import Interrupts
@@ -152,7 +153,7 @@ def learn(
         prior: the prior simulator: ``kinematic``, ``nominal``, or a car file such as a diagnosed model. ``auto`` starts
             with the nominal one; between episodes, effects and parameters that the recordings support are added to it,
             and those that the recordings contradict are removed.
-        method: ``gp-sim-posterior``; ``gp-posterior`` without a simulator; ``sim-fsvgd``, ``sim-fsvgd-mended`` and
+        method: ``gp-sim-posterior``; ``gp-posterior`` without a simulator; ``sim-fsvgd``, ``sim-fsvgd-corrected`` and
             ``fsvgd`` are the paper's algorithms with its settings.
         history: number of past commands that model and policy observe; by default it covers the car's delays.
         model_steps: optimiser steps of the model before each episode; 2500 by default.
@@ -180,8 +181,9 @@ def learn(
         ConfigError, DataError: an argument is invalid or differs from the run to resume, or training failed.
         NotReadyError, ActuatorFaultError, PoseLostError: the car cannot be driven and has not moved.
     """
+    present = cast("Method", current_method(method))
     return _learn(LearnRequest(
-        car, episodes, ticks, prior, method, history, model_steps, updates, seed, device, place,
+        car, episodes, ticks, prior, present, history, model_steps, updates, seed, device, place,
         None if resume is None else Path(resume), Path(out), name, rerun, live, viewer, vehicle, reality, dry_run,
         task, track, ray, ray_wait,
     ), hooks or LearnHooks())  # fmt: skip
@@ -313,7 +315,7 @@ def _check(request: LearnRequest) -> None:
         raise ConfigError(f"--method {request.method}: choose one of {', '.join(get_args(Method))}.")
     if request.prior == AUTO and request.method != "gp-sim-posterior":
         raise ConfigError(
-            f"--prior auto: its repairs are for --method gp-sim-posterior; {request.method} needs another --prior."
+            f"--prior auto: its corrections are for --method gp-sim-posterior; {request.method} needs another --prior."
         )
 
 
@@ -355,7 +357,7 @@ def _check_as_before(request: LearnRequest, campaign: Campaign, choice: CarChoic
     default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
     saved = {name: getattr(plan, name) for name in PLANNED}
     changed = [n for n in PLANNED if getattr(request, n) not in (default[n], saved[n])]
-    is_same = campaign.repairs_prior == (request.prior == AUTO)
+    is_same = campaign.corrects_prior == (request.prior == AUTO)
     if request.prior != default["prior"] and not (
         is_same and training_plan(request, choice).prior_toml == plan.prior_toml
     ):

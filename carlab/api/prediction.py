@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from carlab.cars import CarFile
     from carlab.diagnosis.events import EventUse
-    from carlab.diagnosis.findings import Change, FitErrors
+    from carlab.diagnosis.findings import FitErrors, QuantityChange
     from carlab.diagnosis.score_recording import RecordingScore
     from carlab.prediction.errors import ChannelError
 
@@ -73,7 +73,7 @@ class PredictionErrors:
         return channel_errors(self.score.whole.errors[model])
 
     @property
-    def changes(self) -> tuple[Change, ...]:
+    def changes(self) -> tuple[QuantityChange, ...]:
         """Estimated change of the car over the recording; empty without adaptation."""
         from carlab.diagnosis.drift import changes_along
 

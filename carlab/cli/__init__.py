@@ -38,6 +38,7 @@ def run(argv: Sequence[str]) -> int:
 
     from carlab.cli.console import console, fail, log_to_console
     from carlab.core.errors import CarlabError
+    from carlab.core.method_names import with_current_methods
     from carlab.core.version import VERSION
 
     if list(argv) == ["--version"]:
@@ -49,7 +50,9 @@ def run(argv: Sequence[str]) -> int:
         from carlab.cli.options import CarOptions, TaskOptions
 
         improve_help((*(each for each in verbs.values() if isinstance(each, type)), CarOptions, TaskOptions))
-    verb = tyro.extras.subcommand_cli_from_dict(verbs, args=list(argv), prog="carlab", description=_DESCRIPTION)
+    verb = tyro.extras.subcommand_cli_from_dict(
+        verbs, args=with_current_methods(argv), prog="carlab", description=_DESCRIPTION
+    )
     log_to_console(verbose=bool(getattr(verb, "verbose", False)))
     try:
         return int(verb.run())

@@ -45,7 +45,7 @@ def run_priors(options: BenchOptions) -> int:
             model = _diagnosed(files[:-1], car, work / "diagnosis")
         else:
             model = options.diagnosed
-            check_unseen(model, files[-1])
+            check_held_out(model, files[-1])
         diagnosed = load_car_file(model).simulator
         simulator = load_car_file(car).simulator
         case = recorded_case([load_episodes(path) for path in files], car, options.history)
@@ -84,7 +84,7 @@ def _jobs(
     return jobs
 
 
-def check_unseen(model: Path, held_out: Path) -> None:
+def check_held_out(model: Path, held_out: Path) -> None:
     """Check that the report of a diagnosed car does not list the held-out recording.
 
     Raises:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from carlab.core.documents import Tick
     from carlab.core.outcome import EndReason
     from carlab.experiment.campaign.figures import EpisodeFigures
-    from carlab.experiment.campaign.prior_repair import PriorVersion
+    from carlab.experiment.campaign.prior_correction import PriorVersion
     from carlab.experiment.campaign.quick_check import QuickCheck
 
 STEPS_PERIOD_S = 600.0
@@ -82,7 +82,8 @@ class Learn:
     method: Method = "gp-sim-posterior"
     """gp-sim-posterior: particles fitted to a Gaussian-process posterior around the simulator (carlab's own method).
     gp-posterior: the same without a simulator. sim-fsvgd: the paper's algorithm as in the authors' public code, with
-    the simulator prior; sim-fsvgd-mended: without the errors of that code; fsvgd: the paper's, without a simulator."""
+    the simulator prior; sim-fsvgd-corrected: without the errors of that code; fsvgd: the paper's, without a
+    simulator."""
 
     history: int | None = None
     """Number of past commands that model and policy observe. By default it covers the command delay, the latency of

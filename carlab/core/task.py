@@ -258,7 +258,7 @@ class RecordedTask(Task):
         return self.start
 
     def reward(self, features: Any, action: Any, next_features: Any) -> Any:
-        """Zero."""
+        """Zero for every step."""
         return 0.0 * next_features[..., 0]
 
     def summary(self, times_s: FloatArray, states: FloatArray) -> dict[str, float]:

@@ -22,14 +22,14 @@ from carlab.diagnosis.evidence import (
     unexplained_share,
     verdict_of,
 )
-from carlab.diagnosis.findings import Ceiling, DataFault, Diagnosis, Exhibits, FitErrors, RecordingUse
+from carlab.diagnosis.findings import Ceiling, DataFault, Diagnosis, FigureData, FitErrors, RecordingUse
 from carlab.diagnosis.identification.held_out_errors import HeldOut, noise_floor
 from carlab.diagnosis.identification.measurement_noise import Noise, estimate_noise
 from carlab.diagnosis.identification.velocity_window import with_initial_states
 from carlab.diagnosis.naming import NamingResult, accept_names, describe_unexplained, residual_of
 from carlab.diagnosis.recording_faults import find as data_faults_of
 from carlab.diagnosis.recordings import Inconclusive, SplitRecordings, checked_held_out_share, split_recordings
-from carlab.diagnosis.report.exhibits import exhibits_of
+from carlab.diagnosis.report.figure_data import figure_data_of
 from carlab.diagnosis.search_timer import SearchTimer
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem
 from carlab.diagnosis.selection.search import search
@@ -40,7 +40,7 @@ from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.jobs.function_workers import FunctionWorkers
 from carlab.prediction.network_ensemble import EnsembleSettings, check_duration, train_ensemble
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel, SimulatorModel
-from carlab.prediction.windows import PredictionWindows, tracks_of
+from carlab.prediction.windows import PredictionWindows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CATALOGUE
 
@@ -54,7 +54,7 @@ class Outcome:
     """The diagnosis, the data of its figures, the corrected simulator, and all models with the held-out windows."""
 
     diagnosis: Diagnosis
-    exhibits: Exhibits
+    figure_data: FigureData
     model: SimulatorConfig
     models: Mapping[str, PredictiveModel]
     held_out_windows: PredictionWindows
@@ -144,7 +144,7 @@ def diagnose(
 def _with_run(outcome: Outcome, timer: SearchTimer, decisions: Sequence[Decision]) -> Outcome:
     """The outcome with time, extent and decisions of the search."""
     diagnosis = replace(outcome.diagnosis, seconds=timer.elapsed_s(), search=timer.extent())
-    return replace(outcome, diagnosis=diagnosis, exhibits=replace(outcome.exhibits, decisions=tuple(decisions)))
+    return replace(outcome, diagnosis=diagnosis, figure_data=replace(outcome.figure_data, decisions=tuple(decisions)))
 
 
 def _prepare_recordings(
@@ -164,12 +164,12 @@ def _prepare_recordings(
         )
     except Inconclusive as error:
         error.data_faults = faults
-        usable_s = sum(track.duration_s for track in tracks_of(fit))
+        usable_s = sum(segment.duration_s for segment in segments_of(fit))
         if faults and usable_s < settings.min_fit_s and usable_s < settings.unusable_share * recorded_s:
             error.verdict = "data"
         raise
     if request.ceiling or request.discrepancy:
-        check_duration(recordings.fit_tracks, EnsembleSettings())
+        check_duration(recordings.fit_segments, EnsembleSettings())
     recordings, noise = _estimate_noise(recordings, nominal, request.settings.identification)
     return recordings, noise, faults
 
@@ -184,7 +184,7 @@ def _estimate_noise(
     recordings = replace(
         recordings, fit_windows=fit_windows, held_out_windows=held_out_windows, event_windows=event_windows
     )
-    return recordings, estimate_noise(recordings.fit_tracks, fit_windows.curvature_bias, settings=settings)
+    return recordings, estimate_noise(recordings.fit_segments, fit_windows.curvature_bias, settings=settings)
 
 
 def _search_effects(
@@ -205,9 +205,9 @@ def _search_effects(
     search_control = replace(control, progress=search_progress)
     found = search(problem, search_control)
     control.progress("searching for physics outside the catalogue", 0.8)
-    vibration = find_vibration(recordings.fit_tracks, request.settings.unexplained)
+    vibration = find_vibration(recordings.fit_segments, request.settings.unexplained)
     if vibration is not None:
-        noise = estimate_noise(recordings.fit_tracks, windows.curvature_bias, slowest=True, settings=identification)
+        noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, slowest=True, settings=identification)
     held_out = HeldOut.of(recordings.held_out_windows, noise, nominal, identification)
     if request.effects is None:
         naming = accept_names(problem, found, held_out, vibration, search_control)
@@ -239,7 +239,7 @@ def _assemble_result(
     final_errors = {name: held_out.final_error(each) for name, each in models.items()}
     held_out_errors = {name: held_out.summary(error) for name, error in final_errors.items()}
     held_out_errors["noise_floor"] = held_out.floor_summary()
-    tracks, settings = recordings.fit_tracks, request.settings.curves
+    segments, settings = recordings.fit_segments, request.settings.curves
     diagnosis = Diagnosis(
         verdict=verdict,
         sentence="",
@@ -252,7 +252,7 @@ def _assemble_result(
         recordings=tuple(request.uses),
         seed=request.seed,
         seconds=0.0,
-        curves=() if measured is None else curve_findings(measured, request.nominal, tracks, settings),
+        curves=() if measured is None else curve_findings(measured, request.nominal, segments, settings),
         ceiling=_ceiling(held_out_errors),
         skill=skill_of(
             held_out.windows,
@@ -264,10 +264,10 @@ def _assemble_result(
         events=recordings.events,
         held_out_with_events=_errors_with_events(models, final_errors, held_out, recordings.event_windows),
     )
-    exhibits = exhibits_of(scored, recordings)
+    figure_data = figure_data_of(scored, recordings)
     noise = replace(held_out.recording_noise, adaptation=None if adaptation is None else adaptation.noise)
-    exhibits = replace(exhibits, noise=noise)
-    return Outcome(diagnosis, exhibits, model or scored.found.best.config, models, held_out.windows)
+    figure_data = replace(figure_data, noise=noise)
+    return Outcome(diagnosis, figure_data, model or scored.found.best.config, models, held_out.windows)
 
 
 def _errors_with_events(
@@ -290,7 +290,7 @@ def _measured_curves(
     if not request.curves or unexplained < settings.min_unexplained_share or control.stop():
         return None
     found = fit_curves(scored.problem, scored.found, control)
-    return None if found is None else without_extrapolation(found, recordings.fit_tracks, settings)
+    return None if found is None else without_extrapolation(found, recordings.fit_segments, settings)
 
 
 def _models(
@@ -313,7 +313,7 @@ def _models(
 
     def trained(simulator: PredictiveModel | None) -> PredictiveModel:
         return train_ensemble(
-            recordings.fit_tracks,
+            recordings.fit_segments,
             simulator=simulator,
             seed=request.seed,
             velocity_window_s2=recordings.fit_windows.velocity_window_s2,
@@ -342,8 +342,8 @@ def _adaptation(
         return None
     control.progress("adapting along the held-out recordings", 0.93)
     config = scored.found.best.config if measured is None else measured.fit.config
-    tracks = recordings.fit_tracks, recordings.held_out_tracks
-    return adapt_to_held_out(config, *tracks, scored.held_out, request.settings.drift)
+    segments = recordings.fit_segments, recordings.held_out_segments
+    return adapt_to_held_out(config, *segments, scored.held_out, request.settings.drift)
 
 
 def _ceiling(errors: Mapping[str, FitErrors]) -> Ceiling | None:

@@ -1,7 +1,7 @@
 """Drift: what changed in the car since the fitted recordings, from its adaptation to held-out recordings.
 
 An adaptation also follows errors of a wrong simulator. So a drift must be slow, and the slow adaptation must predict
-unseen windows better than the simulator, than the simulator with the mean disturbance of the fitted recordings, and
+held-out windows better than the simulator, than the simulator with the mean disturbance of the fitted recordings, and
 than the simulator whose prediction is corrected by the mean error of fitted windows in similar states.
 """
 
@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import AdaptationNoise
-from carlab.diagnosis.findings import Change, Drift
+from carlab.diagnosis.findings import Drift, QuantityChange
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.settings import DEFAULT, DriftSettings
 from carlab.prediction.adaptation import MIN_FEATURE_STD, AdaptiveModel, DisturbanceSeries, adapt, choose_noise
@@ -27,7 +27,7 @@ from carlab.prediction.disturbances import DisturbedModel
 from carlab.prediction.error_memory import state_features
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel
-from carlab.prediction.windows import Track, cut_windows
+from carlab.prediction.windows import RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
 QUANTITIES = (("drive force", "1"), ("steering trim", "rad"), ("grip", "1"), ("force forward", "m/s2"))
@@ -57,39 +57,41 @@ class _SlowAdaptation:
 
 def adapt_to_held_out(
     config: SimulatorConfig,
-    fit_tracks: Sequence[Track],
-    held_out_tracks: Sequence[Track],
+    fit_segments: Sequence[RecordingSegment],
+    held_out_segments: Sequence[RecordingSegment],
     held_out: HeldOut,
     settings: DriftSettings,
 ) -> Adaptation:
     """Adapt a simulator along held-out recordings, and find what changed in the car since the fitted ones.
 
     Args:
-        config: the simulator, fitted to ``fit_tracks``.
-        fit_tracks: fitted recordings; the noise of the filter is chosen on them.
-        held_out_tracks: held-out recordings.
+        config: the simulator, fitted to ``fit_segments``.
+        fit_segments: fitted recordings; the noise of the filter is chosen on them.
+        held_out_segments: held-out recordings.
         held_out: windows of the held-out recordings.
         settings: conditions of a drift.
     """
     whole = AdaptationSettings()
     window_s2 = held_out.windows.velocity_window_s2
-    noise = choose_noise(config, fit_tracks, whole, velocity_window_s2=window_s2)
-    model = adapt(config, held_out_tracks, noise, whole, fitted=fit_tracks, velocity_window_s2=window_s2)
+    noise = choose_noise(config, fit_segments, whole, velocity_window_s2=window_s2)
+    model = adapt(config, held_out_segments, noise, whole, fitted=fit_segments, velocity_window_s2=window_s2)
     times_s = tuple(t for t in whole.time_constants_s if t >= settings.min_time_constant_s)
     slow = replace(whole, time_constants_s=times_s)
 
     @cache
     def slowly_adapted(mask: Mask) -> _SlowAdaptation:
-        made = adapt(config, held_out_tracks, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
+        made = adapt(
+            config, held_out_segments, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2
+        )
         return _SlowAdaptation(made, held_out.final_error(made))
 
     @cache
     def along_fitted(mask: Mask) -> FloatArray:
-        fitted = adapt(config, fit_tracks, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
+        fitted = adapt(config, fit_segments, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
         return fitted.series().mean
 
     plain = held_out.final_error(config)
-    similar = _similar_states(config, fit_tracks, held_out, plain, settings)
+    similar = _similar_states(config, fit_segments, held_out, plain, settings)
     constant = DisturbedModel(config, along_fitted(EVERYTHING).mean(axis=0), slow)
     errors = {
         "model": plain,
@@ -134,7 +136,7 @@ def _drift_of(
     slow = slowly_adapted(EVERYTHING)
     gains = [_gain_z(held_out_part, errors[name][own], slow.errors[own], settings) for name in BASELINES]
     is_drift = min(gains) >= settings.gain_z_min
-    changes: tuple[Change, ...] = ()
+    changes: tuple[QuantityChange, ...] = ()
     if is_drift and any(mask := _changed(held_out_part, own, errors["model"], slowly_adapted, settings)):
         changes = _changes(slowly_adapted(mask).model.series(), number, mask, along_fitted(mask), settings)
     shown = np.flatnonzero(series.recording == number)
@@ -171,7 +173,7 @@ def _changed(
     slowly_adapted: Callable[[Mask], _SlowAdaptation],
     settings: DriftSettings,
 ) -> Mask:
-    """Which quantities changed: forward selection by the gain on unseen windows."""
+    """Which quantities changed: forward selection by the gain on held-out windows."""
     mask: Mask = (False,) * len(QUANTITIES)
     current = plain[own]
     while not all(mask):
@@ -188,7 +190,7 @@ def _changed(
 
 def _changes(
     series: DisturbanceSeries, number: int, mask: Mask, along_fitted: FloatArray, settings: DriftSettings
-) -> tuple[Change, ...]:
+) -> tuple[QuantityChange, ...]:
     """Significant changes of the quantities in ``mask`` from the fitted recordings, most significant first."""
     own = series.recording == number
     mean, std = series.mean[own], series.std[own]
@@ -199,17 +201,17 @@ def _changes(
         value = float(mean[~first, k].mean()) - before
         spread = float(np.sqrt(np.mean(std[~first, k] ** 2) + np.var(along_fitted[:, k])))
         ends = float(mean[first, k].mean()) - before, float(mean[last, k].mean()) - before
-        found.append(Change(*QUANTITIES[k], value, spread, *ends))
+        found.append(QuantityChange(*QUANTITIES[k], value, spread, *ends))
     kept = [c for c in found if max(abs(c.value), abs(c.last - c.first)) >= settings.change_z_min * c.std]
     return tuple(sorted(kept, key=lambda c: -abs(c.value) / c.std))
 
 
-def changes_along(series: DisturbanceSeries, settings: DriftSettings = DEFAULT.drift) -> tuple[Change, ...]:
+def changes_along(series: DisturbanceSeries, settings: DriftSettings = DEFAULT.drift) -> tuple[QuantityChange, ...]:
     """All quantities along one recording or several, whether significant or not."""
     t_s = series.t_s
     first, last = _ends(t_s, settings)
     return tuple(
-        Change(
+        QuantityChange(
             name,
             unit,
             float(series.mean[:, k].mean()),
@@ -252,13 +254,13 @@ class _SimilarStates:
 
 def _similar_states(
     config: SimulatorConfig,
-    fit_tracks: Sequence[Track],
+    fit_segments: Sequence[RecordingSegment],
     held_out: HeldOut,
     errors: FloatArray,
     settings: DriftSettings,
 ) -> _SimilarStates:
     windows = held_out.windows
-    fitted = cut_windows(fit_tracks, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
+    fitted = cut_windows(fit_segments, windows.horizon_s, settings.fit_stride_s).thinned(settings.max_fit_windows)
     fitted = replace(fitted, velocity_window_s2=windows.velocity_window_s2)
     fit_errors = final_errors(SimulatorModel(config), fitted)
     fit_states, states = state_features(fitted), state_features(windows)

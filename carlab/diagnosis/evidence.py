@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carlab.core.quantities import STATE_NAMES, FloatArray
-from carlab.diagnosis.findings import DataFault, EffectFinding, Estimate, Evidence, Verdict, Where
+from carlab.diagnosis.findings import DataFault, EffectFinding, ErrorLocation, Estimate, Evidence, Verdict
 from carlab.diagnosis.identification.fit import Fit, clustered_gain
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.identification.joint_fit import joint_fit
@@ -93,15 +93,15 @@ def effect_findings(
     return tuple(found)
 
 
-def score_ladder(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
+def scores_by_step(scored: ScoredSearch) -> tuple[tuple[str, float], ...]:
     """Held-out scores of the nominal simulator, the refit, each step of the search, and the accepted effects."""
     held_out, found, scores = scored.held_out, scored.found, scored.scores()
-    ladder = [("nominal", scores["nominal"]), ("refit", scores["refit"])]
+    steps = [("nominal", scores["nominal"]), ("refit", scores["refit"])]
     for name, fit in found.history:
-        ladder.append((f"+ {name}", held_out.score(held_out.final_error(fit.config))))
+        steps.append((f"+ {name}", held_out.score(held_out.final_error(fit.config))))
     if found.history and found.history[-1][1] is not found.best:
-        ladder.append(("accepted effects", scores["with_effects"]))
-    return tuple(ladder)
+        steps.append(("accepted effects", scores["with_effects"]))
+    return tuple(steps)
 
 
 def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
@@ -141,7 +141,7 @@ def _confidence(scored: ScoredSearch, name: str) -> float:
 
 def _where(
     scored: ScoredSearch, name: str, parameters: Mapping[str, Estimate], error: FloatArray, without: Fit
-) -> Where:
+) -> ErrorLocation:
     """Channels sorted by the fall of their squared score, and regime, lag, time and place of the effect."""
     floor, windows = scored.held_out.floor, scored.problem.windows
     removed = np.mean((error / floor) ** 2, axis=0) - np.mean((scored.errors["with_effects"] / floor) ** 2, axis=0)
@@ -156,7 +156,7 @@ def _where(
     time = (0.0, float(windows.t0_s.max())) if "time" in effect.depends_on else None
     final = prediction_errors(simulate_windows(windows, without.config), windows)[0, :, -1]
     size = np.abs(final[:, STATE_NAMES.index(channels[0])])
-    return Where(channels, worst_regime(start_features(windows), size), lag, time, place)
+    return ErrorLocation(channels, worst_regime(start_features(windows), size), lag, time, place)
 
 
 def estimate(scored: ScoredSearch, name: str) -> Estimate:
@@ -228,7 +228,7 @@ __all__ = [
     "Texts",
     "base_estimates",
     "effect_findings",
-    "score_ladder",
+    "scores_by_step",
     "unexplained_share",
     "verdict_of",
 ]

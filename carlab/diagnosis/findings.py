@@ -25,7 +25,7 @@ Verdict = Literal["mismatch", "parameters", "none", "data", "unexplained", "inco
 
 
 @dataclass(frozen=True, slots=True)
-class Where:
+class ErrorLocation:
     """Location of an effect's error; ``time`` is (start, end) [s], ``place`` is (x, y, radius) [m]."""
 
     channels: tuple[str, ...]
@@ -58,7 +58,7 @@ class EffectFinding:
     id: str
     confidence: float
     parameters: Mapping[str, Estimate]
-    where: Where
+    where: ErrorLocation
     evidence: Evidence
     sentence: str
     indistinguishable_from: tuple[str, ...] = ()
@@ -131,7 +131,7 @@ class Skill:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class QuantityChange:
     """A quantity of the car that changed since the fitted recordings.
 
     Attributes:
@@ -157,9 +157,9 @@ class Drift:
 
     Attributes:
         recording: number of the recording, from 1.
-        is_drift: whether a slow adaptation predicts unseen windows better by the minimum number of standard errors than
-            the simulator, than the simulator with the mean disturbance of the fitted recordings, and than the simulator
-            corrected by the mean error of fitted windows in similar states.
+        is_drift: whether a slow adaptation predicts held-out windows better, by the minimum number of standard errors,
+            than the simulator, than the simulator with the mean disturbance of the fitted recordings, and than the
+            simulator corrected by the mean error of fitted windows in similar states.
         changes: quantities that changed, largest gain first; empty without a drift, or if no single one is significant.
         time_constant_s: likeliest time constant of the slow adaptation [s].
         model_m, adapted_m, slow_m, similar_states_m: root mean square position errors after the horizon [m] of the
@@ -175,7 +175,7 @@ class Drift:
 
     recording: int
     is_drift: bool
-    changes: tuple[Change, ...]
+    changes: tuple[QuantityChange, ...]
     time_constant_s: float
     model_m: float
     adapted_m: float
@@ -315,20 +315,21 @@ class Trace:
 
 
 @dataclass(frozen=True, slots=True)
-class Exhibits:
+class FigureData:
     """Data of the report's figures.
 
-    ladder: scores from nominal over refit and each added effect to the noise floor, with labels
+    traces: held-out recordings with their predictions, and fitted recordings with events
+    scores_by_step: label and held-out score of: nominal, refit, each added effect, noise floor
     regimes: by feature name, bin centres (n,) and rms error in noise floors of refit and with_effects, each (n,)
     correlation: by effect id, lags [s] (n,), cross-correlation of the refit's residual with the effect's input (n,),
                  and the 99 % bound
-    candidates: candidates for the first effect: id, gain on unseen blocks in standard errors, loss with it
+    candidates: candidates for the first effect: id, gain on left-out blocks in standard errors, loss with it
     decisions: accepted and rejected effects with statistics and thresholds
     noise: noise of the recordings, for model.toml
     """
 
     traces: tuple[Trace, ...] = ()
-    ladder: tuple[tuple[str, float], ...] = ()
+    scores_by_step: tuple[tuple[str, float], ...] = ()
     regimes: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=dict)
     correlation: Mapping[str, tuple[FloatArray, FloatArray, float]] = field(default_factory=dict)
     candidates: tuple[tuple[str, float, float], ...] = ()

@@ -63,7 +63,7 @@ class FormFinding:
 
 @dataclass(frozen=True, slots=True)
 class CurveFinding:
-    """A measured curve beside that of the car file, at the knots of its axes (an array with one dimension an axis).
+    """A measured curve and that of the car file, at the knots of its axes (an array with one dimension an axis).
 
     Attributes:
         id: id of the curve.

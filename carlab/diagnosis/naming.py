@@ -206,7 +206,7 @@ def explained_share(problem: SearchProblem, found: SearchResult, held_out: HeldO
                 (),
                 np.zeros((len(windows), 0)),
                 held_out.noise.measured,
-                max_error=problem.settings.selection.max_unseen_error,
+                max_error=problem.settings.selection.max_left_out_error,
                 settings=problem.settings.identification,
             )
             total += float(loss.sum()) - 3.0 * (windows.steps - 1) * len(windows)

@@ -12,7 +12,7 @@ from carlab.core.errors import ConfigError, DataError
 from carlab.diagnosis.events import Event, EventUse, mark_events
 from carlab.diagnosis.findings import DataFault, Verdict
 from carlab.diagnosis.settings import DiagnosisSettings, WindowSettings
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows, split_tracks, tracks_of
+from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows, segments_of, split_segments
 from sim_backends.car_parameters import SimulatorConfig
 
 
@@ -30,10 +30,10 @@ class Inconclusive(DataError):
 
 @dataclass(frozen=True, slots=True)
 class SplitRecordings:
-    """Tracks and prediction windows to fit, and held-out ones; ``event_windows`` are held-out ones with events."""
+    """Segments and prediction windows to fit, and held-out ones; ``event_windows`` are held-out ones with events."""
 
-    fit_tracks: tuple[Track, ...]
-    held_out_tracks: tuple[Track, ...]
+    fit_segments: tuple[RecordingSegment, ...]
+    held_out_segments: tuple[RecordingSegment, ...]
     fit_windows: PredictionWindows
     held_out_windows: PredictionWindows
     event_windows: PredictionWindows
@@ -79,74 +79,76 @@ def split_recordings(
     if not keep_events:
         fit, held_out = marked_fit, marked_held_out
     cut = settings.windows
-    fit_tracks, held_out_tracks = _split(fit, held_out, held_out_share, cut)
-    check_excitation(fit_tracks, cut)
-    fit_windows, fit_event_windows = _cut(fit_tracks, cut.fit_window_s, cut.fit_stride_s, cut.max_fit_windows)
+    fit_segments, held_out_segments = _split(fit, held_out, held_out_share, cut)
+    check_excitation(fit_segments, cut)
+    fit_windows, fit_event_windows = _cut(fit_segments, cut.fit_window_s, cut.fit_stride_s, cut.max_fit_windows)
     held_out_windows, event_windows = _cut(
-        held_out_tracks, cut.held_out_window_s, cut.held_out_stride_s, cut.max_held_out_windows
+        held_out_segments, cut.held_out_window_s, cut.held_out_stride_s, cut.max_held_out_windows
     )
-    events = (*_with_roles(fit_events, () if has_own else held_out_tracks), *_held_out(held_out_events))
+    events = (*_with_roles(fit_events, () if has_own else held_out_segments), *_held_out(held_out_events))
     use = EventUse(events, not keep_events, len(fit_event_windows), len(event_windows))
-    return SplitRecordings(tuple(fit_tracks), tuple(held_out_tracks), fit_windows, held_out_windows, event_windows, use)
+    return SplitRecordings(
+        tuple(fit_segments), tuple(held_out_segments), fit_windows, held_out_windows, event_windows, use
+    )
 
 
 def _held_out(events: Sequence[Event]) -> tuple[Event, ...]:
     return tuple(replace(event, role="held out") for event in events)
 
 
-def _with_roles(events: Sequence[Event], held_out_tracks: Sequence[Track]) -> tuple[Event, ...]:
+def _with_roles(events: Sequence[Event], held_out_segments: Sequence[RecordingSegment]) -> tuple[Event, ...]:
     """Events of recordings to fit: those in a held-out part of their recording are held out."""
 
     def is_held_out(event: Event) -> bool:
-        own = [track for track in held_out_tracks if track.recording == event.recording - 1]
-        return any(track.t_s[0] <= event.to_s and event.from_s <= track.t_s[-1] for track in own)
+        own = [segment for segment in held_out_segments if segment.recording == event.recording - 1]
+        return any(segment.t_s[0] <= event.to_s and event.from_s <= segment.t_s[-1] for segment in own)
 
     return tuple(replace(event, role="held out" if is_held_out(event) else "fit") for event in events)
 
 
 def _split(
     fit: Sequence[EpisodeData], held_out: Sequence[EpisodeData], share: float, settings: WindowSettings
-) -> tuple[list[Track], list[Track]]:
-    """Tracks to fit and held-out tracks; without held-out recordings, the end of each recording is held out."""
-    fit_tracks = tracks_of(fit)
-    if not fit_tracks:
+) -> tuple[list[RecordingSegment], list[RecordingSegment]]:
+    """Segments to fit and held-out segments; without held-out recordings, the end of each recording is held out."""
+    fit_segments = segments_of(fit)
+    if not fit_segments:
         raise Inconclusive("No recording has an unbroken stretch of half a second; record without gaps.")
-    period_s = fit_tracks[0].period_s
+    period_s = fit_segments[0].period_s
     if held_out:
-        held_out_tracks = tracks_of(held_out, period_s)
-        if not held_out_tracks:
+        held_out_segments = segments_of(held_out, period_s)
+        if not held_out_segments:
             raise Inconclusive(
                 "The held-out recordings have no unbroken stretch of half a second; hold out other recordings."
             )
-        return fit_tracks, held_out_tracks
-    return split_tracks(fit_tracks, share, settings.held_out_window_s + settings.split_guard_s)
+        return fit_segments, held_out_segments
+    return split_segments(fit_segments, share, settings.held_out_window_s + settings.split_guard_s)
 
 
 def _cut(
-    tracks: Sequence[Track], horizon_s: float, stride_s: float, max_windows: int
+    segments: Sequence[RecordingSegment], horizon_s: float, stride_s: float, max_windows: int
 ) -> tuple[PredictionWindows, PredictionWindows]:
     """Prediction windows without and with events. Raises Inconclusive without windows."""
-    if not tracks:
+    if not segments:
         raise Inconclusive("The recording is too short to hold out a part of it; record a longer drive (100 s).")
     try:
-        return cut_windows(tracks, horizon_s, stride_s, with_events=True).thinned(max_windows).split_at_events()
+        return cut_windows(segments, horizon_s, stride_s, with_events=True).thinned(max_windows).split_at_events()
     except DataError as error:
         raise Inconclusive(str(error)) from error
 
 
-def check_excitation(tracks: Sequence[Track], settings: WindowSettings) -> None:
+def check_excitation(segments: Sequence[RecordingSegment], settings: WindowSettings) -> None:
     """Raise Inconclusive if the excitation is not sufficient; the message states what to record."""
-    seconds = sum(track.duration_s for track in tracks)
+    seconds = sum(segment.duration_s for segment in segments)
     if seconds < settings.min_fit_s:
         raise Inconclusive(
             f"The recordings to fit contain {seconds:.1f} s of driving (without parts that are held out). A diagnosis "
             f"needs at least {settings.min_fit_s:.0f} s, better 100 s, with changing speed and steering, for example "
             "carlab drive --policy gamepad --ticks 3600, or --episodes 30 of the parking policy."
         )
-    speed = np.concatenate([np.hypot(t.smooth[:, 3], t.smooth[:, 4]) for t in tracks])
+    speed = np.concatenate([np.hypot(t.smooth[:, 3], t.smooth[:, 4]) for t in segments])
     if np.quantile(speed, 0.9) < settings.min_speed_mps:
         raise Inconclusive("The car hardly moves in the recordings to fit; record a drive.")
-    commands = np.concatenate([t.commands for t in tracks])
+    commands = np.concatenate([t.commands for t in segments])
     for k, name in enumerate(("steering", "throttle")):
         if commands[:, k].std() < settings.min_command_std:
             raise Inconclusive(

@@ -29,10 +29,12 @@ from carlab.prediction.adaptation import AdaptiveModel, choose_noise
 from carlab.prediction.adaptation import adapt as adapt_along
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import ConstantVelocity, NoChange, PredictiveModel, SimulatorModel, predicted_at
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows, split_tracks, tracks_of
+from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows, segments_of, split_segments
 from sim_backends.car_parameters import SimulatorConfig
 
 MODEL, ADAPTED, CONSTANT_VELOCITY, NO_CHANGE = "model", "adapted", "constant velocity", "no change"
+_GUARD_S = DEFAULT.windows.held_out_window_s + DEFAULT.windows.split_guard_s
+"""Gap between the first and the last part of a recording [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,18 +125,18 @@ def score_recording(
         raise DataError("The recording contains no command; give a recording of a drive.")
     repaired, _, faults = recording_faults.check(episodes, [], config)
     marked, events = mark_events(repaired, config)
-    tracks = tracks_of(repaired if keep_events else marked)
-    if not tracks:
+    segments = segments_of(repaired if keep_events else marked)
+    if not segments:
         raise DataError("The recording has no unbroken stretch of half a second; record without gaps.")
-    whole = _score("whole recording", tracks, tracks, config, noise, horizon_s, stride_s)
-    early, late = split_tracks(tracks, holdout_share, DEFAULT.windows.held_out_window_s + DEFAULT.windows.split_guard_s)
+    whole = _score("whole recording", segments, segments, config, noise, horizon_s, stride_s)
+    early, late = split_segments(segments, holdout_share, _GUARD_S)
     try:
         last = _score(f"last {100.0 * holdout_share:g} %", early, late, config, noise, horizon_s, stride_s)
     except DataError:
         last = None
     adaptation = None
     if adapt:
-        adaptation = _adapted(tracks, config, noise, whole.held_out.windows.velocity_window_s2)
+        adaptation = _adapted(segments, config, noise, whole.held_out.windows.velocity_window_s2)
         whole = _with_model(whole, adaptation)
         last = None if last is None else _with_model(last, adaptation)
     return RecordingScore(
@@ -142,7 +144,7 @@ def score_recording(
         whole,
         last,
         tuple(repaired),
-        _overlays(repaired, tracks, config, horizon_s),
+        _overlays(repaired, segments, config, horizon_s),
         tuple(faults),
         adaptation,
         EventUse(events, not keep_events, 0, len(whole.event_windows)),
@@ -150,13 +152,13 @@ def score_recording(
 
 
 def _adapted(
-    tracks: list[Track], config: SimulatorConfig, known: RecordingNoise | None, window_s2: float
+    segments: list[RecordingSegment], config: SimulatorConfig, known: RecordingNoise | None, window_s2: float
 ) -> AdaptiveModel:
     """The simulator adapted along the recording."""
     noise = None if known is None else known.adaptation
     if noise is None:
-        noise = choose_noise(config, tracks, velocity_window_s2=window_s2)
-    return adapt_along(config, tracks, noise, velocity_window_s2=window_s2)
+        noise = choose_noise(config, segments, velocity_window_s2=window_s2)
+    return adapt_along(config, segments, noise, velocity_window_s2=window_s2)
 
 
 def _with_model(part: PartScore, adaptation: AdaptiveModel) -> PartScore:
@@ -170,31 +172,31 @@ def _with_model(part: PartScore, adaptation: AdaptiveModel) -> PartScore:
 
 def _score(
     part: str,
-    fit_tracks: list[Track],
-    tracks: list[Track],
+    fit_segments: list[RecordingSegment],
+    segments: list[RecordingSegment],
     config: SimulatorConfig,
     known: RecordingNoise | None,
     horizon_s: float,
     stride_s: float,
 ) -> PartScore:
-    """Errors on ``tracks``; velocity window and noise are known or those of ``fit_tracks``.
+    """Errors on ``segments``; velocity window and noise are known or those of ``fit_segments``.
 
     Raises DataError without windows.
     """
-    if not fit_tracks or not tracks:
+    if not fit_segments or not segments:
         raise DataError("The part is too short.")
     settings = DEFAULT.windows
-    fit_windows = cut_windows(fit_tracks, min(settings.fit_window_s, horizon_s), settings.fit_stride_s)
+    fit_windows = cut_windows(fit_segments, min(settings.fit_window_s, horizon_s), settings.fit_stride_s)
     fit_windows = fit_windows.thinned(settings.max_fit_windows)
-    cut = cut_windows(tracks, horizon_s, stride_s, with_events=True).thinned(settings.max_held_out_windows)
+    cut = cut_windows(segments, horizon_s, stride_s, with_events=True).thinned(settings.max_held_out_windows)
     windows, event_windows = cut.split_at_events()
     window_s2 = None if known is None else known.velocity_window_s2
     fit_windows, windows, event_windows = with_initial_states(
         (fit_windows, windows, event_windows), config, variance_s2=window_s2
     )
     if known is None:
-        shakes = find_vibration(fit_tracks) is not None
-        noise = estimate_noise(fit_tracks, fit_windows.curvature_bias, slowest=shakes)
+        vibrates = find_vibration(fit_segments) is not None
+        noise = estimate_noise(fit_segments, fit_windows.curvature_bias, slowest=vibrates)
     else:
         noise = Noise.of(known)
     floor = None if known is None else known.floor_after(windows.horizon_s)
@@ -211,9 +213,9 @@ def _score(
 
 
 def _overlays(
-    episodes: Sequence[EpisodeData], tracks: Sequence[Track], config: SimulatorConfig, horizon_s: float
+    episodes: Sequence[EpisodeData], segments: Sequence[RecordingSegment], config: SimulatorConfig, horizon_s: float
 ) -> tuple[FloatArray, ...]:
-    windows = cut_windows(tracks, horizon_s, horizon_s, with_events=True)
+    windows = cut_windows(segments, horizon_s, horizon_s, with_events=True)
     predicted = SimulatorModel(config).predict(windows)
     found = []
     for index, episode in enumerate(episodes):

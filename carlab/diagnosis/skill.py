@@ -1,4 +1,4 @@
-"""Position error of the diagnosed model beside constant velocity, by held-out recording and regime."""
+"""Position errors of the diagnosed model and of constant velocity, by held-out recording and regime."""
 
 from __future__ import annotations
 

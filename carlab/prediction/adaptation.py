@@ -27,7 +27,7 @@ from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import bounded_final_errors, linearised, simulate_disturbed
 from carlab.prediction.error_memory import ErrorMemory, state_features
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import IndexArray, PredictionWindows, Track, cut_windows
+from carlab.prediction.windows import IndexArray, PredictionWindows, RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
 MIN_FEATURE_STD = 0.01
@@ -152,12 +152,12 @@ class AdaptiveModel:
 
 def adapt(
     config: SimulatorConfig,
-    tracks: Sequence[Track],
+    segments: Sequence[RecordingSegment],
     noise: AdaptationNoise,
     settings: AdaptationSettings | None = None,
     *,
     drifts: Sequence[Sequence[bool]] = SINGLE_AND_ALL,
-    fitted: Sequence[Track] = (),
+    fitted: Sequence[RecordingSegment] = (),
     remember: bool = True,
     velocity_window_s2: float = 0.0,
 ) -> AdaptiveModel:
@@ -165,12 +165,12 @@ def adapt(
 
     Args:
         config: the fitted simulator.
-        tracks: all tracks of the recordings; an estimate at t uses only their rows before t.
+        segments: all segments of the recordings; an estimate at t uses only their rows before t.
         noise: noise of the filter.
         settings: settings of the adaptation.
         drifts: which of the n drifting disturbances may differ from 0, for each group of candidates; a group has one
             candidate for each time constant.
-        fitted: tracks of earlier recordings, whose errors are also remembered.
+        fitted: segments of earlier recordings, whose errors are also remembered.
         remember: whether errors in similar states are remembered at all.
         velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
 
@@ -178,7 +178,7 @@ def adapt(
         DataError: the car moves in no window.
     """
     settings = settings or AdaptationSettings()
-    windows = _windows(tracks, settings.window_s, settings.window_s, velocity_window_s2)
+    windows = _windows(segments, settings.window_s, settings.window_s, velocity_window_s2)
     processes = _processes(noise, settings, np.array(drifts, dtype=np.float64))
     at = np.zeros((*processes.std.shape[:1], len(windows), processes.std.shape[1]))
     for _ in range(settings.linearisations):
@@ -187,7 +187,7 @@ def adapt(
         at = filtered.predicted
     memories = tuple(
         ErrorMemory(
-            config, tracks, earlier, np.array(noise.feature_std), guard_s(windows), velocity_window_s2, settings
+            config, segments, earlier, np.array(noise.feature_std), guard_s(windows), velocity_window_s2, settings
         )
         for earlier in ([(), fitted] if fitted else [()])
         if remember
@@ -204,7 +204,7 @@ def adapt(
         guard_s(windows),
         settings,
     )
-    return _with_losses(model, tracks, noise, velocity_window_s2)
+    return _with_losses(model, segments, noise, velocity_window_s2)
 
 
 def guard_s(windows: PredictionWindows) -> float:
@@ -214,7 +214,7 @@ def guard_s(windows: PredictionWindows) -> float:
 
 def choose_noise(
     config: SimulatorConfig,
-    tracks: Sequence[Track],
+    segments: Sequence[RecordingSegment],
     settings: AdaptationSettings | None = None,
     *,
     velocity_window_s2: float = 0.0,
@@ -227,7 +227,7 @@ def choose_noise(
         DataError: the car moves in no window.
     """
     settings = settings or AdaptationSettings()
-    windows = _windows(tracks, settings.window_s, settings.window_s, velocity_window_s2)
+    windows = _windows(segments, settings.window_s, settings.window_s, velocity_window_s2)
     measured = linearised(windows, config, np.zeros((1, len(windows), len(settings.drift_std))), settings)
     calm = np.quantile(np.abs(measured.error[0]), settings.calm_quantile, axis=0)
     calm = np.maximum(calm / ndtri(0.5 + 0.5 * settings.calm_quantile), MIN_STD)
@@ -241,12 +241,12 @@ def choose_noise(
         settings.dof,
     )
     best = int(np.argmin(run_filter(measured, processes).nll.sum(axis=1)))
-    windows = _windows(tracks, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
+    windows = _windows(segments, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
     error_std, white_share = _as_std(errors[best] * calm), float(whites[best])
     plain = _spread(simulate_windows(windows, config)[0], windows, settings)
     feature_std = cast(FeatureStd, tuple(np.maximum(state_features(windows).std(axis=0), MIN_FEATURE_STD).tolist()))
     noise = AdaptationNoise(error_std, white_share, _as_std(plain), feature_std)
-    adapted = adapt(config, tracks, noise, settings, velocity_window_s2=velocity_window_s2).predict(windows)
+    adapted = adapt(config, segments, noise, settings, velocity_window_s2=velocity_window_s2).predict(windows)
     return replace(noise, loss_std=_as_std(np.minimum(plain, _spread(adapted, windows, settings))))
 
 
@@ -261,12 +261,12 @@ def _as_std(values: FloatArray) -> StateStd:
 
 
 def _with_losses(
-    model: AdaptiveModel, tracks: Sequence[Track], noise: AdaptationNoise, velocity_window_s2: float
+    model: AdaptiveModel, segments: Sequence[RecordingSegment], noise: AdaptationNoise, velocity_window_s2: float
 ) -> AdaptiveModel:
-    """The model with the losses of all candidates along the tracks; without a long enough window the same model."""
+    """The model with the losses of all candidates along the segments; without a long enough window the same model."""
     settings = model.settings
     try:
-        windows = _windows(tracks, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
+        windows = _windows(segments, settings.weight_horizon_s, settings.weight_stride_s, velocity_window_s2)
     except DataError:
         return model
     errors = bounded_final_errors(windows, model.candidates(windows), settings)
@@ -300,9 +300,9 @@ def _processes(noise: AdaptationNoise, settings: AdaptationSettings, drifts: Flo
 
 
 def _windows(
-    tracks: Sequence[Track], horizon_s: float, stride_s: float, velocity_window_s2: float
+    segments: Sequence[RecordingSegment], horizon_s: float, stride_s: float, velocity_window_s2: float
 ) -> PredictionWindows:
     """Windows in the order of recording and time."""
-    windows = cut_windows(tracks, horizon_s, stride_s)
+    windows = cut_windows(segments, horizon_s, stride_s)
     windows = windows.take(np.lexsort((windows.t0_s, windows.recording)))
     return replace(windows, velocity_window_s2=velocity_window_s2)

@@ -13,9 +13,9 @@ from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import PredictionWindows
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.effects import DRIFTING, PUSHING
+from sim_backends.effects import BODY_FORCE_PARAMETERS, DRIFTING_PARAMETERS
 
-DISTURBANCES = (*DRIFTING, *PUSHING)
+DISTURBANCE_NAMES = (*DRIFTING_PARAMETERS, *BODY_FORCE_PARAMETERS)
 """Dotted names of the m disturbances; the first n of them drift."""
 
 
@@ -38,7 +38,7 @@ def linearised(
 ) -> MeasuredWindows:
     """Errors after S windows with disturbances ``at`` (C, S, n), and their Jacobian by all m disturbances."""
     candidates, count, size = at.shape
-    total = len(DISTURBANCES)
+    total = len(DISTURBANCE_NAMES)
     full = np.zeros((candidates, count, total))
     full[..., :size] = np.clip(at, -np.array(settings.limits[:size]), settings.limits[:size])
     steps = np.array(settings.steps)
@@ -64,7 +64,9 @@ def simulate_disturbed(
     limits = np.array(settings.limits[:size])
     given = np.clip(disturbances, -limits, limits) * unit
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a diverged simulation has bounded errors
-        return simulate_windows(windows, config, {name: given[..., k] for k, name in enumerate(DISTURBANCES[:size])})
+        return simulate_windows(
+            windows, config, {name: given[..., k] for k, name in enumerate(DISTURBANCE_NAMES[:size])}
+        )
 
 
 def bounded_final_errors(windows: PredictionWindows, predicted: FloatArray, settings: AdaptationSettings) -> FloatArray:

@@ -21,7 +21,7 @@ from carlab.core.quantities import FloatArray
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 
 BATCH = 128
@@ -34,8 +34,8 @@ class ErrorMemory:
 
     Attributes:
         config: the simulator.
-        tracks: tracks of the recordings that are predicted; only windows before a prediction are used.
-        fitted: tracks of earlier recordings, all of whose windows are used.
+        segments: segments of the recordings that are predicted; only windows before a prediction are used.
+        fitted: segments of earlier recordings, all of whose windows are used.
         state_std: (7,) unit of the features of the state.
         guard_s: minimum time [s] between the end of a used window and the start of a prediction.
         velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
@@ -43,8 +43,8 @@ class ErrorMemory:
     """
 
     config: SimulatorConfig
-    tracks: Sequence[Track]
-    fitted: Sequence[Track]
+    segments: Sequence[RecordingSegment]
+    fitted: Sequence[RecordingSegment]
     state_std: FloatArray
     guard_s: float
     velocity_window_s2: float
@@ -52,7 +52,7 @@ class ErrorMemory:
 
     def corrected(self, windows: PredictionWindows, predicted: FloatArray) -> FloatArray:
         """Predictions (S, K + 1, 6) of the simulator less their expected errors."""
-        past = self._windows(self.tracks, windows.horizon_s)
+        past = self._windows(self.segments, windows.horizon_s)
         earlier = self._windows(self.fitted, windows.horizon_s)
         if past is None and earlier is None:
             return predicted
@@ -69,10 +69,10 @@ class ErrorMemory:
             expected[rows] = np.tensordot(weights, errors, axes=1)
         return predicted - _in_world(expected, windows)
 
-    def _windows(self, tracks: Sequence[Track], horizon_s: float) -> PredictionWindows | None:
-        """Windows of the tracks; None if the car moves in none."""
+    def _windows(self, segments: Sequence[RecordingSegment], horizon_s: float) -> PredictionWindows | None:
+        """Windows of the segments; None if the car moves in none."""
         try:
-            windows = cut_windows(tracks, horizon_s, self.settings.weight_stride_s) if tracks else None
+            windows = cut_windows(segments, horizon_s, self.settings.weight_stride_s) if segments else None
         except DataError:
             return None
         return None if windows is None else replace(windows, velocity_window_s2=self.velocity_window_s2)

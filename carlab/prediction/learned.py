@@ -14,7 +14,7 @@ from carlab.core.observation import decode_state, encode
 from carlab.core.planar import to_body
 from carlab.core.quantities import FloatArray
 from carlab.prediction.initial_states import as_recorded
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from learning.world.disturbance import RolloutModel, start_rollouts
 from learning.world.drive_windows import DriveWindows
 
@@ -111,7 +111,7 @@ def recorded_windows(episodes: Sequence[EpisodeData], horizon_s: float, stride_s
     """
     if not episodes:
         raise DataError("There is no recording to cut windows from; record a drive.")
-    return as_recorded(cut_windows(tracks_of(episodes, episodes[0].period_s), horizon_s, stride_s))
+    return as_recorded(cut_windows(segments_of(episodes, episodes[0].period_s), horizon_s, stride_s))
 
 
 def drive_windows(windows: PredictionWindows, history: int) -> DriveWindows:

@@ -5,7 +5,7 @@ velocities at all. Each network maps past commands and the body velocities of th
 is the error of a whole window (simulation error training; Forgione and Piga 2021, "Continuous-time system
 identification with neural networks: Model structures and fitting criteria").
 
-A learned discrepancy is the same ensemble beside a simulator: its networks also see the simulated velocities, and their
+A learned discrepancy is the same ensemble with a simulator: its networks also see the simulated velocities, and their
 output is added to the simulated accelerations (an additive model discrepancy; Kennedy and O'Hagan 2001, "Bayesian
 calibration of computer models").
 """
@@ -26,7 +26,7 @@ from carlab.core.quantities import FloatArray
 from carlab.core.robust import STD_OVER_MAD
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import ConstantVelocity, PredictiveModel
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows
 
 Progress = Callable[[str, float], None]
 Weights = tuple[torch.Tensor, ...]
@@ -111,9 +111,9 @@ class _Inputs:
     simulated: torch.Tensor | None
 
 
-def check_duration(tracks: Sequence[Track], settings: EnsembleSettings) -> None:
+def check_duration(segments: Sequence[RecordingSegment], settings: EnsembleSettings) -> None:
     """Raise DataError if the recordings are too short to train on."""
-    seconds = sum(track.duration_s for track in tracks)
+    seconds = sum(segment.duration_s for segment in segments)
     if seconds < settings.min_duration_s:
         raise DataError(
             f"The recordings to fit contain {seconds:.0f} s of driving; a network needs at least "
@@ -122,7 +122,7 @@ def check_duration(tracks: Sequence[Track], settings: EnsembleSettings) -> None:
 
 
 def train_ensemble(
-    tracks: Sequence[Track],
+    segments: Sequence[RecordingSegment],
     settings: EnsembleSettings | None = None,
     *,
     simulator: PredictiveModel | None = None,
@@ -132,10 +132,10 @@ def train_ensemble(
     progress: Progress = lambda activity, share: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> NetworkEnsemble:
-    """Train an ensemble on the windows of tracks.
+    """Train an ensemble on the windows of recorded segments.
 
     Args:
-        tracks: recordings to fit, at least ``settings.min_duration_s`` in all.
+        segments: recordings to fit, at least ``settings.min_duration_s`` in all.
         settings: sizes and training.
         simulator: model whose discrepancy the networks learn; without it they are a black box.
         seed: seed of initial weights, batches and validation blocks.
@@ -148,8 +148,8 @@ def train_ensemble(
         DataError: too little driving.
     """
     settings = settings or EnsembleSettings()
-    check_duration(tracks, settings)
-    windows = cut_windows(tracks, settings.horizon_s, settings.stride_s)
+    check_duration(segments, settings)
+    windows = cut_windows(segments, settings.horizon_s, settings.stride_s)
     windows = replace(windows, velocity_window_s2=velocity_window_s2)
     return _Training(windows, settings, simulator, seed, torch.device(device)).run(progress, stop)
 

@@ -40,7 +40,7 @@ BLOCK_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class RecordingSegment:
     """An unbroken stretch of a recording on an even grid of n rows.
 
     Attributes:
@@ -74,8 +74,8 @@ class Track:
         """Rows times period."""
         return len(self.t_s) * self.period_s
 
-    def part(self, rows: slice) -> Track:
-        """Select rows of the track; ``residual`` and ``speed`` remain those of the whole track."""
+    def part(self, rows: slice) -> RecordingSegment:
+        """Select rows of the segment; ``residual`` and ``speed`` remain those of the whole segment."""
         return replace(
             self,
             t_s=self.t_s[rows],
@@ -154,7 +154,7 @@ class PredictionWindows:
         return self.take(np.unique(np.linspace(0, len(self) - 1, max_windows).round().astype(np.int64)))
 
 
-def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) -> list[Track]:
+def segments_of(episodes: Sequence[EpisodeData], period_s: float | None = None) -> list[RecordingSegment]:
     """Resample recordings on an even grid, cut at gaps and missing values.
 
     Faster recordings are thinned to ``MAX_PERIOD_S`` after smoothing; commands become means over the cells.
@@ -175,14 +175,14 @@ def tracks_of(episodes: Sequence[EpisodeData], period_s: float | None = None) ->
             period_s = episode.period_s * max(int(MAX_PERIOD_S / episode.period_s + 1e-6), 1)
         every = max(round(period_s / episode.period_s), 1)
         for rows in unbroken_rows(episode):
-            track = _track(index, episode, rows, period_s / every, every)
-            if track is not None:
-                found.append(track)
+            segment = _segment(index, episode, rows, period_s / every, every)
+            if segment is not None:
+                found.append(segment)
     return found
 
 
 def unbroken_rows(episode: EpisodeData) -> Iterable[slice]:
-    """Stretches of a recording without gaps, missing values and changes of the segment."""
+    """Stretches of a recording without gaps, missing values and changes of the column ``segment``."""
     t = episode.times_s
     whole = np.asarray(np.isfinite(episode.states).all(axis=1))
     broken = np.asarray(np.diff(t) > max(3.0 * episode.period_s, 0.1)) | ~(whole[1:] & whole[:-1])
@@ -194,7 +194,7 @@ def unbroken_rows(episode: EpisodeData) -> Iterable[slice]:
             yield slice(int(first), int(last))
 
 
-def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every: int) -> Track | None:
+def _segment(index: int, episode: EpisodeData, rows: slice, period_s: float, every: int) -> RecordingSegment | None:
     t = episode.times_s[rows]
     states = episode.states[rows].copy()
     states[:, 2] = np.unwrap(states[:, 2])
@@ -220,7 +220,7 @@ def _track(index: int, episode: EpisodeData, rows: slice, period_s: float, every
         commands = commands[:whole].reshape(-1, every, 2).mean(axis=1)
         grid, states, smooth, curvature_bias = (v[:whole:every] for v in (grid, states, smooth, curvature_bias))
         in_event = in_event[:whole:every]
-    return Track(
+    return RecordingSegment(
         recording=index,
         period_s=every * period_s,
         t_s=grid - episode.times_s[0],
@@ -276,32 +276,37 @@ def smoothing_width(period_s: float) -> int:
 
 
 def cut_windows(
-    tracks: Sequence[Track], horizon_s: float, stride_s: float, block_s: float = BLOCK_S, *, with_events: bool = False
+    segments: Sequence[RecordingSegment],
+    horizon_s: float,
+    stride_s: float,
+    block_s: float = BLOCK_S,
+    *,
+    with_events: bool = False,
 ) -> PredictionWindows:
-    """Cut tracks into windows in which the car moves, without those with rows of events.
+    """Cut segments into windows in which the car moves, without those with rows of events.
 
     Args:
-        tracks: all have the same period.
+        segments: all have the same period.
         horizon_s: length of a window.
         stride_s: time between the starts of windows.
         block_s: length of the blocks that count as independent.
         with_events: also cut windows with rows of events.
 
     Raises:
-        DataError: no track, or the car moves in no window.
+        DataError: no segment, or the car moves in no window.
     """
-    if not tracks:
+    if not segments:
         raise DataError("The recordings have no stretch without a gap that is long enough; record a longer drive.")
-    period_s = tracks[0].period_s
+    period_s = segments[0].period_s
     steps = max(round(horizon_s / period_s), 1)
     stride = max(round(stride_s / period_s), 1)
     past = max(round(HISTORY_S / period_s), 1)
     starts = [
-        (track, row)
-        for track in tracks
-        for row in range(past, len(track.t_s) - steps, stride)
-        if np.hypot(*track.smooth[row : row + steps + 1, 3:5].T).max() >= MIN_SPEED_MPS
-        and (with_events or not track.in_event[row : row + steps + 1].any())
+        (segment, row)
+        for segment in segments
+        for row in range(past, len(segment.t_s) - steps, stride)
+        if np.hypot(*segment.smooth[row : row + steps + 1, 3:5].T).max() >= MIN_SPEED_MPS
+        and (with_events or not segment.in_event[row : row + steps + 1].any())
     ]
     if not starts:
         raise DataError(
@@ -310,28 +315,30 @@ def cut_windows(
         )
     return PredictionWindows(
         period_s=period_s,
-        initial_states=np.stack([track.smooth[row] for track, row in starts]),
-        past_commands=np.stack([track.commands[row - past : row] for track, row in starts]),
-        commands=np.stack([track.commands[row : row + steps] for track, row in starts]),
-        measured=np.stack([track.states[row : row + steps + 1] for track, row in starts]),
-        past_states=np.stack([track.smooth[row - past : row] for track, row in starts]),
-        curvature_bias=np.stack([track.curvature_bias[row] for track, row in starts]),
-        t0_s=np.array([track.t_s[row] for track, row in starts]),
-        recording=np.array([track.recording for track, _ in starts]),
-        block=np.array([track.recording * 1_000_000 + int(track.t_s[row] / block_s) for track, row in starts]),
-        in_event=np.array([track.in_event[row : row + steps + 1].any() for track, row in starts]),
+        initial_states=np.stack([segment.smooth[row] for segment, row in starts]),
+        past_commands=np.stack([segment.commands[row - past : row] for segment, row in starts]),
+        commands=np.stack([segment.commands[row : row + steps] for segment, row in starts]),
+        measured=np.stack([segment.states[row : row + steps + 1] for segment, row in starts]),
+        past_states=np.stack([segment.smooth[row - past : row] for segment, row in starts]),
+        curvature_bias=np.stack([segment.curvature_bias[row] for segment, row in starts]),
+        t0_s=np.array([segment.t_s[row] for segment, row in starts]),
+        recording=np.array([segment.recording for segment, _ in starts]),
+        block=np.array([segment.recording * 1_000_000 + int(segment.t_s[row] / block_s) for segment, row in starts]),
+        in_event=np.array([segment.in_event[row : row + steps + 1].any() for segment, row in starts]),
     )
 
 
-def split_tracks(tracks: Sequence[Track], share: float, guard_s: float) -> tuple[list[Track], list[Track]]:
-    """Split each track into its first part and its last ``share``, with a gap of ``guard_s`` between them.
+def split_segments(
+    segments: Sequence[RecordingSegment], share: float, guard_s: float
+) -> tuple[list[RecordingSegment], list[RecordingSegment]]:
+    """Split each segment into its first part and its last ``share``, with a gap of ``guard_s`` between them.
 
     Parts that are not longer than the gap are omitted.
     """
     early, late = [], []
-    guard = round(guard_s / tracks[0].period_s) if tracks else 0
-    for track in tracks:
-        cut_at = round((1.0 - share) * len(track.t_s))
-        early.append(track.part(slice(0, max(cut_at - guard, 0))))
-        late.append(track.part(slice(cut_at, len(track.t_s))))
+    guard = round(guard_s / segments[0].period_s) if segments else 0
+    for segment in segments:
+        cut_at = round((1.0 - share) * len(segment.t_s))
+        early.append(segment.part(slice(0, max(cut_at - guard, 0))))
+        late.append(segment.part(slice(cut_at, len(segment.t_s))))
     return [t for t in early if len(t.t_s) > guard], [t for t in late if len(t.t_s) > guard]

@@ -11,6 +11,7 @@ import numpy as np
 
 from carlab.core.errors import ConfigError, DataError
 from carlab.core.json_files import plain, read_json
+from carlab.core.method_names import FORMER_METHODS, current_method
 from carlab.experiment.campaign.campaign import CAMPAIGN_FILE
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.report import CURVE_FILE
@@ -75,7 +76,8 @@ class MethodFigures:
 
 def run_folder(runs: Path, method: str, seed: int) -> Path | None:
     """The folder of an earlier run. Raises DataError if there are several."""
-    found = sorted(p for p in runs.glob(f"*_{run_name(method, seed)}") if p.is_dir())
+    names = [name for name in (method, *FORMER_METHODS) if current_method(name) == method]
+    found = sorted(p for name in names for p in runs.glob(f"*_{run_name(name, seed)}") if p.is_dir())
     if len(found) > 1:
         raise DataError(f"{runs} has {len(found)} runs named {run_name(method, seed)}; remove all but one.")
     return found[0] if found else None

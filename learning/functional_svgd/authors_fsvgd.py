@@ -5,7 +5,7 @@ Inputs of a network are pose and velocities in the world frame; it predicts thei
 of the yaw as independent outputs. Without a simulator the weight of the Gaussian-process prior is ``1 / (L (batch +
 points))``, because the authors average its score over particles and points and sum the likelihood; the repulsive term
 is weaker by ``1 / L``; and at their bandwidth the kernel matrix is the identity, so that particles do not interact.
-``mended`` fits have none of these errors; their bandwidth follows the median heuristic. Draws of the simulator are
+``corrected`` fits have none of these errors; their bandwidth follows the median heuristic. Draws of the simulator are
 taken once.
 """
 
@@ -56,15 +56,15 @@ PATIENCE = 3
 """Evaluations without improvement that end a fit. The authors' fit continues but keeps the same networks."""
 
 
-def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, mended: bool = False) -> FsvgdSettings:
-    """The authors' settings; ``mended`` without the errors of their code."""
+def authors_settings(steps: int, seed: int, *, with_simulator: bool = False, corrected: bool = False) -> FsvgdSettings:
+    """The authors' settings; ``corrected`` without the errors of their code."""
     noise = tuple(s / o for s, o in zip(NOISE_STD, CHANGE_STD, strict=True))
     settings = FsvgdSettings(
         particles=PARTICLES, steps=steps, batch=BATCH, measurement_points=POINTS, bandwidth=0.2, natural=False,
         noise_std=noise, noise_rate=1.0, likelihood_exponent=0.5, anneal_rate=False,
         validation_period=min(2000, steps), patience=PATIENCE, seed=seed,
     )  # fmt: skip
-    if mended:
+    if corrected:
         return replace(settings, bandwidth=None)
     return settings.with_published_errors(BATCH, with_simulator=with_simulator)
 
@@ -130,7 +130,7 @@ def fit_authors_fsvgd(
     progress: Callable[[int], None] = lambda step: None,
     device: torch.device | str = "cpu",
     simulator: CarModel | None = None,
-    mended: bool = False,
+    corrected: bool = False,
 ) -> WorldDynamics:
     """Fit from scratch to all episodes; without episodes, return networks with initial weights as the authors do.
 
@@ -142,12 +142,12 @@ def fit_authors_fsvgd(
         progress: called with the number of steps done.
         device: of the fit; random numbers are drawn on the CPU.
         simulator: prior of Sim-FSVGD; None: FSVGD.
-        mended: without the errors of the authors' code.
+        corrected: without the errors of the authors' code.
 
     Raises:
         DataError: the episodes hold too few rows.
     """
-    settings = authors_settings(steps, seed, with_simulator=simulator is not None, mended=mended)
+    settings = authors_settings(steps, seed, with_simulator=simulator is not None, corrected=corrected)
     width = STATE_FEATURES + 2 * (history + 1)
     input_std = torch.tensor([*STATE_STD, *(1.0,) * (2 * history + 2)])
     units = Normaliser(torch.zeros(width), input_std, torch.zeros(STATE_FEATURES), torch.tensor(CHANGE_STD))

@@ -54,7 +54,7 @@ class _Batch(NamedTuple):
 
 
 @dataclass
-class _Flat:
+class _StackedNetworks:
     """Networks of one shape as one tensor (L, P); the parameters of their modules are views of it."""
 
     network: Network
@@ -81,9 +81,9 @@ class FastSac(SAC):
             raise ConfigError("FastSac needs ReLU networks and a learned temperature; use stable_baselines3.SAC.")
         actor = policy.actor
         heads = [[m for head in (actor.mu, actor.log_std) for m in _linear(cast(nn.Module, head))]]
-        self._actor = _flattened([[[m] for m in _linear(actor.latent_pi)] + heads])
-        self._critics = _flattened([[[m] for m in _linear(q)] for q in policy.critic.q_networks])
-        self._targets = _flattened([[[m] for m in _linear(q)] for q in policy.critic_target.q_networks])
+        self._actor = _stacked([[[m] for m in _linear(actor.latent_pi)] + heads])
+        self._critics = _stacked([[[m] for m in _linear(q)] for q in policy.critic.q_networks])
+        self._targets = _stacked([[[m] for m in _linear(q)] for q in policy.critic_target.q_networks])
         self._temperature = Adam(self.log_ent_coef.detach())
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
@@ -189,7 +189,7 @@ def _linear(module: nn.Module) -> list[nn.Linear]:
     return [m for m in module.modules() if isinstance(m, nn.Linear)]
 
 
-def _flattened(networks: Iterable[list[list[nn.Linear]]]) -> _Flat:
+def _stacked(networks: Iterable[list[list[nn.Linear]]]) -> _StackedNetworks:
     """Move the parameters of networks of one shape into one tensor, of which their modules become views.
 
     Args:
@@ -211,7 +211,7 @@ def _flattened(networks: Iterable[list[list[nn.Linear]]]) -> _Flat:
                     view.copy_(parameter.data)
                     parameter.data = view
                 begin = columns.stop
-    return _Flat(shape, flat)
+    return _StackedNetworks(shape, flat)
 
 
 __all__ = ["FastSac"]

@@ -28,6 +28,7 @@ EARLIER_AGENT_FILE = "agent.zip"
 FILE_VERSION = 1
 MAX_OBSERVATION_SIZE = 1000
 NEVER = 2**62
+"""Number of steps that no training reaches."""
 DIVERGED = "The policy diverged; train it with a smaller learning rate."
 
 

@@ -72,7 +72,7 @@ class Sinusoids:
 
     @property
     def size(self) -> int:
-        """Three."""
+        """Number of parameters."""
         return 3
 
     def parameters(self, normal: Tensor) -> Tensor:
@@ -196,7 +196,7 @@ class KinematicCar:
 
     @property
     def size(self) -> int:
-        """Seven."""
+        """Number of parameters."""
         return 7
 
     def parameters(self, normal: Tensor) -> Tensor:

@@ -35,8 +35,8 @@ MIN_SHARE = 0.05
 LAG_TICKS = 2
 """Ticks over which the velocity filter is simulated."""
 MAX_START_SPEED_MPS = 3.0
-ROWS_A_DRIVE = 10
-TICKS_APART = 3
+ROWS_PER_DRIVE = 10
+TICKS_BETWEEN_ROWS = 3
 MEAN_HOLD_TICKS = 8
 """Mean duration for which a command of a random drive is held."""
 
@@ -131,8 +131,8 @@ class CarModel:
         Raises:
             DataError: most rows are implausible.
         """
-        cars = -(-count // ROWS_A_DRIVE)
-        ticks = self.history + 1 + TICKS_APART * ROWS_A_DRIVE
+        cars = -(-count // ROWS_PER_DRIVE)
+        ticks = self.history + 1 + TICKS_BETWEEN_ROWS * ROWS_PER_DRIVE
         random_commands = 2.0 * torch.rand((cars, ticks, 2), generator=generator) - 1.0
         changes = torch.rand((cars, ticks), generator=generator) < 1.0 / MEAN_HOLD_TICKS
         changes[:, 0] = True
@@ -141,7 +141,7 @@ class CarModel:
         start = torch.zeros((cars, 6))
         start[:, 3] = MAX_START_SPEED_MPS * torch.rand(cars, generator=generator)
         states = self._roll(start, commands, None, draw_parameters(self, cars, generator), 1)
-        rows = self.history + 1 + TICKS_APART * torch.arange(ROWS_A_DRIVE)
+        rows = self.history + 1 + TICKS_BETWEEN_ROWS * torch.arange(ROWS_PER_DRIVE)
         past = rows[:, None] + torch.arange(-self.history, 1)
         inputs = torch.cat([states[:, rows, 3:], commands[:, past].flatten(2)], dim=2).flatten(0, 1)
         inputs = inputs[torch.randperm(len(inputs), generator=generator)]

@@ -26,8 +26,8 @@ from learning.priors.simulator_model import CarModel
 from learning.transitions import OUTPUTS, Transitions
 from learning.world.car_dynamics import CarDynamics
 
-Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-mended", "fsvgd"]
-PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-mended", "fsvgd")
+Method = Literal["gp-sim-posterior", "gp-posterior", "sim-fsvgd", "sim-fsvgd-corrected", "fsvgd"]
+PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd")
 """The paper's algorithms; the others are carlab's."""
 LearnedCar = CarDynamics | WorldDynamics
 FILE_VERSION = 6
@@ -40,7 +40,9 @@ MAX_ROWS = 800
 """Maximum number of rows of the fit; a random subset of more."""
 _UNIT_SAMPLES = 2000
 _UNITS = ("input_mean", "input_std", "output_mean", "output_std")
-_OPTIONAL = ("turn", "trend", "correlation", "reach")
+_DOF_KEY, _DECORRELATION_KEY, _INPUT_CLIP_KEY = "freedom", "turn", "reach"
+"""Names in the files of the degrees of freedom, the decorrelation of the outputs, and the bounds of the inputs."""
+_OPTIONAL_KEYS = (_DECORRELATION_KEY, "trend", "correlation", _INPUT_CLIP_KEY)
 _FRAMES = ("body", "world")
 _ACTIVATIONS: tuple[Activation, ...] = get_args(Activation)
 
@@ -171,7 +173,7 @@ def save_car_arrays(dynamics: LearnedCar, path: Path) -> None:
     write_arrays(path, arrays | {
         "version": FILE_VERSION, "history": dynamics.history, "frame": _FRAMES.index(content["frame"]),
         "activation": _ACTIVATIONS.index(content["activation"]), "network": torch.tensor(content["network"]),
-        "freedom": torch.tensor(content["freedom"], dtype=torch.float64),
+        _DOF_KEY: torch.tensor(content[_DOF_KEY], dtype=torch.float64),
     })  # fmt: skip
 
 
@@ -181,7 +183,7 @@ def load_car_arrays(path: Path) -> LearnedCar:
     def read() -> dict[str, Any]:
         arrays = read_arrays(path)
         tensors = {k: torch.from_numpy(v.copy()) for k, v in arrays.items()}
-        optional: dict[str, Any] = dict.fromkeys(_OPTIONAL)
+        optional: dict[str, Any] = dict.fromkeys(_OPTIONAL_KEYS)
         return optional | tensors | {
             "version": whole_number(arrays, "version"), "history": whole_number(arrays, "history"),
             "frame": _FRAMES[whole_number(arrays, "frame")], "network": [int(n) for n in arrays["network"]],
@@ -198,7 +200,7 @@ def load_car_arrays(path: Path) -> LearnedCar:
 
 
 def _content(dynamics: LearnedCar) -> dict[str, Any]:
-    """Content of a file: ``freedom`` is ``dof``, ``turn`` is ``decorrelation``, ``reach`` is ``input_clip``."""
+    """Content of a file."""
     posterior = dynamics.posterior.to("cpu")
     units = posterior.normaliser
     return {
@@ -209,12 +211,12 @@ def _content(dynamics: LearnedCar) -> dict[str, Any]:
         "activation": posterior.network.activation,
         "parameters": posterior.parameters,
         "noise_std": posterior.noise_std,
-        "freedom": posterior.dof,
+        _DOF_KEY: posterior.dof,
         "units": [units.input_mean, units.input_std, units.output_mean, units.output_std],
-        "turn": units.decorrelation,
+        _DECORRELATION_KEY: units.decorrelation,
         "trend": posterior.trend,
         "correlation": posterior.correlation,
-        "reach": posterior.input_clip,
+        _INPUT_CLIP_KEY: posterior.input_clip,
     }
 
 
@@ -231,10 +233,10 @@ def _read(path: Path, device: torch.device | str, read: Callable[[], dict[str, A
         parameters: Tensor = content["parameters"]
         count = parameters.shape[1]
         units = Normaliser(*content["units"])
-        if content["turn"] is not None:
-            units = units.decorrelated(content["turn"])
-        noise_std, dof = content["noise_std"], float(content["freedom"])
-        optional = (content[name] for name in ("trend", "correlation", "reach"))
+        if content[_DECORRELATION_KEY] is not None:
+            units = units.decorrelated(content[_DECORRELATION_KEY])
+        noise_std, dof = content["noise_std"], float(content[_DOF_KEY])
+        optional = (content[name] for name in ("trend", "correlation", _INPUT_CLIP_KEY))
         posterior = ParticlePosterior(network, parameters, noise_std, units, dof, *optional)
         frames: dict[str, type[LearnedCar]] = {"body": CarDynamics, "world": WorldDynamics}
         car: LearnedCar = frames[content.get("frame", "body")](posterior, content["history"])
@@ -265,12 +267,12 @@ def _check_shapes(car: LearnedCar) -> None:
         "parameters": (posterior.parameters, (max(len(posterior.parameters), 1), posterior.network.parameters)),
         "noise_std": (posterior.noise_std, (o,)), "input_mean": (units.input_mean, (d,)),
         "input_std": (units.input_std, (d,)), "output_mean": (units.output_mean, (o,)),
-        "output_std": (units.output_std, (o,)), "turn": (units.decorrelation, (o, o)),
+        "output_std": (units.output_std, (o,)), _DECORRELATION_KEY: (units.decorrelation, (o, o)),
         "trend": (posterior.trend, (1 + d, o)), "correlation": (posterior.correlation, (o, o)),
-        "reach": (posterior.input_clip, (d,)),
+        _INPUT_CLIP_KEY: (posterior.input_clip, (d,)),
     }  # fmt: skip
     for name, (part, shape) in parts.items():
-        if part is None and name in _OPTIONAL:
+        if part is None and name in _OPTIONAL_KEYS:
             continue
         if not isinstance(part, Tensor) or part.layout != torch.strided or not part.is_floating_point():
             raise ValueError(f"{name} is not an array of numbers")

@@ -43,7 +43,7 @@ def policy_spaces(width: int) -> tuple[gym.spaces.Box, gym.spaces.Box]:
     return gym.spaces.Box(-high, high, dtype=np.float32), gym.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
-class Drives(NamedTuple):
+class RolloutEpisodes(NamedTuple):
     """Episodes in the learned car, on the CPU: returns (N,), constraint costs (N,) and final features (N, 7 + 2 H)."""
 
     returns: Tensor
@@ -117,7 +117,7 @@ class ModelEnv(VecEnv):
         """Start all cars. Their episodes end at different ticks, so that no batch consists of start states."""
         self._start(np.arange(self.num_envs))
         self._ticks = self._rng.integers(self._task.max_ticks, size=self.num_envs)
-        return self._seen()
+        return self._policy_inputs()
 
     def step_async(self, actions: NDArray[np.float32]) -> None:
         """Store the commands (cars, 2)."""
@@ -150,7 +150,7 @@ class ModelEnv(VecEnv):
 
     def roll_out(
         self, act: Callable[[NDArray[np.float32]], NDArray[np.float32]], max_ticks: int | None = None
-    ) -> Drives:
+    ) -> RolloutEpisodes:
         """Drive one complete episode of every car by a policy, from start states of the task.
 
         Args:
@@ -163,19 +163,19 @@ class ModelEnv(VecEnv):
         self._start(np.arange(self.num_envs), training=False)
         total, cost = torch.zeros(self.num_envs), torch.zeros(self.num_envs)
         ended = torch.zeros(self.num_envs, dtype=torch.bool)
-        last, seen = self._features.cpu().clone(), self._seen()
+        last, inputs = self._features.cpu().clone(), self._policy_inputs()
         with torch.no_grad():
             for _ in range(max_ticks or self._task.max_ticks):
                 before = self._features
-                action = self._gate(before, torch.as_tensor(act(seen)).to(self._device))
+                action = self._gate(before, torch.as_tensor(act(inputs)).to(self._device))
                 after = self._rollouts.step(before, action, self._generator)
                 here = after.cpu()
                 total += torch.where(ended, 0.0, self._task.reward(before, action, after).cpu())
                 cost += torch.where(ended, 0.0, self._task.cost(here))
                 last = torch.where(ended[:, None], last, here)
                 ended |= torch.from_numpy(self._stopped(here)) | self._task.terminated(here)
-                self._features, seen = after, policy_inputs(here.numpy())
-        return Drives(total, cost, last)
+                self._features, inputs = after, policy_inputs(here.numpy())
+        return RolloutEpisodes(total, cost, last)
 
     @property
     def features(self) -> Tensor:
@@ -220,7 +220,7 @@ class ModelEnv(VecEnv):
         array: NDArray[np.float32] = start_features.numpy()
         return array
 
-    def _seen(self) -> NDArray[np.float32]:
+    def _policy_inputs(self) -> NDArray[np.float32]:
         return policy_inputs(self._features.cpu().numpy())
 
     def close(self) -> None:
@@ -255,4 +255,4 @@ class ModelEnv(VecEnv):
         return [False] * len(list(self._get_indices(indices)))
 
 
-__all__ = ["FEATURE_UNITS", "Drives", "ModelEnv", "policy_inputs", "policy_spaces"]
+__all__ = ["FEATURE_UNITS", "ModelEnv", "RolloutEpisodes", "policy_inputs", "policy_spaces"]

@@ -25,7 +25,7 @@ from sim_backends.effects.base import (
 from sim_backends.effects.body import LateralBias, RoadSlope, TorqueSteer, YawDamping
 from sim_backends.effects.curves import CURVES, MeasuredCurve
 from sim_backends.effects.delays import CommandDelay, SteeringDelay, ThrottleDelay
-from sim_backends.effects.disturbances import DISTURBANCES, DRIFTING, PUSHING, Disturbance
+from sim_backends.effects.disturbances import BODY_FORCE_PARAMETERS, DISTURBANCES, DRIFTING_PARAMETERS, Disturbance
 from sim_backends.effects.drive import BatterySag, BrakeAsymmetry, MotorSaturation, TractionLimit
 from sim_backends.effects.lags import MotorLag, SteeringLag
 from sim_backends.effects.loads import AerodynamicDownforce, LoadTransfer, RollDynamics
@@ -113,11 +113,11 @@ def confusable_effects() -> dict[str, tuple[str, ...]]:
 
 
 __all__ = [
+    "BODY_FORCE_PARAMETERS",
     "CATALOGUE",
     "CURVES",
-    "DRIFTING",
+    "DRIFTING_PARAMETERS",
     "EFFECTS",
-    "PUSHING",
     "ActuatorEffect",
     "Confusable",
     "DelayEffect",

@@ -30,7 +30,7 @@ class YawDamping(DynamicsEffect):
     parameters = (EffectParameter("coefficient", "N m s/rad", 0.0, 0.0, 10.0, 0.05),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Damp."""
+        """Subtract the damping moment."""
         forces.moment = forces.moment - values["coefficient"] * forces.yaw_rate
 
 
@@ -45,7 +45,7 @@ class TorqueSteer(DynamicsEffect):
     parameters = (EffectParameter("coefficient", "N m", 0.0, -10.0, 10.0, 0.1),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Turn."""
+        """Add the moment."""
         forces.moment = forces.moment + values["coefficient"] * forces.throttle
 
 

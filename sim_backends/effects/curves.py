@@ -238,7 +238,7 @@ class DriveMap(MeasuredCurve, DynamicsEffect):
         return np.asarray(force / values["vehicle.mass"])
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Add."""
+        """Add the deviation to the drive force."""
         added = self.deviation(ops, self.coordinates(ops, forces), values)
         forces.drive = forces.drive + forces.mass * added
 
@@ -264,7 +264,7 @@ class SteeringCurve(MeasuredCurve, ActuatorEffect):
         return np.asarray(coordinates[0])
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
-        """Add."""
+        """Add the deviation to the command."""
         return command + self.deviation(ops, (command,), values)
 
 
@@ -324,7 +324,7 @@ class FrontTyreMap(_SideForceMap):
         return ops.slope_angle(across, ops.floor(ops.abs(along), SLIP_FLOOR_MPS))
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Add."""
+        """Add the deviation to the side force of the front axle."""
         forces.side_front = forces.side_front + forces.load_front * self.added(ops, forces, values)
 
 
@@ -343,7 +343,7 @@ class RearTyreMap(_SideForceMap):
         return ops.slope_angle(rear, ops.floor(ops.abs(forces.vx), SLIP_FLOOR_MPS))
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Add."""
+        """Add the deviation to the side force of the rear axle."""
         forces.side_rear = forces.side_rear + forces.load_rear * self.added(ops, forces, values)
 
 

@@ -28,7 +28,7 @@ class DriveChange(Disturbance, DynamicsEffect):
     parameters = (EffectParameter("share", "1", 0.0, -1.0, 10.0, -0.2),)
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Scale."""
+        """Multiply the drive force."""
         forces.drive = forces.drive * (1.0 + values["share"])
 
 
@@ -43,7 +43,7 @@ class GripChange(Disturbance, DynamicsEffect):
     parameters = (EffectParameter("share", "1", 0.0, -1.0, 10.0, -0.2),)
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Scale."""
+        """Multiply the side forces."""
         factor = 1.0 + values["share"]
         forces.side_front, forces.side_rear = forces.side_front * factor, forces.side_rear * factor
 
@@ -59,7 +59,7 @@ class SteeringTrim(Disturbance, ActuatorEffect):
     parameters = (EffectParameter("angle", "rad", 0.0, -1.0, 1.0, 0.05),)
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
-        """Shift."""
+        """Add the angle to the steering angle."""
         return command + values["angle"]
 
 
@@ -76,7 +76,7 @@ class BodyForce(Disturbance, DynamicsEffect):
     )
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Push."""
+        """Add force and moment to the body."""
         forces.force_x = forces.force_x + values["forward"]
         forces.force_y = forces.force_y + values["left"]
         forces.moment = forces.moment + values["moment"]
@@ -87,7 +87,7 @@ def _names(*effects: Effect) -> tuple[str, ...]:
 
 
 DISTURBANCES: tuple[Effect, ...] = (DriveChange(), SteeringTrim(), GripChange(), BodyForce())
-DRIFTING = _names(DriveChange(), SteeringTrim(), GripChange())
+DRIFTING_PARAMETERS = _names(DriveChange(), SteeringTrim(), GripChange())
 """Dotted names of the numbers that drift slowly: drive force [1], steering [rad], grip [1]."""
-PUSHING = _names(BodyForce())
+BODY_FORCE_PARAMETERS = _names(BodyForce())
 """Dotted names of the force forward and left [N], and of the moment [N m]."""

@@ -34,7 +34,7 @@ class BatterySag(DynamicsEffect):
     )
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Weaken."""
+        """Multiply the drive force by the remaining share."""
         forces.drive = forces.drive * ops.floor(1.0 - values["rate"] * forces.t_s, 0.0)
 
 
@@ -119,7 +119,7 @@ class TractionLimit(DynamicsEffect):
     )
 
     def on_traction(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Clip."""
+        """Limit the drive force to a share of the grip of the driven wheels."""
         rear = forces.grip_rear * forces.load_rear
         grip = ops.where(values["axle"] < 0.5, rear, rear + forces.grip_front * forces.load_front)
         limited = values["share"] < MAX_SHARE

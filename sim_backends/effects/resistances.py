@@ -22,7 +22,7 @@ class RollingResistance(DynamicsEffect):
     parameters = (EffectParameter("force", "N", 0.0, 0.0, 50.0, 0.8),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Brake."""
+        """Subtract the resistance."""
         forces.force_x = ops.fms(values["force"], ops.tanh(forces.vx * (1.0 / ROLLING_SPEED_MPS)), forces.force_x)
 
 
@@ -46,7 +46,7 @@ class AerodynamicDrag(DynamicsEffect):
     )
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Brake."""
+        """Subtract the drag."""
         forces.force_x = ops.fms(values["coefficient"], forces.vx * ops.abs(forces.vx), forces.force_x)
 
 
@@ -62,6 +62,6 @@ class CorneringDrag(DynamicsEffect):
     parameters = (EffectParameter("coefficient", "N/rad", 0.0, 0.0, 100.0, 3.0),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Brake."""
+        """Subtract the drag."""
         size = values["coefficient"] * ops.abs(forces.wheel_angle)
         forces.force_x = ops.fms(size, ops.tanh(forces.vx * (1.0 / ROLLING_SPEED_MPS)), forces.force_x)

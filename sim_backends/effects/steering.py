@@ -201,5 +201,5 @@ class SteeringOffset(ActuatorEffect):
     )
 
     def apply(self, ops: Ops, command: Value, values: Parameters) -> Value:
-        """Shift."""
+        """Add the angle to the steering angle."""
         return command + values["angle"]

@@ -97,7 +97,7 @@ class FrictionDrift(DynamicsEffect):
     parameters = (EffectParameter("rate", "1/s", 0.0, -1.0, 1.0, -0.003),)
 
     def on_grip(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Scale."""
+        """Multiply the grip of both axles."""
         factor = ops.floor(1.0 + values["rate"] * forces.t_s, 0.0)
         forces.grip_front, forces.grip_rear = forces.grip_front * factor, forces.grip_rear * factor
 

@@ -63,7 +63,7 @@ class Wind(DynamicsEffect):
     confusable = (Confusable("road_slope"),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Blow."""
+        """Add the force of the wind."""
         ahead = values["direction"] - forces.yaw
         air_x = forces.vx - values["speed"] * ops.cos(ahead)
         air_y = forces.vy - values["speed"] * ops.sin(ahead)
@@ -137,7 +137,7 @@ class LockedAxle(DynamicsEffect):
     confusable = (Confusable("yaw_damping"),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Scrub."""
+        """Subtract the scrub moment of the tyres."""
         speed = ops.floor(ops.abs(forces.vx), SCRUB_FLOOR_MPS)
         scrub = ops.tanh(forces.yaw_rate / speed * (1.0 / SCRUB_CURVATURE))
         forces.moment = forces.moment - values["moment"] * scrub
@@ -154,7 +154,7 @@ class BrakingPull(DynamicsEffect):
     confusable = (Confusable("torque_steer"),)
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Pull."""
+        """Add the moment of the brakes."""
         forces.moment = forces.moment + values["coefficient"] * ops.floor(-forces.throttle, 0.0)
 
 
@@ -173,7 +173,7 @@ class CoastBrake(DynamicsEffect):
     )
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
-        """Brake."""
+        """Subtract the braking force."""
         share = forces.throttle * (1.0 / COAST_THROTTLE)
         forces.force_x = ops.fms(values["coefficient"], forces.vx * ops.exp(-share * share), forces.force_x)
 
@@ -190,13 +190,13 @@ class PositionScale(ObservationEffect):
     confusable = (Confusable("marker_offset"),)
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Stretch."""
+        """Multiply positions and velocities by the scale."""
         x, y, yaw, vx, vy, yaw_rate = state
         stretch = 1.0 + values["scale"]
         return x * stretch, y * stretch, yaw, vx * stretch, vy * stretch, yaw_rate
 
     def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Shrink."""
+        """Divide positions and velocities by the scale."""
         x, y, yaw, vx, vy, yaw_rate = measured
         stretch = 1.0 + values["scale"]
         return x / stretch, y / stretch, yaw, vx / stretch, vy / stretch, yaw_rate

@@ -11,7 +11,7 @@ from carlab.cli import run
 from carlab.diagnosis.events import EventUse
 from carlab.diagnosis.report.write import JSON_NAME
 from carlab.prediction.predict import ConstantVelocity, NoChange
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -49,7 +49,7 @@ def test_figures_are_printed_and_written(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The diagnosis is replaced: three models on the windows of two held-out drives."""
-    windows = cut_windows(tracks_of([drive(SimulatorConfig(), 12.0, k) for k in (1, 2)], PERIOD_S), 1.0, 0.25)
+    windows = cut_windows(segments_of([drive(SimulatorConfig(), 12.0, k) for k in (1, 2)], PERIOD_S), 1.0, 0.25)
     models = {"nominal": NoChange(), "adapted": NoChange(), "constant_velocity": ConstantVelocity()}
     asked: dict[str, object] = {}
 

@@ -209,7 +209,7 @@ def test_published_errors_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
         return fit_fsvgd(inputs, outputs, pool, prior, normaliser, replace(settings, steps=2))
 
     monkeypatch.setattr(regression_methods, "fit_fsvgd", spy)
-    names = ("sim-fsvgd", "sim-fsvgd-mended", "fsvgd", "fsvgd-mended")
+    names = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd", "fsvgd-corrected")
     list(run_study("pendulum", rows=(20,), seeds=1, methods=names))
     assert [(s.repulsion, s.prior_exponent) for s in received.values()] == [
         (0.05, 1.0), (1.0, 1.0), (0.05, 1.0 / (20 * (8 + 32))), (1.0, 1.0),

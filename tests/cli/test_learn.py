@@ -82,7 +82,7 @@ def extended(learned: tuple[int, str, Path], tmp_path_factory: pytest.TempPathFa
         ("--prior Kinematic", "--prior Kinematic: give kinematic, nominal, auto or an existing car file."),
         (
             "--prior auto --method fsvgd",
-            "--prior auto: its repairs are for --method gp-sim-posterior; fsvgd needs another --prior.",
+            "--prior auto: its corrections are for --method gp-sim-posterior; fsvgd needs another --prior.",
         ),
         ("--updates -5", "--updates -5: give a number above zero."),
         ("--model-steps 0", "--model-steps 0: give a number above zero."),

@@ -96,7 +96,7 @@ def test_colour_of_a_method_is_unique_and_the_same_in_every_picture():
         for line in figure.axes[1].get_lines():
             assert colours.setdefault(line.get_label(), line.get_color()) == line.get_color()
         pyplot.close(figure)
-    variants = 3  # sim-posterior, sim-fsvgd-mended and fsvgd-mended have the colour of the whole method.
+    variants = 3  # sim-posterior, sim-fsvgd-corrected and fsvgd-corrected have the colour of the whole method.
     assert len(set(colours.values())) == len(METHODS) - variants
 
 

@@ -10,14 +10,14 @@ from carlab.diagnosis.findings import (
     DataFault,
     Diagnosis,
     EffectFinding,
+    ErrorLocation,
     Estimate,
     Evidence,
-    Exhibits,
+    FigureData,
     FitErrors,
     RecordingUse,
     Trace,
     Unexplained,
-    Where,
 )
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -63,7 +63,7 @@ def lag_finding() -> EffectFinding:
         id="steering_lag",
         confidence=0.49,
         parameters={"time_constant": estimate(0.11, 0.0091, "s")},
-        where=Where(("yaw_rate", "vy"), "|steering rate| > 2.1 /s", 0.11, None, None),
+        where=ErrorLocation(("yaw_rate", "vy"), "|steering rate| > 2.1 /s", 0.11, None, None),
         evidence=Evidence(
             0.413, 14.2, 0.63, {"yaw_rate": 0.92, "vy": 0.41, "yaw": 0.33, "x": 0.02, "y": 0.1, "vx": -0.01}
         ),
@@ -80,7 +80,7 @@ def patch_finding() -> EffectFinding:
         "radius": estimate(0.62, 0.045, "m"),
         "loss": estimate(0.47, 0.052, "1"),
     }
-    where = Where(("vy",), "speed > 1.9 m/s", None, (3.5, 21.25), (1.31, -0.42, 0.62))
+    where = ErrorLocation(("vy",), "speed > 1.9 m/s", None, (3.5, 21.25), (1.31, -0.42, 0.62))
     evidence = Evidence(0.17, 6.4, 0.88, {"vy": 0.44, "yaw_rate": 0.21, "yaw": 0.12, "x": 0.01, "y": 0.05, "vx": 0.03})
     return EffectFinding("low_friction_patch", 0.97, parameters, where, evidence, "")
 
@@ -109,13 +109,13 @@ def mismatch() -> Diagnosis:
     return Diagnosis("mismatch", "", effects, PARAMETERS, 1.0, held, None, faults, USES, 7, 41.3)
 
 
-def exhibits() -> Exhibits:
+def figure_data() -> FigureData:
     lags = np.arange(12) / 30.0
     curve = 0.46 * np.exp(-((lags - 0.1) ** 2) / 0.006)
     speed, ay = np.linspace(0.4, 2.4, 6), np.linspace(0.1, 6.2, 6)
-    return Exhibits(
+    return FigureData(
         traces=(trace(), replace(trace("recording 2"), marked=((7.0, 8.0),))),
-        ladder=(
+        scores_by_step=(
             ("nominal", 7.42),
             ("refit", 3.86),
             ("+ steering_lag", 1.81),

@@ -8,7 +8,7 @@ import pytest
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.selection.candidates import acceptance, is_accepted
 from carlab.diagnosis.selection.problem import Candidate, SearchProblem
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -17,7 +17,7 @@ CAR = SimulatorConfig(control_period_s=PERIOD_S)
 
 @pytest.fixture(scope="module")
 def problem() -> SearchProblem:
-    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    windows = cut_windows(segments_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     return SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ())
 
 
@@ -39,9 +39,9 @@ def test_strong_candidate_is_accepted(problem: SearchProblem, strong: Candidate)
     "changed",
     [
         pytest.param({"gain": -1.0}, id="fitted windows get worse"),
-        pytest.param({"unseen_gain": -1.0}, id="other blocks get worse"),
-        pytest.param({"unseen_gain": 1e-9}, id="other blocks hardly change"),
-        pytest.param({"chi2": 0.0, "unseen_error": 1e9}, id="not significant"),
+        pytest.param({"left_out_gain": -1.0}, id="other blocks get worse"),
+        pytest.param({"left_out_gain": 1e-9}, id="other blocks hardly change"),
+        pytest.param({"chi2": 0.0, "left_out_gain_error": 1e9}, id="not significant"),
     ],
 )
 def test_rejected_candidate_meets_no_set_of_conditions(

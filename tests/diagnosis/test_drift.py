@@ -14,7 +14,7 @@ from carlab.diagnosis.report.html_page import render_page
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.report.write import completed
 from carlab.diagnosis.settings import DEFAULT
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.changing_drives import changing_drive
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -25,10 +25,10 @@ SECONDS = 60.0
 
 def drift_of(fit, held_out, config=CONFIG):
     """Drift of each held-out episode."""
-    fit_tracks, tracks = tracks_of(fit), tracks_of(held_out)
-    windows = cut_windows(tracks, 1.0, 0.25)
-    noise = estimate_noise(fit_tracks, windows.curvature_bias)
-    return adapt_to_held_out(config, fit_tracks, tracks, HeldOut.of(windows, noise, config), DEFAULT.drift).drift
+    fit_segments, segments = segments_of(fit), segments_of(held_out)
+    windows = cut_windows(segments, 1.0, 0.25)
+    noise = estimate_noise(fit_segments, windows.curvature_bias)
+    return adapt_to_held_out(config, fit_segments, segments, HeldOut.of(windows, noise, config), DEFAULT.drift).drift
 
 
 @pytest.fixture(scope="module")
@@ -85,13 +85,13 @@ def test_diagnosis_states_the_drift_in_its_report(fitted):
     outcome = diagnose([fitted], [held_out], CONFIG, texts, effects=(), adapt=True)
     errors = outcome.diagnosis.held_out
     assert errors["adapted"].position_m < 0.4 * errors["refit"].position_m
-    assert outcome.exhibits.noise.adaptation is not None
+    assert outcome.figure_data.noise.adaptation is not None
     report = completed(outcome.diagnosis)
     assert "In held-out recording 1 the car differs from the fitted recordings. The drive force is" in report.sentence
     (table,) = report.to_dict()["drift"]
     assert table["changes"][0]["value"] == pytest.approx(-0.3, abs=0.04)
     assert len(table["t_s"]) == len(table["mean"]) == len(table["std"])
-    page = render_page(outcome.diagnosis, outcome.exhibits)
+    page = render_page(outcome.diagnosis, outcome.figure_data)
     assert "Change of the car since the fitted recordings" in page
     without = diagnose([fitted], [held_out], CONFIG, texts, effects=())
     assert without.diagnosis.drift == ()

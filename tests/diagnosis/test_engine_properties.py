@@ -24,7 +24,7 @@ from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.unexplained.residual_terms import TERMS, responses
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.effects import EFFECTS, confusable_effects
 
@@ -60,7 +60,7 @@ def drag(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
 @pytest.fixture(scope="module")
 def windows(drag: tuple[Path, float]) -> PredictionWindows:
     """Return prediction windows of the drive with drag."""
-    return cut_windows(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), 0.8, 0.5)
+    return cut_windows(segments_of(list(import_csv(drag[0] / "fit.csv").episodes)), 0.8, 0.5)
 
 
 def rigidly_moved(table: Table, angle: float = 2.1, shift: tuple[float, float] = (3.0, -5.0)) -> Table:
@@ -155,7 +155,7 @@ def test_rival_physics_replaces_a_spurious_effect(
     assert [e.id for e in without_rivals.effects] == [spurious]
 
 
-def test_effect_without_gain_on_unseen_blocks_is_eliminated(
+def test_effect_without_gain_on_left_out_blocks_is_eliminated(
     drag: tuple[Path, float], windows: PredictionWindows
 ) -> None:
     car = load_car_file(drag[0] / "car.toml").simulator
@@ -191,7 +191,7 @@ def test_impulse_responses_sum_to_the_simulated_change(drag: tuple[Path, float],
 def test_one_step_without_a_fold_approximates_a_refit(drag: tuple[Path, float], windows: PredictionWindows) -> None:
     car = with_effect(load_car_file(drag[0] / "car.toml").simulator, "aerodynamic_drag")
     free = (*base_parameters(car), *effect_parameters("aerodynamic_drag", car))
-    noise = estimate_noise(tracks_of(list(import_csv(drag[0] / "fit.csv").episodes)), windows.curvature_bias)
+    noise = estimate_noise(segments_of(list(import_csv(drag[0] / "fit.csv").episodes)), windows.curvature_bias)
     fitter = Fitter(windows, Scale(np.array([8, 16, 24]), np.tile(3.0 * noise.measured, (3, 1))))
     fit = fitter.fit(car, free, iterations=30)
     folds = (windows.block // 2) % 3

@@ -19,7 +19,7 @@ from carlab.diagnosis.findings import FitErrors
 from carlab.diagnosis.report.events import diagnosed_event_sentences, event_sentences
 from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.score_recording import MODEL, score_recording
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends.car_parameters import CarParameters, SimulatorConfig
 from sim_backends.effects import confusable_effects
 from tests.helpers.event_drives import EventDrive, event_drive
@@ -127,24 +127,24 @@ def test_size_of_an_event_is_that_of_the_blow() -> None:
 def test_windows_without_events_do_not_touch_them() -> None:
     driven = event_drive(1, "blow")
     (marked,), events = mark_events([driven.episode], driven.config)
-    tracks = tracks_of([marked])
-    every = cut_windows(tracks, 1.0, 0.1, with_events=True)
+    segments = segments_of([marked])
+    every = cut_windows(segments, 1.0, 0.1, with_events=True)
     without, with_them = every.split_at_events()
-    assert np.array_equal(cut_windows(tracks, 1.0, 0.1).t0_s, without.t0_s)
+    assert np.array_equal(cut_windows(segments, 1.0, 0.1).t0_s, without.t0_s)
     for windows, touches in ((without, False), (with_them, True)):
         for begin_s in windows.t0_s:
             near = [e for e in events if e.from_s <= begin_s + 1.0 + 0.136 and e.to_s >= begin_s - 0.136]
             assert bool(near) is touches
     untouched, none = mark_events([event_drive(11).episode], driven.config)
     assert none == ()
-    assert not cut_windows(tracks_of(untouched), 1.0, 1.0, with_events=True).in_event.any()
+    assert not cut_windows(segments_of(untouched), 1.0, 1.0, with_events=True).in_event.any()
 
 
 def test_windows_that_all_have_events_are_refused() -> None:
     driven = event_drive(1, "blow")
     marked = replace(driven.episode, extra={"event": np.ones(len(driven.episode.times_s))})
     with pytest.raises(DataError, match="event"):
-        cut_windows(tracks_of([marked]), 1.0, 1.0, with_events=True).split_at_events()
+        cut_windows(segments_of([marked]), 1.0, 1.0, with_events=True).split_at_events()
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_diagnosis_lists_events_and_scores_without_and_with_them(hit: EventDrive
     diagnosis = outcome.diagnosis
     report = diagnosis.to_dict()["events"]
     assert len(report["found"]) == len(hit.spans)
-    boundary_s = outcome.exhibits.traces[0].times_s[0]
+    boundary_s = outcome.figure_data.traces[0].times_s[0]
     assert [e["role"] for e in report["found"]] == ["held out" if b > boundary_s else "fit" for b, _ in hit.spans]
     assert report["are_left_out"]
     assert report["fit_windows"] > 0
@@ -170,7 +170,7 @@ def test_diagnosis_lists_events_and_scores_without_and_with_them(hit: EventDrive
     for name, factor in (("nominal", 2.0), ("with_effects", 2.0), ("constant_velocity", 1.0)):
         with_them = report["held_out_with_events"][name]
         assert with_them["position_m"] > factor * diagnosis.held_out[name].position_m
-    assert sum(len(t.events) for t in outcome.exhibits.traces) == len(hit.spans)
+    assert sum(len(t.events) for t in outcome.figure_data.traces) == len(hit.spans)
     assert len(diagnosed_event_sentences(diagnosis)) == 1 + len(hit.spans)
 
 

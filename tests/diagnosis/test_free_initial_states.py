@@ -20,7 +20,7 @@ from carlab.diagnosis.selection.problem import SearchProblem, SearchResult
 from carlab.diagnosis.settings import DEFAULT
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -35,7 +35,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatorConfig
     write_csv(folder / "fit.csv", case.fit)
     case.nominal.write(folder / "car.toml")
     car = load_car_file(folder / "car.toml").simulator
-    windows = cut_windows(tracks_of(list(import_csv(folder / "fit.csv").episodes)), 0.8, 0.5).thinned(60)
+    windows = cut_windows(segments_of(list(import_csv(folder / "fit.csv").episodes)), 0.8, 0.5).thinned(60)
     rng = np.random.default_rng(0)
     motion = simulate_windows(windows, car)[0]
     wrong = windows.initial_states + 3.0 * STD * rng.standard_normal((len(windows), 6))

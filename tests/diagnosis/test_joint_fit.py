@@ -13,7 +13,7 @@ from carlab.diagnosis.identification.fit_parameters import effect_parameters, wi
 from carlab.diagnosis.identification.joint_fit import joint_fit
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -50,7 +50,7 @@ def by_scipy(windows: PredictionWindows, fit: Fit) -> float:
 
 
 def test_joint_fit_is_the_least_squares_fit_of_scipy() -> None:
-    windows = cut_windows(tracks_of([drive(TRUE, 8.0, 3)]), 0.8, 2.0)
+    windows = cut_windows(segments_of([drive(TRUE, 8.0, 3)]), 0.8, 2.0)
     fitter, start = fitted(windows)
     start = replace(start, z=start.z - 0.1)
     found = joint_fit(
@@ -69,7 +69,7 @@ def estimates() -> list[tuple[Fit, Fit]]:
     """Fits with estimated and with free initial states, of eight drives of one car."""
     found = []
     for seed in range(8):
-        fitter, start = fitted(cut_windows(tracks_of([drive(TRUE, 20.0, 10 + seed)]), 0.8, 0.5))
+        fitter, start = fitted(cut_windows(segments_of([drive(TRUE, 20.0, 10 + seed)]), 0.8, 0.5))
         joint = joint_fit(fitter, start, STD)
         assert joint is not None
         found.append((fitter.with_covariance(start), joint))
@@ -98,5 +98,5 @@ def test_standard_errors_are_those_of_repeated_drives(estimates: list[tuple[Fit,
 def test_simulator_that_lacks_physics_is_not_refined() -> None:
     """Free initial states would hide a part of the error of a simulator without the drag of the true car."""
     true = replace(TRUE, effects={**TRUE.effects, "aerodynamic_drag": {"coefficient": 0.6}})
-    fitter, start = fitted(cut_windows(tracks_of([drive(true, 20.0, 3)]), 0.8, 0.5))
+    fitter, start = fitted(cut_windows(segments_of([drive(true, 20.0, 3)]), 0.8, 0.5))
     assert joint_fit(fitter, start, STD) is None

@@ -21,7 +21,7 @@ from carlab.diagnosis.selection.problem import SearchProblem
 from carlab.diagnosis.settings import DEFAULT, CurveSettings
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import SimulatorModel
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import EFFECTS, SimulatorConfig, registered
 from sim_backends.effects import CURVES, DynamicsEffect, EffectParameter, confusable_effects
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -110,7 +110,7 @@ def test_model_does_not_extrapolate_beyond_the_recordings(outcome):
 
 
 def test_report_and_model_file_contain_the_curves(outcome, tmp_path):
-    write_report(outcome.diagnosis, outcome.exhibits, tmp_path, outcome.model)
+    write_report(outcome.diagnosis, outcome.figure_data, tmp_path, outcome.model)
     report = json.loads((tmp_path / "report.json").read_text())
     table = next(c for c in report["curves"] if c["id"] == "drive_map")
     assert np.shape(table["measured"]) == tuple(len(axis["knots"]) for axis in table["axes"])
@@ -124,7 +124,7 @@ def test_report_and_model_file_contain_the_curves(outcome, tmp_path):
 
 
 def test_penalty_of_a_curve_is_that_of_its_roughness():
-    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    windows = cut_windows(segments_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     problem = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ())
     free = problem.free_parameters(("front_tyre_map",))
     fitter = Fitter(windows, Scale(np.array([1]), np.ones((1, 6))))
@@ -141,9 +141,9 @@ def test_penalty_of_a_curve_is_that_of_its_roughness():
 def test_driving_time_counts_rows_near_each_knot():
     curve = next(c for c in CURVES if c.id == "steering_curve")
     episode = drive(CAR, 10.0, 4)
-    tracks = tuple(tracks_of([episode]))
-    total = driving_time_s(curve, replace(CAR, command_delay_s=0.0), tracks)
-    angle = CAR.parameters.max_angle_rad * np.concatenate([t.commands[:, 0] for t in tracks])
+    segments = tuple(segments_of([episode]))
+    total = driving_time_s(curve, replace(CAR, command_delay_s=0.0), segments)
+    angle = CAR.parameters.max_angle_rad * np.concatenate([t.commands[:, 0] for t in segments])
     knots = np.array(curve.axes[0].knots)
     expected = [np.interp(angle, knots, np.eye(len(knots))[k]).sum() * PERIOD_S for k in range(len(knots))]
     assert total == pytest.approx(np.array(expected))
@@ -185,11 +185,11 @@ def test_curve_findings_of_the_car_file_equal_its_curve(curve):
     from carlab.diagnosis.identification.fit import Fit
 
     config = replace(CAR, effects={curve.id: {}})
-    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    windows = cut_windows(segments_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     free = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ()).free_parameters((curve.id,))
     fit = Fit(config, free, np.zeros(len(free)), 0.0, np.zeros(1), np.eye(len(free)))
     found = curve_findings(
-        CurveFit((curve.id,), (), fit, 5.0), CAR, tuple(tracks_of([drive(CAR, 30.0, 7)])), DEFAULT.curves
+        CurveFit((curve.id,), (), fit, 5.0), CAR, tuple(segments_of([drive(CAR, 30.0, 7)])), DEFAULT.curves
     )
     seen = np.isfinite(found[0].measured)
     assert seen.any()
@@ -202,7 +202,7 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     from carlab.diagnosis.identification.fit import Fit
 
     config = replace(CAR, effects={"drive_map": {}})
-    windows = cut_windows(tracks_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
+    windows = cut_windows(segments_of([drive(CAR, 15.0, 3)]), 0.8, 0.5)
     free = SearchProblem(CAR, windows, np.full(6, 1e-2), np.full(6, 1e-2), {}, ()).free_parameters(("drive_map",))
     names = [f.name for f in free]
     gain, knot = names.index("motor.drive_gain"), names.index("effects.drive_map.value_12_6")  # throttle 1
@@ -211,9 +211,9 @@ def test_band_of_a_curve_includes_the_covariance_of_base_parameters():
     covariance[gain, gain], covariance[knot, knot] = 1.0, slope**2
     covariance[gain, knot] = covariance[knot, gain] = -0.9 * slope
     fit = Fit(config, free, np.zeros(len(free)), 0.0, np.zeros(1), covariance)
-    tracks = tuple(tracks_of([drive(CAR, 60.0, 7)]))
+    segments = tuple(segments_of([drive(CAR, 60.0, 7)]))
     settings = replace(DEFAULT.curves, min_support_s=0.0)
-    found = curve_findings(CurveFit(("drive_map",), (), fit, 5.0), CAR, tracks, settings)[0]
+    found = curve_findings(CurveFit(("drive_map",), (), fit, 5.0), CAR, segments, settings)[0]
     assert found.std[12, 6] == pytest.approx(slope * np.sqrt(2.0 - 1.8), rel=0.02)
     assert found.std[12, 7] == pytest.approx(slope, rel=0.02)
     assert found.std[6, 7] == pytest.approx(0.0, abs=1e-9)  # no throttle
@@ -231,9 +231,9 @@ def test_verdict_states_the_error_with_measured_curves(outcome):
 
 
 def test_simulator_with_curves_predicts_a_drive_that_it_was_not_fitted_to(drives):
-    fit, unseen = drives
+    fit, held_out = drives
     found = simulator_with_curves([fit], CAR, settings=SETTINGS)
-    windows = cut_windows(tracks_of([unseen]), 1.0, 0.5)
+    windows = cut_windows(segments_of([held_out]), 1.0, 0.5)
     rms = {}
     for name, config in (("car file", CAR), ("curves", found)):
         error = prediction_errors(SimulatorModel(config).predict(windows), windows)[:, -1]

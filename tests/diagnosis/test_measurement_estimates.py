@@ -12,8 +12,7 @@ import pytest
 
 from carlab.benchmark import make_case
 from carlab.benchmark.cases.case import Case
-from carlab.benchmark.world.driver import HumanDriver
-from carlab.benchmark.world.driver import Track as Course
+from carlab.benchmark.world.driver import HumanDriver, Track
 from carlab.benchmark.world.measurement import Noise, as_table, record, write_csv
 from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import drive as simulated_drive
@@ -27,7 +26,7 @@ from carlab.diagnosis.report.sentences import effect_sentence, separating_drive
 from carlab.diagnosis.unexplained.vibration import find_vibration
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows, segments_of
 from carlab.recording.csv.foreign import import_csv
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import confusable_effects
@@ -42,7 +41,7 @@ class Drive:
 
     case: Case
     folder: Path
-    tracks: list[Track]
+    segments: list[RecordingSegment]
     nominal: SimulatorConfig
 
     def clean_at(self, windows: PredictionWindows) -> np.ndarray:
@@ -57,8 +56,8 @@ def drive(folder: Path, case: Case) -> Drive:
     write_csv(folder / "fit.csv", case.fit)
     write_csv(folder / "hold.csv", case.hold)
     case.nominal.write(folder / "car.toml")
-    tracks = tracks_of(list(import_csv(folder / "fit.csv").episodes))
-    return Drive(case, folder, tracks, load_car_file(folder / "car.toml").simulator)
+    segments = segments_of(list(import_csv(folder / "fit.csv").episodes))
+    return Drive(case, folder, segments, load_car_file(folder / "car.toml").simulator)
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -77,8 +76,8 @@ def shaking(tmp_path_factory: pytest.TempPathFactory) -> Drive:
 
 def test_estimated_noise_equals_the_added_noise(plain: Drive) -> None:
     """Differentiated velocities have coloured noise; the formula for white noise is 15 % too high."""
-    windows = cut_windows(plain.tracks, 0.8, 0.3)
-    found = estimate_noise(plain.tracks, windows.curvature_bias).measured
+    windows = cut_windows(plain.segments, 0.8, 0.3)
+    found = estimate_noise(plain.segments, windows.curvature_bias).measured
     added = np.std(plain.case.recordings[0].error, axis=0)
     assert np.allclose(found[:3] / added[:3], 1.0, atol=0.1)
     assert np.allclose(found[3:] / added[3:], 1.0, atol=0.15)
@@ -87,25 +86,25 @@ def test_estimated_noise_equals_the_added_noise(plain: Drive) -> None:
 
 def test_estimated_floor_equals_that_of_the_generator(plain: Drive) -> None:
     """The reference floor after 1 s uses the generator's true car and initial states."""
-    windows = cut_windows(plain.tracks, 1.0, 0.25)
-    floor = noise_floor(windows, estimate_noise(plain.tracks, windows.curvature_bias), plain.nominal)[-1]
+    windows = cut_windows(plain.segments, 1.0, 0.25)
+    floor = noise_floor(windows, estimate_noise(plain.segments, windows.curvature_bias), plain.nominal)[-1]
     assert np.exp(np.mean(np.log(floor / np.array(plain.case.floor)))) == pytest.approx(1.0, abs=0.15)
 
 
 def test_initial_states_are_more_accurate_without_curvature_bias(plain: Drive) -> None:
-    windows = cut_windows(plain.tracks, 0.8, 0.3)
+    windows = cut_windows(plain.segments, 0.8, 0.3)
     better = without_curvature_bias(windows, plain.nominal)
     truth = plain.clean_at(windows)
     before, after = (np.sqrt(np.mean((s.initial_states - truth) ** 2, axis=0)) for s in (windows, better))
     assert np.all(after[3:] < before[3:])
     assert after[5] < 0.95 * before[5]
-    noise = estimate_noise(plain.tracks, better.curvature_bias).initial_state
+    noise = estimate_noise(plain.segments, better.curvature_bias).initial_state
     assert np.allclose(noise[[0, 1, 3, 4]] / after[[0, 1, 3, 4]], 1.0, atol=0.25)
 
 
 def test_wrong_steering_commands_reduce_the_correction(plain: Drive) -> None:
     """Modified commands disagree with the recording, so they hardly change the initial states."""
-    windows = cut_windows(plain.tracks, 0.8, 0.3)
+    windows = cut_windows(plain.segments, 0.8, 0.3)
     rng = np.random.default_rng(0)
     shuffled = rng.permutation(len(windows))
     wrong = replace(windows, past_commands=windows.past_commands[shuffled], commands=windows.commands[shuffled])
@@ -122,39 +121,39 @@ def test_wrong_steering_commands_reduce_the_correction(plain: Drive) -> None:
 def test_velocity_window_is_estimated(plain: Drive, tmp_path: Path, window_s: float) -> None:
     """A drive at 120 Hz is differentiated by parabolas over a window; the variance is width^2 / 20."""
     car = plain.case.true_car
-    world, course = World(car), Course(np.random.default_rng(5))
+    world, course = World(car), Track(np.random.default_rng(5))
     human = HumanDriver(car, course, np.random.default_rng(6))
     driven = simulated_drive(world, human, 60.0, start=human.start())
     noise = Noise(car.position_std, car.yaw_std, window_s)
     write_csv(tmp_path / "drive.csv", as_table(record(driven, world, noise, np.random.default_rng(7))))
-    windows = cut_windows(tracks_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
+    windows = cut_windows(segments_of(list(import_csv(tmp_path / "drive.csv").episodes)), 0.8, 0.3)
     assert np.sqrt(20.0 * velocity_window_variance_s2(windows, plain.nominal)) == pytest.approx(window_s, abs=0.025)
 
 
 def test_instantaneous_velocities_have_no_window(plain: Drive) -> None:
-    windows = cut_windows(plain.tracks, 0.8, 0.3)
+    windows = cut_windows(plain.segments, 0.8, 0.3)
     exact = replace(windows, measured=simulate_windows(windows, plain.nominal)[0])
     assert np.sqrt(20.0 * velocity_window_variance_s2(exact, plain.nominal)) < 0.03
 
 
 def test_vibration_of_a_wheel_is_found_with_its_radius(shaking: Drive, plain: Drive) -> None:
-    found = find_vibration(shaking.tracks)
+    found = find_vibration(shaking.segments)
     assert found is not None
     assert 1.0 / (2.0 * np.pi * found.periods_per_m) == pytest.approx(0.06, rel=0.02)
     assert re.search("6[01] mm", found.class_statement())
-    assert find_vibration(plain.tracks) is None
+    assert find_vibration(plain.segments) is None
 
 
 @pytest.mark.parametrize(("fixed_frequency", "is_found"), [(True, False), (False, True)])
 def test_fixed_frequency_is_not_attributed_to_a_wheel(plain: Drive, fixed_frequency: bool, is_found: bool) -> None:
     """The yaw rate vibrates at 6 Hz or at 4 periods per metre."""
-    tracks = []
-    for track in plain.tracks:
-        cycles = 6.0 * np.arange(len(track.speed)) if fixed_frequency else 4.0 * np.cumsum(track.speed)
-        residual = track.residual.copy()
-        residual[:, 5] += 3.0 * np.std(residual[:, 5]) * np.sin(2.0 * np.pi * cycles * track.sampled_s)
-        tracks.append(replace(track, residual=residual))
-    found = find_vibration(tracks)
+    segments = []
+    for segment in plain.segments:
+        cycles = 6.0 * np.arange(len(segment.speed)) if fixed_frequency else 4.0 * np.cumsum(segment.speed)
+        residual = segment.residual.copy()
+        residual[:, 5] += 3.0 * np.std(residual[:, 5]) * np.sin(2.0 * np.pi * cycles * segment.sampled_s)
+        segments.append(replace(segment, residual=residual))
+    found = find_vibration(segments)
     assert (found is not None) == is_found
     if found is not None:
         assert found.periods_per_m == pytest.approx(4.0, abs=0.05)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from carlab.diagnosis.curves.form_fit import read_form
+from carlab.diagnosis.curves.form_fit import identify_form
 from carlab.diagnosis.curves.named_forms import FORMS, TYRE_FORMS
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.report.curves import form_sentence
@@ -149,7 +149,7 @@ def test_the_true_form_is_named_with_its_parameters(form_id):
     curve_id, truth, expected = TRUTHS[form_id]
     named, z = [], []
     for seed in range(5):
-        form = read_form(*measured_curve(curve_id, truth, seed), DEFAULT.curves)
+        form = identify_form(*measured_curve(curve_id, truth, seed), DEFAULT.curves)
         named.append(form.id if form.is_within_band else "")
         if form.id == form_id:
             z += [(form.parameters[name].value - value) / form.parameters[name].std for name, value in expected.items()]
@@ -179,7 +179,7 @@ def random_smooth(curve_id, seed):
 @pytest.mark.parametrize("curve_id", list(FORMS))
 def test_random_smooth_curves_are_not_named(curve_id):
     forms = [
-        read_form(*measured_curve(curve_id, random_smooth(curve_id, seed), seed, anchored=False), DEFAULT.curves)
+        identify_form(*measured_curve(curve_id, random_smooth(curve_id, seed), seed, anchored=False), DEFAULT.curves)
         for seed in range(10)
     ]
     assert sum(form.is_within_band for form in forms) <= 1
@@ -190,14 +190,16 @@ def test_random_smooth_curves_are_not_named(curve_id):
 def test_true_forms_have_the_nominal_level():
     """Of curves of a true form, at most a few in a hundred lie outside of the band."""
     curve_id, truth, _ = TRUTHS["steering_asymmetry"]
-    inside = [read_form(*measured_curve(curve_id, truth, seed), DEFAULT.curves).is_within_band for seed in range(100)]
+    inside = [
+        identify_form(*measured_curve(curve_id, truth, seed), DEFAULT.curves).is_within_band for seed in range(100)
+    ]
     assert np.mean(inside) >= 0.94
 
 
 def test_forms_that_a_wide_band_does_not_distinguish_are_all_named():
     curve, covariance = measured_curve("front_tyre_map", TRUTHS["saturating_tyre"][1], 0)
     wide = replace(curve, std=12.0 * curve.std)
-    form = read_form(wide, 144.0 * covariance, DEFAULT.curves)
+    form = identify_form(wide, 144.0 * covariance, DEFAULT.curves)
     assert form.is_within_band
     assert len(form.indistinguishable_from) >= 1
     assert "Also within the band: a " in form_sentence(replace(wide, form=form))
@@ -207,20 +209,20 @@ def test_knots_without_data_are_not_compared_and_too_few_have_no_form():
     curve, covariance = measured_curve("steering_curve", TRUTHS["steering_asymmetry"][1], 1)
     wrong = curve.measured.copy()
     wrong[-1] = np.nan
-    form = read_form(replace(curve, measured=wrong), covariance, DEFAULT.curves)
+    form = identify_form(replace(curve, measured=wrong), covariance, DEFAULT.curves)
     assert form.knots == 7  # of nine knots, one is anchored at 0
     assert form.id == "steering_asymmetry"
     wrong[3:] = np.nan
-    form = read_form(replace(curve, measured=wrong), covariance, DEFAULT.curves)
+    form = identify_form(replace(curve, measured=wrong), covariance, DEFAULT.curves)
     assert (form.knots, form.id) == (3, "linear_steering")  # others have two parameters
     wrong[2:] = np.nan
-    assert read_form(replace(curve, measured=wrong), covariance, DEFAULT.curves) is None
+    assert identify_form(replace(curve, measured=wrong), covariance, DEFAULT.curves) is None
     assert form_sentence(curve) == ""
 
 
 def test_sentence_of_a_named_form_has_parameters_with_units_and_intervals():
     curve, covariance = measured_curve("steering_curve", TRUTHS["steering_nonlinearity"][1], 2)
-    form = read_form(curve, covariance, DEFAULT.curves)
+    form = identify_form(curve, covariance, DEFAULT.curves)
     sentence = form_sentence(replace(curve, form=form))
     assert sentence.startswith("The wheel angle has the form of a saturation of the steering towards full lock: gain ")
     assert "limit 0.3" in sentence

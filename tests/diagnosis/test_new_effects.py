@@ -29,7 +29,7 @@ from carlab.diagnosis.report.sentences import (
 from carlab.diagnosis.report.write import write_report
 from carlab.prediction.initial_states import as_recorded
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import CarModel, known_ranges
 from sim_backends import EFFECTS, REGISTRY, SimulatedCar, SimulatorConfig, registered, rollout
@@ -145,7 +145,7 @@ def found(_registered: None) -> Outcome:
 @pytest.fixture(scope="module")
 def report(found: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    write_report(found.diagnosis, found.exhibits, folder, found.model)
+    write_report(found.diagnosis, found.figure_data, folder, found.model)
     return folder
 
 
@@ -258,7 +258,7 @@ def test_windows_with_a_velocity_effect_start_from_true_velocities() -> None:
         measured = rollout(config, start, torch.from_numpy(sent)[None], measured=True).measured
         assert measured is not None
         episode = EpisodeData(np.arange(ticks + 1) / 30.0, measured[0].numpy(), sent, sent, np.zeros(ticks))
-        windows = cut_windows(tracks_of([episode]), 0.5, 0.5)
+        windows = cut_windows(segments_of([episode]), 0.5, 0.5)
         for variant in (windows, as_recorded(windows)):
             error = simulate_windows(variant, config)[0, -2:] - variant.measured[-2:]
             assert np.abs(error[..., :2]).max() < 2e-3

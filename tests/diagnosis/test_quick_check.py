@@ -18,7 +18,7 @@ from carlab.diagnosis.quick.quick_check import QuickCheck, quick_check
 from carlab.diagnosis.quick.sentences import sentences, short
 from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.state_alignment import align_states, window_variance_s2
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from carlab.recording.mcap.source import read_episode
 from sim_backends.car_parameters import SimulatorConfig
 
@@ -135,7 +135,7 @@ def test_outlier_in_one_episode_is_undecided(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def windows() -> PredictionWindows:
-    return cut_windows(tracks_of(drives.concealed_drives(None, 0.0, seed=30).episodes), 0.8, 0.2)
+    return cut_windows(segments_of(drives.concealed_drives(None, 0.0, seed=30).episodes), 0.8, 0.2)
 
 
 def test_errors_on_one_side_at_one_place_or_while_braking_are_located(windows: PredictionWindows) -> None:

@@ -19,7 +19,7 @@ from carlab.core.errors import DataError
 from carlab.diagnosis.findings import (
     DataFault,
     Diagnosis,
-    Exhibits,
+    FigureData,
     RecordingUse,
     Unexplained,
 )
@@ -43,7 +43,7 @@ def case(request: pytest.FixtureRequest) -> Diagnosis:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("reports") / "new" / "folder"
-    write_report(material.mismatch(), material.exhibits(), folder, material.model())
+    write_report(material.mismatch(), material.figure_data(), folder, material.model())
     return folder
 
 
@@ -85,7 +85,7 @@ def read_page(folder: Path) -> tuple[str, Page]:
 
 
 def test_json_has_the_keys_of_the_schema_for_each_verdict(case: Diagnosis, tmp_path: Path) -> None:
-    write_report(case, Exhibits(), tmp_path, material.model())
+    write_report(case, FigureData(), tmp_path, material.model())
     report = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
     assert report["schema"] == "carlab.diagnosis/1"
     assert report["verdict"] == case.verdict
@@ -125,12 +125,12 @@ def test_json_contains_the_numbers_and_default_sentences(written: Path) -> None:
 
 def test_numbers_that_are_not_finite_become_null(tmp_path: Path) -> None:
     case = replace(material.mismatch(), seconds=math.nan)
-    write_report(case, Exhibits(), tmp_path, material.model())
+    write_report(case, FigureData(), tmp_path, material.model())
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["seconds"] is None
 
 
 def test_page_is_one_file_without_scripts_and_external_references(case: Diagnosis, tmp_path: Path) -> None:
-    write_report(case, material.exhibits(), tmp_path, material.model())
+    write_report(case, material.figure_data(), tmp_path, material.model())
     text, page = read_page(tmp_path)
     assert not {"script", "link", "img", "iframe", "object", "embed"} & set(page.tags)
     assert not {"src", "href", "xlink:href", "srcset"} & {name for name, _ in page.attributes}
@@ -156,7 +156,7 @@ def _numbers_of(value: object) -> set[str]:
 
 
 def test_each_number_in_the_text_comes_from_the_data(case: Diagnosis, tmp_path: Path) -> None:
-    pictures = material.exhibits()
+    pictures = material.figure_data()
     write_report(case, pictures, tmp_path, material.model())
     _, page = read_page(tmp_path)
     known = _numbers_of(json.loads((tmp_path / "report.json").read_text(encoding="utf-8")))
@@ -187,7 +187,7 @@ def test_page_contains_effect_interval_set_and_next_drive(written: Path) -> None
 
 
 def test_report_without_a_verdict_states_why_and_what_to_record(tmp_path: Path) -> None:
-    write_report(material.inconclusive(), Exhibits(), tmp_path, material.model())
+    write_report(material.inconclusive(), FigureData(), tmp_path, material.model())
     words = " ".join(read_page(tmp_path)[1].words)
     assert "No verdict. The car hardly moves in the recordings to fit" in words
     assert "carlab drive --policy figure_eight" in words
@@ -203,7 +203,9 @@ def test_names_from_outside_are_escaped(tmp_path: Path) -> None:
         effects=(replace(material.lag_finding(), where=replace(material.lag_finding().where, regime=HOSTILE)),),
     )
     regimes = {HOSTILE: (np.arange(3.0), np.ones(3), np.ones(3))}
-    hostile = replace(material.exhibits(), traces=(material.trace(HOSTILE),), ladder=((HOSTILE, 1.0),), regimes=regimes)
+    hostile = replace(
+        material.figure_data(), traces=(material.trace(HOSTILE),), scores_by_step=((HOSTILE, 1.0),), regimes=regimes
+    )
     write_report(case, hostile, tmp_path, material.model())
     text, page = read_page(tmp_path)
     assert "script" not in page.tags
@@ -247,7 +249,7 @@ def test_rerun_reads_the_recording_and_prints_its_entities(written: Path) -> Non
 def test_recordings_of_equal_names_have_different_entities(tmp_path: Path) -> None:
     write_report(
         material.mismatch(),
-        Exhibits(traces=(material.trace("a b"), material.trace("a b"), material.trace("verdict"))),
+        FigureData(traces=(material.trace("a b"), material.trace("a b"), material.trace("verdict"))),
         tmp_path,
         material.model(),
     )
@@ -258,8 +260,8 @@ def test_recordings_of_equal_names_have_different_entities(tmp_path: Path) -> No
 
 
 def test_report_replaces_an_older_one_without_leftover_files(tmp_path: Path) -> None:
-    write_report(material.mismatch(), material.exhibits(), tmp_path, material.model())
-    write_report(material.no_mismatch(), Exhibits(), tmp_path, material.model())
+    write_report(material.mismatch(), material.figure_data(), tmp_path, material.model())
+    write_report(material.no_mismatch(), FigureData(), tmp_path, material.model())
     assert json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))["verdict"] == "none"
     assert {p.name for p in tmp_path.iterdir()} == {"report.json", "report.html", "report.rrd", "model.toml"}
 
@@ -267,7 +269,7 @@ def test_report_replaces_an_older_one_without_leftover_files(tmp_path: Path) -> 
 def test_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("mine", encoding="utf-8")
     with pytest.raises(DataError, match="a file has the path of its folder; choose another folder"):
-        write_report(material.no_mismatch(), Exhibits(), tmp_path / "taken", material.model())
+        write_report(material.no_mismatch(), FigureData(), tmp_path / "taken", material.model())
     assert (tmp_path / "taken").read_text(encoding="utf-8") == "mine"
 
 
@@ -275,7 +277,7 @@ def test_file_in_place_of_the_folder_raises_data_error(tmp_path: Path) -> None:
 def test_file_that_cannot_be_written_leaves_no_report_json(tmp_path: Path, name: str) -> None:
     (tmp_path / name).mkdir()
     with pytest.raises(DataError, match=re.escape(name)):
-        write_report(material.no_mismatch(), Exhibits(), tmp_path, material.model())
+        write_report(material.no_mismatch(), FigureData(), tmp_path, material.model())
     assert not (tmp_path / "report.json").exists()
     assert [p for p in tmp_path.iterdir() if "partial" in p.name] == []
 

@@ -11,13 +11,13 @@ from carlab.diagnosis.findings import (
     DataFault,
     Diagnosis,
     EffectFinding,
+    ErrorLocation,
     Estimate,
     Evidence,
     FitErrors,
     SearchExtent,
     Skill,
     Unexplained,
-    Where,
 )
 from carlab.diagnosis.report.curves import curves_advice
 from carlab.diagnosis.report.sentences import (
@@ -52,7 +52,7 @@ def around(value: float, unit: str) -> Estimate:
 def finding(effect_id: str, others: tuple[str, ...] = ()) -> EffectFinding:
     parameters = {p.name: around(p.typical, p.unit) for p in CATALOGUE[effect_id].parameters}
     evidence = Evidence(0.3, 9.0, 0.6, {"vx": 0.2})
-    return EffectFinding(effect_id, 0.9, parameters, Where(("vx",), "speed > 1 m/s"), evidence, "", others)
+    return EffectFinding(effect_id, 0.9, parameters, ErrorLocation(("vx",), "speed > 1 m/s"), evidence, "", others)
 
 
 def diagnosis(verdict: str, *effects: EffectFinding, refit: float = 4.0, with_effects: float = 2.5) -> Diagnosis:

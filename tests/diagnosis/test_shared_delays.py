@@ -12,7 +12,7 @@ from carlab.diagnosis.selection.pairwise_tests import compare_pairs
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import fit_base, fit_with_scale
 from carlab.diagnosis.selection.shared_delays import replace_shared_delays
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
 from sim_backends.effects import EFFECTS
@@ -27,7 +27,7 @@ NOISE = 3e-4 * np.array([1.0, 1.0, 2.0, 20.0, 20.0, 40.0])
 def fitted(true: dict[str, float], accepted: tuple[str, ...]) -> tuple[SearchProblem, Model]:
     """A drive of a car with true delays and lags [s], and a simulator with the accepted ones."""
     effects = {effect: {EFFECTS[effect].lag_parameter: lag} for effect, lag in true.items()}
-    windows = cut_windows(tracks_of([drive(replace(CAR, effects=effects), 40.0, 1)]), 0.8, 0.6)
+    windows = cut_windows(segments_of([drive(replace(CAR, effects=effects), 40.0, 1)]), 0.8, 0.6)
     problem = SearchProblem(CAR, windows, FLOOR, NOISE, {})
     base = fit_base(problem)
     free = problem.free_parameters(accepted)

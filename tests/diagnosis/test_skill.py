@@ -13,7 +13,7 @@ from carlab.diagnosis.settings import DEFAULT
 from carlab.diagnosis.skill import skill_of
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import ConstantVelocity, NoChange
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from sim_backends.effects import confusable_effects
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -35,7 +35,7 @@ def circle(seconds: float) -> EpisodeData:
 
 
 def test_a_standing_prediction_errs_by_the_chord_of_a_circle() -> None:
-    windows = cut_windows(tracks_of([circle(30.0), circle(30.0)]), 1.0, 0.25)
+    windows = cut_windows(segments_of([circle(30.0), circle(30.0)]), 1.0, 0.25)
     standing, constant = (final_errors(model, windows) for model in (NoChange(), ConstantVelocity()))
     rows = skill_of(windows, standing, constant, DEFAULT.evidence)
     chord_m = 2.0 * RADIUS_M * np.sin(0.5 * YAW_RATE * windows.horizon_s)

@@ -45,7 +45,7 @@ def found(case: Case, folder: Path, candidates: tuple[str, ...], monkeypatch: py
 
 def decisions_by(outcome: Outcome, setting: str) -> list[Decision]:
     """Decisions in which a threshold was used."""
-    return [d for d in outcome.exhibits.decisions if any(c.setting == setting for cs in d.alternatives for c in cs)]
+    return [d for d in outcome.figure_data.decisions if any(c.setting == setting for cs in d.alternatives for c in cs)]
 
 
 def wheel_angle(model: SimulatorConfig, command: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path, monkeypa
     """A random increasing map of the steering command resembles an offset, which all other checks accept."""
     case = made("outside", "random_steering_map", "outside")
     outcome = found(case, tmp_path, STATIC, monkeypatch)
-    refused = [(d.effect, d.alternatives[0][0].setting) for d in outcome.exhibits.decisions if not d.passed]
+    refused = [(d.effect, d.alternatives[0][0].setting) for d in outcome.figure_data.decisions if not d.passed]
     assert outcome.diagnosis.verdict == "unexplained"
     assert outcome.diagnosis.effects == ()
     assert [each for each in refused if each[0] == "steering_offset"] == [("steering_offset", "rivals.curve_z_min")]

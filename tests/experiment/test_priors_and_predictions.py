@@ -23,7 +23,7 @@ from learning.policy.sac_agent import SacAgent, SacSettings
 from learning.posterior.particle_posterior import ParticlePosterior
 from learning.world import model_env
 from learning.world.car_dynamics import CarDynamics
-from learning.world.model_env import Drives
+from learning.world.model_env import RolloutEpisodes
 from sim_backends.car_parameters import SimulatorConfig, preset_names
 
 
@@ -102,9 +102,9 @@ def test_weight_of_drawn_cars_falls_with_the_number_of_episodes(
         def __init__(self, returns: torch.Tensor) -> None:
             self._returns = returns
 
-        def roll_out(self, act: object, max_ticks: int | None = None) -> Drives:
+        def roll_out(self, act: object, max_ticks: int | None = None) -> RolloutEpisodes:
             count = len(self._returns)
-            return Drives(self._returns, torch.zeros(count), torch.zeros(count, 13))
+            return RolloutEpisodes(self._returns, torch.zeros(count), torch.zeros(count, 13))
 
     monkeypatch.setattr(model_env, "ModelEnv", lambda *args, **options: Cars(torch.zeros(64)))
     plan = TrainingPlan(tomli_w.dumps(SimulatorConfig().to_tables()))

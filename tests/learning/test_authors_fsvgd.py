@@ -97,12 +97,13 @@ def test_too_few_rows_for_a_validation_split_are_refused() -> None:
 
 
 def test_prior_exponent_is_that_of_the_authors() -> None:
-    published, simulator, mended = (
-        authors_settings(1000, 0, with_simulator=s, mended=m) for s, m in ((False, False), (True, False), (True, True))
+    published, simulator, corrected = (
+        authors_settings(1000, 0, with_simulator=s, corrected=m)
+        for s, m in ((False, False), (True, False), (True, True))
     )
     assert (published.prior_exponent, published.repulsion) == (pytest.approx(1 / 480), 0.1)
     assert (simulator.prior_exponent, simulator.repulsion) == (1.0, 0.1)
-    assert (mended.prior_exponent, mended.repulsion, mended.bandwidth) == (1.0, 1.0, None)
+    assert (corrected.prior_exponent, corrected.repulsion, corrected.bandwidth) == (1.0, 1.0, None)
     assert published.bandwidth == simulator.bandwidth == 0.2
 
 
@@ -178,11 +179,11 @@ def test_simulator_prior_changes_the_fit(monkeypatch: pytest.MonkeyPatch) -> Non
         monkeypatch.setattr(f"learning.functional_svgd.authors_fsvgd.{name}", value)
     config = SimulatorConfig(kind="kinematic")
     model = CarModel(config, HISTORY, known_ranges(config))
-    without, published, mended = (
-        fit_authors_fsvgd([circling()], HISTORY, 3, simulator=simulator, mended=is_mended)
-        for simulator, is_mended in ((None, False), (model, False), (model, True))
+    without, published, corrected = (
+        fit_authors_fsvgd([circling()], HISTORY, 3, simulator=simulator, corrected=is_corrected)
+        for simulator, is_corrected in ((None, False), (model, False), (model, True))
     )
-    parameters = [fit.posterior.parameters for fit in (without, published, mended)]
+    parameters = [fit.posterior.parameters for fit in (without, published, corrected)]
     assert all(torch.isfinite(p).all() for p in parameters)
     assert not torch.equal(parameters[0], parameters[1])
     assert not torch.equal(parameters[1], parameters[2])

@@ -9,10 +9,10 @@ from carlab.core.recording_noise import AdaptationNoise
 from carlab.prediction.adaptation import adapt, choose_noise
 from carlab.prediction.adaptation_filter import MeasuredWindows, Processes, run_filter
 from carlab.prediction.adaptation_settings import AdaptationSettings
-from carlab.prediction.disturbances import DISTURBANCES, linearised
+from carlab.prediction.disturbances import DISTURBANCE_NAMES, linearised
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel, simulate_windows
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.changing_drives import changing_drive
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -36,17 +36,17 @@ def position_rms(model, windows):
 
 @pytest.fixture(scope="module")
 def noise() -> AdaptationNoise:
-    return choose_noise(CONFIG, tracks_of([drive(CONFIG, SECONDS, 1)]))
+    return choose_noise(CONFIG, segments_of([drive(CONFIG, SECONDS, 1)]))
 
 
 @pytest.fixture(scope="module")
-def changed_tracks():
-    return tracks_of([changing_drive(CONFIG, SECONDS, 2, drive_factor, trim_rad)])
+def changed_segments():
+    return segments_of([changing_drive(CONFIG, SECONDS, 2, drive_factor, trim_rad)])
 
 
 @pytest.fixture(scope="module")
-def changed(noise, changed_tracks):
-    return adapt(CONFIG, changed_tracks, noise)
+def changed(noise, changed_segments):
+    return adapt(CONFIG, changed_segments, noise)
 
 
 def test_estimates_follow_a_fading_drive_force_and_steering_trim_within_their_band(changed):
@@ -58,20 +58,20 @@ def test_estimates_follow_a_fading_drive_force_and_steering_trim_within_their_ba
     assert np.sqrt(np.mean(error[late, 1] ** 2)) < 0.006
     for k in range(4):
         z = np.abs(error[late, k]) / series.std[late, k]
-        assert np.mean(z < 2.5) > 0.85, DISTURBANCES[k]
+        assert np.mean(z < 2.5) > 0.85, DISTURBANCE_NAMES[k]
     assert series.std[late, 0].mean() < 0.1  # the band is narrower than the change
 
 
-def test_adapted_predictions_of_a_changing_car_are_several_times_better(changed, changed_tracks):
-    windows = cut_windows(changed_tracks, 1.0, 0.25)
+def test_adapted_predictions_of_a_changing_car_are_several_times_better(changed, changed_segments):
+    windows = cut_windows(changed_segments, 1.0, 0.25)
     late = windows.take(windows.t0_s > 20.0)
     assert position_rms(changed, late) < 0.4 * position_rms(SimulatorModel(CONFIG), late)
 
 
 def test_adaptation_to_a_car_without_a_change_costs_little(noise):
-    tracks = tracks_of([drive(CONFIG, SECONDS, 3)])
-    windows = cut_windows(tracks, 1.0, 0.25)
-    adapted = adapt(CONFIG, tracks, noise)
+    segments = segments_of([drive(CONFIG, SECONDS, 3)])
+    windows = cut_windows(segments, 1.0, 0.25)
+    adapted = adapt(CONFIG, segments, noise)
     assert position_rms(adapted, windows) < 1.15 * position_rms(SimulatorModel(CONFIG), windows)
     mean = adapted.series().mean[-50:].mean(axis=0)
     assert np.all(np.abs(mean) < [0.03, 0.005, 0.05, 0.05])
@@ -86,8 +86,8 @@ def test_a_prediction_uses_only_rows_before_its_start(noise):
     states[row:, 3:] += [1.0, 0.5, -2.0]
     other = replace(episode, states=states)
     changed_at_s = row * PERIOD_S
-    models = [adapt(CONFIG, tracks_of([e]), noise) for e in (episode, other)]
-    windows = cut_windows(tracks_of([episode]), 1.0, 0.1)
+    models = [adapt(CONFIG, segments_of([e]), noise) for e in (episode, other)]
+    windows = cut_windows(segments_of([episode]), 1.0, 0.1)
     before = windows.take(windows.t0_s < changed_at_s - 0.15)  # the smoothing of other windows uses the changed rows
     first, second = (m.predict(before.take(before.t0_s > changed_at_s - 1.0)) for m in models)
     assert np.array_equal(first, second)
@@ -95,9 +95,9 @@ def test_a_prediction_uses_only_rows_before_its_start(noise):
     assert not np.allclose(models[0].predict(after), models[1].predict(after))
 
 
-def test_each_recording_starts_without_a_change(noise, changed_tracks):
-    again = [replace(t, recording=1) for t in changed_tracks]
-    model = adapt(CONFIG, [*changed_tracks, *again], noise)
+def test_each_recording_starts_without_a_change(noise, changed_segments):
+    again = [replace(t, recording=1) for t in changed_segments]
+    model = adapt(CONFIG, [*changed_segments, *again], noise)
     recording, t_s = np.array([0, 1]), np.array([50.0, 50.0])
     found = model.disturbances(recording, t_s)
     assert np.allclose(found[:, 0], found[:, 1], atol=1e-9)
@@ -148,11 +148,13 @@ def test_an_outlier_moves_the_estimate_little():
 
 
 def test_jacobian_and_values_of_each_window_equal_single_simulations():
-    windows = cut_windows(tracks_of([drive(CONFIG, 8.0, 5)]), 0.3, 0.6)
+    windows = cut_windows(segments_of([drive(CONFIG, 8.0, 5)]), 0.3, 0.6)
     values = np.linspace(-0.2, 0.2, len(windows))
-    together = simulate_windows(windows, CONFIG, {DISTURBANCES[0]: values[None]})[0]
+    together = simulate_windows(windows, CONFIG, {DISTURBANCE_NAMES[0]: values[None]})[0]
     for k in range(0, len(windows), 4):
-        alone = simulate_windows(windows.take(np.array([k])), CONFIG.with_values({DISTURBANCES[0]: float(values[k])}))
+        alone = simulate_windows(
+            windows.take(np.array([k])), CONFIG.with_values({DISTURBANCE_NAMES[0]: float(values[k])})
+        )
         assert np.allclose(together[k], alone[0, 0], atol=1e-5)
     at = np.zeros((1, len(windows), 4))
     measured = linearised(windows, CONFIG, at, AdaptationSettings())

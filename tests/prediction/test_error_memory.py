@@ -10,7 +10,7 @@ from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.error_memory import _weights
 from carlab.prediction.errors import final_errors
 from carlab.prediction.predict import SimulatorModel
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -46,9 +46,9 @@ def test_no_past_and_distant_states_give_no_correction():
 def test_errors_that_depend_on_the_state_are_predicted_from_similar_states(with_fitted):
     """The motor saturates and drag grows with speed; the simulator has neither."""
     car = replace(CONFIG, effects={"motor_saturation": {"force": 3.0}, "aerodynamic_drag": {"coefficient": 0.3}})
-    fitted, tracks = tracks_of([drive(car, 60.0, 1)]), tracks_of([drive(car, 60.0, 2)])
-    model = adapt(CONFIG, tracks, choose_noise(CONFIG, fitted), fitted=fitted if with_fitted else ())
-    windows = cut_windows(tracks, 1.0, 0.25)
+    fitted, segments = segments_of([drive(car, 60.0, 1)]), segments_of([drive(car, 60.0, 2)])
+    model = adapt(CONFIG, segments, choose_noise(CONFIG, fitted), fitted=fitted if with_fitted else ())
+    windows = cut_windows(segments, 1.0, 0.25)
     late = windows.take(windows.t0_s > 20.0)
     plain, adapted = (
         float(np.sqrt(np.mean(final_errors(m, late)[:, :2] ** 2))) for m in (SimulatorModel(CONFIG), model)

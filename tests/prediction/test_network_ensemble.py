@@ -11,7 +11,7 @@ from carlab.diagnosis.ceiling import ceiling_of
 from carlab.prediction.errors import final_errors
 from carlab.prediction.network_ensemble import EnsembleSettings, train_ensemble
 from carlab.prediction.predict import ConstantVelocity, SimulatorModel
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
@@ -19,18 +19,18 @@ SMALL = EnsembleSettings(updates=250, check_every=50, n_networks=2, hidden_units
 
 
 @pytest.fixture(scope="module")
-def tracks():
-    return tracks_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 120.0, 11)])
+def segments():
+    return segments_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 120.0, 11)])
 
 
 @pytest.fixture(scope="module")
-def model(tracks):
-    return train_ensemble(tracks, SMALL)
+def model(segments):
+    return train_ensemble(segments, SMALL)
 
 
 @pytest.fixture(scope="module")
 def held_out():
-    return cut_windows(tracks_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 30.0, 12)]), 1.0, 0.25)
+    return cut_windows(segments_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 30.0, 12)]), 1.0, 0.25)
 
 
 def rms(model, windows):
@@ -66,22 +66,22 @@ def test_prediction_moves_with_the_frame_of_the_recording(model, held_out):
     assert model.predict(elsewhere) == pytest.approx(moved(model.predict(held_out)), abs=1e-4)
 
 
-def test_training_repeats_with_the_same_seed(tracks, held_out):
+def test_training_repeats_with_the_same_seed(segments, held_out):
     short = replace(SMALL, updates=20)
-    first, again, other = (train_ensemble(tracks, short, seed=k).predict(held_out) for k in (3, 3, 4))
+    first, again, other = (train_ensemble(segments, short, seed=k).predict(held_out) for k in (3, 3, 4))
     assert (first == again).all()
     assert not (first == other).all()
 
 
-def test_stop_ends_the_training_with_a_usable_model(tracks, held_out):
-    model = train_ensemble(tracks, SMALL, stop=lambda: True)
+def test_stop_ends_the_training_with_a_usable_model(segments, held_out):
+    model = train_ensemble(segments, SMALL, stop=lambda: True)
     assert np.isfinite(model.predict(held_out)).all()
 
 
 def test_short_recordings_are_refused_in_one_sentence():
-    tracks = tracks_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 10.0, 1)])
+    segments = segments_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 10.0, 1)])
     with pytest.raises(DataError, match="contain 10 s of driving; a network needs at least 60 s"):
-        train_ensemble(tracks)
+        train_ensemble(segments)
 
 
 def test_windows_with_another_rate_are_refused(model, held_out):
@@ -97,8 +97,8 @@ def weak_motor():
 
 
 @pytest.fixture(scope="module")
-def corrected(tracks, weak_motor):
-    return train_ensemble(tracks, SMALL, simulator=weak_motor)
+def corrected(segments, weak_motor):
+    return train_ensemble(segments, SMALL, simulator=weak_motor)
 
 
 def test_discrepancy_without_output_is_the_simulator(corrected, weak_motor, held_out):
@@ -114,9 +114,9 @@ def test_discrepancy_corrects_a_wrong_drive_force(corrected, weak_motor, held_ou
     assert after[3] < 0.3 * before[3]
 
 
-def test_discrepancy_of_the_true_simulator_adds_little_error(tracks, held_out):
+def test_discrepancy_of_the_true_simulator_adds_little_error(segments, held_out):
     truth = SimulatorModel(SimulatorConfig(control_period_s=PERIOD_S))
-    corrected = train_ensemble(tracks, SMALL, simulator=truth)
+    corrected = train_ensemble(segments, SMALL, simulator=truth)
     assert (rms(corrected, held_out)[:2] < rms(truth, held_out)[:2] + 0.01).all()
 
 

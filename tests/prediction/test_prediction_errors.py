@@ -15,7 +15,7 @@ from carlab.prediction.errors import channel_errors, final_errors, prediction_er
 from carlab.prediction.initial_states import as_recorded, without_curvature_bias
 from carlab.prediction.learned import LearnedModel
 from carlab.prediction.predict import ConstantVelocity, NoChange, PredictiveModel, SimulatorModel, predicted_at
-from carlab.prediction.windows import cut_windows, split_tracks, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of, split_segments
 from sim_backends import CarParameters, SimulatorConfig
 from sim_backends.car_parameters import MocapParameters
 
@@ -90,7 +90,7 @@ def uneven():
 
 def recorded_windows(episode, horizon_s=1.0, stride_s=0.25):
     """Cut windows with the recorded states as initial states."""
-    return as_recorded(cut_windows(tracks_of([episode]), horizon_s, stride_s))
+    return as_recorded(cut_windows(segments_of([episode]), horizon_s, stride_s))
 
 
 def rms_of(config, windows):
@@ -146,7 +146,7 @@ def test_commands_before_a_window_act_through_the_delay(even):
 
 
 def test_smoothed_initial_states_are_close_to_the_recorded_ones_without_noise(even):
-    windows = cut_windows(tracks_of([even]), 1.0, 0.25)
+    windows = cut_windows(segments_of([even]), 1.0, 0.25)
     recorded = as_recorded(windows).initial_states
     better = without_curvature_bias(windows, CONFIG)
     before, after = (np.sqrt(np.mean((w.initial_states - recorded) ** 2, axis=0)) for w in (windows, better))
@@ -203,11 +203,11 @@ def test_gap_in_time_ends_a_window(even):
 
 
 def test_last_share_is_split_off_with_a_guard_interval(even):
-    tracks = tracks_of([even])
-    early, late = split_tracks(tracks, 0.3, 1.5)
+    segments = segments_of([even])
+    early, late = split_segments(segments, 0.3, 1.5)
     assert late[0].t_s[0] == pytest.approx(0.7 * 8.0, abs=0.04)
     assert late[0].t_s[0] - early[0].t_s[-1] == pytest.approx(1.5, abs=0.07)
-    assert len(late[0].t_s) + len(early[0].t_s) == len(tracks[0].t_s) - 45
+    assert len(late[0].t_s) + len(early[0].t_s) == len(segments[0].t_s) - 45
 
 
 def test_recordings_without_windows_are_refused(even):
@@ -215,7 +215,7 @@ def test_recordings_without_windows_are_refused(even):
         recorded_windows(even, 60.0)
     single = EpisodeData(np.zeros(1), np.zeros((1, 6)), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     with pytest.raises(DataError, match="0 commands"):
-        tracks_of([single])
+        segments_of([single])
 
 
 def test_mocap_latency_acts_like_command_delay(even):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from carlab.core.errors import ConfigError, DataError
+from carlab.core.method_names import with_current_methods
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from carlab.studies.parking import as_json, check_run, draw, read_curve, run_folder, summarised
@@ -116,6 +117,17 @@ def test_earlier_names_of_methods_are_read_with_their_current_names(caplog: pyte
     for old, new in (("sim-fsvgd", "gp-sim-posterior"), ("fsvgd", "gp-posterior"), ("fsvgd-authors", "fsvgd")):
         assert plan_from_json({**earlier, "method": old}).method == new
         assert caplog.records[-1].getMessage() == f"The run's method '{old}' is now called '{new}'."
+    renamed = {**plan_as_json(plan), "method": "sim-fsvgd-mended"}
+    assert plan_from_json(renamed).method == "sim-fsvgd-corrected"
+
+
+def test_folder_and_options_with_the_former_name_of_a_method_are_found(tmp_path: Path) -> None:
+    folder = write_run(tmp_path, "sim-fsvgd-mended", 0, [1.0], set())
+    assert run_folder(tmp_path, "sim-fsvgd-corrected", 0) == folder
+    given = ["bench", "parking", "--methods", "fsvgd", "sim-fsvgd-mended", "--runs", "fsvgd-mended"]
+    expected = ["bench", "parking", "--methods", "fsvgd", "sim-fsvgd-corrected", "--runs", "fsvgd-mended"]
+    assert with_current_methods(given) == expected
+    assert with_current_methods(["learn", "--method=sim-fsvgd-mended"]) == ["learn", "--method=sim-fsvgd-corrected"]
 
 
 def test_a_run_of_the_earlier_method_of_that_name_is_refused(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from carlab.core.errors import DataError
 from carlab.prediction.predict import ConstantVelocity, NoChange
-from carlab.prediction.windows import cut_windows, tracks_of
+from carlab.prediction.windows import cut_windows, segments_of
 from carlab.studies.real_cars import ALL, real_car_errors, split_by_name
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
@@ -16,7 +16,7 @@ from tests.helpers.recorded_drives import PERIOD_S, drive
 @pytest.fixture(scope="module")
 def windows():
     config = SimulatorConfig(control_period_s=PERIOD_S)
-    return cut_windows(tracks_of([drive(config, 15.0, k, noise=0.0) for k in (1, 2)]), 1.0, 0.25)
+    return cut_windows(segments_of([drive(config, 15.0, k, noise=0.0) for k in (1, 2)]), 1.0, 0.25)
 
 
 def test_errors_of_a_still_car_are_the_distances_driven(windows):

@@ -35,7 +35,7 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class Change:
+class TransformedRecording:
     """A recording with one more effect, and what is true about it.
 
     ``inexact`` is the root mean square error of the transformation as a share of the effect.
@@ -58,13 +58,13 @@ class Kind:
     names: tuple[str, ...]
     channel: Channel
     sizes: tuple[float, float, float]
-    change: Callable[[Table, float, float], Change]
+    change: Callable[[Table, float, float], TransformedRecording]
 
-    def apply(self, table: Table, size: float, draw: float) -> Change:
+    def apply(self, table: Table, size: float, draw: float) -> TransformedRecording:
         """Return the recording of a car with the effect."""
         return self.change(table, size, draw)
 
-    def as_dict(self, change: Change, size: float) -> dict[str, Any]:
+    def as_dict(self, change: TransformedRecording, size: float) -> dict[str, Any]:
         """The answer, as JSON."""
         return {
             "id": self.id, "names": list(self.names), "size": size, "inexact": change.inexact,
@@ -76,95 +76,95 @@ def _sign(draw: float) -> float:
     return 1.0 if draw < 0.5 else -1.0
 
 
-def _delay(parameter: str, *channels: str) -> Callable[[Table, float, float], Change]:
-    def change(table: Table, size: float, draw: float) -> Change:
+def _delay(parameter: str, *channels: str) -> Callable[[Table, float, float], TransformedRecording]:
+    def change(table: Table, size: float, draw: float) -> TransformedRecording:
         period_s = float(np.median(np.diff(table["t"])))
         rows = max(1, round(size / period_s))
         moved = {name: c.issued_earlier(table[name], rows) for name in channels}
-        return Change({**table, **moved}, (Truth(parameter, rows * period_s),))
+        return TransformedRecording({**table, **moved}, (Truth(parameter, rows * period_s),))
 
     return change
 
 
-def _lag(channel: str) -> Callable[[Table, float, float], Change]:
-    def change(table: Table, size: float, draw: float) -> Change:
+def _lag(channel: str) -> Callable[[Table, float, float], TransformedRecording]:
+    def change(table: Table, size: float, draw: float) -> TransformedRecording:
         earlier, lagged = c.before_lag(table["t"], table[channel], size)
         mean = 0.5 * (table[channel] + np.concatenate([table[channel][:1], table[channel][:-1]]))
         untransformed = ramp_filter(table["t"], mean[:, None], size)[:, 0]
         inexact = float(np.std(lagged - mean) / max(np.std(untransformed - mean), 1e-9))
-        return Change({**table, channel: earlier}, (Truth("time_constant", size),), inexact)
+        return TransformedRecording({**table, channel: earlier}, (Truth("time_constant", size),), inexact)
 
     return change
 
 
-def _gain(table: Table, size: float, draw: float) -> Change:
+def _gain(table: Table, size: float, draw: float) -> TransformedRecording:
     gain = (1.0 + size) ** _sign(draw)
     moved = c.with_command(table, "steering", lambda u: u / gain)
-    return Change(moved, (Truth("value", gain, "multiplies"),))
+    return TransformedRecording(moved, (Truth("value", gain, "multiplies"),))
 
 
-def _offset(table: Table, size: float, draw: float) -> Change:
+def _offset(table: Table, size: float, draw: float) -> TransformedRecording:
     shift = _sign(draw) * size * FULL_LOCK
     moved = c.with_command(table, "steering", lambda u: u - shift)
-    return Change(moved, (Truth("angle", shift, per_lock=True),))
+    return TransformedRecording(moved, (Truth("angle", shift, per_lock=True),))
 
 
-def _asymmetry(table: Table, size: float, draw: float) -> Change:
+def _asymmetry(table: Table, size: float, draw: float) -> TransformedRecording:
     gain = _sign(draw) * size
     moved = c.with_command(table, "steering", lambda u: u / (1.0 + gain * np.sign(u)))
-    return Change(moved, (Truth("gain", gain),))
+    return TransformedRecording(moved, (Truth("gain", gain),))
 
 
-def _steering_dead_band(table: Table, size: float, draw: float) -> Change:
+def _steering_dead_band(table: Table, size: float, draw: float) -> TransformedRecording:
     width = size * FULL_LOCK
     moved = c.with_command(table, "steering", lambda u: c.before_dead_band(u, 0.5 * width))
-    return Change(moved, (Truth("width", width, per_lock=True),))
+    return TransformedRecording(moved, (Truth("width", width, per_lock=True),))
 
 
-def _play(table: Table, size: float, draw: float) -> Change:
+def _play(table: Table, size: float, draw: float) -> TransformedRecording:
     play = size * FULL_LOCK
     moved = c.with_command(table, "steering", lambda u: c.before_play(u, play))
-    return Change(moved, (Truth("play", play, per_lock=True),))
+    return TransformedRecording(moved, (Truth("play", play, per_lock=True),))
 
 
-def _saturation(table: Table, size: float, draw: float) -> Change:
+def _saturation(table: Table, size: float, draw: float) -> TransformedRecording:
     """``size``: the share by which the angle at full lock is smaller than a linear one."""
     x = float(np.interp(size, 1.0 - np.tanh(_ARGUMENTS) / _ARGUMENTS, _ARGUMENTS))  # tanh(x) = (1 - size) x
     saturation = FULL_LOCK / math.tanh(x)
     moved = c.with_command(table, "steering", lambda u: c.before_saturation(u, saturation))
-    return Change(moved, (Truth("saturation", saturation, "replaces", per_lock=True),))
+    return TransformedRecording(moved, (Truth("saturation", saturation, "replaces", per_lock=True),))
 
 
 _ARGUMENTS = np.linspace(0.01, 2.0, 400)
 
 
-def _throttle_dead_band(table: Table, size: float, draw: float) -> Change:
+def _throttle_dead_band(table: Table, size: float, draw: float) -> TransformedRecording:
     moved = c.with_command(table, "throttle", lambda u: c.before_dead_band(u * (1.0 - size), size))
-    return Change(moved, (Truth("width", size),))
+    return TransformedRecording(moved, (Truth("width", size),))
 
 
-def _exponent(table: Table, size: float, draw: float) -> Change:
+def _exponent(table: Table, size: float, draw: float) -> TransformedRecording:
     exponent = (1.0 + size) ** _sign(draw)
     moved = c.with_command(table, "throttle", lambda u: np.sign(u) * np.abs(u) ** (1.0 / exponent))
-    return Change(moved, (Truth("exponent", exponent, "multiplies"),))
+    return TransformedRecording(moved, (Truth("exponent", exponent, "multiplies"),))
 
 
-def _marker(table: Table, size: float, draw: float) -> Change:
+def _marker(table: Table, size: float, draw: float) -> TransformedRecording:
     ahead, left = size * math.cos(2.0 * math.pi * draw), size * math.sin(2.0 * math.pi * draw)
-    return Change(c.moved_point(table, ahead, left), (Truth("ahead", ahead), Truth("left", left)))
+    return TransformedRecording(c.moved_point(table, ahead, left), (Truth("ahead", ahead), Truth("left", left)))
 
 
-def _misalignment(table: Table, size: float, draw: float) -> Change:
+def _misalignment(table: Table, size: float, draw: float) -> TransformedRecording:
     angle = _sign(draw) * size
-    return Change(c.turned_frame(table, angle), (Truth("angle", angle),))
+    return TransformedRecording(c.turned_frame(table, angle), (Truth("angle", angle),))
 
 
-def _latency(table: Table, size: float, draw: float) -> Change:
-    return Change(c.delayed_observation(table, size), (Truth("latency", size),))
+def _latency(table: Table, size: float, draw: float) -> TransformedRecording:
+    return TransformedRecording(c.delayed_observation(table, size), (Truth("latency", size),))
 
 
-def _filter(table: Table, size: float, draw: float) -> Change:
-    return Change(c.filtered_velocity(table, size), (Truth("time_constant", size),))
+def _filter(table: Table, size: float, draw: float) -> TransformedRecording:
+    return TransformedRecording(c.filtered_velocity(table, size), (Truth("time_constant", size),))
 
 
 _LATE = ("command_delay", "mocap_latency")  # all commands later and all measurements later are the same recording

@@ -174,7 +174,7 @@ def _refine(
     offset = linear.difference.common * linear.secants.of_group[1][linear.point]
     offset = offset + (before.offset if before else 0.0)
     fit = fit_change(material.fitters[1], config, free, starts, material.model, offset, settings)
-    ratio = 2.0 * fit.gain / linear.difference.borrowed
+    ratio = 2.0 * fit.gain / linear.difference.variance_ratio
     p = p_value(linear.difference, ratio, len(at.z0))
     return _Refined(linear, fit, ratio, p, offset)
 
@@ -213,7 +213,7 @@ def _change(
 ) -> Change:
     z, index, last = joint
     at, found = one.linear.secants.at, one.linear.difference
-    variance = np.diag(last.naive_covariance)[index] * found.design_effect * found.borrowed
+    variance = np.diag(last.naive_covariance)[index] * found.design_effect * found.variance_ratio
     std = np.sqrt(variance + (model_error_share * (z - at.z0)) ** 2)
     quantile = float(stats.t.ppf(0.95, max(min(found.dof - (len(index) - 1), found.spread.dof), 1.0)))
     low, value, high = (size_of(at.candidate, z + side * quantile * std, at.z0) for side in (-1.0, 0.0, 1.0))

@@ -21,6 +21,7 @@ from carlab.diagnosis.settings import ComparisonSettings
 from carlab.prediction.windows import IndexArray
 
 MIN_INFORMATION = 1.0
+"""Minimum information of a group along a secant: the reciprocal variance of its step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,7 @@ class Difference:
         return float(np.sqrt(max(self.likelihood_ratio, 0.0) / self.design_effect))
 
     @property
-    def borrowed(self) -> float:
+    def variance_ratio(self) -> float:
         """Variance of the difference over that of the second group's step."""
         first, second = self.information
         return 1.0 + second / first

@@ -23,7 +23,7 @@ from carlab.diagnosis.selection.refit import fit_with_scale
 from carlab.diagnosis.settings import DiagnosisSettings
 from carlab.diagnosis.state_alignment import with_known_latency
 from carlab.prediction.initial_states import without_curvature_bias
-from carlab.prediction.windows import IndexArray, PredictionWindows, Track, cut_windows, tracks_of
+from carlab.prediction.windows import IndexArray, PredictionWindows, RecordingSegment, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import CURVES, confusable_effects
 
@@ -69,18 +69,18 @@ def compared_groups(
     """
     nominal = with_known_latency(nominal, (*reference, *changed))
     reference, changed, _ = data_faults_of.check(reference, changed, nominal, alike=True)
-    tracks = [_checked_tracks(group, k, settings) for k, group in enumerate((reference, changed))]
-    periods = [t[0].period_s for t in tracks]
+    segments = [_checked_segments(group, k, settings) for k, group in enumerate((reference, changed))]
+    periods = [t[0].period_s for t in segments]
     if max(periods) > settings.comparison.period_ratio_max * min(periods):
         raise DataError(
             f"The groups have periods of {periods[0]:.3f} s and {periods[1]:.3f} s; compare recordings of one car."
         )
-    first, second = (_windows(tracks_of(group, periods[0]), settings) for group in (reference, changed))
+    first, second = (_windows(segments_of(group, periods[0]), settings) for group in (reference, changed))
     variance_s2 = velocity_window_variance_s2(first, nominal, settings.identification)
     first, second = (
         without_curvature_bias(replace(w, velocity_window_s2=variance_s2), nominal) for w in (first, second)
     )
-    noise = estimate_noise(tracks[0], first.curvature_bias, settings=settings.identification)
+    noise = estimate_noise(segments[0], first.curvature_bias, settings=settings.identification)
     per_step = noise_floor(first, noise, nominal, settings.identification)[1:]
     floor = np.sqrt(np.mean(per_step**2, axis=0))
     problem = SearchProblem(nominal, first, floor, noise.measured, confusable_effects(), (), settings)
@@ -106,22 +106,24 @@ def _errors(fitter: Fitter, config: SimulatorConfig) -> FloatArray:
     return np.asarray(white.reshape(len(white), -1))
 
 
-def _checked_tracks(episodes: Sequence[EpisodeData], k: int, settings: DiagnosisSettings) -> list[Track]:
-    """Tracks of a group. Raises DataError if it is too short or too uniform."""
+def _checked_segments(episodes: Sequence[EpisodeData], k: int, settings: DiagnosisSettings) -> list[RecordingSegment]:
+    """Segments of a group. Raises DataError if it is too short or too uniform."""
     which = ("first", "second")[k]
-    tracks = tracks_of(episodes)
-    seconds = sum(track.duration_s for track in tracks)
+    segments = segments_of(episodes)
+    seconds = sum(segment.duration_s for segment in segments)
     needed_s = settings.comparison.block_s * settings.comparison.min_blocks
     if seconds < needed_s:
         raise DataError(
             f"The {which} group has {seconds:.0f} s of driving; a comparison needs {needed_s:.0f} s in each group."
         )
-    check_excitation(tracks, settings.windows)
-    return tracks
+    check_excitation(segments, settings.windows)
+    return segments
 
 
-def _windows(tracks: Sequence[Track], settings: DiagnosisSettings) -> PredictionWindows:
-    cut = cut_windows(tracks, settings.windows.fit_window_s, settings.windows.fit_stride_s, settings.comparison.block_s)
+def _windows(segments: Sequence[RecordingSegment], settings: DiagnosisSettings) -> PredictionWindows:
+    cut = cut_windows(
+        segments, settings.windows.fit_window_s, settings.windows.fit_stride_s, settings.comparison.block_s
+    )
     if len(np.unique(cut.block)) < settings.comparison.min_blocks:
         raise DataError("The car moves too little in one group; record at least one minute of driving.")
     return cut.thinned(settings.windows.max_fit_windows)

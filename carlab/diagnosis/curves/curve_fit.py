@@ -1,4 +1,4 @@
-"""Joint fit of measured curves, base parameters and effects; curves that unseen blocks do not need are removed."""
+"""Joint fit of measured curves, base parameters and effects; curves that left-out blocks do not need are removed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class CurveFit:
     curves            ids of the curves
     effects           effects of the catalogue in the fit
     fit               the fit, with covariance
-    standard_errors   fall of the loss on unseen blocks, against the same model without curves, in standard errors
+    standard_errors   fall of the loss on left-out blocks, against the same model without curves, in standard errors
     """
 
     curves: tuple[str, ...]
@@ -35,7 +35,7 @@ class CurveFit:
 
 
 def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl) -> CurveFit | None:
-    """Fit all applicable curves, remove those that unseen blocks do not need; None if none remains.
+    """Fit all applicable curves, remove those that left-out blocks do not need; None if none remains.
 
     Named effects that a curve contains are omitted. The fit begins on fewer windows, to save time.
     """
@@ -54,9 +54,9 @@ def fit_curves(problem: SearchProblem, found: SearchResult, control: RunControl)
     scale = _scale(problem, fit.config)
     named = _effects_with(problem, found, ())
     reference = _fit(problem, named, _coordinates(found.best), settings.first_iterations, settings.last_iterations)
-    losses = [_unseen_loss(problem, each, scale) for each in (reference, fit)]
+    losses = [_left_out_loss(problem, each, scale) for each in (reference, fit)]
     gain, error = clustered_gain(losses[0], losses[1], problem.windows)
-    log.info("measured curves %s: unseen gain %.1f standard errors", ", ".join(curves), gain / error)
+    log.info("measured curves %s: gain on left-out blocks %.1f standard errors", ", ".join(curves), gain / error)
     if gain < settings.accept_z_min * error:
         return None
     fit = problem.fitter(scale).with_covariance(fit)
@@ -93,27 +93,27 @@ def _fit(problem: SearchProblem, effects: tuple[str, ...], start: dict[str, floa
 def _eliminate(
     problem: SearchProblem, fit: Fit, effects: tuple[str, ...], curves: tuple[str, ...], control: RunControl
 ) -> tuple[Fit, tuple[str, ...]]:
-    """Remove each curve, the last one first, if the loss on unseen blocks does not rise without it."""
+    """Remove each curve, the last one first, if the loss on left-out blocks does not rise without it."""
     settings = problem.settings.curves
     scale = _scale(problem, fit.config)
-    loss = _unseen_loss(problem, fit, scale)
+    loss = _left_out_loss(problem, fit, scale)
     for k, name in enumerate(reversed(curves)):
         if control.stop():
             break
         control.progress(f"measured curves without {EFFECTS[name].class_statement}", 0.3 + 0.06 * k)
         kept = tuple(c for c in curves if c != name)
         without = _fit(problem, (*effects, *kept), _coordinates(fit), settings.last_iterations)
-        loss_without = _unseen_loss(problem, without, scale)
+        loss_without = _left_out_loss(problem, without, scale)
         rise, error = clustered_gain(loss_without, loss, problem.windows)
-        log.info("without %s: the loss on unseen blocks rises by %.1f standard errors", name, rise / error)
+        log.info("without %s: the loss on left-out blocks rises by %.1f standard errors", name, rise / error)
         if rise < settings.keep_z_min * error:
             fit, curves, loss = without, kept, loss_without
     return fit, curves
 
 
-def _unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
+def _left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
     """Loss of each window (S,) by a fit without its block."""
-    limit = problem.settings.selection.max_unseen_error
+    limit = problem.settings.selection.max_left_out_error
     return problem.fitter(scale).leave_fold_out_loss(fit, problem.folds(), limit)
 
 

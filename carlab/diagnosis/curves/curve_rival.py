@@ -1,7 +1,7 @@
 """A measured curve as a rival of the named effects that it contains.
 
 A curve contains the named form as a special case, so it fits about as well if that form is the physics. If it predicts
-unseen blocks significantly better, by a relevant share of its own gain over the refit, the named form is not the
+left-out blocks significantly better, by a relevant share of its own gain over the refit, the named form is not the
 physics: the residual is then described by the class of the curve. The initial states of the windows are free, because
 their errors hide most of the difference (``identification.free_initial_states``).
 """
@@ -12,7 +12,7 @@ import logging
 
 from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import clustered_gain
-from carlab.diagnosis.selection.pairwise_tests import unseen_loss
+from carlab.diagnosis.selection.pairwise_tests import left_out_loss
 from carlab.diagnosis.selection.problem import RunControl, SearchProblem, SearchResult, is_applicable
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.selection.rival_physics import RivalPhysics
@@ -40,7 +40,7 @@ def replacing_curve(problem: SearchProblem, found: SearchResult, control: RunCon
         return None
     control.progress(f"measured curve in place of {', '.join(contained)}", 0.96)
     rival = curve_in_addition(problem, found, tuple(n for n in found.effects if n not in contained))
-    base, own, with_curve = (unseen_loss(problem, fit, found.scale) for fit in (found.base, found.best, rival.fit))
+    base, own, with_curve = (left_out_loss(problem, fit, found.scale) for fit in (found.base, found.best, rival.fit))
     gain, error = clustered_gain(own, with_curve, problem.windows)
     total = float((base - with_curve).sum())
     share = gain / total if total > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""Read a measured curve: fit named forms to its knots, and give a name only if a form lies within the band.
+"""Identify the named form of a measured curve: fit forms to its knots; a form within the band gives the name.
 
 A measured curve is linear between knots, a form is not. So a form is compared by its least-squares approximation that
 is linear between the same knots. The misfit is the sum of squared differences over the variances of the knots. Its
@@ -76,7 +76,7 @@ class _Knots:
         return np.asarray((grid.ravel()[self.used] - self.measured) / self.std)
 
 
-def read_form(curve: CurveFinding, covariance: FloatArray | None, settings: CurveSettings) -> FormFinding | None:
+def identify_form(curve: CurveFinding, covariance: FloatArray | None, settings: CurveSettings) -> FormFinding | None:
     """The named form of a measured curve, or the closest one if none lies within the band.
 
     Args:
@@ -164,4 +164,4 @@ def _projection(x: FloatArray, knots: Sequence[float]) -> FloatArray:
     return np.asarray(np.linalg.solve(hats.T * spacing @ hats, hats.T * spacing))
 
 
-__all__ = ["read_form"]
+__all__ = ["identify_form"]

@@ -40,7 +40,7 @@ def simulator_with_curves(
         settings: settings of the diagnosis.
 
     Returns:
-        The simulator with its curves. Without a curve that unseen blocks need: with the refitted parameters and the
+        The simulator with its curves. Without a curve that left-out blocks need: with the refitted parameters and the
         delay.
 
     Raises:
@@ -51,7 +51,7 @@ def simulator_with_curves(
     # The second argument is scored by a diagnosis; the fit does not use it.
     recordings = split_recordings(repaired, repaired, settings.windows.default_held_out_share, nominal, settings)
     (windows,) = with_initial_states((recordings.fit_windows,), nominal, settings.identification)
-    noise = estimate_noise(recordings.fit_tracks, windows.curvature_bias, settings=settings.identification)
+    noise = estimate_noise(recordings.fit_segments, windows.curvature_bias, settings=settings.identification)
     floor = np.sqrt(np.mean(noise_floor(windows, noise, nominal, settings.identification)[1:] ** 2, axis=0))
     problem = SearchProblem(nominal, windows, floor, noise.measured, {}, EFFECTS_WITH_CURVES, settings)
     control = RunControl()
@@ -59,7 +59,7 @@ def simulator_with_curves(
     measured = fit_curves(problem, found, control)
     if measured is None:
         return found.best.config
-    return without_extrapolation(measured, recordings.fit_tracks, settings.curves).fit.config
+    return without_extrapolation(measured, recordings.fit_segments, settings.curves).fit.config
 
 
 __all__ = ["EFFECTS_WITH_CURVES", "simulator_with_curves"]

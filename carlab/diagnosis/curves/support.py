@@ -10,10 +10,10 @@ from scipy.ndimage import distance_transform_edt
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_fit import CurveFit
-from carlab.diagnosis.curves.form_fit import read_form
+from carlab.diagnosis.curves.form_fit import identify_form
 from carlab.diagnosis.findings import CurveAxis, CurveFinding
 from carlab.diagnosis.settings import CurveSettings
-from carlab.prediction.windows import Track
+from carlab.prediction.windows import RecordingSegment
 from sim_backends.array_ops import ARRAYS
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS, Forces, MeasuredCurve
@@ -21,14 +21,14 @@ from sim_backends.effects.curves import weights
 
 
 def curve_findings(
-    found: CurveFit, nominal: SimulatorConfig, tracks: tuple[Track, ...], settings: CurveSettings
+    found: CurveFit, nominal: SimulatorConfig, segments: tuple[RecordingSegment, ...], settings: CurveSettings
 ) -> tuple[CurveFinding, ...]:
-    """Each measured curve beside that of the car file; knots without data have no value."""
+    """Each measured curve and that of the car file; knots without data have no value."""
     made = []
     for curve_id in found.curves:
         curve = EFFECTS[curve_id]
         assert isinstance(curve, MeasuredCurve)
-        support_s = driving_time_s(curve, found.fit.config, tracks)
+        support_s = driving_time_s(curve, found.fit.config, segments)
         grid = np.meshgrid(*(np.array(axis.knots) for axis in curve.axes), indexing="ij")
         measured = _curve(found, curve, found.fit.z, grid)
         driven = support_s >= settings.min_support_s
@@ -44,17 +44,17 @@ def curve_findings(
             std=np.where(driven, std, np.nan),
             support_s=support_s,
         )
-        made.append(replace(finding, form=read_form(finding, covariance, settings)))
+        made.append(replace(finding, form=identify_form(finding, covariance, settings)))
     return tuple(made)
 
 
-def without_extrapolation(found: CurveFit, tracks: tuple[Track, ...], settings: CurveSettings) -> CurveFit:
+def without_extrapolation(found: CurveFit, segments: tuple[RecordingSegment, ...], settings: CurveSettings) -> CurveFit:
     """Give knots without any data the deviation of the nearest knot with data; the penalty alone would extrapolate."""
     changes: dict[str, float] = {}
     for curve_id in found.curves:
         curve = EFFECTS[curve_id]
         assert isinstance(curve, MeasuredCurve)
-        driven = driving_time_s(curve, found.fit.config, tracks) >= settings.min_fitted_s
+        driven = driving_time_s(curve, found.fit.config, segments) >= settings.min_fitted_s
         values = found.fit.config.values()
         table = np.array(curve.table({p.name: values[f"effects.{curve.id}.{p.name}"] for p in curve.parameters}))
         if driven.any():
@@ -66,37 +66,37 @@ def without_extrapolation(found: CurveFit, tracks: tuple[Track, ...], settings: 
     return replace(found, fit=replace(fit, config=fit.config.with_values(changes), z=np.array(z)))
 
 
-def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, tracks: tuple[Track, ...]) -> FloatArray:
+def driving_time_s(curve: MeasuredCurve, config: SimulatorConfig, segments: tuple[RecordingSegment, ...]) -> FloatArray:
     """Driving time [s] near each knot: each row counts with its interpolation weights."""
     total = np.zeros([len(axis.knots) for axis in curve.axes])
-    for track in tracks:
-        coordinates = curve.coordinates(ARRAYS, recorded_forces(track, config))
+    for segment in segments:
+        coordinates = curve.coordinates(ARRAYS, recorded_forces(segment, config))
         by_axis = [
             np.stack(np.broadcast_arrays(*weights(ARRAYS, np.asarray(x), axis.knots)))
             for x, axis in zip(coordinates, curve.axes, strict=True)
         ]
         product = by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] * by_axis[1][None]
-        total += track.period_s * product.sum(axis=-1)
+        total += segment.period_s * product.sum(axis=-1)
     return total
 
 
-def recorded_forces(track: Track, config: SimulatorConfig) -> Forces:
+def recorded_forces(segment: RecordingSegment, config: SimulatorConfig) -> Forces:
     """State, delayed commands and longitudinal force of a recording, as inputs of curves.
 
     The first command is held before the recording begins, because earlier commands are unknown.
     """
     parameters = config.parameters
-    vx, vy, yaw_rate = track.smooth[:, 3:].T
+    vx, vy, yaw_rate = segment.smooth[:, 3:].T
     rows = np.arange(len(vx))
     commands = [
-        column[np.clip(rows - round(delay_s / track.period_s), 0, len(rows) - 1)]
-        for column, delay_s in zip(track.commands.T, config.delays_s(), strict=True)
+        column[np.clip(rows - round(delay_s / segment.period_s), 0, len(rows) - 1)]
+        for column, delay_s in zip(segment.commands.T, config.delays_s(), strict=True)
     ]
     angle = parameters.max_angle_rad * commands[0]
-    acceleration = np.gradient(vx, track.period_s) - vy * yaw_rate
+    acceleration = np.gradient(vx, segment.period_s) - vy * yaw_rate
     zero = np.zeros_like(vx)
     return Forces(
-        t_s=track.t_s, x=zero, y=zero, yaw=zero, vx=vx, vy=vy, yaw_rate=yaw_rate,
+        t_s=segment.t_s, x=zero, y=zero, yaw=zero, vx=vx, vy=vy, yaw_rate=yaw_rate,
         wheel_angle=angle, wheel_sin=np.sin(angle), wheel_cos=np.cos(angle), throttle=commands[1],
         mass=parameters.mass_kg, front_axle=parameters.front_axle_m, rear_axle=parameters.rear_axle_m,
         load_front=zero, load_rear=zero, grip_front=zero, grip_rear=zero,

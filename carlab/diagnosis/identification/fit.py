@@ -298,8 +298,8 @@ class Fitter:
             step *= min(1.0, self.settings.max_fold_step / max(float(np.abs(step).max()), 1e-12))
             trials = fit.z + np.array(self.settings.fold_step_shares)[:, None] * step
             whites = self.white(fit.config, fit.free, trials)
-            seen = self.huber(whites[:, ~own]).sum(axis=(1, 2, 3)) + self.prior(fit.free, trials)
-            best = int(np.argmin(seen))
+            other_costs = self.huber(whites[:, ~own]).sum(axis=(1, 2, 3)) + self.prior(fit.free, trials)
+            best = int(np.argmin(other_costs))
             yield own, trials[best], whites[best, own]
 
     def linearised(self, fit: Fit) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ from sim_backends.car_parameters import LATENCY, SimulatorConfig
 from sim_backends.effects import EFFECTS
 from sim_backends.registry import REGISTRY
 
-BASE = (
+BASE_PARAMETERS = (
     "vehicle.yaw_inertia",
     "tyre.front.B",
     "tyre.front.C",
@@ -26,7 +26,7 @@ BASE = (
     "motor.damping",
     "steering.max_angle",
 )
-TYRES = tuple(name for name in BASE if name.startswith("tyre."))
+TYRE_PARAMETERS = tuple(name for name in BASE_PARAMETERS if name.startswith("tyre."))
 MIN_POSITIVE_SHARE = 1e-3
 """Smallest value of a parameter that must be positive, over its typical size."""
 
@@ -34,9 +34,8 @@ MIN_POSITIVE_SHARE = 1e-3
 DIFFERENCE_STEP = 0.02
 """Step of a coordinate for finite differences."""
 DELAY_DIFFERENCE_STEP = 0.3
-"""The same for delays. With measured maps, the prediction of a window that starts at rest is discontinuous in a delay:
-of 150 windows of the ETH RC car, eight from rest gave 94 % of its information with a step of 0.02, so its interval
-was too narrow by a factor of about two. With steps of 0.3 to 1 the information is that of the other windows."""
+"""The same for delays. With measured maps, the prediction of a window that starts at rest is discontinuous in a delay.
+A small step would overstate the information of such windows, and the interval of the delay would be too narrow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +86,11 @@ class FitParameter:
 def base_parameters(
     config: SimulatorConfig, settings: IdentificationSettings = DEFAULT.identification
 ) -> tuple[FitParameter, ...]:
-    """Free base parameters of a refit: ``BASE``, parameters with a range in the car file, and an unknown latency."""
+    """Free base parameters: ``BASE_PARAMETERS``, those with a range in the car file, and an unknown latency."""
     values = config.values()
-    names = [name for name in BASE if config.kind != "kinematic" or name not in (*TYRES, "vehicle.yaw_inertia")]
+    names = list(BASE_PARAMETERS)
+    if config.kind == "kinematic":
+        names = [name for name in names if name not in (*TYRE_PARAMETERS, "vehicle.yaw_inertia")]
     names += [n for n in config.priors if n not in names and not n.startswith(("effects.", "timing.", "mocap."))]
     found = []
     for name in names:

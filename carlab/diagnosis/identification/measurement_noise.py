@@ -18,7 +18,7 @@ from carlab.core.quantities import FloatArray
 from carlab.core.recording_noise import RecordingNoise, StateStd
 from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.settings import DEFAULT, IdentificationSettings
-from carlab.prediction.windows import MIN_QUINTIC_WIDTH, Track, smoothing_width
+from carlab.prediction.windows import MIN_QUINTIC_WIDTH, RecordingSegment, smoothing_width
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Noise:
 
 
 def estimate_noise(
-    tracks: Sequence[Track],
+    segments: Sequence[RecordingSegment],
     curvature_bias: FloatArray,
     *,
     slowest: bool = False,
@@ -53,16 +53,16 @@ def estimate_noise(
     noise of that difference.
 
     Args:
-        tracks: the recordings.
+        segments: the recordings.
         curvature_bias: (S, 6) of prediction windows: initial states by a local quintic minus those by the local cubic.
         slowest: whether to use only the slowest rows for the noise of the channels.
         settings: settings of the estimate.
     """
-    period_s = tracks[0].sampled_s
+    period_s = segments[0].sampled_s
     width = smoothing_width(period_s)
-    residual = np.concatenate([t.residual for t in tracks])
+    residual = np.concatenate([t.residual for t in segments])
     if slowest:
-        speed = np.concatenate([t.speed for t in tracks])
+        speed = np.concatenate([t.speed for t in segments])
         residual = residual[speed <= np.quantile(speed, settings.slowest_share)]
     measured = np.array(
         [_deviation(residual[:, k], period_s, width, velocity=k > 2, settings=settings) for k in range(6)]

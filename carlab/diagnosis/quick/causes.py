@@ -99,7 +99,7 @@ def find_causes(
         settings: amount of work and thresholds.
     """
     fitter = Fitter(windows, scale_of(windows, floor, settings))
-    reference = fitter.loss(simulator, max_error=settings.max_unseen_error)
+    reference = fitter.loss(simulator, max_error=settings.max_left_out_error)
     perfect = 0.5 * len(fitter.scale.steps) * 6 * len(windows)
     excess = max(float(reference.sum()) - perfect, 1e-9)
     halves = _halves(windows)
@@ -212,8 +212,10 @@ def _test(
     for mine, others in (halves, halves[::-1]):
         own = Fitter(fitter.windows.take(mine), fitter.scale)
         fits.append(own.fit(candidate.config, candidate.free, start, iterations=iterations))
-        unseen = Fitter(fitter.windows.take(others), fitter.scale)
-        loss[others] = unseen.loss(candidate.config, candidate.free, fits[-1].z, max_error=settings.max_unseen_error)
+        left_out = Fitter(fitter.windows.take(others), fitter.scale)
+        loss[others] = left_out.loss(
+            candidate.config, candidate.free, fits[-1].z, max_error=settings.max_left_out_error
+        )
     return _Tested(candidate, loss, (fits[0], fits[1]))
 
 

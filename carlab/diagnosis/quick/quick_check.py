@@ -29,7 +29,7 @@ from carlab.diagnosis.state_alignment import align_states, window_variance_s2, w
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.initial_states import without_curvature_bias
 from carlab.prediction.predict import simulate_windows
-from carlab.prediction.windows import HISTORY_S, PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import HISTORY_S, PredictionWindows, cut_windows, segments_of
 from sim_backends.car_parameters import SimulatorConfig
 
 SCHEMA = "carlab.light_diagnosis/1"
@@ -145,7 +145,7 @@ def held_out_loss(
     except DataError:
         return None
     fitter = Fitter(windows, scale_of(windows, floor, settings))
-    return [float(fitter.loss(each, max_error=settings.max_unseen_error).sum()) for each in simulators]
+    return [float(fitter.loss(each, max_error=settings.max_left_out_error).sum()) for each in simulators]
 
 
 def _checked(
@@ -180,15 +180,15 @@ def _windows(
     episodes: Sequence[EpisodeData], simulator: SimulatorConfig, window_s2: float | None, settings: QuickSettings
 ) -> tuple[PredictionWindows, FloatArray]:
     """Windows of all recordings, and the noise floor along them (K + 1, 6). Raises DataError without windows."""
-    tracks = tracks_of([e for e in episodes if e.ticks >= 2])
-    if not tracks:
+    segments = segments_of([e for e in episodes if e.ticks >= 2])
+    if not segments:
         raise DataError("No recording has an unbroken stretch of half a second.")
-    few = len({t.recording for t in tracks}) < settings.few_episodes
+    few = len({t.recording for t in segments}) < settings.few_episodes
     block_s = settings.short_block_s if few else settings.block_s
-    windows = cut_windows(tracks, settings.window_s, settings.stride_s, block_s).thinned(settings.max_windows)
+    windows = cut_windows(segments, settings.window_s, settings.stride_s, block_s).thinned(settings.max_windows)
     variance_s2 = velocity_window_variance_s2(windows, simulator) if window_s2 is None else window_s2
     windows = without_curvature_bias(replace(windows, velocity_window_s2=variance_s2), simulator)
-    return windows, noise_floor(windows, estimate_noise(tracks, windows.curvature_bias), simulator)
+    return windows, noise_floor(windows, estimate_noise(segments, windows.curvature_bias), simulator)
 
 
 def _score(final: FloatArray, windows: PredictionWindows) -> tuple[float, float]:

@@ -13,12 +13,12 @@ from carlab.core.errors import DataError
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.diagnosis.findings import DataFault
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.dynamics.integrate import MAX_STEP_S
 
-WINDOWS = 64
+MAX_WINDOWS = 64
 HORIZON_S = 1.0
 
 
@@ -31,14 +31,14 @@ def check_integration(
     because a spinning car amplifies all errors. Returns an empty list without windows.
     """
     try:
-        tracks = tracks_of(fit)
-        if not tracks:
+        segments = segments_of(fit)
+        if not segments:
             return []
-        windows = cut_windows(tracks, HORIZON_S, 0.5)
+        windows = cut_windows(segments, HORIZON_S, 0.5)
     except DataError:
         return []
-    windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, WINDOWS).round().astype(np.int64)))
-    noise = estimate_noise(tracks, windows.curvature_bias).measured
+    windows = windows.take(np.unique(np.linspace(0, len(windows) - 1, MAX_WINDOWS).round().astype(np.int64)))
+    noise = estimate_noise(segments, windows.curvature_bias).measured
     with np.errstate(all="ignore"):  # a step that is far too coarse overflows
         difference = np.abs(_ends(windows, nominal, max_step_s) - _ends(windows, nominal, 0.25 * max_step_s))
     difference = np.where(np.isfinite(difference), difference, np.inf)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from carlab.diagnosis.findings import Change, Diagnosis, Drift
+from carlab.diagnosis.findings import Diagnosis, Drift, QuantityChange
 from carlab.diagnosis.report.numbers import listed, number, percent, with_unit
 from carlab.diagnosis.settings import DEFAULT
 
@@ -52,7 +52,7 @@ def drift_sentences(diagnosis: Diagnosis) -> list[str]:
     return made
 
 
-def _change_sentence(change: Change) -> str:
+def _change_sentence(change: QuantityChange) -> str:
     """The size of a change with its standard deviation, and the change along the recording if it is significant."""
     value = change.value
     if change.quantity == "steering trim":

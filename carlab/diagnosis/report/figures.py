@@ -1,4 +1,4 @@
-"""The report's figures, drawn from the exhibits of a diagnosis."""
+"""The report's figures, drawn from the figure data of a diagnosis."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from carlab.core.angles import wrap
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
-from carlab.diagnosis.findings import EffectFinding, Exhibits, Trace
+from carlab.diagnosis.findings import EffectFinding, FigureData, Trace
 from carlab.diagnosis.report.sentences import CHANNEL_WORDS, number, percent, unit_text
 from carlab.diagnosis.report.svg import Chart, bar_rows, padded
 
@@ -64,15 +64,15 @@ def residual(trace: Trace, which: str) -> FloatArray:
     return error
 
 
-def without_effects(exhibits: Exhibits) -> Exhibits:
+def without_effects(figure_data: FigureData) -> FigureData:
     """Remove the curves of the simulator with effects, for a verdict without effects."""
     traces = tuple(
         replace(t, predicted={m: rows for m, rows in t.predicted.items() if m != "with_effects"})
-        for t in exhibits.traces
+        for t in figure_data.traces
     )
-    ladder = tuple(rung for rung in exhibits.ladder if not rung[0].startswith("+ "))
-    regimes = {name: (x, a, np.full_like(a, np.nan)) for name, (x, a, _) in exhibits.regimes.items()}
-    return replace(exhibits, traces=traces, ladder=ladder, regimes=regimes, correlation={})
+    scores_by_step = tuple(step for step in figure_data.scores_by_step if not step[0].startswith("+ "))
+    regimes = {name: (x, a, np.full_like(a, np.nan)) for name, (x, a, _) in figure_data.regimes.items()}
+    return replace(figure_data, traces=traces, scores_by_step=scores_by_step, regimes=regimes, correlation={})
 
 
 def worst_stretch(traces: Sequence[Trace]) -> tuple[Trace, tuple[float, float]] | None:
@@ -158,11 +158,11 @@ def error_in_time(trace: Trace) -> Figure | None:
     return Figure(chart.render(), "")
 
 
-def regime_charts(exhibits: Exhibits) -> list[Figure]:
+def regime_charts(figure_data: FigureData) -> list[Figure]:
     """Error against each driving condition, for the refit and with effects."""
     made = []
-    top = padded([v for _, a, b in exhibits.regimes.values() for v in (*a, *b)])[1] if exhibits.regimes else 1.0
-    for name, (centres, before, after) in exhibits.regimes.items():
+    top = padded([v for _, a, b in figure_data.regimes.values() for v in (*a, *b)])[1] if figure_data.regimes else 1.0
+    for name, (centres, before, after) in figure_data.regimes.items():
         label = unit_text(name)
         chart = Chart(
             f"Error against {label}", padded(centres), (0.0, max(top, 1.2)), (300, 220), (label, "error [noise floors]")
@@ -175,11 +175,11 @@ def regime_charts(exhibits: Exhibits) -> list[Figure]:
     return made
 
 
-def correlation_chart(exhibits: Exhibits, effect_id: str) -> Figure | None:
+def correlation_chart(figure_data: FigureData, effect_id: str) -> Figure | None:
     """Cross-correlation of the refit's residual with the command of the effect, with its 99 % bounds."""
-    if effect_id not in exhibits.correlation:
+    if effect_id not in figure_data.correlation:
         return None
-    lags_s, values, bound = exhibits.correlation[effect_id]
+    lags_s, values, bound = figure_data.correlation[effect_id]
     reach = max(float(np.nanmax(np.abs(values), initial=0.0)), bound) * 1.15 + 1e-9
     chart = Chart(
         "Cross-correlation of the residual with the command",
@@ -209,12 +209,12 @@ def correlation_chart(exhibits: Exhibits, effect_id: str) -> Figure | None:
     return Figure(chart.render(), words)
 
 
-def ladder_chart(exhibits: Exhibits) -> Figure | None:
+def score_chart(figure_data: FigureData) -> Figure | None:
     """Scores of the car file, the refit, each added effect, and the noise floor."""
-    if not exhibits.ladder:
+    if not figure_data.scores_by_step:
         return None
     rows = []
-    for label, score in exhibits.ladder:
+    for label, score in figure_data.scores_by_step:
         added = label.startswith("+ ")
         words = "+ " + label[2:].replace("_", " ") if added else LABELS.get(label, label)
         style = "with_effects" if added else "floor" if "floor" in label else label if label in MODELS else "other"

@@ -8,7 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate, Exhibits
+from carlab.diagnosis.findings import Diagnosis, EffectFinding, Estimate, FigureData
 from carlab.diagnosis.report import figures
 from carlab.diagnosis.report import sentences as text
 from carlab.diagnosis.report.curves import ceiling_sentence, curve_charts, curve_sentences
@@ -19,7 +19,7 @@ from carlab.diagnosis.report.svg import interval_bar
 from carlab.diagnosis.settings import DEFAULT
 
 
-def render_page(diagnosis: Diagnosis, exhibits: Exhibits) -> str:
+def render_page(diagnosis: Diagnosis, figure_data: FigureData) -> str:
     """Render the page: self-contained, without scripts; all text from outside is escaped."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {
@@ -29,35 +29,35 @@ def render_page(diagnosis: Diagnosis, exhibits: Exhibits) -> str:
         "words": lambda name: name.replace("_", " "),
     }
     source = (resources.files("carlab.diagnosis.report") / "templates" / "report.html").read_text(encoding="utf-8")
-    return environment.from_string(source).render(**page_context(diagnosis, exhibits))
+    return environment.from_string(source).render(**page_context(diagnosis, figure_data))
 
 
-def page_context(diagnosis: Diagnosis, exhibits: Exhibits) -> dict[str, Any]:
+def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any]:
     """Variables of the template. Figures contain effects only if the verdict names some."""
-    exhibits = exhibits if diagnosis.effects else figures.without_effects(exhibits)
+    figure_data = figure_data if diagnosis.effects else figures.without_effects(figure_data)
     drive, why = text.next_drive(diagnosis)
     rest = diagnosis.unexplained
-    worst = figures.worst_stretch(exhibits.traces)
-    candidates = sorted((c for c in exhibits.candidates if math.isfinite(c[1])), key=lambda c: -c[1])
+    worst = figures.worst_stretch(figure_data.traces)
+    candidates = sorted((c for c in figure_data.candidates if math.isfinite(c[1])), key=lambda c: -c[1])
     return {
         "d": diagnosis,
         "title": text.verdict_title(diagnosis),
         "sentence": diagnosis.sentence if _has_own_sentence(diagnosis) else text.verdict_sentence(diagnosis),
         "cards": _cards(diagnosis),
-        "effects": [_effect(effect, exhibits) for effect in diagnosis.effects],
+        "effects": [_effect(effect, figure_data) for effect in diagnosis.effects],
         "overlay": figures.overlay(*worst, diagnosis.effects) if worst else [],
         "overlay_trace": worst[0].name if worst else "",
         "overlay_stretch": worst[1] if worst else (0.0, 0.0),
         "overlay_models": [m for m in figures.MODELS if worst and m in worst[0].predicted],
         "labels": figures.LABELS,
-        "in_time": [(t.name, f, t.marked) for t in exhibits.traces if (f := figures.error_in_time(t)) is not None],
-        "regimes": figures.regime_charts(exhibits),
-        "ladder": figures.ladder_chart(exhibits),
+        "in_time": [(t.name, f, t.marked) for t in figure_data.traces if (f := figures.error_in_time(t)) is not None],
+        "regimes": figures.regime_charts(figure_data),
+        "score_chart": figures.score_chart(figure_data),
         "explained": text.explained_share(diagnosis),
         "known": bool(diagnosis.effects) and math.isfinite(text.explained_share(diagnosis)),
-        "driven": bool(exhibits.traces),
+        "driven": bool(figure_data.traces),
         "candidates": [(text.effect_noun(c[0]), c[0], c[1]) for c in candidates[: DEFAULT.report.max_candidates]],
-        "tried": len(exhibits.candidates),
+        "candidate_count": len(figure_data.candidates),
         "curves": [(c, curve_charts(c)) for c in diagnosis.curves],
         "curve_sentences": curve_sentences(diagnosis),
         "ceiling": ceiling_sentence(diagnosis),
@@ -91,7 +91,7 @@ def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     return [{"label": figures.LABELS[k], "errors": diagnosis.held_out[k], "style": k} for k in shown]
 
 
-def _effect(effect: EffectFinding, exhibits: Exhibits) -> dict[str, Any]:
+def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
     where, evidence = effect.where, effect.evidence
     places = [f"in {text.listed([text.CHANNEL_WORDS.get(c, c) for c in where.channels])}"] if where.channels else []
     places.append(text.regime_words(where.regime))
@@ -122,7 +122,7 @@ def _effect(effect: EffectFinding, exhibits: Exhibits) -> dict[str, Any]:
         if effect.indistinguishable_from
         else "",
         "refutation": text.refutation_sentence(effect.id),
-        "correlation": figures.correlation_chart(exhibits, effect.id),
+        "correlation": figures.correlation_chart(figure_data, effect.id),
         "fingerprint": figures.fingerprint_chart(effect) if evidence.deletion_fingerprint else None,
     }
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
+from carlab.diagnosis.findings import Diagnosis, FigureData, Trace
 from carlab.diagnosis.settings import DEFAULT
 from carlab.recording.rerun import blueprint
 
@@ -33,19 +33,19 @@ COLORS = {
 }
 
 
-def draw_picture(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
+def draw_picture(diagnosis: Diagnosis, figure_data: FigureData, path: Path) -> None:
     """Write a PNG; panes without data are omitted.
 
     Args:
         diagnosis: the result.
-        exhibits: scores and traces.
+        figure_data: scores and traces.
         path: the file; an existing one is replaced.
     """
     figure = Figure(figsize=(13.0, 4.6), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
-    shown = [e for e in exhibits.traces if e.marked]
+    shown = [e for e in figure_data.traces if e.marked]
     panes = figure.subplots(1, 1 + min(len(shown), 2), squeeze=False)[0]
-    _ladder(panes[0], exhibits)
+    _draw_scores(panes[0], figure_data)
     for axes, trace in zip(panes[1:], shown, strict=False):
         _worst(axes, trace)
     names = (
@@ -58,9 +58,9 @@ def draw_picture(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _ladder(axes: Axes, exhibits: Exhibits) -> None:
-    labels = [name for name, _ in exhibits.ladder]
-    scores = np.array([score for _, score in exhibits.ladder])
+def _draw_scores(axes: Axes, figure_data: FigureData) -> None:
+    labels = [name for name, _ in figure_data.scores_by_step]
+    scores = np.array([score for _, score in figure_data.scores_by_step])
     places = np.arange(len(labels))[::-1]
     kinds = [COLORS.get(name, COLORS["with_effects"]) for name in labels]
     axes.barh(places, scores, color=[_color(blueprint.GREY) if n == "noise floor" else c for n, c in zip(labels, kinds,

@@ -21,7 +21,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.findings import Diagnosis, Exhibits, Trace
+from carlab.diagnosis.findings import Diagnosis, FigureData, Trace
 from carlab.diagnosis.report.events import event_label
 from carlab.diagnosis.report.figures import LABELS, MODELS, residual, restarts
 from carlab.diagnosis.report.sentences import number, verdict_sentence
@@ -40,24 +40,24 @@ CHANNELS = {"vx": 3, "vy": 4, "yaw_rate": 5}
 UNITS = {"position": "m", "yaw": "rad", "vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 
 
-def write_rrd(diagnosis: Diagnosis, exhibits: Exhibits, path: Path) -> None:
+def write_rrd(diagnosis: Diagnosis, figure_data: FigureData, path: Path) -> None:
     """Write the recording; an existing file is replaced when the new one is complete.
 
     Raises:
         DataError: the file cannot be written.
     """
-    parts = entity_names(exhibits)
-    with rerun_file(path, blueprint=_blueprint(parts, exhibits)) as stream:
+    parts = entity_names(figure_data)
+    with rerun_file(path, blueprint=_blueprint(parts, figure_data)) as stream:
         stream.send_recording_name("Diagnosis")
         stream.log(VERDICT, rr.TextDocument(_verdict(diagnosis), media_type=rr.MediaType.MARKDOWN), static=True)
-        for part, trace in zip(parts, exhibits.traces, strict=True):
+        for part, trace in zip(parts, figure_data.traces, strict=True):
             _send_trace(stream, part, trace, diagnosis)
 
 
-def entity_names(exhibits: Exhibits) -> list[str]:
+def entity_names(figure_data: FigureData) -> list[str]:
     """First part of the entity paths of each trace: its name, with a number if names are equal."""
     names: list[str] = []
-    for trace in exhibits.traces:
+    for trace in figure_data.traces:
         name = base = entity_part(trace.name)
         count = 2
         while name in (*names, VERDICT):
@@ -171,8 +171,8 @@ def _send_marks(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: 
         stream.log(f"{part}/marks", rr.TextLog(words, level=level))
 
 
-def _blueprint(parts: list[str], exhibits: Exhibits) -> rrb.Blueprint:
-    tabs = [_tab(part, trace) for part, trace in zip(parts, exhibits.traces, strict=True)]
+def _blueprint(parts: list[str], figure_data: FigureData) -> rrb.Blueprint:
+    tabs = [_tab(part, trace) for part, trace in zip(parts, figure_data.traces, strict=True)]
     verdict = rrb.TextDocumentView(origin=f"/{VERDICT}", name="Verdict")
     return rrb.Blueprint(
         rrb.Tabs(*tabs, verdict, active_tab=0),

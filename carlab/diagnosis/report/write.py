@@ -15,7 +15,7 @@ import tomli_w
 from carlab.core.errors import DataError
 from carlab.core.recording_noise import RecordingNoise
 from carlab.diagnosis.decisions import to_dict
-from carlab.diagnosis.findings import Diagnosis, Exhibits
+from carlab.diagnosis.findings import Diagnosis, FigureData
 from carlab.diagnosis.report import sentences as text
 from carlab.recording.atomic_files import write_text
 from carlab.recording.sink import describe_os_error, make_folder
@@ -29,7 +29,7 @@ DECISIONS_NAME = "decisions.json"
 COMMENT_CHARACTERS = 110
 
 
-def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: SimulatorConfig) -> None:
+def write_report(diagnosis: Diagnosis, figure_data: FigureData, folder: Path, model: SimulatorConfig) -> None:
     """Write the whole report and replace an existing one.
 
     Each file is written atomically. report.json is written last, so if it exists, all files exist. A diagnosis
@@ -37,7 +37,7 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
 
     Args:
         diagnosis: the result.
-        exhibits: data of the figures; may be empty.
+        figure_data: data of the figures; may be empty.
         folder: created if missing.
         model: the simulator with the fitted parameters and effects, for model.toml.
 
@@ -52,8 +52,8 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
     complete = completed(diagnosis)
     report = json.dumps(complete.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     texts = {
-        MODEL_NAME: model_toml(complete, model, exhibits.noise),
-        HTML_NAME: render_page(diagnosis, exhibits),
+        MODEL_NAME: model_toml(complete, model, figure_data.noise),
+        HTML_NAME: render_page(diagnosis, figure_data),
         JSON_NAME: report,
     }
     try:
@@ -63,17 +63,17 @@ def write_report(diagnosis: Diagnosis, exhibits: Exhibits, folder: Path, model: 
         (folder / PICTURE_NAME).unlink(missing_ok=True)
     except OSError as error:
         raise DataError(describe_os_error(error, folder)) from error
-    write_rrd(complete, exhibits, folder / RRD_NAME)
-    if exhibits.ladder:
-        draw_picture(complete, exhibits, folder / PICTURE_NAME)
+    write_rrd(complete, figure_data, folder / RRD_NAME)
+    if figure_data.scores_by_step:
+        draw_picture(complete, figure_data, folder / PICTURE_NAME)
     for name, content in texts.items():
         write_text(folder / name, content)
 
 
-def write_decisions(exhibits: Exhibits, folder: Path) -> Path:
+def write_decisions(figure_data: FigureData, folder: Path) -> Path:
     """Write decisions.json into a folder and return its path."""
     path = folder / DECISIONS_NAME
-    write_text(path, json.dumps(to_dict(exhibits.decisions), indent=1, allow_nan=False) + "\n")
+    write_text(path, json.dumps(to_dict(figure_data.decisions), indent=1, allow_nan=False) + "\n")
     return path
 
 

@@ -1,4 +1,4 @@
-"""Candidates for the next effect: screening, refit, test on unseen blocks, acceptance.
+"""Candidates for the next effect: screening, refit, test on left-out blocks, acceptance.
 
 A gain in likelihood is divided by its design effect, the ratio of the sandwich covariance to the naive one (Kent 1982),
 because neighbouring errors are dependent. It must hold on blocks of the recording that are not fitted.
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 def next_candidates(problem: SearchProblem, model: Model, control: RunControl) -> tuple[Candidate, ...]:
-    """Refitted candidates, sorted by gain; those tested on unseen blocks come first."""
+    """Refitted candidates, sorted by gain; those tested on left-out blocks come first."""
     names = [n for n in problem.candidates if n not in model.effects and problem.is_candidate(n)]
     screened = screen_candidates(problem, model, names, control)
     chosen = _to_refit(problem, model, screened)
@@ -58,31 +58,33 @@ def _to_refit(
 def _tested(
     problem: SearchProblem, model: Model, refitted: list[Candidate], control: RunControl
 ) -> tuple[Candidate, ...]:
-    """Test the candidates with the largest gains on unseen blocks."""
+    """Test the candidates with the largest gains on left-out blocks."""
     settings = problem.settings.selection
     fitter = problem.fitter(model.scale)
-    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_unseen_error)
+    reference = fitter.leave_fold_out_loss(model.fit, problem.folds(), settings.max_left_out_error)
     min_gain = settings.min_gain_share * refitted[0].gain
     count = sum(c.gain >= min_gain or k < 2 for k, c in enumerate(refitted))
     share = (len(model.effects) + 0.7) / settings.max_effects
     tested = control.workers.map(
-        with_unseen_gain,
+        with_left_out_gain,
         [(problem.without_refits(), fitter, candidate, reference) for candidate in refitted[:count]],
         stop=control.ends_search,
         started=lambda k: control.progress(f"cross-validating {refitted[k].effect}", share),
     )
     found = [new or old for new, old in zip(tested, refitted[:count], strict=True)] + refitted[count:]
-    found.sort(key=lambda c: (not c.is_tested, -(c.gain + c.unseen_gain)))
+    found.sort(key=lambda c: (not c.is_tested, -(c.gain + c.left_out_gain)))
     for c in found:
         if c.is_tested:
             _log(problem, model, c)
     return tuple(found)
 
 
-def with_unseen_gain(problem: SearchProblem, fitter: Fitter, candidate: Candidate, reference: FloatArray) -> Candidate:
-    """The candidate with its chi2 and with its gain over ``reference`` (S,) on blocks that are not fitted."""
+def with_left_out_gain(
+    problem: SearchProblem, fitter: Fitter, candidate: Candidate, reference: FloatArray
+) -> Candidate:
+    """The candidate with its chi2 and with its gain over ``reference`` (S,) on left-out blocks."""
     fit = fitter.with_covariance(candidate.fit)
-    loss = fitter.leave_fold_out_loss(fit, problem.folds(), problem.settings.selection.max_unseen_error)
+    loss = fitter.leave_fold_out_loss(fit, problem.folds(), problem.settings.selection.max_left_out_error)
     gain, error = clustered_gain(reference, loss, problem.windows)
     chi2 = 2.0 * candidate.gain / design_effect_of(fit, candidate.effect)
     return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)
@@ -91,18 +93,18 @@ def with_unseen_gain(problem: SearchProblem, fitter: Fitter, candidate: Candidat
 def acceptance(problem: SearchProblem, candidate: Candidate) -> tuple[tuple[Condition, ...], ...]:
     """Alternative sets of conditions; a candidate is accepted if all conditions of one set hold."""
     settings = problem.settings.selection
-    share = candidate.unseen_gain / problem.perfect_loss()
-    ratio = candidate.unseen_gain / candidate.gain if candidate.gain > 0.0 else -math.inf
+    share = candidate.left_out_gain / problem.perfect_loss()
+    ratio = candidate.left_out_gain / candidate.gain if candidate.gain > 0.0 else -math.inf
     extra = problem.required_chi2(candidate.effect) - settings.accept_chi2_min
-    holds_unseen = Condition("selection.accept_unseen_ratio", ratio, settings.accept_unseen_ratio)
+    holds_left_out = Condition("selection.accept_unseen_ratio", ratio, settings.accept_unseen_ratio)
     return (
         (
-            holds_unseen,
+            holds_left_out,
             Condition("selection.accept_chi2_min", candidate.chi2 - extra, settings.accept_chi2_min),
             Condition("selection.accept_unseen_share", share, settings.accept_unseen_share),
         ),
         (
-            holds_unseen,
+            holds_left_out,
             Condition("selection.steady_z_min", candidate.standard_errors, settings.steady_z_min),
             Condition("selection.steady_unseen_share", share, settings.steady_unseen_share),
         ),
@@ -130,9 +132,9 @@ def accepted(
 def _log(problem: SearchProblem, model: Model, c: Candidate) -> None:
     numbers = {k: round(v, 4) for k, v in c.fit.values().items() if k.startswith("effects." + c.effect)}
     log.info(
-        "candidate %d %s: gain %.1f, chi2 %.1f (required %.0f), unseen gain %.1f (%.1f standard errors, share %.3f) %s",
-        len(model.effects), c.effect, c.gain, c.chi2, problem.required_chi2(c.effect), c.unseen_gain,
-        c.standard_errors, c.unseen_gain / problem.perfect_loss(), numbers,
+        "candidate %d %s: gain %.1f, chi2 %.1f (required %.0f), left-out gain %.1f (%.1f std errors, share %.3f) %s",
+        len(model.effects), c.effect, c.gain, c.chi2, problem.required_chi2(c.effect), c.left_out_gain,
+        c.standard_errors, c.left_out_gain / problem.perfect_loss(), numbers,
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def effect_of_each_command(model: Model, name: str) -> tuple[str, ...]:
 
 
 def confusable_shared_delays(model: Model) -> list[tuple[str, str]]:
-    """Pairs of an accepted effect and a delay of both commands that resembles it beside the effect of the other one.
+    """Pairs of an accepted delay or lag of one command and a delay of both commands that may replace it.
 
     A delay of both commands replaces the shorter of two delays or lags; the longer one becomes shorter by it.
     """

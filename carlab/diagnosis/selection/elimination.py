@@ -1,4 +1,4 @@
-"""Backward elimination: remove effects whose removal does not increase the loss on unseen blocks."""
+"""Backward elimination: remove effects whose removal does not increase the loss on left-out blocks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Deletion:
-    """A refitted model without one effect, and the increase of its loss on unseen blocks in standard errors."""
+    """A refitted model without one effect, and the increase of its loss on left-out blocks in standard errors."""
 
     without: Fit
     standard_errors: float
@@ -35,7 +35,7 @@ def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> di
     if not model.effects:
         return {}
     fitter = problem.fitter(model.scale)
-    folds, limit = problem.folds(), problem.settings.selection.max_unseen_error
+    folds, limit = problem.folds(), problem.settings.selection.max_left_out_error
     with_all = fitter.leave_fold_out_loss(model.fit, folds, limit)
     found = {}
     for name, reduced in refit_without_each(problem, model, control).items():
@@ -46,7 +46,7 @@ def delete_each(problem: SearchProblem, model: Model, control: RunControl) -> di
 
 
 def eliminate(problem: SearchProblem, model: Model, control: RunControl) -> EliminationResult:
-    """Remove the weakest effect on unseen blocks until all remaining effects are significant."""
+    """Remove the weakest effect on left-out blocks until all remaining effects are significant."""
     keep_z_min = problem.settings.selection.keep_z_min
     deletions = delete_each(problem, model, control)
     while len(model.effects) > 1 and not control.stop():
@@ -57,7 +57,7 @@ def eliminate(problem: SearchProblem, model: Model, control: RunControl) -> Elim
         control.record(Decision("keep", weakest, ((condition,),), kept, len(model.effects)))
         if kept:
             break
-        log.info("removed %s: the loss on unseen blocks rises by %.1f standard errors only", weakest, z)
+        log.info("removed %s: the loss on left-out blocks rises by %.1f standard errors only", weakest, z)
         model = Model(tuple(e for e in model.effects if e != weakest), deletions[weakest].without, model.scale)
         deletions = delete_each(problem, model, control)
     return EliminationResult(model, deletions)

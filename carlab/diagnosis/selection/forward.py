@@ -1,7 +1,7 @@
 """Forward selection along several paths.
 
 A greedy search can take a wrong turn: its first effect may be a proxy of two others. Where the greedy path has several
-effects and leaves a part of the excess, other choices are followed to their end, and unseen blocks choose between the
+effects and leaves a part of the excess, other choices are followed to their end, and left-out blocks choose between the
 paths (limited discrepancy search, Harvey and Ginsberg 1995, with one deviation from the greedy choices).
 """
 
@@ -37,15 +37,15 @@ class Choice:
 class Path:
     """Effects added to the base model one after the other.
 
-    model         fit with all effects
-    history       (effect, fit) in the order of acceptance
-    tried         candidates for the first effect of this path
-    alternatives  further accepted candidates of each step, not confusable with the one that was added
+    model             fit with all effects
+    history           (effect, fit) in the order of acceptance
+    first_candidates  candidates for the first effect of this path
+    alternatives      further accepted candidates of each step, not confusable with the one that was added
     """
 
     model: Model
     history: tuple[tuple[str, Fit], ...] = ()
-    tried: tuple[Candidate, ...] = ()
+    first_candidates: tuple[Candidate, ...] = ()
     alternatives: tuple[Choice, ...] = ()
 
 
@@ -58,7 +58,7 @@ def extend(
         count = len(path.model.effects)
         control.progress(f"searching for effect {count + 1}", count / max_effects)
         candidates = next_candidates(problem, path.model, control)
-        path = path if path.history else replace(path, tried=candidates)
+        path = path if path.history else replace(path, first_candidates=candidates)
         chosen = accepted(problem, path.model, candidates, control)
         if control.ends_search() or not chosen:
             break
@@ -71,12 +71,13 @@ def extend(
 
 
 def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunControl) -> Path:
-    """The greedy path, or the path with one other choice that predicts unseen blocks significantly better."""
+    """The greedy path, or the path with one other choice that predicts left-out blocks significantly better."""
     settings = problem.settings.selection
     if len(greedy.model.effects) < settings.min_effects_for_alternatives:
         return greedy
     best, visited = greedy, {frozenset(greedy.model.effects)}
-    choices = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.unseen_gain)[: settings.max_alternatives]
+    best_first = sorted(greedy.alternatives, key=lambda choice: -choice.candidate.left_out_gain)
+    choices = best_first[: settings.max_alternatives]
     for k, choice in enumerate(choices):
         if control.ends_search() or remaining_excess(problem, base, best.model) < settings.min_remaining_excess:
             break
@@ -86,7 +87,7 @@ def best_path(problem: SearchProblem, base: Model, greedy: Path, control: RunCon
         path = extend(problem, _add(problem, choice.path, (choice.candidate,), labelled), labelled, visited)
         visited.add(frozenset(path.model.effects))
         if _is_better(problem, path.model, best.model):
-            log.info("the alternative predicts unseen blocks better: %s", ", ".join(path.model.effects))
+            log.info("the alternative predicts left-out blocks better: %s", ", ".join(path.model.effects))
             best = path
     return best
 
@@ -105,7 +106,9 @@ def _add(problem: SearchProblem, path: Path, chosen: tuple[Candidate, ...], cont
     model = apply_moves(problem, added, control)
     confusable = problem.confusable.get(leader.effect, ())
     others = tuple(Choice(path, c) for c in chosen[1:] if c.effect not in confusable)
-    return Path(model, (*path.history, (leader.effect, model.fit)), path.tried, (*path.alternatives, *others))
+    return Path(
+        model, (*path.history, (leader.effect, model.fit)), path.first_candidates, (*path.alternatives, *others)
+    )
 
 
 def _labelled(control: RunControl, label: str) -> RunControl:
@@ -118,14 +121,14 @@ def _labelled(control: RunControl, label: str) -> RunControl:
 
 
 def _is_better(problem: SearchProblem, model: Model, reference: Model) -> bool:
-    """Whether a model predicts unseen blocks significantly better than the reference, with the reference's scale."""
+    """Whether a model predicts left-out blocks significantly better than the reference, with the reference's scale."""
     settings = problem.settings.selection
     fitter = problem.fitter(reference.scale)
     loss, reference_loss = (
-        fitter.leave_fold_out_loss(m.fit, problem.folds(), settings.max_unseen_error) for m in (model, reference)
+        fitter.leave_fold_out_loss(m.fit, problem.folds(), settings.max_left_out_error) for m in (model, reference)
     )
     gain, error = clustered_gain(reference_loss, loss, problem.windows)
-    log.info("unseen gain of the alternative: %.1f (%.1f standard errors)", gain, gain / error)
+    log.info("gain on left-out blocks of the alternative: %.1f (%.1f standard errors)", gain, gain / error)
     return gain > settings.tie_z * error
 
 

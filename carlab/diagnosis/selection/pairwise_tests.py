@@ -1,6 +1,6 @@
-"""Pairwise comparison of each accepted effect with its confusable effects on unseen blocks.
+"""Pairwise comparison of each accepted effect with its confusable effects on left-out blocks.
 
-The comparison is that of non-nested models (Vuong 1989), with losses on blocks that are not fitted and standard errors
+The comparison is that of non-nested models (Vuong 1989), with losses on left-out blocks and standard errors
 clustered by block. Confusable effects differ little, so the initial states of the windows are free
 (``free_initial_states``).
 """
@@ -29,8 +29,8 @@ class PairwiseResult:
     """Strength and rivals of each accepted effect.
 
     chi2     twice the gain of the effect over its design effect
-    rivals   effects that unseen blocks do not distinguish from it, the nearest first
-    better   the confusable effect that predicts unseen blocks best, if it does so better than the effect
+    rivals   effects that left-out blocks do not distinguish from it, the nearest first
+    better   the confusable effect that predicts left-out blocks best, if it does so better than the effect
     """
 
     chi2: Mapping[str, float] = field(default_factory=dict)
@@ -41,7 +41,7 @@ class PairwiseResult:
 def choose_confusable(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> tuple[Model, PairwiseResult]:
-    """Replace effects of a model by confusable effects that predict unseen blocks better."""
+    """Replace effects of a model by confusable effects that predict left-out blocks better."""
     pairs = compare_pairs(problem, eliminated, control)
     for _ in eliminated.model.effects:
         if not pairs.better or control.stop():
@@ -62,7 +62,7 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
     if not model.effects:
         return PairwiseResult()
     with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
-    own_loss = unseen_loss(problem, model.fit, model.scale)
+    own_loss = left_out_loss(problem, model.fit, model.scale)
     fitted = _fitted_rivals(problem, eliminated, control)
     chi2, rivals, better = {}, {}, {}
     for name in model.effects:
@@ -85,7 +85,7 @@ def _fitted_rivals(
 ) -> dict[str, list[tuple[Candidate, FloatArray]]]:
     """For each effect of a model, the confusable effects in its place that explain a similar part.
 
-    Each has its loss on unseen blocks (S,).
+    Each has its loss on left-out blocks (S,).
     """
     model = eliminated.model
     confusable = [(name, other) for name in model.effects for other in problem.confusable.get(name, ())]
@@ -110,7 +110,7 @@ def _fitted_rivals(
 def _fitted_rival(
     problem: SearchProblem, model: Model, without: Fit, name: str, other: str
 ) -> tuple[Candidate, FloatArray] | None:
-    """Fit ``other`` in place of ``name``, with its loss on unseen blocks (S,); None if it explains too little."""
+    """Fit ``other`` in place of ``name``, with its loss on left-out blocks (S,); None if it explains too little."""
     screening = problem.settings.screening
     reduced = Model(tuple(e for e in model.effects if e != name), without, model.scale)
     fitter, config = problem.fitter(model.scale), problem.config_with(reduced.effects)
@@ -118,10 +118,10 @@ def _fitted_rival(
     rival = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
     if rival.gain < problem.settings.selection.min_gain_share * (without.cost - model.fit.cost):
         return None
-    return rival, unseen_loss(problem, rival.fit, model.scale)
+    return rival, left_out_loss(problem, rival.fit, model.scale)
 
 
-def unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
+def left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
     """Loss of each window (S,) by a fit without its fold, with free initial states."""
     return loss_of_free_initial_states(
         problem.windows,
@@ -129,9 +129,9 @@ def unseen_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:
         fit.free,
         problem.fitter(scale).leave_fold_out_coordinates(fit, problem.folds()),
         problem.measured_std,
-        max_error=problem.settings.selection.max_unseen_error,
+        max_error=problem.settings.selection.max_left_out_error,
         settings=problem.settings.identification,
     )
 
 
-__all__ = ["PairwiseResult", "choose_confusable", "compare_pairs", "unseen_loss"]
+__all__ = ["PairwiseResult", "choose_confusable", "compare_pairs", "left_out_loss"]

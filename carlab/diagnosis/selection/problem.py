@@ -108,45 +108,45 @@ class Model:
 class Candidate:
     """An effect added to a model.
 
-    gain            fall of the loss on the windows that are fitted
-    chi2            twice the gain over its design effect
-    unseen_gain     fall of the loss on blocks that are not fitted; -inf if not tested
-    unseen_error    its clustered standard error
-    unseen_loss     of each window (S,); empty if not tested
+    gain                 fall of the loss on the windows that are fitted
+    chi2                 twice the gain over its design effect
+    left_out_gain        fall of the loss on left-out blocks in cross-validation; -inf if not tested
+    left_out_gain_error  its clustered standard error
+    left_out_loss        of each window (S,), by the fit without its fold; empty if not tested
     """
 
     effect: str
     fit: Fit
     gain: float
     chi2: float = 0.0
-    unseen_gain: float = -math.inf
-    unseen_error: float = math.inf
-    unseen_loss: FloatArray = field(default_factory=lambda: np.zeros(0))
+    left_out_gain: float = -math.inf
+    left_out_gain_error: float = math.inf
+    left_out_loss: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def is_tested(self) -> bool:
-        """Whether it was tested on unseen blocks."""
-        return len(self.unseen_loss) > 0
+        """Whether it was tested on left-out blocks."""
+        return len(self.left_out_loss) > 0
 
     @property
     def standard_errors(self) -> float:
-        """Unseen gain in standard errors."""
-        return self.unseen_gain / self.unseen_error if math.isfinite(self.unseen_error) else 0.0
+        """Gain on left-out blocks in standard errors."""
+        return self.left_out_gain / self.left_out_gain_error if math.isfinite(self.left_out_gain_error) else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
     """Result of a search.
 
-    base      refit without effects
-    best      fit with the accepted effects
-    effects   accepted, the strongest first
-    chi2      chi2 of the removal of each accepted effect from ``best``
-    rivals    effects that unseen blocks do not distinguish from each accepted effect
-    history   (effect, fit) in the order of acceptance
-    tried     candidates for the first effect
-    scale     error scale of ``best``
-    is_complete  whether the search ended by itself and was not cut short
+    base              refit without effects
+    best              fit with the accepted effects
+    effects           accepted, the strongest first
+    chi2              chi2 of the removal of each accepted effect from ``best``
+    rivals            effects that left-out blocks do not distinguish from each accepted effect
+    history           (effect, fit) in the order of acceptance
+    first_candidates  candidates for the first effect
+    scale             error scale of ``best``
+    is_complete       whether the search ended by itself and was not cut short
     """
 
     base: Fit
@@ -155,7 +155,7 @@ class SearchResult:
     chi2: Mapping[str, float]
     rivals: Mapping[str, tuple[str, ...]]
     history: tuple[tuple[str, Fit], ...]
-    tried: tuple[Candidate, ...]
+    first_candidates: tuple[Candidate, ...]
     scale: Scale
     is_complete: bool = True
 

@@ -1,8 +1,8 @@
 """Forward selection of missing effects.
 
-Each step screens all candidates, refits the best of them together with the base parameters, tests them on unseen
-blocks, accepts one, and applies moves. Where several effects leave a part of the excess, other choices are followed.
-Elimination and the choice between confusable effects come last. The stages exchange fitted models
+Each step screens all candidates, refits the best of them together with the base parameters, tests them on
+left-out blocks, accepts one, and applies moves. Where several effects leave a part of the excess, other choices are
+followed. Elimination and the choice between confusable effects come last. The stages exchange fitted models
 (``selection.problem``); no stage calls a later stage.
 """
 
@@ -30,7 +30,15 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
     model, pairs = choose_confusable(problem, eliminated, control)
     ordered = tuple(sorted(model.effects, key=lambda e: -pairs.chi2[e]))
     return SearchResult(
-        base.fit, model.fit, ordered, pairs.chi2, pairs.rivals, path.history, greedy.tried, model.scale, is_complete
+        base.fit,
+        model.fit,
+        ordered,
+        pairs.chi2,
+        pairs.rivals,
+        path.history,
+        greedy.first_candidates,
+        model.scale,
+        is_complete,
     )
 
 

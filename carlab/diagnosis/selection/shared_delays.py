@@ -19,7 +19,7 @@ from carlab.diagnosis.decisions import Condition, Decision
 from carlab.diagnosis.identification.fit import Fit, clustered_gain, design_effect_of
 from carlab.diagnosis.selection.delay_groups import effect_of_each_command, group_lags_s
 from carlab.diagnosis.selection.elimination import EliminationResult, eliminate
-from carlab.diagnosis.selection.pairwise_tests import unseen_loss
+from carlab.diagnosis.selection.pairwise_tests import left_out_loss
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit
 from carlab.diagnosis.settings import SelectionSettings
@@ -33,7 +33,7 @@ class _Replacement:
     """A fit with ``new`` effects in place of ``old`` ones.
 
     chi2   twice its gain over the design effect
-    loss   of each window (S,) on unseen blocks, with free initial states
+    loss   of each window (S,) on left-out blocks, with free initial states
     """
 
     old: frozenset[str]
@@ -46,7 +46,7 @@ class _Replacement:
 def replace_shared_delays(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> EliminationResult:
-    """Replace accepted delays and lags by other delays and lags that predict held-out blocks better."""
+    """Replace accepted delays and lags by other delays and lags that predict left-out blocks better."""
     for name in (name for name, effect in EFFECTS.items() if effect.split_into):
         model = eliminated.model
         exchanges = (_splits if name in model.effects else _merges)(problem, model, name)
@@ -55,7 +55,7 @@ def replace_shared_delays(
         control.progress(f"comparing {name} with delays and lags of single commands", 0.94)
         arguments = [(problem.without_refits(), model, *exchange) for exchange in exchanges]
         fitted = [each for each in control.workers.map(_fitted, arguments, stop=control.stop) if each is not None]
-        own_loss = unseen_loss(problem, model.fit, model.scale) if fitted else np.zeros(0)
+        own_loss = left_out_loss(problem, model.fit, model.scale) if fitted else np.zeros(0)
         passing = [each for each in fitted if _passes(problem, model, each, own_loss, control)]
         if passing:
             best = min(passing, key=lambda each: float(each.loss.sum()))
@@ -115,7 +115,7 @@ def _fitted(problem: SearchProblem, model: Model, old: frozenset[str], new: dict
     chi2 = 2.0 * (model.fit.cost - fit.cost) / max(design_effect_of(with_covariance, e) for e in new)
     if chi2 < (settings.accept_chi2_min if len(new) > len(old) else -settings.accept_chi2_min):
         return None
-    return _Replacement(old, tuple(new), fit, chi2, unseen_loss(problem, fit, model.scale))
+    return _Replacement(old, tuple(new), fit, chi2, left_out_loss(problem, fit, model.scale))
 
 
 def _passes(
@@ -134,12 +134,12 @@ def _passes(
 def _conditions(replacement: _Replacement, z: float, settings: SelectionSettings) -> tuple[Condition, ...]:
     """Conditions of a replacement, by the number of its effects.
 
-    An additional effect needs the significance of any accepted effect. An equal number needs a lower loss on held-out
+    An additional effect needs the significance of any accepted effect. An equal number needs a lower loss on left-out
     blocks. Fewer effects need a loss that is not significantly higher.
 
     Args:
         replacement: the new and the old effects.
-        z: fall of the loss on held-out blocks [standard errors].
+        z: fall of the loss on left-out blocks [standard errors].
         settings: thresholds.
     """
     if len(replacement.new) > len(replacement.old):

@@ -1,8 +1,8 @@
 """Settings of the diagnosis: thresholds and search parameters of all stages, with meaning, unit and reason.
 
-"Development cases" are the concealed cases of ``carlab prove --set development``; figures of the test set were never
-used to choose a setting. ``carlab prove --set development --calibrate`` sweeps the
-thresholds that accept or reject effects.
+The thresholds that accept or reject effects are chosen on the concealed cases of ``carlab prove --set development``,
+never on the test set. ``carlab prove --set development --calibrate`` states the false and missed names over the range
+of each of them.
 """
 
 from __future__ import annotations

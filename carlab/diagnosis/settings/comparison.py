@@ -64,8 +64,7 @@ class ComparisonSettings:
     """Maximum number of changes."""
     model_error_share: float = 0.1
     """Standard deviation of a size due to the error of the model, as a share of the size: a wrong model predicts the
-    influence of a change with a relative error. On 24 development cases of the ETH RC car (seed 12), sizes of correctly
-    named changes had a relative root mean square error of 0.09, without one whose influence another change took."""
+    influence of a change with a relative error, about 0.1 for sizes of correctly named changes of a real car."""
     tie_z: float = 2.0
     """Two candidates are indistinguishable if their losses on the second group differ by less [standard errors]."""
     period_ratio_max: float = 1.2

@@ -12,7 +12,7 @@ class DriftSettings:
     min_time_constant_s: float = 100.0
     """Minimum time constant [s] of a drift; what changes within 10 s may be an error that depends on the state."""
     gain_z_min: float = 2.0
-    """Minimum gain of the adapted prediction on unseen windows [standard errors], and of each reported quantity."""
+    """Minimum gain of the adapted prediction on held-out windows [standard errors], and of each reported quantity."""
     change_z_min: float = 2.0
     """Minimum change of a reported quantity [standard deviations]."""
     min_blocks: int = 4

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class EventSettings:
-    """When a motion is an event. Chosen on ETH train_1 and on 125 drives of the generator, which no test uses."""
+    """When a motion is an event. Chosen on a real recording and on simulated drives that no test uses."""
 
     widths_s: tuple[float, ...] = (0.034, 0.068)
     """Widths [s] over which the velocities before and after a row are averaged: one and two rows at 30 Hz. A collision
@@ -19,7 +19,7 @@ class EventSettings:
     usual_quantile: float = 0.98
     """Quantile of the changes of a recording that counts as usual driving: its hardest braking and steering."""
     usual_factor: float = 1.45
-    """Minimum change, over the usual one. The ETH car brakes and drives with 1.5 times the grip of its car file."""
+    """Minimum change, over the usual one. The car may brake and drive with more than the grip of its car file."""
     noise_z: float = 6.0
     """Minimum change [standard deviations of its noise]. Errors of stamps have long tails."""
     steady_widths: int = 9

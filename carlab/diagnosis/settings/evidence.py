@@ -18,19 +18,19 @@ class EvidenceSettings:
     interval_z: float = 1.6449
     """Quantile of the normal distribution for 90 % intervals."""
     interval_factor: float = 1.25
-    """Factor on the width of intervals of the sandwich covariance, which covered 79 % on development cases."""
+    """Factor on the width of 90 % intervals of the sandwich covariance, which alone cover 79 % on development cases."""
     min_relative_std: float = 0.01
     """Minimum half width of an interval over ``interval_z``, as a share of the value: allows for model error."""
     joint_interval_factor: float = 1.5
     joint_min_relative_std: float = 0.002
-    """The same for joint fits of parameters and initial states, whose errors are a third as large. Chosen on
-    development cases (docs/decisions/0023)."""
+    """The same for joint fits of parameters and initial states, whose errors are a third as large
+    (docs/decisions/0023)."""
     unexplained_score_min: float = 1.2
-    """Refit score (noise floors) above which unnamed terms count as missing physics. Chosen on development cases."""
+    """Refit score (noise floors) above which unnamed terms count as missing physics."""
     unexplained_score_min_without_term: float = 1.8
     """The same if no unnamed term is significant."""
     confidence_half: float = 8.0
-    """Square root of chi2 at which half of the effects are correct: logistic regression on development cases."""
+    """Square root of chi2 at which half of the effects are correct, by logistic regression on development cases."""
     confidence_slope: float = 5.0
     """Slope of that regression in the logarithm of the root."""
     min_explained_excess: float = 0.05
@@ -68,7 +68,7 @@ class UnexplainedSettings:
     regime_windows_min: int = 5
     """Minimum number of windows in a regime and outside it."""
     vibration_ratio_min: float = 4.5
-    """Minimum power of a line over the mean power; development recordings without vibration stay below 3.2."""
+    """Minimum power of a line over the mean power; recordings without vibration stay below 3.2."""
     vibration_p_max: float = 1e-15
     """Maximum p-value of that power; matters for short recordings."""
     vibration_block_s: float = 4.0

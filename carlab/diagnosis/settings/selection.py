@@ -33,51 +33,51 @@ class ScreeningSettings:
 
 @dataclass(frozen=True, slots=True)
 class SelectionSettings:
-    """Joint refits, tests on unseen blocks, acceptance, moves, elimination and pairwise tests."""
+    """Joint refits, tests on left-out blocks, acceptance, moves, elimination and pairwise tests.
+
+    ``unseen`` in the name of a setting means left-out blocks; ``decisions.json`` has these names.
+    """
 
     max_refits: int = 10
     """Maximum number of candidates, by screening score, that are refitted together with the base parameters."""
     confusable_leaders: int = 3
     """Number of leading candidates whose confusable effects are refitted as well."""
     folds: int = 6
-    """Number of folds of blocks for the test on unseen blocks."""
+    """Number of folds of blocks for the test on left-out blocks."""
     min_score_share: float = 0.1
-    """A candidate is refitted if its screening score is at least this share of the best. Chosen on development
-    cases."""
+    """A candidate is refitted if its screening score is at least this share of the best."""
     min_score_chi2: float = 8.0
     """A candidate is refitted if twice its score over the design effect is at least this."""
     min_gain_share: float = 0.3
-    """A refitted candidate is tested on unseen blocks if its gain is at least this share of the best."""
-    max_unseen_error: float = 12.0
-    """Whitened errors on unseen blocks are clipped here [standard deviations], to limit the influence of one spin."""
+    """A refitted candidate is tested on left-out blocks if its gain is at least this share of the best."""
+    max_left_out_error: float = 12.0
+    """Whitened errors on left-out blocks are clipped here [standard deviations], to limit the influence of one spin."""
     accept_chi2_min: float = 25.0
-    """Minimum chi2 (twice the gain over the design effect) of an accepted effect with one parameter. Chosen on
-    development cases: about 60 candidates are compared."""
+    """Minimum chi2 (twice the gain over the design effect) of an accepted effect with one parameter; well above the
+    usual limit of one test, because about 60 candidates are compared."""
     accept_chi2_per_number: float = 8.0
-    """Additional chi2 per additional parameter and for an infinite identity value. Chosen on development cases."""
+    """Additional chi2 per additional parameter and for an infinite identity value."""
     accept_unseen_share: float = 0.015
-    """Minimum unseen gain of an accepted effect, as a share of the loss of a perfect simulator."""
+    """Minimum gain on left-out blocks of an accepted effect, as a share of the loss of a perfect simulator."""
     accept_unseen_ratio: float = 0.3
-    """Minimum unseen gain of an accepted effect, as a share of its gain on the fitted blocks."""
+    """Minimum gain on left-out blocks of an accepted effect, as a share of its gain on the fitted blocks."""
     steady_z_min: float = 3.0
-    """Alternative: minimum unseen gain [standard errors] together with ``steady_unseen_share``."""
+    """Alternative: minimum gain on left-out blocks [standard errors] together with ``steady_unseen_share``."""
     steady_unseen_share: float = 0.03
-    """Alternative: minimum unseen gain, as a share of the loss of a perfect simulator."""
+    """Alternative: minimum gain on left-out blocks, as a share of the loss of a perfect simulator."""
     keep_chi2_min: float = 16.0
     """Minimum chi2 of an earlier effect after others were added, and minimum chi2 of a swap."""
     swap_score_share: float = 0.7
     """A confusable effect may replace an effect if its screening score is at least this share of the effect's gain."""
     search_time_share: float = 0.6
-    """Share of ``--budget`` after which the search ends. The rest is for eliminations, pairwise tests and the report.
-    On the ETH car (five effects, two processes) the limit of 300 s is kept with 0.6 (258 s) and exceeded with 0.75
-    (338 s)."""
+    """Share of ``--budget`` for the search; the rest is for eliminations, pairwise tests and the report."""
     max_effects: int = 10
     """Maximum number of effects."""
     min_remaining_excess: float = 0.1
     """Other choices are followed if the effects of the greedy path leave this share of the refit's squared excess."""
     min_effects_for_alternatives: int = 3
     """Minimum number of effects of the greedy path, so that other choices are followed. With one or two effects, they
-    changed no name in 70 development cases, and took a fifth of the time."""
+    cost time and seldom change a name."""
     max_alternatives: int = 3
     """Maximum number of other choices that are followed to their end."""
     scale_change_max: float = 0.03
@@ -87,10 +87,10 @@ class SelectionSettings:
     start_iterations: int = 3
     """Number of iterations by which the initial points of a candidate are compared."""
     max_start_windows: int = 180
-    """Number of windows on which initial points are compared, as many as for screening. Full fits from the best point
-    use all windows. With all windows these comparisons took 40 % of a search on the ETH car."""
+    """Number of windows on which initial points are compared, as many as for screening; bounds the time. Fits from the
+    best point use all windows."""
     keep_z_min: float = 1.2
-    """One of several effects is removed if its removal costs less than this on unseen blocks [standard errors]."""
+    """One of several effects is removed if its removal costs less than this on left-out blocks [standard errors]."""
     min_practical_size: float = 0.2
     """Minimum size of an effect: the change of a channel at the end of the fitted windows by its removal and a refit,
     over the error that remains [noise floors, or robust errors of the simulator where these are larger]. A smaller
@@ -100,19 +100,17 @@ class SelectionSettings:
     """Minimum relative rise of the held-out score without an effect."""
     min_held_out_z: float = -1.0
     """Alternative: minimum fall of the held-out log-likelihood without the effect [standard errors]. The score gives
-    much weight to single windows, for example in a spin; the robust likelihood does not. With a minimum of 2, a
-    concealed friction ellipse of a development case is withdrawn: its removal lowers the score by 13 %, but raises
-    the likelihood by 0.6 standard errors only."""
+    much weight to single windows, for example in a spin; the robust likelihood does not."""
     tie_z: float = 2.0
-    """Another path replaces the greedy path if its loss on unseen blocks is lower by this [standard errors]."""
+    """Another path replaces the greedy path if its loss on left-out blocks is lower by this [standard errors]."""
     rival_z: float = 3.0
-    """Two confusable effects are indistinguishable if their losses on unseen blocks, with free initial states, differ
+    """Two confusable effects are indistinguishable if their losses on left-out blocks, with free initial states, differ
     by less [standard errors]."""
     better_rival_z: float = 1.0
-    """A confusable effect replaces an effect if its loss on unseen blocks, with free initial states, is lower by this
+    """A confusable effect replaces an effect if its loss on left-out blocks, with free initial states, is lower by this
     [standard errors]."""
     split_z_min: float = 2.0
-    """An effect of each command replaces one effect of both commands if the loss on unseen blocks, with free initial
+    """An effect of each command replaces one effect of both commands if the loss on left-out blocks, with free initial
     states, is lower by this [standard errors], and if the gain is that of a further effect (``accept_chi2_min``)."""
     max_set_rivals: int = 2
     """Maximum number of effects in ``indistinguishable_from`` of report.json."""
@@ -133,16 +131,15 @@ class RivalSettings:
     additional_chi2_min: float = 20.0
     """Minimum chi2 of uncatalogued physics that is reported in addition to effects."""
     spurious_share: float = 0.1
-    """Effects are spurious if unnamed physics gains more than this share of the total gain. Chosen on development
-    cases."""
+    """Effects are spurious if unnamed physics gains more than this share of the total gain."""
     spurious_share_of_most: float = 0.25
-    """The same for effects that explain ``min_explained_share_of_most``. On 60 development cases of seeds 0 and 5,
-    unnamed physics gains 0.14 beside two effects of an unexpected form, and 0.30 or more beside 11 of 12 spurious
-    names."""
+    """The same for effects that explain ``min_explained_share_of_most``. It is larger, because unnamed physics
+    also gains where the form of a true effect differs from that of the catalogue, but less than with a spurious
+    name."""
     min_explained_share_of_most: float = 0.85
     """Share of the refit's excess, in the loss with free initial states, from which ``spurious_share_of_most`` applies.
-    On development cases of seeds 60 to 62, the 17 named sets of concealed effects explain 0.92 or more; two servos that
-    sag under load, named as a lag, explain 0.57 and 0.75, and unnamed physics gains 0.12 and 0.14 beside them."""
+    On development cases true effects explain more, and effects that stand for other physics less
+    (docs/decisions/0019)."""
     spurious_share_many: float = 0.3
     """The same for ``many_effects`` effects or more: such a car may also have physics outside the catalogue."""
     many_effects: int = 3
@@ -153,15 +150,13 @@ class RivalSettings:
     """One or two effects are spurious if unnamed terms gain this many times the gain of the effects."""
     min_explained_share: float = 0.5
     """Minimum share of the refit's excess that one or two effects explain: of the loss with free initial states, or of
-    the held-out squared score. On 70 development cases of seeds 0 and 5, concealed effects explain 0.53 of the loss
-    or more; five spurious names explain 0.17 to 0.49 of it, and two of these 0.25 and 0.27 of the squared score."""
+    the held-out squared score. On development cases true effects explain more than half, spurious names less."""
     curve_z_min: float = 3.0
-    """A steering curve replaces named steering effects that it contains if its loss on unseen blocks, with free initial
-    states, is lower by this [standard errors], and by ``min_curve_share``. On development cases of seeds 60 to 62, it
-    is lower by 3.7 to 8.1 for five random maps of the steering, and by at most 0.9 for concealed effects."""
+    """A steering curve replaces named steering effects that it contains if its loss on left-out blocks, with free
+    initial states, is lower by this [standard errors], and by ``min_curve_share`` (docs/decisions/0019)."""
     min_curve_share: float = 0.1
-    """Minimum of this fall, as a share of the fall from the refit to the curve: 0.25 or more for the random maps,
-    0.001 or less for the effects."""
+    """Minimum of this fall, as a share of the fall from the refit to the curve. A curve that only follows a named
+    effect gains almost nothing."""
     min_held_out_excess: float = 0.1
     """Minimum squared excess of the refit for this share; a smaller one is as uncertain as the noise floor."""
     weak_term_chi2: float = 14.0

@@ -18,7 +18,7 @@ from scipy.stats import gamma
 from carlab.core.quantities import STATE_NAMES, FloatArray
 from carlab.core.robust import STD_OVER_MAD
 from carlab.diagnosis.settings import DEFAULT, UnexplainedSettings
-from carlab.prediction.windows import Track
+from carlab.prediction.windows import RecordingSegment
 
 PERIODS_PER_M = np.arange(1.0, 12.0, 0.05)
 """Lines over the distance travelled [1/m]: wheels of 13 to 160 mm radius."""
@@ -56,28 +56,30 @@ class Vibration:
         return f"{STATE_NAMES[k]} += {self.amplitude[k]:.2g} sin(2 pi s / {1.0 / self.periods_per_m:.3g} m)"
 
 
-def find_vibration(tracks: Sequence[Track], settings: UnexplainedSettings = DEFAULT.unexplained) -> Vibration | None:
+def find_vibration(
+    segments: Sequence[RecordingSegment], settings: UnexplainedSettings = DEFAULT.unexplained
+) -> Vibration | None:
     """The strongest significant line in yaw, vx, vy or yaw rate, or None."""
     power, strength, by_time = (np.zeros((6, n)) for n in (len(PERIODS_PER_M), len(PERIODS_PER_M), len(FREQUENCIES_HZ)))
     blocks = 0
-    for track in tracks:
-        spread = STD_OVER_MAD * np.median(np.abs(track.residual), axis=0)
-        residual = np.clip(track.residual, -settings.vibration_max_z * spread, settings.vibration_max_z * spread)
-        distance_m = np.cumsum(track.speed) * track.sampled_s
-        length = max(round(settings.vibration_block_s / track.sampled_s), 2)
+    for segment in segments:
+        spread = STD_OVER_MAD * np.median(np.abs(segment.residual), axis=0)
+        residual = np.clip(segment.residual, -settings.vibration_max_z * spread, settings.vibration_max_z * spread)
+        distance_m = np.cumsum(segment.speed) * segment.sampled_s
+        length = max(round(settings.vibration_block_s / segment.sampled_s), 2)
         in_time = _lines(
-            np.where(0.5 / track.sampled_s > FREQUENCIES_HZ, FREQUENCIES_HZ, 0.0),
-            track.sampled_s * np.arange(float(length)),
+            np.where(0.5 / segment.sampled_s > FREQUENCIES_HZ, FREQUENCIES_HZ, 0.0),
+            segment.sampled_s * np.arange(float(length)),
         )
         for first in range(0, len(distance_m) - length + 1, length):
             block = slice(first, first + length)
-            if track.speed[block].mean() < settings.vibration_speed_min_mps:
+            if segment.speed[block].mean() < settings.vibration_speed_min_mps:
                 continue
-            weighted = residual[block] * track.speed[block, None]
+            weighted = residual[block] * segment.speed[block, None]
             energy = np.maximum(np.sum(weighted**2, axis=0), 1e-30)[:, None]
             of_line = np.abs(_lines(PERIODS_PER_M, distance_m[block]) @ weighted).T ** 2
             power += of_line / energy
-            strength += of_line / np.sum(track.speed[block] ** 2) ** 2
+            strength += of_line / np.sum(segment.speed[block] ** 2) ** 2
             by_time += np.abs(in_time @ weighted).T ** 2 / energy
             blocks += 1
     if blocks == 0:
@@ -89,7 +91,7 @@ def find_vibration(tracks: Sequence[Track], settings: UnexplainedSettings = DEFA
         return None
     if gamma.sf(highest, blocks) > settings.vibration_p_max:
         return None
-    median_mps = float(np.median(np.concatenate([track.speed for track in tracks])))
+    median_mps = float(np.median(np.concatenate([segment.speed for segment in segments])))
     amplitude = 2.0 * np.sqrt(strength[:, line] / blocks) * median_mps
     return Vibration(float(PERIODS_PER_M[line]), amplitude, power[:, line] / blocks, settings.vibration_ratio_min)
 

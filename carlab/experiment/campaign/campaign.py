@@ -5,7 +5,7 @@ its next step.
 
 | finished recordings | models/000k, k = recordings + 1 | next step |
 | --- | --- | --- |
-| fewer than the target | absent | train; with ``repairs_prior`` repair the prior before it, unless that is done |
+| fewer than the target | absent | train; with ``corrects_prior`` correct the prior before it, unless that is done |
 | fewer than the target | present | drive |
 | target reached | | none |
 """
@@ -28,8 +28,13 @@ from carlab.core.outcome import EndReason
 from carlab.core.quantities import Reality
 from carlab.core.safety import SafetyEnvelope
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
-from carlab.experiment.campaign.prior_process import RepairRequest, read_version, repair_path, run_repair_subprocess
-from carlab.experiment.campaign.prior_repair import PriorVersion, corrected, without_ranges
+from carlab.experiment.campaign.prior_correction import PriorVersion, corrected, without_ranges
+from carlab.experiment.campaign.prior_correction_process import (
+    CorrectionRequest,
+    correction_path,
+    read_version,
+    run_correction_subprocess,
+)
 from carlab.experiment.campaign.quick_check import QuickCheck, check_path, run_check_subprocess
 from carlab.experiment.campaign.training import Progress, model_folder, training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
@@ -105,7 +110,7 @@ class CampaignHooks:
     on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
     on_checking: Callable[[], None] = lambda: None
     on_check: Callable[[QuickCheck], None] = lambda check: None
-    on_repairing: Callable[[], None] = lambda: None
+    on_correcting: Callable[[], None] = lambda: None
     on_prior: Callable[[PriorVersion], None] = lambda version: None
     stop: Callable[[], bool] = lambda: False
 
@@ -115,8 +120,8 @@ class Campaign:
     """A run of ``carlab learn`` on an open car.
 
     ``checked_simulator`` is the simulator of the quick check after each episode; by default that of the car file.
-    ``car`` holds the command-line options that select the car. With ``repairs_prior`` the prior is the car file's
-    simulator with the corrections that ``repair`` finds between episodes, and the quick check tests this prior.
+    ``car`` holds the command-line options that select the car. With ``corrects_prior`` the prior is the car file's
+    simulator with the corrections that ``correct`` finds between episodes, and the quick check tests this prior.
     ``trainer`` trains model and policy; by default a child process.
     """
 
@@ -130,15 +135,15 @@ class Campaign:
     record_rerun: bool = True
     checked_simulator: SimulatorConfig | None = None
     car: str = ""
-    repairs_prior: bool = False
-    repair: Callable[[RepairRequest, Callable[[], bool]], PriorVersion | None] = run_repair_subprocess
+    corrects_prior: bool = False
+    correct: Callable[[CorrectionRequest, Callable[[], bool]], PriorVersion | None] = run_correction_subprocess
     trainer: Trainer | None = None
 
     def write_plan(self) -> None:
         """Write the settings that resuming the run needs."""
         settings: dict[str, Any] = {"episodes": self.episodes, "ticks": self.max_ticks}
         settings |= {"place": self.place, "rerun": self.record_rerun, "car": self.car}
-        settings["repairs_prior"] = self.repairs_prior
+        settings["repairs_prior"] = self.corrects_prior
         if self.checked_simulator is not None:
             settings["questioned"] = self.checked_simulator.to_tables()
         self.run.write_json(CAMPAIGN_FILE, {**settings, "plan": plan_as_json(self.plan)})
@@ -156,7 +161,7 @@ class Campaign:
         while (done := len(self.run.recordings())) < self.episodes:
             folder = model_folder(self.run.models, done + 1)
             if not folder.is_dir():
-                if not self._repair_prior():
+                if not self._correct_prior():
                     return
                 trained = (self.trainer or train_in_subprocess)(
                     self.current_plan(done),
@@ -203,7 +208,7 @@ class Campaign:
             return
         self.hooks.on_checking()
         simulator = self.checked_simulator or self.choice.simulator
-        if self.repairs_prior:
+        if self.corrects_prior:
             simulator = without_ranges(self._simulator(self._version(number - 1)))
         check = run_check_subprocess(self.run, simulator, self.hooks.stop)
         if check is not None:
@@ -211,7 +216,7 @@ class Campaign:
 
     def current_plan(self, recordings: int) -> TrainingPlan:
         """The plan with the version of the prior after a number of recordings."""
-        if not self.repairs_prior:
+        if not self.corrects_prior:
             return self.plan
         import tomli_w
 
@@ -232,17 +237,17 @@ class Campaign:
     def _initial_prior(self) -> SimulatorConfig:
         return SimulatorConfig.from_tables(tomllib.loads(self.plan.prior_toml))
 
-    def _repair_prior(self) -> bool:
-        """Repair the prior after the newest episode, unless that is done; False if it was stopped."""
+    def _correct_prior(self) -> bool:
+        """Correct the prior after the newest episode, unless that is done; False if it was stopped."""
         number = len(self.run.recordings())
-        path = repair_path(self.run, number)
-        if not self.repairs_prior or not number or path.is_file() or not check_path(self.run, number).is_file():
+        path = correction_path(self.run, number)
+        if not self.corrects_prior or not number or path.is_file() or not check_path(self.run, number).is_file():
             return not self.hooks.stop()
-        self.hooks.on_repairing()
-        request = RepairRequest(
+        self.hooks.on_correcting()
+        request = CorrectionRequest(
             tuple(self.run.recordings()), self.plan.prior_toml, self._version(number - 1), path.parent
         )
-        version = self.repair(request, self.hooks.stop)
+        version = self.correct(request, self.hooks.stop)
         if version is not None:
             self.hooks.on_prior(version)
         return version is not None

@@ -55,7 +55,7 @@ class EpisodeFigures:
         excess_std: its standard error.
         diagnosis: messages of the quick check.
         predicted_low, predicted_high: interval that contains the return with a probability of 90 %; NaN if unknown.
-        prior_change: what changed in the simulator prior before the episode, and why; empty without repair.
+        prior_change: what changed in the simulator prior before the episode, and why; empty without correction.
         outcome: result of the episode in the words of the task.
         cost: sum of the constraint cost; NaN for a task without a constraint.
         violations: ticks with a constraint cost; NaN for a task without a constraint.

@@ -24,7 +24,7 @@ from carlab.core.quantities import FloatArray
 from carlab.core.safety import SafetyEnvelope
 from carlab.core.state_estimator import StateEstimator
 from carlab.experiment.campaign.predicted_return import predicted_figures
-from carlab.experiment.campaign.prior_process import read_version
+from carlab.experiment.campaign.prior_correction_process import read_version
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.prediction.learned import drive_windows, recorded_windows
 from carlab.recording.episode_builder import VELOCITY_DELAY
@@ -257,7 +257,14 @@ def _fitted(
     if is_papers:
         simulator = None if plan.method == "fsvgd" else model
         return fit_authors_fsvgd(
-            episodes, plan.history, steps, seed, report_step, plan.device, simulator, plan.method == "sim-fsvgd-mended"
+            episodes,
+            plan.history,
+            steps,
+            seed,
+            report_step,
+            plan.device,
+            simulator,
+            plan.method == "sim-fsvgd-corrected",
         )
     settings = CarFitSettings(plan.method, steps, seed=seed)
     earlier = before if isinstance(before, CarDynamics) else None

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
+from carlab.core.method_names import current_method
 from carlab.core.task import Task
 from carlab.core.task_choice import PARKING, TaskChoice
 from learning.world.car_fit import Method
@@ -26,7 +27,7 @@ class TrainingPlan:
         prior_toml: car file of the prior simulator, with ranges and effects.
         history: number of past commands that model and policy observe.
         method: ``gp-sim-posterior`` has a simulator prior, ``gp-posterior`` has none; ``sim-fsvgd``,
-            ``sim-fsvgd-mended`` and ``fsvgd`` are the paper's, with its settings.
+            ``sim-fsvgd-corrected`` and ``fsvgd`` are the paper's, with its settings.
         model_steps: steps of the particles' optimiser; None: the default of the method.
         updates: gradient steps of SAC (``updates_before``).
         ticks: ticks of an episode; None: those of the task.
@@ -71,7 +72,7 @@ def plan_as_json(plan: TrainingPlan) -> dict[str, Any]:
 def method_of(plan: Mapping[str, Any]) -> str:
     """Method of a plan in a JSON file by its current name; files before version 2 have other names."""
     method = str(plan["method"]) if "method" in plan else "gp-sim-posterior"
-    return method if plan.get("version", 1) >= PLAN_VERSION else EARLIER_NAMES.get(method, method)
+    return current_method(method if plan.get("version", 1) >= PLAN_VERSION else EARLIER_NAMES.get(method, method))
 
 
 def plan_from_json(content: Mapping[str, Any]) -> TrainingPlan:

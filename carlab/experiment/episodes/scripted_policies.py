@@ -23,7 +23,7 @@ class NeutralPolicy:
         """Do nothing: the policy has no state."""
 
     def act(self, view: PolicyInput) -> Action | None:
-        """Neutral."""
+        """Neutral steering and throttle."""
         return NEUTRAL
 
 

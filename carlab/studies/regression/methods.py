@@ -3,7 +3,7 @@
 carlab's methods (``gp-...``) condition a Gaussian process (``learning.posterior``) around a simulator, around zero, or
 average several by held-out density. ``sim-fsvgd`` and ``fsvgd`` are the paper's (``functional_svgd.fsvgd``) with
 the steps, batches, points, bandwidth and starting noise of the authors' public code; prior moments come from a fixed
-set of draws. Their ``-mended`` forms correct two errors of that code: the repulsive term divided by the number of
+set of draws. Their ``-corrected`` forms correct two errors of that code: the repulsive term divided by the number of
 particles, and the almost absent Gaussian-process prior of FSVGD.
 """
 
@@ -99,7 +99,7 @@ class FitTask:
             steps=self.steps or STEPS, noise_std=noise, fit_noise=case.fit_noise, noise_rows=NOISE_ROWS, seed=self.seed
         )
 
-    def authors_settings(self, *, with_simulator: bool, mended: bool) -> FsvgdSettings:
+    def authors_settings(self, *, with_simulator: bool, corrected: bool) -> FsvgdSettings:
         """The authors' settings of functional SVGD."""
         case, rows = self.case, len(self.data.inputs)
         noise = tuple(s / o for s, o in zip(case.likelihood_std, case.output_std, strict=True))
@@ -115,7 +115,7 @@ class FitTask:
                 steps=steps, batch=8, measurement_points=32, bandwidth=10.0 if case.name == "realcar" else 2.0,
                 natural=False, anneal_rate=False, noise_std=noise, noise_rate=1.0, seed=self.seed,
             )  # fmt: skip
-        return settings if mended else settings.with_published_errors(rows, with_simulator=with_simulator)
+        return settings if corrected else settings.with_published_errors(rows, with_simulator=with_simulator)
 
     def pool(self) -> Tensor:
         """Inputs of the domain (M, D)."""
@@ -172,7 +172,7 @@ class FitTask:
 
         return average([fit(*candidate) for candidate in candidates], self.data.inputs, self.data.outputs, self.seed)
 
-    def sim_fsvgd(self, *, mended: bool) -> Model:
+    def sim_fsvgd(self, *, corrected: bool) -> Model:
         """The paper's Sim-FSVGD."""
         case, normaliser = self.case, self.normaliser
         pool, generator = self.pool(), torch.Generator().manual_seed(30_000 + self.seed)
@@ -181,14 +181,14 @@ class FitTask:
             parameters = draw_parameters(case.prior, PRIOR_DRAWS, generator).to(prior_inputs)
             draws = normaliser.outputs(case.prior(prior_inputs, parameters))
         prior = SimulatorPrior(draws, prior_inputs, case.discrepancy())
-        settings = self.authors_settings(with_simulator=True, mended=mended)
+        settings = self.authors_settings(with_simulator=True, corrected=corrected)
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
-    def fsvgd(self, *, mended: bool) -> Model:
+    def fsvgd(self, *, corrected: bool) -> Model:
         """The paper's FSVGD: a Gaussian-process prior."""
         normaliser, pool = self.normaliser, self.pool()
         prior = GaussianProcessPrior(normaliser.inputs(torch.cat([self.data.inputs, pool])), self.function_prior())
-        settings = self.authors_settings(with_simulator=False, mended=mended)
+        settings = self.authors_settings(with_simulator=False, corrected=corrected)
         return fit_fsvgd(self.data.inputs, self.data.outputs, pool, prior, normaliser, settings)
 
     def sysid(self) -> IdentifiedSimulator:
@@ -216,17 +216,17 @@ METHODS: dict[str, Callable[[FitTask], Model]] = {
     "gp-sim-posterior": lambda task: task.distilled(task.case.prior, task.data.outputs, task.discrepancy_size),
     "sim-posterior": lambda task: task.distilled(task.case.prior, task.data.outputs, None),
     "gp-posterior": lambda task: task.distilled(None, task.data.outputs, PRIOR_FUNCTION),
-    "sim-fsvgd": lambda task: task.sim_fsvgd(mended=False),
-    "sim-fsvgd-mended": lambda task: task.sim_fsvgd(mended=True),
-    "fsvgd": lambda task: task.fsvgd(mended=False),
-    "fsvgd-mended": lambda task: task.fsvgd(mended=True),
+    "sim-fsvgd": lambda task: task.sim_fsvgd(corrected=False),
+    "sim-fsvgd-corrected": lambda task: task.sim_fsvgd(corrected=True),
+    "fsvgd": lambda task: task.fsvgd(corrected=False),
+    "fsvgd-corrected": lambda task: task.fsvgd(corrected=True),
     "SysID": FitTask.sysid,
     "GreyBox": FitTask.grey_box,
     "ensemble": FitTask.ensemble,
     "ridge": FitTask.ridge,
 }
 """Methods by their name in tables and on the command line; ``sim-posterior`` has no model discrepancy."""
-PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-mended", "fsvgd", "fsvgd-mended")
+PAPER_METHODS = ("sim-fsvgd", "sim-fsvgd-corrected", "fsvgd", "fsvgd-corrected")
 """The paper's algorithms; their inputs are in the world frame."""
 
 __all__ = ["METHODS", "PAPER_METHODS", "STEPS", "FitTask", "Model", "SmoothedParticles"]

@@ -29,7 +29,7 @@ LABELS = {
 MAX_RATIO_FINE_TICKS = 100.0
 """A logarithmic axis with a larger ratio has ticks at powers of ten alone."""
 SIZE_INCHES = (11.0, 8.0)
-_SAME_COLOUR = {"sim-posterior": "gp-sim-posterior", "sim-fsvgd-mended": "sim-fsvgd", "fsvgd-mended": "fsvgd"}
+_SAME_COLOUR = {"sim-posterior": "gp-sim-posterior", "sim-fsvgd-corrected": "sim-fsvgd", "fsvgd-corrected": "fsvgd"}
 """A method without one of its parts has the same colour, dashed."""
 
 

@@ -1,4 +1,4 @@
-"""The repair of the prior after an episode, in another process: test of the corrections, and diagnosis.
+"""The correction of the prior after an episode, in another process: test of the corrections, and diagnosis.
 
 The result is a file in the model folder of the episode (``models/0003/repair.json``). A failure leaves the prior
 unchanged; the run continues.
@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 from carlab.core.errors import CarlabError, DataError
 from carlab.core.json_files import read_json
 from carlab.experiment.campaign.child_process import ChildError, run_in_child
-from carlab.experiment.campaign.prior_repair import (
+from carlab.experiment.campaign.prior_correction import (
     PARAMETERS,
     Correction,
     Findings,
     PriorVersion,
     corrected,
-    repaired,
+    next_version,
     without_ranges,
 )
 from carlab.experiment.campaign.quick_check import CHECK_FILE, MIN_DIAGNOSIS_EPISODES
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from carlab.core.episode_data import EpisodeData
     from carlab.diagnosis.findings import Diagnosis
 
-REPAIR_FILE = "repair.json"
+CORRECTION_FILE = "repair.json"  # Older run folders have files of this name.
 DIAGNOSIS_BUDGET_S = 60.0
 """Time limit of a diagnosis between two episodes [s]."""
 EPISODES_BETWEEN_DIAGNOSES = 3
@@ -44,8 +44,8 @@ HELD_OUT_EVERY = 3
 
 
 @dataclass(frozen=True, slots=True)
-class RepairRequest:
-    """Input of a repair.
+class CorrectionRequest:
+    """Input of a correction of the prior.
 
     Attributes:
         recordings: all recordings of the run.
@@ -62,41 +62,43 @@ class RepairRequest:
     budget_s: float = DIAGNOSIS_BUDGET_S
 
 
-def repair_path(run: RunDirectory, episode: int) -> Path:
-    """File of the repair after an episode."""
-    return run.models / f"{episode:04d}" / REPAIR_FILE
+def correction_path(run: RunDirectory, episode: int) -> Path:
+    """File of the correction after an episode."""
+    return run.models / f"{episode:04d}" / CORRECTION_FILE
 
 
 def read_version(run: RunDirectory, episode: int) -> PriorVersion | None:
     """The version of the prior after an episode; None if there is none. Raises DataError for an invalid file."""
-    path = repair_path(run, episode)
+    path = correction_path(run, episode)
     if not path.is_file():
         return None
     try:
         return PriorVersion.from_dict(read_json(path, keep_infinite=True))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{path} cannot be read ({error}); remove it, and the run repeats the repair.") from error
+        raise DataError(f"{path} cannot be read ({error}); remove it, and the run repeats the correction.") from error
 
 
-def run_repair_subprocess(request: RepairRequest, stop: Callable[[], bool] = lambda: False) -> PriorVersion | None:
-    """Repair the prior in another process, and save the new version; None if ``stop`` ended it.
+def run_correction_subprocess(
+    request: CorrectionRequest, stop: Callable[[], bool] = lambda: False
+) -> PriorVersion | None:
+    """Correct the prior in another process, and save the new version; None if ``stop`` ended it.
 
     Raises:
         DataError: the file cannot be written.
     """
     try:
         version: PriorVersion | None = run_in_child(
-            "repair of the prior", repair, (request,), stop, expected=(CarlabError, OSError, ValueError)
+            "correction of the prior", correct_prior, (request,), stop, expected=(CarlabError, OSError, ValueError)
         )
     except ChildError as error:
         version = _failed(request, f"its process died ({error})" if error.end == "died" else str(error))
     if version is None:
         return None
-    write_text(request.folder / REPAIR_FILE, json.dumps(version.to_dict(), indent=2) + "\n")
+    write_text(request.folder / CORRECTION_FILE, json.dumps(version.to_dict(), indent=2) + "\n")
     return version
 
 
-def repair(request: RepairRequest) -> PriorVersion:
+def correct_prior(request: CorrectionRequest) -> PriorVersion:
     """The next version of the prior. Raises CarlabError if a recording cannot be read."""
     from carlab.recording.mcap.source import has_ticks, read_episode
 
@@ -112,7 +114,7 @@ def repair(request: RepairRequest) -> PriorVersion:
     is_needed = check.get("verdict") == "left" or bool(contradicted)
     if len(episodes) >= MIN_DIAGNOSIS_EPISODES and is_due and is_needed:
         found = diagnosed(found, episodes, without_ranges(car), request.budget_s)
-    return repaired(request.before, car, found)
+    return next_version(request.before, car, found)
 
 
 def contradicted_by(
@@ -196,20 +198,20 @@ def _valid(std: dict[str, float], values: dict[str, float]) -> dict[str, float]:
     }
 
 
-def _failed(request: RepairRequest, reason: str) -> PriorVersion:
+def _failed(request: CorrectionRequest, reason: str) -> PriorVersion:
     text = f"The correction of the prior after episode {len(request.recordings)} failed ({reason.rstrip('.')})"
     return replace(request.before, sentence=f"{text}; the prior is unchanged.")
 
 
 __all__ = [
+    "CORRECTION_FILE",
     "DIAGNOSIS_BUDGET_S",
-    "REPAIR_FILE",
-    "RepairRequest",
+    "CorrectionRequest",
     "contradicted_by",
+    "correct_prior",
+    "correction_path",
     "corrections_of",
     "diagnosed",
     "read_version",
-    "repair",
-    "repair_path",
-    "run_repair_subprocess",
+    "run_correction_subprocess",
 ]

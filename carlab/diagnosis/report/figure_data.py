@@ -10,14 +10,14 @@ import numpy as np
 from carlab.core.errors import DataError
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.events import Event
-from carlab.diagnosis.evidence import ScoredSearch, score_ladder
-from carlab.diagnosis.findings import Exhibits, Trace
+from carlab.diagnosis.evidence import ScoredSearch, scores_by_step
+from carlab.diagnosis.findings import FigureData, Trace
 from carlab.diagnosis.recordings import SplitRecordings
 from carlab.diagnosis.settings import ReportSettings
 from carlab.diagnosis.unexplained.description import REGIMES, start_features
 from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import predicted_at, simulate_windows
-from carlab.prediction.windows import PredictionWindows, Track, cut_windows
+from carlab.prediction.windows import PredictionWindows, RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS
 
@@ -25,7 +25,7 @@ TRACES_TRIED = 6
 """Number of the longest held-out recordings that are searched for traces with motion."""
 
 
-def exhibits_of(scored: ScoredSearch, recordings: SplitRecordings) -> Exhibits:
+def figure_data_of(scored: ScoredSearch, recordings: SplitRecordings) -> FigureData:
     """Data of the figures."""
     settings, found = scored.problem.settings.report, scored.found
     correlation = {
@@ -33,11 +33,11 @@ def exhibits_of(scored: ScoredSearch, recordings: SplitRecordings) -> Exhibits:
         for name in found.effects[: settings.max_correlations]
     }
     candidates = tuple(
-        (c.effect, c.standard_errors if math.isfinite(c.unseen_error) else 0.0, float(c.fit.loss.sum()))
-        for c in found.tried
+        (c.effect, c.standard_errors if math.isfinite(c.left_out_gain_error) else 0.0, float(c.fit.loss.sum()))
+        for c in found.first_candidates
     )
-    ladder = (*score_ladder(scored), ("noise floor", 1.0))
-    return Exhibits(_traces(scored, recordings), ladder, _regimes(scored), correlation, candidates)
+    steps = (*scores_by_step(scored), ("noise floor", 1.0))
+    return FigureData(_traces(scored, recordings), steps, _regimes(scored), correlation, candidates)
 
 
 def _regimes(scored: ScoredSearch) -> dict[str, tuple[FloatArray, FloatArray, FloatArray]]:
@@ -89,34 +89,34 @@ def _traces(scored: ScoredSearch, recordings: SplitRecordings) -> tuple[Trace, .
     }
     settings = scored.problem.settings
     horizon_s, worst = settings.windows.held_out_window_s, settings.report.worst_stretches
-    longest = sorted(recordings.held_out_tracks, key=lambda track: -len(track.t_s))[:TRACES_TRIED]
+    longest = sorted(recordings.held_out_segments, key=lambda segment: -len(segment.t_s))[:TRACES_TRIED]
     events = recordings.events.found
-    traces = [t for track in longest if (t := _trace(track, models, horizon_s, worst, events)) is not None]
+    traces = [t for segment in longest if (t := _trace(segment, models, horizon_s, worst, events)) is not None]
     fitted = [
-        Trace(f"fitted recording {track.recording + 1}", track.t_s, track.states, {}, (), own)
-        for track in recordings.fit_tracks
-        if (own := _events_in(track, events, "fit"))
+        Trace(f"fitted recording {segment.recording + 1}", segment.t_s, segment.states, {}, (), own)
+        for segment in recordings.fit_segments
+        if (own := _events_in(segment, events, "fit"))
     ]
     count = settings.report.max_traces
     return (*traces[:count], *fitted[:count])
 
 
-def _events_in(track: Track, events: Sequence[Event], role: str) -> tuple[Event, ...]:
-    begin_s, end_s = float(track.t_s[0]), float(track.t_s[-1])
-    own = [e for e in events if e.role == role and e.recording == track.recording + 1]
+def _events_in(segment: RecordingSegment, events: Sequence[Event], role: str) -> tuple[Event, ...]:
+    begin_s, end_s = float(segment.t_s[0]), float(segment.t_s[-1])
+    own = [e for e in events if e.role == role and e.recording == segment.recording + 1]
     return tuple(e for e in own if begin_s <= e.to_s and e.from_s <= end_s)
 
 
 def _trace(
-    track: Track,
+    segment: RecordingSegment,
     models: Mapping[str, SimulatorConfig],
     horizon_s: float,
     worst_stretches: int,
     events: Sequence[Event],
 ) -> Trace | None:
-    """Predictions along a track, restarted every horizon; None if the car does not move for a horizon."""
+    """Predictions along a segment, restarted every horizon; None if the car does not move for a horizon."""
     try:
-        windows = cut_windows([track], horizon_s, horizon_s, with_events=True)
+        windows = cut_windows([segment], horizon_s, horizon_s, with_events=True)
     except DataError:
         return None
     span_s = windows.horizon_s
@@ -124,13 +124,15 @@ def _trace(
     worst: list[tuple[float, float]] = []
     for name, config in models.items():
         out = simulate_windows(windows, config)
-        predicted[name] = predicted_at(track.t_s, windows, out[0])
+        predicted[name] = predicted_at(segment.t_s, windows, out[0])
         if name == "refit":
             final = np.linalg.norm(prediction_errors(out, windows)[0, :, -1, :2], axis=1)
             order = [k for k in np.argsort(-final) if not windows.in_event[k]][:worst_stretches]
             worst = [(float(windows.t0_s[k]), float(windows.t0_s[k] + span_s)) for k in order]
-    own = _events_in(track, events, "held out")
-    return Trace(f"recording {track.recording + 1}", track.t_s, track.states, predicted, tuple(sorted(worst)), own)
+    own = _events_in(segment, events, "held out")
+    return Trace(
+        f"recording {segment.recording + 1}", segment.t_s, segment.states, predicted, tuple(sorted(worst)), own
+    )
 
 
-__all__ = ["exhibits_of"]
+__all__ = ["figure_data_of"]

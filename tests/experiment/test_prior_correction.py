@@ -1,4 +1,4 @@
-"""The repair of the simulator prior: what enters, what leaves, resuming, and one real diagnosis of a lag."""
+"""The correction of the simulator prior: what enters, what leaves, resuming, and one real diagnosis of a lag."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
 from carlab.experiment.campaign.figures import EpisodeFigures
-from carlab.experiment.campaign.prior_process import (
-    RepairRequest,
-    contradicted_by,
-    diagnosed,
-    read_version,
-    repair,
-    repair_path,
-    run_repair_subprocess,
-)
-from carlab.experiment.campaign.prior_repair import (
+from carlab.experiment.campaign.prior_correction import (
     PARAMETERS,
     Correction,
     Findings,
     PriorVersion,
     corrected,
     needed_history,
-    repaired,
+    next_version,
+)
+from carlab.experiment.campaign.prior_correction_process import (
+    CorrectionRequest,
+    contradicted_by,
+    correct_prior,
+    correction_path,
+    diagnosed,
+    read_version,
+    run_correction_subprocess,
 )
 from carlab.experiment.campaign.quick_check import check_path, run_check_subprocess
 from carlab.recording.mcap.source import read_documents, read_episode
@@ -64,8 +64,8 @@ def left(episodes: int, *causes: dict[str, Any], **others: Any) -> Findings:
     return Findings(episodes, {"verdict": "left", "causes": list(causes)}, **others)
 
 
-def test_effect_with_support_on_unseen_windows_enters_with_its_uncertainty() -> None:
-    version = repaired(PriorVersion(history=4), CAR, left(1, cause("motor_lag", 0.9, **{LAG: 0.08})))
+def test_effect_with_cross_validated_support_enters_with_its_uncertainty() -> None:
+    version = next_version(PriorVersion(history=4), CAR, left(1, cause("motor_lag", 0.9, **{LAG: 0.08})))
     (entered,) = version.corrections
     assert (entered.id, entered.values, entered.episodes) == ("motor_lag", {LAG: 0.08}, 1)
     assert entered.std[LAG] == pytest.approx(0.016), "the difference of the halves"
@@ -91,7 +91,7 @@ def test_effect_with_support_on_unseen_windows_enters_with_its_uncertainty() -> 
 )
 def test_prior_is_unchanged_without_a_usable_cause(found: Findings) -> None:
     before = PriorVersion((MOTOR_LAG,), 8)
-    version = repaired(before, CAR, found)
+    version = next_version(before, CAR, found)
     assert version.corrections == before.corrections
     assert version.sentence.startswith("The prior is unchanged after episode 2: ")
 
@@ -100,7 +100,7 @@ def test_cause_that_ties_with_an_unusable_first_one_enters() -> None:
     found = left(
         1, cause("low_friction_patch", 0.99), cause("tyre.mu", 0.98, tie=True, **{"tyre.front.mu": 0.26})
     )  # fmt: skip
-    (entered,) = repaired(PriorVersion(history=4), CAR, found).corrections
+    (entered,) = next_version(PriorVersion(history=4), CAR, found).corrections
     assert entered.id == PARAMETERS
     prior = corrected(CAR, [entered])
     assert prior.values()["tyre.front.mu"] == 0.26
@@ -108,7 +108,7 @@ def test_cause_that_ties_with_an_unusable_first_one_enters() -> None:
 
 
 def test_contradicted_effect_leaves() -> None:
-    version = repaired(PriorVersion((MOTOR_LAG,), 4), CAR, left(3, contradicted=("motor_lag",)))
+    version = next_version(PriorVersion((MOTOR_LAG,), 4), CAR, left(3, contradicted=("motor_lag",)))
     assert version.corrections == ()
     assert "motor_lag is removed (episode 3 is predicted better without it)" in version.sentence
 
@@ -116,37 +116,37 @@ def test_contradicted_effect_leaves() -> None:
 def test_complete_diagnosis_replaces_and_cut_one_only_adds() -> None:
     before = PriorVersion((MOTOR_LAG,), 4)
     delay = Correction("command_delay", {DELAY: 0.05}, {DELAY: 0.002}, 4, "diagnosis", "held out")
-    complete = repaired(before, CAR, Findings(4, diagnosed=(delay,), diagnosis="mismatch"))
+    complete = next_version(before, CAR, Findings(4, diagnosed=(delay,), diagnosis="mismatch"))
     assert [c.id for c in complete.corrections] == ["command_delay"]
     assert "motor_lag is removed (the diagnosis of 4 episodes does not confirm it)" in complete.sentence
     assert complete.diagnosed == 4
-    cut = repaired(before, CAR, Findings(4, diagnosed=(delay,), diagnosis="mismatch", is_complete=False))
+    cut = next_version(before, CAR, Findings(4, diagnosed=(delay,), diagnosis="mismatch", is_complete=False))
     assert {c.id for c in cut.corrections} == {"command_delay", "motor_lag"}
-    none = repaired(before, CAR, Findings(4, diagnosed=(), diagnosis="none"))
+    none = next_version(before, CAR, Findings(4, diagnosed=(), diagnosis="none"))
     assert none.corrections == ()
 
 
 def test_past_commands_follow_the_found_delay_and_never_decrease() -> None:
     assert needed_history(CAR) == 4
-    version = repaired(PriorVersion(history=4), CAR, left(1, cause("command_delay", 0.99, **{DELAY: 0.08})))
+    version = next_version(PriorVersion(history=4), CAR, left(1, cause("command_delay", 0.99, **{DELAY: 0.08})))
     # 0.16 s of delay, 0.008 s of latency and half of the 0.1 s window are 6.5 periods of 1 / 30 s.
     assert version.history == needed_history(replace(CAR, command_delay_s=0.16)) > 4
     assert f"observe {version.history} past commands instead of 4" in version.sentence
-    back = repaired(version, CAR, left(2, contradicted=("command_delay",)))
+    back = next_version(version, CAR, left(2, contradicted=("command_delay",)))
     assert (back.corrections, back.history) == ((), version.history)
 
 
 def test_impossible_correction_changes_nothing() -> None:
     found = left(1, cause("command_delay", 0.99, **{DELAY: -0.5}))
     before = PriorVersion(history=4)
-    version = repaired(before, CAR, found)
+    version = next_version(before, CAR, found)
     assert version.corrections == ()
     assert "its correction is impossible" in version.sentence
 
 
 def test_version_is_read_as_it_was_written(tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path, "run")
-    path = repair_path(run, 1)
+    path = correction_path(run, 1)
     path.parent.mkdir()
     assert read_version(run, 1) is None
     saturation = {"effects.motor_saturation.force": math.inf}
@@ -159,7 +159,7 @@ def test_version_is_read_as_it_was_written(tmp_path: Path) -> None:
         *('{"corrections": [], "history": ' + history + ", " + rest for history in ("-1", "1e9", "NaN")),
     ):
         path.write_text(content)
-        with pytest.raises(DataError, match=r"remove it, and the run repeats the repair\.$"):
+        with pytest.raises(DataError, match=r"remove it, and the run repeats the correction\.$"):
             read_version(run, 1)
 
 
@@ -180,21 +180,21 @@ def test_newest_episode_contradicts_a_wrong_effect_only(lagging: RunDirectory) -
     assert contradicted_by(newest, PLAIN, [MOTOR_LAG], [MOTOR_LAG]) == ()
 
 
-def test_repair_in_another_process_enters_the_true_effect(lagging: RunDirectory) -> None:
+def test_correction_in_another_process_enters_the_true_effect(lagging: RunDirectory) -> None:
     assert run_check_subprocess(lagging, PLAIN) is not None
     folder = check_path(lagging, 4).parent
     before = PriorVersion(history=4, diagnosed=4)
-    request = RepairRequest(tuple(lagging.recordings()), tomli_w.dumps(CAR.to_tables()), before, folder)
-    version = run_repair_subprocess(request)
+    request = CorrectionRequest(tuple(lagging.recordings()), tomli_w.dumps(CAR.to_tables()), before, folder)
+    version = run_correction_subprocess(request)
     assert version is not None
     assert [c.id for c in version.corrections] == ["motor_lag"]
     assert version.corrections[0].values[LAG] == pytest.approx(0.08, abs=0.01)
     assert read_version(lagging, 4) == version
-    repair_path(lagging, 4).unlink()
-    assert run_repair_subprocess(request, stop=lambda: True) is None
-    assert not repair_path(lagging, 4).exists()
+    correction_path(lagging, 4).unlink()
+    assert run_correction_subprocess(request, stop=lambda: True) is None
+    assert not correction_path(lagging, 4).exists()
     broken = replace(request, recordings=(*request.recordings[:3], folder / "missing.mcap"))
-    failed = run_repair_subprocess(broken)
+    failed = run_correction_subprocess(broken)
     assert failed is not None
     assert failed.corrections == before.corrections
     assert "failed" in failed.sentence
@@ -228,18 +228,18 @@ def test_run_uses_the_newest_version_of_the_prior_when_it_is_resumed(tmp_path: P
     figures: list[EpisodeFigures] = []
     hooks = CampaignHooks(on_prior=lambda v: sentences.append(v.sentence), on_figures=figures.append)
 
-    def scripted(request: RepairRequest, stop: Callable[[], bool]) -> PriorVersion:
+    def scripted(request: CorrectionRequest, stop: Callable[[], bool]) -> PriorVersion:
         assert (len(request.recordings), request.before) == (1, PriorVersion(history=2))
         (request.folder / "repair.json").write_text(json.dumps(version.to_dict()))
         return version
 
     plan = tiny_plan(choice)
-    campaign = Campaign(choice, plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False, repairs_prior=True)
+    campaign = Campaign(choice, plan, 1, run, hooks, max_ticks=TICKS, record_rerun=False, corrects_prior=True)
     with choice.car:
         campaign.write_plan()
         assert len(list(campaign.run_episodes())) == 1
         resumed = resumed_campaign(run, choice, hooks)
-        resumed.repair, resumed.episodes = scripted, 2
+        resumed.correct, resumed.episodes = scripted, 2
         assert len(list(resumed.run_episodes())) == 1
     assert sentences == [version.sentence]
     assert (run.models / "0001" / "prior.toml").read_text() == plan.prior_toml
@@ -253,9 +253,9 @@ def test_run_uses_the_newest_version_of_the_prior_when_it_is_resumed(tmp_path: P
     assert again.current_plan(2).prior_toml == (run.models / "0002" / "prior.toml").read_text()
 
 
-def test_repair_needs_the_file_of_the_check(lagging: RunDirectory, tmp_path: Path) -> None:
-    request = RepairRequest(
+def test_correction_needs_the_file_of_the_check(lagging: RunDirectory, tmp_path: Path) -> None:
+    request = CorrectionRequest(
         tuple(lagging.recordings()[:1]), tomli_w.dumps(CAR.to_tables()), PriorVersion(history=4), tmp_path
     )  # fmt: skip
     with pytest.raises(OSError, match=r"diagnosis\.json"):
-        repair(request)
+        correct_prior(request)

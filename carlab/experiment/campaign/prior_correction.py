@@ -1,4 +1,4 @@
-"""Repair of the simulator prior between episodes: what the recordings support enters, what they contradict leaves.
+"""Correction of the simulator prior between episodes: what the recordings support enters, what they contradict leaves.
 
 The prior is the car file's simulator with corrections. After each episode the corrections are tested on the newest
 episode, which none of them was fitted to. If the quick check finds that the prior does not explain the recordings, its
@@ -153,7 +153,7 @@ def needed_history(simulator: SimulatorConfig) -> int:
     return min(max(round(span_s / simulator.control_period_s), MIN_HISTORY), MAX_HISTORY)
 
 
-def repaired(before: PriorVersion, car: SimulatorConfig, found: Findings) -> PriorVersion:
+def next_version(before: PriorVersion, car: SimulatorConfig, found: Findings) -> PriorVersion:
     """The next version of the prior, with the sentence that states what changed and why.
 
     Args:
@@ -263,6 +263,6 @@ __all__ = [
     "PriorVersion",
     "corrected",
     "needed_history",
-    "repaired",
+    "next_version",
     "without_ranges",
 ]
