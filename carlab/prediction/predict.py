@@ -147,14 +147,21 @@ def simulate_windows(
         engine=engine,
     ).states
     rows = np.ascontiguousarray(states.permute(1, 2, 0).numpy(), dtype=np.float64)
-    measured = measurement.measure(
-        [tuple(tick) for tick in rows.reshape(windows.steps + 1, 6, sets, count)],
+    trajectory: list[State] = [tuple(tick) for tick in rows.reshape(windows.steps + 1, 6, sets, count)]
+    return _stacked(_measured(trajectory, windows, measurement, ticks), sets)
+
+
+def _measured(
+    trajectory: list[State], windows: PredictionWindows, measurement: MeasurementModel, ticks: IndexArray | None
+) -> list[State]:
+    """Measured states of a trajectory of true ones, at some or all ticks."""
+    return measurement.measure(
+        trajectory,
         windows.period_s,
         window_s2=windows.velocity_window_s2,
         velocities_before=[tuple(windows.past_states[:, k, 3:].T) for k in range(windows.past_states.shape[1])],
         ticks=None if ticks is None else ticks.tolist(),
     )
-    return _stacked(measured, sets)
 
 
 def velocity_curvature(states: FloatArray, period_s: float) -> FloatArray:

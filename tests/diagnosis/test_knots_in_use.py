@@ -11,7 +11,7 @@ from carlab.diagnosis.identification.fit import Fitter, Scale
 from carlab.diagnosis.identification.fit_parameters import difference_steps, values_at
 from carlab.diagnosis.identification.knots_in_use import influencing_parameters
 from carlab.diagnosis.selection.problem import SearchProblem
-from carlab.prediction.windows import PredictionWindows, cut_windows, tracks_of
+from carlab.prediction.windows import PredictionWindows, cut_windows, segments_of
 from sim_backends import EFFECTS, SimulatorConfig
 from sim_backends.array_ops import ARRAYS
 from sim_backends.effects import CURVES
@@ -25,7 +25,7 @@ FLOOR = np.full(6, 1e-2)
 
 @pytest.fixture(scope="module")
 def windows() -> PredictionWindows:
-    return cut_windows(tracks_of([drive(CAR, 40.0, 3)]), 0.8, 1.0)
+    return cut_windows(segments_of([drive(CAR, 40.0, 3)]), 0.8, 1.0)
 
 
 def test_jacobian_equals_differences_of_all_windows(windows: PredictionWindows) -> None:
