@@ -31,7 +31,8 @@ class LogEntry:
 class CommandLog:
     """Entries in memory and, if a path is given, in a file of JSON lines; each line is flushed, so a kill loses none.
 
-    The file is for people. If it cannot be written, the log warns once and continues in memory.
+    The file is for people. If it cannot be written, the log warns once and continues in memory. It does not warn if the
+    folder is missing: a run that ends before its first episode removes its folder.
     """
 
     def __init__(self, path: Path | None = None) -> None:
@@ -46,7 +47,7 @@ class CommandLog:
             try:
                 self._file = self.path.open("a", encoding="utf-8")
             except FileNotFoundError:
-                return  # The run ended before its first episode, and its folder was removed.
+                return
             except OSError as error:
                 self._give_up_file(error)
 

@@ -119,14 +119,3 @@ def test_lateness_is_measured_in_both_conditions() -> None:
         p50, p99, top = (figures[f"sender_100_hz_{condition}_late_{k}_ms"] for k in ("p50", "p99", "max"))
         assert 0.0 < p50 <= p99 <= top
     assert figures["sender_100_hz_loaded_to_idle_p99_ratio"] > 0.0
-
-
-def test_log_of_a_run_whose_folder_was_removed_stays_in_memory(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """^C before the first episode removes the folder while the emulated car starts."""
-    log = CommandLog(tmp_path / "removed" / "firmware.jsonl")
-    log.open()
-    log.add(0.0, "current", 1.0)
-    assert len(log.entries()) == 1
-    assert not caplog.records

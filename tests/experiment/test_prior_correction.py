@@ -147,7 +147,7 @@ def test_impossible_correction_changes_nothing() -> None:
 def test_version_is_read_as_it_was_written(tmp_path: Path) -> None:
     run = RunDirectory.create(tmp_path, "run")
     path = correction_path(run, 1)
-    path.parent.mkdir()
+    path.parent.mkdir(parents=True)
     assert read_version(run, 1) is None
     saturation = {"effects.motor_saturation.force": math.inf}
     version = PriorVersion((MOTOR_LAG, Correction("motor_saturation", saturation, {}, 1, "diagnosis")), 5, "Why.", 1)
@@ -169,7 +169,7 @@ def lagging(tmp_path_factory: pytest.TempPathFactory) -> RunDirectory:
     true = replace(CAR, effects={"motor_lag": {"time_constant": 0.08}})
     run: RunDirectory = drives.drive_like_learning(true, tmp_path_factory.mktemp("lag"), 4, seed=5)
     for number in range(1, 5):
-        (run.models / f"{number:04d}").mkdir()
+        (run.models / f"{number:04d}").mkdir(parents=True)
     return run
 
 

@@ -27,7 +27,7 @@ ROW = EpisodeFigures(1, 20.0, 30.0, False, 0.5, 0.1, 0.0, 97, 1.0, 0.1, 3.0, 60.
 def make_run(folder: Path, true: SimulatorConfig, episodes: int) -> RunDirectory:
     run: RunDirectory = drives.drive_like_learning(true, folder, episodes, seed=21)
     for number in range(1, episodes + 1):
-        (run.models / f"{number:04d}").mkdir()
+        (run.models / f"{number:04d}").mkdir(parents=True)
     return run
 
 

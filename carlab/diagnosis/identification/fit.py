@@ -142,7 +142,7 @@ class Fitter:
         influences = influencing_parameters(self.windows, config, values_at(free, z))
         steps = difference_steps(free)
         jacobian = np.zeros((len(free), *white.shape))
-        is_delay = np.array([f.is_delay for f in free])
+        is_delay = np.array([f.is_delay for f in free], dtype=bool)
         for group in (np.flatnonzero(~is_delay), np.flatnonzero(is_delay)):
             batches = math.ceil(influences[group].sum() / (len(self.windows) * self.settings.max_batch_sets))
             for batch in np.array_split(group, batches) if batches else ():
