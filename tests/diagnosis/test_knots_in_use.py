@@ -77,3 +77,10 @@ def test_listener_receives_coordinates_inside_the_block_only() -> None:
         curve.deviation(ARRAYS, (0.1,), coefficients)
     curve.deviation(ARRAYS, (0.2,), coefficients)
     assert seen == [(curve.id, 0.1)]
+
+
+def test_fit_without_free_parameters_has_an_empty_jacobian(windows: PredictionWindows) -> None:
+    fitter = Fitter(windows, Scale(np.array([windows.steps]), np.ones((1, 6))))
+    jacobian, white = fitter.linearised(fitter.fit(CAR, ()))
+    assert jacobian.shape == (0, len(windows), 1, 6)
+    assert white.shape == (len(windows), 1, 6)

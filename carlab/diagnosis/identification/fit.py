@@ -144,7 +144,7 @@ class Fitter:
         jacobian = np.zeros((len(free), *white.shape))
         is_delay = np.array([f.is_delay for f in free], dtype=bool)
         for group in (np.flatnonzero(~is_delay), np.flatnonzero(is_delay)):
-            batches = math.ceil(influences[group].sum() / (len(self.windows) * self.settings.max_batch_sets))
+            batches = math.ceil(influences[group].sum() / (max(len(self.windows), 1) * self.settings.max_batch_sets))
             for batch in np.array_split(group, batches) if batches else ():
                 row, window = np.nonzero(influences[batch])
                 values = values_at(free, z)
