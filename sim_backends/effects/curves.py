@@ -158,7 +158,7 @@ _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @contextmanager
-def listening(listener: Listener) -> Iterator[None]:
+def report_evaluations(listener: Listener) -> Iterator[None]:
     """Call ``listener`` with the coordinates of each evaluation of a measured curve by this thread.
 
     The compiled step evaluates curves only while it is traced; ``rollout(engine="operators")`` evaluates them all.

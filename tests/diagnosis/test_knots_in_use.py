@@ -15,7 +15,7 @@ from carlab.prediction.windows import PredictionWindows, cut_windows, segments_o
 from sim_backends import EFFECTS, SimulatorConfig
 from sim_backends.array_ops import ARRAYS
 from sim_backends.effects import CURVES
-from sim_backends.effects.curves import DriveMap, free_knots, listening
+from sim_backends.effects.curves import DriveMap, free_knots, report_evaluations
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
 CAR = SimulatorConfig(control_period_s=PERIOD_S)
@@ -73,7 +73,7 @@ def test_coasting_car_uses_the_knots_beside_its_throttle_and_speed(windows: Pred
 def test_listener_receives_coordinates_inside_the_block_only() -> None:
     curve, seen = CURVES[1], []
     coefficients = curve.coefficients({p.name: 0.0 for p in curve.parameters})
-    with listening(lambda which, coordinates: seen.append((which.id, *coordinates))):
+    with report_evaluations(lambda which, coordinates: seen.append((which.id, *coordinates))):
         curve.deviation(ARRAYS, (0.1,), coefficients)
     curve.deviation(ARRAYS, (0.2,), coefficients)
     assert seen == [(curve.id, 0.1)]
@@ -84,3 +84,15 @@ def test_fit_without_free_parameters_has_an_empty_jacobian(windows: PredictionWi
     jacobian, white = fitter.linearised(fitter.fit(CAR, ()))
     assert jacobian.shape == (0, len(windows), 1, 6)
     assert white.shape == (len(windows), 1, 6)
+
+
+def test_curve_of_the_car_file_that_is_not_fitted_leaves_the_knots_of_the_others(windows: PredictionWindows) -> None:
+    some = windows.take(np.arange(3))
+    steering = EFFECTS["steering_curve"]
+    values = {f"effects.steering_curve.{p.name}": np.zeros(1) for p in steering.parameters}
+    alone, both = (
+        influencing_parameters(some, replace(CAR, effects=effects), values)
+        for effects in ({"steering_curve": {}}, {"steering_curve": {}, "drive_map": {}})
+    )
+    assert alone.any()
+    np.testing.assert_array_equal(both, alone)

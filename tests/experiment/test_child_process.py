@@ -16,6 +16,12 @@ import pytest
 
 from carlab.experiment.campaign.child_process import child_context, interrupts_blocked
 
+CHILD = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # A shell ignores SIGINT in background jobs.
+print("ready", flush=True)
+input()
+"""
 SOURCE = """
 import json, os, pathlib, sys
 names = [os.readlink(f"/proc/self/fd/{k}") for k in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{k}")]
@@ -25,9 +31,7 @@ pathlib.Path(%r).write_text(json.dumps({"modules": list(sys.modules), "open": na
 
 def test_process_that_is_started_in_the_block_gets_no_interrupt() -> None:
     with interrupts_blocked():
-        child = subprocess.Popen(
-            [sys.executable, "-c", "print('ready', flush=True); input()"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
+        child = subprocess.Popen([sys.executable, "-c", CHILD], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert child.stdout is not None
     assert child.stdout.readline() == b"ready\n"
     child.send_signal(signal.SIGINT)

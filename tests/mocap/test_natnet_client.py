@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import struct
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -117,7 +116,7 @@ def test_client_receives_models_and_frames_of_every_version(
         until(lambda: len(received.frames) >= 20)
         assert client.version == version
         assert client.statistics()["malformed"] == 0.0
-        assert client.request("FrameRate").data == struct.pack("<f", 240.0)
+        assert client.request("FrameRate").data == bytes.fromhex("00007043")  # 240 as little-endian float32
     assert all(frame.rigid_bodies[0].is_tracked for frame, *_ in received.frames)
 
 

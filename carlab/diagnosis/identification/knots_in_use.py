@@ -18,7 +18,7 @@ from sim_backends.array_ops import ARRAYS, Value
 from sim_backends.batch.rollout import CARS_AT_ONCE
 from sim_backends.car_parameters import SimulatorConfig
 from sim_backends.effects import EFFECTS, MeasuredCurve
-from sim_backends.effects.curves import free_knots, listening, weights
+from sim_backends.effects.curves import free_knots, report_evaluations, weights
 
 BoolArray = NDArray[np.bool_]
 
@@ -67,13 +67,16 @@ def knots_in_use(
     used = {curve.id: np.zeros((*(len(axis.knots) for axis in curve.axes), count), dtype=bool) for curve in curves}
 
     def mark(curve: MeasuredCurve, coordinates: Sequence[Value]) -> None:
+        if curve.id not in used:  # a curve of the car file, which is not fitted
+            return
         by_axis = [
             np.stack([w > 0.0 for w in weights(ARRAYS, np.broadcast_to(np.asarray(x), count), axis.knots)])
             for x, axis in zip(coordinates, curve.axes, strict=True)
         ]
         used[curve.id] |= by_axis[0] if len(by_axis) == 1 else by_axis[0][:, None] & by_axis[1][None]
 
-    with listening(mark):
+    ignored = np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a diverged simulation
+    with ignored, report_evaluations(mark):
         simulate_windows(windows, config, values, engine="operators")
     return used
 
