@@ -12,7 +12,6 @@ import torch
 from carlab.core.quantities import Action
 from sim_backends.batch.rollout import rollout
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.step import compile_step
 from sim_backends.dynamics.plain_loop import rollout_one_by_one
 from sim_backends.plant import Plant
 
@@ -61,11 +60,10 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
     A car-step is one control period of the default car (1/30 s) in four Runge-Kutta steps of at most 10 ms, which is
     ``16`` evaluations of the model. ``plain_numpy_loop`` is the straightforward NumPy form; ``plain_python_loop`` is
     the fastest that Python alone does (floats and ``math``: the plant of the simulated car). ``torch_operators`` is the
-    same batch without the compiled step.
+    same batch without compiled code.
 
-    ``needed_bytes_per_car_step`` must move between memory and core (commands in, states out), ``operand_bytes`` is what
-    NumPy's operations read and write; each is also given as a share of what the core can copy in memory. A share of
-    operands above 1 means that they stay in the caches.
+    ``needed_bytes_per_car_step`` must move between memory and core (commands in, states out); it is also given as a
+    share of what the core can copy in memory.
     """
     config = SimulatorConfig()
     found: dict[str, float] = {}
@@ -86,7 +84,6 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
         bandwidth = copy_bandwidth_bytes_per_s(64, 3)
     fast = found[f"batched_{cars}_cars_car_steps_per_s"]
     needed = 4.0 * (2 + 6)
-    operands = 4.0 * 4 * compile_step(config.kind, (), True).operands
     return {
         **found,
         "ratio_to_plain_numpy_loop": fast / found["plain_numpy_loop_car_steps_per_s"],
@@ -96,8 +93,6 @@ def simulation_speed(cars: int = 4096, repeats: int = 5, plain_cars: int = 40) -
         "copy_bandwidth_bytes_per_s": bandwidth,
         "needed_bytes_per_car_step": needed,
         "needed_share_of_copy_bandwidth": fast * needed / bandwidth,
-        "operand_bytes_per_car_step": operands,
-        "operand_share_of_copy_bandwidth": fast * operands / bandwidth,
     }
 
 

@@ -1,14 +1,13 @@
 """Batched rollouts in torch, differentiable in states, commands and every parameter.
 
-The equations are those of ``single_track``. On a CPU a Runge-Kutta step of them and its derivative are compiled to
-straight-line NumPy code (``compiled.step``) on the memory of the tensors, in chunks that fit the cache. Without a
-gradient autograd is not used. On one core with AVX-512 (NumPy 2.4, torch 2.13, float32) it is 2.5 times as fast as
-torch's operators forward, 4 times with the gradient. On a GPU, and for second derivatives, torch's operators run.
+The equations are those of ``single_track``. On a CPU the steps and their derivative are compiled to machine code
+(``compiled.advance``) on the memory of the tensors, in chunks that fit the cache. Without a gradient autograd is not
+used. On a GPU, and for second derivatives, torch's operators run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +15,7 @@ import numpy as np
 import torch
 
 from carlab.core.planar import arc
-from sim_backends.array_ops import Ops, Value
+from sim_backends.array_ops import ARRAYS, Ops, Value
 from sim_backends.batch.inputs import (
     Past,
     check_shapes,
@@ -27,10 +26,9 @@ from sim_backends.batch.inputs import (
 )
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.simd import ROWS
-from sim_backends.compiled.stepper import CompiledStepper
+from sim_backends.compiled.advance import CompiledCars, Segment
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
-from sim_backends.dynamics.integrate import MAX_STEP_S, Stepper, integrate_held
+from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
 from sim_backends.dynamics.torch_ops import torch_ops
 from sim_backends.measurement import MeasurementModel, filter_step
@@ -103,7 +101,7 @@ def rollout(
     may_compile = engine == "fastest" and start.device.type == "cpu" and start.dtype in _COMPILED_TYPES
     if needs_gradient:
         return _Batch(config, start, commands, past, given, t0_s, max_step_s, None, may_compile).run(measured)
-    arrays = ROWS if may_compile else None
+    arrays = ARRAYS if may_compile else None
     cars_at_once = CARS_AT_ONCE if start.device.type == "cpu" else max(cars, 1)
     parts = []
     with torch.no_grad():
@@ -132,7 +130,7 @@ def _concatenated(parts: Sequence[torch.Tensor]) -> torch.Tensor:
     return torch.cat([part.permute(1, 2, 0) for part in parts], dim=2).permute(2, 0, 1)
 
 
-class _Segment(NamedTuple):
+class _Piece(NamedTuple):
     """A piece of the period in the array type of the equations."""
 
     start_s: Value
@@ -144,7 +142,7 @@ class _Segment(NamedTuple):
     capture_steps: int
 
     @classmethod
-    def of(cls, piece: Piece, local: Callable[[Value], Value]) -> _Segment:
+    def of(cls, piece: Piece, local: Callable[[Value], Value]) -> _Piece:
         after = None if piece.capture_after_s is None else local(piece.capture_after_s / piece.capture_steps)
         start, length, step = (local(v) for v in (piece.start_s, piece.length_s, piece.length_s / piece.steps))
         return cls(start, length, step, piece.steps, local(piece.has_capture), after, piece.capture_steps)
@@ -185,9 +183,8 @@ class _Batch:
         self.measurement = MeasurementModel(self.ops, full, config.effects)
         self.model = SingleTrack(self.ops, config.kind, full, config.effects)
         self.chain = ActuatorChain(self.ops, full, config.effects)
-        self.stepper: Stepper | None = None
-        if compiled:
-            self.stepper = CompiledStepper(self.ops, config.kind, config.effects, full)
+        self.full, self.is_compiled = full, compiled
+        self.compiled_cars: dict[bool, CompiledCars] = {}
         self.t0_s = self._convert(self._row(t0_s, like)) if isinstance(t0_s, torch.Tensor) else t0_s
         self.past = 0 if past is None else int(past.commands.shape[1])
         self.past_rows: list[State] = []
@@ -218,23 +215,23 @@ class _Batch:
         plan = plan_period(self.period_s, delays_s, number_if_shared(latency_s), self.max_step_s)
         before = self.past if self.chain.has_memory or self.model.extra_states else 0
         acting = [tuple(map(self._convert, pair)) for pair in self._acting_commands(plan, before)]
-        pieces = [_Segment.of(piece, self._convert) for piece in plan.pieces]
+        pieces = [_Piece.of(piece, self._convert) for piece in plan.pieces]
 
         lag_s = self.measurement.velocity_time_constant_s if measured else None
         body: State = tuple(map(self._convert, self.rows))
         extra, memory = self._initial_hidden_states(body, pieces, acting, before)
         now = _Moment((*body, *extra), memory, self.measurement.observe(body)[3:6])
+        segments = list(self._segments(pieces, acting, before, measured))
+        ends = iter(self._advance(now, segments, lag_s))
         trajectory, captured = [body], []
-        for k in range(self.ticks):
+        for _ in range(self.ticks):
             seen = now.state[:6]
-            for piece, commands in zip(pieces, acting, strict=True):
-                held = (commands[0][before + k], commands[1][before + k])
-                t_s = self.t0_s + k * self.period_s + piece.start_s
-                after = self._advance(t_s, now, held, piece.step_s, piece.steps, lag_s)
+            for piece in pieces:
+                at_capture = next(ends) if measured and piece.capture_step_s is not None else None
+                after = next(ends)
                 if measured and piece.has_capture is not False:
-                    capture_s, steps = piece.capture_step_s, piece.capture_steps
-                    at_capture = after if capture_s is None else self._advance(t_s, now, held, capture_s, steps, lag_s)
-                    seen = self._choose(piece.has_capture, self._measured_now(at_capture, lag_s), seen)
+                    moment = after if at_capture is None else at_capture
+                    seen = self._choose(piece.has_capture, self._measured_now(moment, lag_s), seen)
                 now = after
             trajectory.append(now.state[:6])
             captured.append(seen)
@@ -245,7 +242,7 @@ class _Batch:
         return Rollout(states, torch.stack(shown).permute(2, 1, 0))
 
     def _initial_hidden_states(
-        self, start: State, pieces: list[_Segment], acting: list[tuple[Value, ...]], before: int
+        self, start: State, pieces: list[_Piece], acting: list[tuple[Value, ...]], before: int
     ) -> tuple[State, ActuatorState]:
         """Hidden states of body and actuators at the first tick, simulated through the history.
 
@@ -269,27 +266,52 @@ class _Batch:
                 moment = _Moment((*body, *extra), memory, body[3:6])
                 held = (commands[0][k], commands[1][k])
                 begin_s = t_s + k * self.period_s + piece.start_s
-                moment = self._advance(begin_s, moment, held, piece.step_s, piece.steps, None)
+                [moment] = self._advance(moment, [Segment(begin_s, held, piece.step_s, piece.steps)], None)
                 extra, memory = moment.state[6:], moment.memory
         return extra, memory
 
-    def _advance(
-        self, t_s: Value, now: _Moment, held: tuple[Value, Value], step_s: Value, steps: int, lag_s: Value | None
-    ) -> _Moment:
-        """Integrate the car, and the filter on its measured velocities if any."""
-        if lag_s is None:
-            state, memory = integrate_held(
-                self.model, self.chain, t_s, now.state, now.memory, held, step_s, steps, self.stepper
-            )
-            return _Moment(state, memory, state[3:6])
-        for i in range(steps):
-            state, memory = integrate_held(
-                self.model, self.chain, t_s + i * step_s, now.state, now.memory, held, step_s, 1, self.stepper
-            )
-            first, last = (self.measurement.observe(s[:6])[3:6] for s in (now.state, state))
-            filtered = filter_step(self.ops, now.filtered, first, last, step_s, lag_s)
-            now = _Moment(state, memory, filtered)
-        return now
+    def _segments(
+        self, pieces: list[_Piece], acting: list[tuple[Value, ...]], before: int, measured: bool
+    ) -> Iterator[Segment]:
+        """The pieces of all periods, each after its part up to the capture if that is to be measured."""
+        for k in range(self.ticks):
+            for piece, commands in zip(pieces, acting, strict=True):
+                held = (commands[0][before + k], commands[1][before + k])
+                t_s = self.t0_s + k * self.period_s + piece.start_s
+                if measured and piece.capture_step_s is not None:
+                    yield Segment(t_s, held, piece.capture_step_s, piece.capture_steps, is_probe=True)
+                yield Segment(t_s, held, piece.step_s, piece.steps)
+
+    def _advance(self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None) -> list[_Moment]:
+        """Integrate the car, and the filter on its measured velocities if any; the ends of the segments."""
+        if not self.is_compiled:
+            return list(self._advance_by_operators(now, segments, lag_s))
+        has_filter, states, memories = lag_s is not None, len(now.state), len(now.memory)
+        if has_filter not in self.compiled_cars:
+            self.compiled_cars[has_filter] = CompiledCars(self.config.kind, self.config.effects, self.full, has_filter)
+        cars = self.compiled_cars[has_filter]
+        carried = (*now.state, *now.memory, *(now.filtered if has_filter else ()))
+        return [
+            _Moment(end[:states], end[states : states + memories], end[-3:] if has_filter else end[3:6])
+            for end in cars.run(carried, segments)
+        ]
+
+    def _advance_by_operators(
+        self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None
+    ) -> Iterator[_Moment]:
+        for t_s, held, step_s, steps, is_probe in segments:
+            moment = now
+            for i in range(steps):
+                state, memory = integrate_held(
+                    self.model, self.chain, t_s + i * step_s, moment.state, moment.memory, held, step_s, 1
+                )
+                filtered = state[3:6]
+                if lag_s is not None:
+                    first, last = (self.measurement.observe(s[:6])[3:6] for s in (moment.state, state))
+                    filtered = filter_step(self.ops, moment.filtered, first, last, step_s, lag_s)
+                moment = _Moment(state, memory, filtered)
+            yield moment
+            now = now if is_probe else moment
 
     def _acting_commands(self, plan: PeriodPlan, before: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Steering and throttle acting in each piece of each period, each (before + ticks, cars)."""

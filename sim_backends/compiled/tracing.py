@@ -76,6 +76,8 @@ _FOLD: dict[str, Callable[..., float]] = {
     "atan2": math.atan2,
     "tanh": math.tanh,
     "exp": math.exp,
+    "log": math.log,
+    "pow": math.pow,
     "sqrt": math.sqrt,
     "hypot": math.hypot,
     "abs": abs,
@@ -216,6 +218,13 @@ def _pull_quotient(t: Tracer, n: Node, g: Any) -> tuple[Any, ...]:
     return share, -(share * n)
 
 
+def _pull_power(t: Tracer, n: Node, g: Any) -> tuple[Any, ...]:
+    """Derivatives of a power of a positive base."""
+    base, exponent = n.arguments
+    share = g * n
+    return share * exponent / base, share * t.make("log", base)
+
+
 def _pull_extremum(t: Tracer, n: Node, g: Any) -> tuple[Any, ...]:
     a, b = n.arguments
     passes = t.make("less_equal", b, a) if n.operation == "maximum" else t.make("less_equal", a, b)
@@ -234,6 +243,8 @@ _PULLBACKS: dict[str, Callable[[Tracer, Node, Any], tuple[Any, ...]]] = {
     "atan2": _pull_atan2,
     "tanh": lambda t, n, g: (g * (1.0 - n * n),),
     "exp": lambda t, n, g: (g * n,),
+    "log": lambda t, n, g: (g / n.arguments[0],),
+    "pow": _pull_power,
     "sqrt": lambda t, n, g: (0.5 * g / n,),
     "hypot": _pull_hypot,
     "abs": lambda t, n, g: (g * t.make("sign", n.arguments[0]),),

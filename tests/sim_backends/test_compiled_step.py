@@ -1,5 +1,7 @@
 """Test the compiled step against the torch operators it is traced from (values and derivatives)."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -41,23 +43,29 @@ def test_values_and_gradients_equal_those_of_torch_operators(kind, effects, per_
         assert torch.allclose(compiled, reference, rtol=1e-9, atol=1e-10)
 
 
-def test_gradient_of_more_cars_than_one_chunk(monkeypatch):
-    start, commands = some(23, 4)
-    gradients_found = []
-    for chunk in (1000, 7):
-        monkeypatch.setattr("sim_backends.compiled.stepper.CHUNK_CARS", chunk)
-        leaf = commands.clone().requires_grad_()
-        rollout(SimulatorConfig(), start, leaf).states.square().sum().backward()
-        gradients_found.append(leaf.grad)
-    assert torch.equal(*gradients_found)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_car_has_the_same_states_and_gradients_in_a_batch_of_any_size(dtype):
+    """The last vector of a batch overlaps the one before it; batches shorter than a vector are padded."""
+    start, commands = (v.to(dtype) for v in some(37, 4))
+
+    def simulated(cars):
+        leaf = commands[:cars].clone().requires_grad_()
+        states = rollout(SimulatorConfig(), start[:cars], leaf).states
+        states.square().sum().backward()
+        return states.detach(), leaf.grad, rollout(SimulatorConfig(), start[:cars], commands[:cars]).states
+
+    whole = simulated(37)
+    for cars in (1, 2, 7, 8, 9, 16, 31):
+        for part, all_cars in zip(simulated(cars), whole, strict=True):
+            assert torch.equal(part, all_cars[:cars])
 
 
-def test_few_and_many_cars_use_the_same_arithmetic(monkeypatch):
-    start, commands = some(40, 6)
-    few = rollout(SimulatorConfig(), start, commands).states
-    monkeypatch.setattr("sim_backends.compiled.step.FEW_CARS", 10)
-    many = rollout(SimulatorConfig(), start.flip(0), commands.flip(0)).states.flip(0)
-    assert torch.equal(few, many)
+def test_batches_of_several_threads_do_not_disturb_each_other():
+    start, commands = some(500, 10)
+    expected = rollout(SimulatorConfig(), start, commands).states
+    with ThreadPoolExecutor(4) as threads:
+        for found in threads.map(lambda _: rollout(SimulatorConfig(), start, commands).states, range(16)):
+            assert torch.equal(found, expected)
 
 
 def test_second_derivatives_are_refused_unless_on_operators():
@@ -78,12 +86,13 @@ UNARY = {
     "atan": -1.3,
     "tanh": 0.4,
     "exp": 0.3,
+    "log": 0.3,
     "sqrt": 2.0,
     "abs": -0.6,
     "sign": -0.6,
     "neg": 0.2,
 }
-BINARY = ("add", "sub", "mul", "div", "atan2", "hypot", "maximum", "minimum")
+BINARY = ("add", "sub", "mul", "div", "atan2", "hypot", "maximum", "minimum", "pow")
 
 
 @pytest.mark.parametrize("operation", [*UNARY, *BINARY])

@@ -15,13 +15,13 @@ import pytest
 import torch
 
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.step import compile_step, trace_step
-from sim_backends.compiled.stepper import CompiledStepper
+from sim_backends.compiled.advance import CompiledCars, Segment, compile_advance, trace_step
 from sim_backends.dynamics.integrate import rk4_step
-from sim_backends.dynamics.single_track import Actuation, SingleTrack
+from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.dynamics.torch_ops import torch_ops
 
 STEP_S = 1.0 / 120.0
+MAX_ANGLE_RAD = SimulatorConfig().values()["steering.max_angle"]
 SIZES = (64, 1024, 3072)
 Rows = list[torch.Tensor]
 Step = Callable[[Rows], tuple[torch.Tensor, ...]]
@@ -46,11 +46,10 @@ class CasadiOps:
 
 
 def rows_of(cars: int, dtype: torch.dtype) -> Rows:
-    """Return states (6 rows), wheel angle with sine and cosine, and throttle of ``cars`` cars."""
+    """Return states (6 rows), steering command and throttle of ``cars`` cars."""
     rng = np.random.default_rng(0)
     state = rng.normal(0.0, 1.0, (6, cars)) * 0.3 + np.array([0, 0, 0, 2.0, 0, 0])[:, None]
-    angle = rng.uniform(-0.4, 0.4, cars)
-    rows = [*state, angle, np.sin(angle), np.cos(angle), rng.uniform(0.0, 0.5, cars)]
+    rows = [*state, rng.uniform(-1.0, 1.0, cars), rng.uniform(0.0, 0.5, cars)]
     return [torch.tensor(row, dtype=dtype, requires_grad=True) for row in rows]
 
 
@@ -60,19 +59,23 @@ def by_operators(rows: Rows) -> Step:
     model = SingleTrack(ops, "dynamic", values, ())
 
     def step(rows: Rows) -> tuple[torch.Tensor, ...]:
-        actuation = Actuation(*rows[6:])
+        actuation = model.actuation(MAX_ANGLE_RAD * rows[6], rows[7])
         return tuple(rk4_step(model, 0.0, tuple(rows[:6]), STEP_S, actuation, actuation, actuation))
 
     return step
 
 
 def by_compiled_step(rows: Rows) -> Step:
-    values = {name: torch.full_like(rows[0].detach(), v) for name, v in SimulatorConfig().values().items()}
-    stepper = CompiledStepper(torch_ops(rows[0].detach()), "dynamic", (), values)
+    kind = rows[0].detach()
+    values = {name: torch.full_like(kind, v) for name, v in SimulatorConfig().values().items()}
 
     def step(rows: Rows) -> tuple[torch.Tensor, ...]:
-        actuation = Actuation(*rows[6:])
-        return tuple(stepper(0.0, tuple(rows[:6]), STEP_S, actuation, actuation, actuation))
+        on_arrays = not torch.is_grad_enabled()
+        given, numbers = ([v.detach().numpy() for v in rows], {n: v.numpy() for n, v in values.items()})
+        cars = CompiledCars("dynamic", (), numbers if on_arrays else values, has_filter=False)
+        state, commands = (given if on_arrays else rows)[:6], (given if on_arrays else rows)[6:]
+        [end] = cars.run(state, [Segment(0.0, (commands[0], commands[1]), STEP_S, 1)])
+        return tuple(map(torch.as_tensor, end))
 
     return step
 
@@ -89,9 +92,9 @@ def torch_seconds(step: Step, rows: Rows, *, gradient: bool) -> float:
 
 
 def casadi_seconds(casadi: Any, rows: Rows, *, gradient: bool) -> float:
-    symbols = [casadi.SX.sym(f"v{i}") for i in range(10)]
+    symbols = [casadi.SX.sym(f"v{i}") for i in range(8)]
     model = SingleTrack(CasadiOps(casadi), "dynamic", SimulatorConfig().values(), ())  # type: ignore[arg-type]
-    actuation = Actuation(*symbols[6:])
+    actuation = model.actuation(MAX_ANGLE_RAD * symbols[6], symbols[7])
     after = rk4_step(model, 0.0, tuple(symbols[:6]), STEP_S, actuation, actuation, actuation)
     given, result = casadi.vertcat(*symbols), casadi.vertcat(*after)
     outputs = [casadi.gradient(casadi.sum1(result), given)] if gradient else [result]
@@ -141,7 +144,7 @@ def test_compiled_step_is_the_fastest(gradient: bool, dtype: torch.dtype) -> Non
         compiled = torch.compile(operators)
         if cars == SIZES[0]:
             trace_step.cache_clear()
-            compile_step.cache_clear()
+            compile_advance.cache_clear()
             firsts = [f"{seconds(partial(step, rows)):.2f} s" for step in (by_compiled_step(rows), compiled)]
             print("\nFirst call of the compiled step and of torch.compile:", *firsts)
         found = {
