@@ -26,7 +26,7 @@ from sim_backends.batch.inputs import (
 )
 from sim_backends.batch.schedule import Number, PeriodPlan, Piece, plan_period
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.advance import CompiledCars, Segment
+from sim_backends.compiled.advance import CompiledCars, Row, Segment
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
 from sim_backends.dynamics.integrate import MAX_STEP_S, integrate_held
 from sim_backends.dynamics.single_track import SingleTrack, State
@@ -264,7 +264,7 @@ class _Batch:
                 share = piece.start_s * (1.0 / self.period_s)
                 body = tuple(a + (b - a) * share for a, b in zip(ticks[k], ticks[k + 1], strict=True))
                 moment = _Moment((*body, *extra), memory, body[3:6])
-                held = (commands[0][k], commands[1][k])
+                held = (Row(commands[0], k), Row(commands[1], k))
                 begin_s = t_s + k * self.period_s + piece.start_s
                 [moment] = self._advance(moment, [Segment(begin_s, held, piece.step_s, piece.steps)], None)
                 extra, memory = moment.state[6:], moment.memory
@@ -276,7 +276,7 @@ class _Batch:
         """The pieces of all periods, each after its part up to the capture if that is to be measured."""
         for k in range(self.ticks):
             for piece, commands in zip(pieces, acting, strict=True):
-                held = (commands[0][before + k], commands[1][before + k])
+                held = (Row(commands[0], before + k), Row(commands[1], before + k))
                 t_s = self.t0_s + k * self.period_s + piece.start_s
                 if measured and piece.capture_step_s is not None:
                     yield Segment(t_s, held, piece.capture_step_s, piece.capture_steps, is_probe=True)
@@ -299,8 +299,8 @@ class _Batch:
     def _advance_by_operators(
         self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None
     ) -> Iterator[_Moment]:
-        for t_s, held, step_s, steps, is_probe in segments:
-            moment = now
+        for t_s, (steering, throttle), step_s, steps, is_probe in segments:
+            moment, held = now, (steering.value, throttle.value)
             for i in range(steps):
                 state, memory = integrate_held(
                     self.model, self.chain, t_s + i * step_s, moment.state, moment.memory, held, step_s, 1

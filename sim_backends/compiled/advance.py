@@ -19,7 +19,6 @@ from sim_backends.car_parameters import ModelKind
 from sim_backends.compiled.machine_code import (
     FloatRow,
     MachineCode,
-    SegmentTable,
     compile_function,
     compile_segments,
     vector_length,
@@ -132,12 +131,24 @@ def compile_gradient(key: Key, wanted: tuple[bool, ...], dtype: np.dtype[Any]) -
     return compile_function([*inputs, *seeds], results, dtype)
 
 
+class Row(NamedTuple):
+    """A row of a matrix of one value per car and row; its address follows from that of the matrix."""
+
+    matrix: Value
+    index: int
+
+    @property
+    def value(self) -> Value:
+        """The row."""
+        return self.matrix[self.index]
+
+
 class Segment(NamedTuple):
     """An interval with held commands."""
 
     t_s: Value
     """Time at its start."""
-    commands: tuple[Value, Value]
+    commands: tuple[Row, Row]
     step_s: Value
     steps: int
     is_probe: bool = False
@@ -171,7 +182,8 @@ class CompiledCars:
             return [tuple(block) for block in ends[:, :, : self._cars]]
         found = []
         for segment in segments:
-            given = (*self._parameters, segment.step_s, *segment.commands, segment.t_s, *carried)
+            commands = (row.value for row in segment.commands)
+            given = (*self._parameters, segment.step_s, *commands, segment.t_s, *carried)
             after = tuple(_Advance.apply(self._key, segment.steps, *given))  # type: ignore[no-untyped-call]
             found.append(after)
             carried = carried if segment.is_probe else after
@@ -189,13 +201,15 @@ def _run(
     code = compile_advance(key, rows.dtype)
     inputs = np.array([rows.address(value) for value in (*parameters, *carried)], np.uint64)
     results = np.empty((len(segments), len(carried), rows.length), rows.dtype)
-    table = np.empty((len(segments), SegmentTable.OUT + 1), np.uint64)
     uses_time = trace_step(key).uses_time
-    for line, segment in zip(table, segments, strict=True):
-        step = rows.address(segment.step_s)
-        time = rows.address(segment.t_s) if uses_time else step
-        line[:-1] = segment.steps, segment.is_probe, step, time, *map(rows.address, segment.commands)
-    table[:, -1] = results.ctypes.data + results.strides[0] * np.arange(len(segments), dtype=np.uint64)
+    out, size = results.ctypes.data, results.strides[0]
+    lines = []
+    for k, (t_s, (steering, throttle), step_s, steps, is_probe) in enumerate(segments):
+        step = rows.address(step_s)
+        time = rows.address(t_s) if uses_time else step
+        commands = rows.address_in(*steering), rows.address_in(*throttle)
+        lines.append((steps, is_probe, step, time, *commands, out + k * size))
+    table = np.array(lines, np.uint64)
     if segments:
         code.call(rows.length, len(segments), inputs.ctypes.data, table.ctypes.data)
     return results
@@ -216,13 +230,19 @@ class _Rows:
             self._known[key] = ((value, row), row.__array_interface__["data"][0])
         return self._known[key][1]
 
+    def address_in(self, matrix: Value, index: int) -> int:
+        """Address of a row of a matrix."""
+        if matrix.shape[1] != self.length:
+            return self.address(matrix[index])
+        return self.address(matrix) + index * self.length * self.dtype.itemsize
+
 
 def _as_row(value: Value, cars: int, dtype: np.dtype[Any]) -> FloatRow:
-    """A number, array or tensor as a contiguous row."""
+    """A number, array or tensor as a contiguous row, or a matrix of such rows as it is."""
     if isinstance(value, torch.Tensor):
         value = value.detach().numpy()
     if isinstance(value, np.ndarray) and value.ndim:
-        return np.ascontiguousarray(value if len(value) == cars else np.resize(value, cars), dtype)
+        return np.ascontiguousarray(value if value.shape[-1] == cars else np.resize(value, cars), dtype)
     return np.full(cars, value, dtype)
 
 
@@ -238,7 +258,8 @@ class _Advance(torch.autograd.Function):
         rows = [_as_row(value, length, dtype) for value in inputs]
         parameters, (step, steering, throttle, t_s), carried = _cut(rows, len(graph.parameters))
         times = [t_s + k * step for k in range(steps)]
-        segments = [Segment(t, (steering, throttle), step, 1) for t in times]
+        commands = Row(steering[None], 0), Row(throttle[None], 0)
+        segments = [Segment(t, commands, step, 1) for t in times]
         after = _run(key, parameters, carried, segments, _Rows(length, dtype))
         ctx.key, ctx.given, ctx.times = key, [*parameters, step, steering, throttle], times
         ctx.befores = [carried, *after[:-1]]

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from sim_backends.car_parameters import SimulatorConfig
-from sim_backends.compiled.advance import CompiledCars, Segment, compile_advance, trace_step
+from sim_backends.compiled.advance import CompiledCars, Row, Segment, compile_advance, trace_step
 from sim_backends.dynamics.integrate import rk4_step
 from sim_backends.dynamics.single_track import SingleTrack
 from sim_backends.dynamics.torch_ops import torch_ops
@@ -74,7 +74,7 @@ def by_compiled_step(rows: Rows) -> Step:
         given, numbers = ([v.detach().numpy() for v in rows], {n: v.numpy() for n, v in values.items()})
         cars = CompiledCars("dynamic", (), numbers if on_arrays else values, has_filter=False)
         state, commands = (given if on_arrays else rows)[:6], (given if on_arrays else rows)[6:]
-        [end] = cars.run(state, [Segment(0.0, (commands[0], commands[1]), STEP_S, 1)])
+        [end] = cars.run(state, [Segment(0.0, (Row(commands[0][None], 0), Row(commands[1][None], 0)), STEP_S, 1)])
         return tuple(map(torch.as_tensor, end))
 
     return step
