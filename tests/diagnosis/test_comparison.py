@@ -56,6 +56,7 @@ def test_interval_of_a_large_change_contains_it(slower_servo):
     assert estimate.low90 <= LAG_S <= estimate.high90
 
 
+@pytest.mark.slow
 def test_changed_base_parameter_is_named(first):
     gain = CAR.values()["motor.drive_gain"]
     found = compare([first], [second(CAR.with_values({"motor.drive_gain": 0.85 * gain}))], CAR, candidates=CANDIDATES)
@@ -65,7 +66,7 @@ def test_changed_base_parameter_is_named(first):
     assert "motor.drive_gain changed" in found.changes[0].sentence.lower()
 
 
-@pytest.mark.parametrize("seed", [22, 23])
+@pytest.mark.parametrize("seed", [22, pytest.param(23, marks=pytest.mark.slow)])
 def test_same_car_has_no_change(first, seed):
     assert compare([first], [second(CAR, seed)], CAR, candidates=CANDIDATES).verdict == "nothing"
 

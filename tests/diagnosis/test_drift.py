@@ -51,6 +51,7 @@ def test_changed_drive_force_and_trim_are_found_with_their_sizes_and_an_unchange
     assert second.changes == ()
 
 
+@pytest.mark.slow
 def test_fading_drive_force_has_its_change_along_the_recording(fitted):
     (found,) = drift_of([fitted], [changing_drive(CONFIG, SECONDS, 4, lambda t: 1.0 - 0.006 * t, lambda t: 0.0)])
     assert found.is_drift
@@ -67,6 +68,7 @@ def test_physics_that_the_simulator_lacks_in_all_recordings_is_no_drift():
     assert [d.is_drift for d in found] == [False, False]
 
 
+@pytest.mark.slow
 def test_drift_in_states_that_were_not_fitted_may_be_an_error_of_the_model(fitted):
     """A car with three times the drive gain is faster than it ever was in the fitted recording."""
     fast = CONFIG.with_values({"motor.drive_gain": 3.0 * CONFIG.parameters.drive_gain_n})

@@ -32,7 +32,8 @@ def diagnosed(concealed: tuple[Path, float]) -> Path:
     """Run the diagnosis with the held-out recording; return the folder of its report."""
     folder = concealed[0]
     arguments = [str(folder / "fit.csv"), "--car", str(folder / "car.toml"), "--holdout", str(folder / "hold.csv")]
-    assert run(["diagnose", *arguments, "--out", str(folder / "out"), "--decisions"]) == 0
+    few = ["--effects", "steering_lag", "steering_delay", "aerodynamic_drag"]
+    assert run(["diagnose", *arguments, "--out", str(folder / "out"), "--decisions", *few]) == 0
     return folder / "out"
 
 
@@ -51,6 +52,15 @@ def test_concealed_servo_lag_is_named_first_and_estimated(concealed: tuple[Path,
     assert any(d["stage"] == "accept" and d["effect"] == "steering_lag" and d["passed"] for d in decisions)
     for d in decisions:
         assert passes(d, "", 0.0) == d["passed"], f"the recorded statistics give another decision: {d}"
+
+
+@pytest.mark.slow
+def test_servo_lag_is_named_first_of_the_whole_catalogue(concealed: tuple[Path, float]) -> None:
+    folder = concealed[0]
+    report = carlab.diagnose(folder / "fit.csv", folder / "car.toml", held_out=folder / "hold.csv")
+    first = report.diagnosis.effects[0]
+    assert (report.diagnosis.verdict, first.id) == ("mismatch", "steering_lag")
+    assert first.parameters["time_constant"].value == pytest.approx(concealed[1], rel=0.05)
 
 
 def replayed(recording: Path, car: str, part: str, capfd: pytest.CaptureFixture[str]) -> dict[str, list[float]]:
@@ -206,7 +216,7 @@ def test_share_together_with_held_out_recordings_raises_an_error(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("stated", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_unknown_latency_is_a_parameter_and_not_an_effect(
     concealed: tuple[Path, float], tmp_path: Path, stated: bool
 ) -> None:

@@ -93,6 +93,7 @@ def test_diagnosis_is_deterministic(drag: tuple[Path, float]) -> None:
     assert replace(first, seconds=0.0) == replace(second, seconds=0.0)
 
 
+@pytest.mark.slow
 def test_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -> None:
     folder = drag[0]
     table = read_csv(folder / "fit.csv")
@@ -110,8 +111,12 @@ def test_halves_of_a_recording_agree(drag: tuple[Path, float], tmp_path: Path) -
     assert difference < 3.0 * np.hypot(first.std, second.std)
 
 
-def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path) -> None:
-    found = outcome(write(tmp_path, make_case("parameters", 31, fit_s=45, hold_s=20))).diagnosis
+@pytest.mark.parametrize(
+    "candidates", [pytest.param(CANDIDATES[:3], id="few"), pytest.param(None, id="catalogue", marks=pytest.mark.slow)]
+)
+def test_no_effect_is_named_with_wrong_base_parameters(tmp_path: Path, candidates: tuple[str, ...] | None) -> None:
+    case = make_case("parameters", 31, fit_s=45, hold_s=20)
+    found = outcome(write(tmp_path, case), effects=candidates).diagnosis
     assert found.verdict == "parameters"
     assert found.effects == ()
     assert found.held_out["refit"].score < 0.5 * found.held_out["nominal"].score

@@ -92,6 +92,7 @@ def test_explained_share_is_the_excess_that_the_effects_remove(
         assert explained_share(problem, found, held_out) == pytest.approx(expected, abs=0.03)
 
 
+@pytest.mark.slow
 def test_delay_of_the_throttle_is_no_lag_of_the_motor(tmp_path: Path) -> None:
     """With fixed initial states, a bias of these in hard braking makes a lag as likely as the concealed delay."""
     case = make_case("single", 10, effects=("throttle_delay",), excess=3.0, fit_s=60, hold_s=30)

@@ -30,7 +30,7 @@ def recorded(folder: Path, true: SimulatorConfig, seed: int, episodes: int = 5) 
     return [read_episode(path) for path in run.recordings()]
 
 
-@pytest.mark.parametrize("seed", [20, 21, 22])
+@pytest.mark.parametrize("seed", [20, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (21, 22))])
 def test_true_simulator_explains_its_recordings(tmp_path: Path, seed: int) -> None:
     episodes = recorded(tmp_path, SIMULATOR, seed)
     for count in (1, 3, 5):
@@ -49,8 +49,13 @@ def checked(effect: str, size: float) -> tuple[drives.Concealed, QuickCheck]:
 
 
 @pytest.mark.parametrize(
-    ("effect", "size"), [("motor_lag", 1.0), ("marker_offset", 1.0), ("road_slope", 2.0)]
-)  # fmt: skip
+    ("effect", "size"),
+    [
+        ("motor_lag", 1.0),
+        pytest.param("marker_offset", 1.0, marks=pytest.mark.slow),
+        pytest.param("road_slope", 2.0, marks=pytest.mark.slow),
+    ],
+)
 def test_concealed_effect_of_an_independent_generator_is_located_and_named(effect: str, size: float) -> None:
     case, check = checked(effect, size)
     assert check.verdict == "left"
@@ -66,6 +71,7 @@ def test_concealed_effect_of_an_independent_generator_is_located_and_named(effec
     assert effect in short(check)
 
 
+@pytest.mark.slow
 def test_effect_is_named_with_wrong_base_parameters() -> None:
     case = drives.concealed_drives("motor_lag", 3.0, seed=24, share=0.1)
     check = quick_check(case.episodes, case.simulator)
@@ -76,13 +82,17 @@ def test_effect_is_named_with_wrong_base_parameters() -> None:
     assert found.parameters["effects.motor_lag.time_constant"].value == pytest.approx(truth, rel=0.15)
 
 
-def test_wrong_parameter_and_a_changed_effect_are_distinguished_from_new_effects(tmp_path: Path) -> None:
+def test_wrong_parameter_is_distinguished_from_new_effects(tmp_path: Path) -> None:
     weaker = SIMULATOR.with_values({"motor.drive_gain": 7.4})
     check = quick_check(recorded(tmp_path, weaker, 25), SIMULATOR)
     assert (check.verdict, check.causes[0].id) == ("left", "motor.drive_gain")
     change = check.causes[0].parameters["motor.drive_gain"]
     assert change.value == pytest.approx(7.4, rel=0.01)
     assert change.before == SIMULATOR.values()["motor.drive_gain"]
+
+
+@pytest.mark.slow
+def test_changed_effect_is_distinguished_from_new_effects(tmp_path: Path) -> None:
     diagnosed, slower = (replace(SIMULATOR, effects={"steering_lag": {"time_constant": t}}) for t in (0.05, 0.09))
     episodes = recorded(tmp_path, slower, 21)
     assert quick_check(episodes, slower).verdict == "explains", "a simulator must be checked with its effects"

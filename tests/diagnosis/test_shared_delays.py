@@ -40,7 +40,10 @@ def fitted(true: dict[str, float], accepted: tuple[str, ...]) -> tuple[SearchPro
     [
         ({"steering_lag": 0.04, "motor_lag": 0.04}, (DELAY,), {"steering_lag", "motor_lag"}),
         ({"steering_delay": 0.04, "throttle_delay": 0.04}, (DELAY,), {DELAY}),
-        ({DELAY: 0.02, "steering_lag": 0.05}, ("motor_lag", "steering_lag"), {DELAY, "steering_lag"}),
+        pytest.param(
+            *({DELAY: 0.02, "steering_lag": 0.05}, ("motor_lag", "steering_lag"), {DELAY, "steering_lag"}),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["two lags are no delay", "two equal delays are one", "delay and lag are not two lags"],
 )
@@ -60,6 +63,7 @@ def test_delays_and_lags_are_exchanged(true: dict[str, float], accepted: tuple[s
         assert lag == pytest.approx(true.get(effect, 0.04), abs=0.003)
 
 
+@pytest.mark.slow
 def test_shared_delay_is_compared_with_the_shorter_of_two_lags() -> None:
     """A delay of both commands of 4 ms beside a lag of the steering is a lag of the motor and a longer steering lag."""
     problem, model = fitted({DELAY: 0.004, "steering_lag": 0.05}, ("steering_lag", "motor_lag"))

@@ -56,6 +56,7 @@ def wheel_angle(model: SimulatorConfig, command: np.ndarray) -> np.ndarray:
     return np.asarray(curve.apply(ARRAYS, angle, curve.numbers(values))) + values["effects.steering_offset.angle"]
 
 
+@pytest.mark.slow
 def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A random increasing map of the steering command resembles an offset, which all other checks accept."""
     case = made("outside", "random_steering_map", "outside")
@@ -75,10 +76,8 @@ def test_steering_map_that_no_effect_has_is_unexplained(tmp_path: Path, monkeypa
     assert error < 0.5 * np.sqrt(np.mean((linear - true) ** 2))
 
 
-@pytest.mark.parametrize(
-    ("effect", "form"),
-    [("steering_deadband", "other"), pytest.param("steering_asymmetry", "catalogue", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("effect", "form"), [("steering_deadband", "other"), ("steering_asymmetry", "catalogue")])
 def test_steering_effect_that_a_curve_contains_keeps_its_name(
     effect: str, form: FormName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
