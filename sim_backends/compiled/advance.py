@@ -172,7 +172,6 @@ class CompiledCars:
         self._on_arrays = isinstance(mass, np.ndarray)
         self._cars = len(mass)
         self._dtype = mass.dtype if self._on_arrays else np.dtype(str(mass.dtype).removeprefix("torch."))
-
         self._rows = _Rows(max(self._cars, vector_length(self._dtype)), self._dtype)
 
     def run(self, carried: Sequence[Value], segments: Sequence[Segment]) -> list[tuple[Value, ...]]:

@@ -161,7 +161,7 @@ _LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
 def report_evaluations(listener: Listener) -> Iterator[None]:
     """Call ``listener`` with the coordinates of each evaluation of a measured curve by this thread.
 
-    The compiled step evaluates curves only while it is traced; ``rollout(engine="operators")`` evaluates them all.
+    Compiled code evaluates curves only while it is traced; ``rollout(engine="operators")`` evaluates them all.
     """
     token = _LISTENER.set(listener)
     try:
