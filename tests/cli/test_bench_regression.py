@@ -216,8 +216,7 @@ def test_published_errors_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
     ]  # fmt: skip
 
 
-def test_grey_box_improves_on_the_simulator_with_missing_friction(monkeypatch):
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 150)
-    monkeypatch.setattr("learning.baselines.system_identification.N_RESTARTS", 4)
+@pytest.mark.usefixtures("short_identification")
+def test_grey_box_improves_on_the_simulator_with_missing_friction():
     sysid, grey_box = run_study("pendulum", rows=(20,), seeds=1, methods=("SysID", "GreyBox"), steps=300)
     assert grey_box.nll < sysid.nll - 0.5

@@ -20,8 +20,8 @@ Carlab = Callable[..., tuple[int, str]]
 ROOT = Path(__file__).resolve().parents[2]
 FAKE_DIAGNOSIS = ROOT / "tests" / "benchmark" / "fake_diagnosis.py"
 SPECS = [
-    CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=10.0, hold_s=6.0),
-    CaseSpec("null", 2, fit_s=8.0, hold_s=5.0),
+    CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=6.0, hold_s=4.0),
+    CaseSpec("null", 2, fit_s=6.0, hold_s=4.0),
 ]
 # Logs whether the proof was sealed at the start of the diagnosis, then runs the fake diagnosis.
 LOGGING_DIAGNOSIS = """
@@ -135,7 +135,7 @@ while not pathlib.Path(root, "go").exists():
 sys.argv = sys.argv[2:]
 runpy.run_path(fake_diagnosis, run_name="__main__")
 '''
-specs = [CaseSpec("null", k, fit_s=8.0, hold_s=5.0) for k in (2, 3)]
+specs = [CaseSpec("null", k, fit_s=5.0, hold_s=4.0) for k in (2, 3)]
 proof_set.short_set = lambda purpose, seed=0: specs
 prove._diagnose_command = lambda: (sys.executable, "-c", waiting, root, fake_diagnosis)
 sys.exit(run(["prove", "--out", root, "--no-baselines", "--no-oracle"]))

@@ -14,8 +14,8 @@ FEW_STEPS = ["--updates", "64", "--model-steps", "20"]
 SCRIPTS = {
     "own_policy.py": [],
     "write_task.py": [],
-    "add_effect.py": [],
-    "diagnose_csv.py": ["--effects", "steering_lag"],
+    "add_effect.py": ["--seconds", "20"],
+    "diagnose_csv.py": ["--seconds", "20", "--effects", "steering_lag"],
     "train_in_learned_car.py": FEW_STEPS,
     "demo.py": ["--car", "sim", "--episodes", "1", *FEW_STEPS, "--effects", "steering_lag"],
 }

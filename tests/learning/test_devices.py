@@ -50,7 +50,7 @@ from learning.world.model_env import ModelEnv
 from learning.world.rollout_fit import RolloutFitSettings, fit_rollouts
 from sim_backends.car_parameters import SimulatorConfig
 
-ROWS, HISTORY = 48, 1
+ROWS, HISTORY = 42, 1
 TRUE = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6))
 PENDULUM_UNITS = Normaliser(
     torch.zeros(4), torch.tensor([1.0, 1.0, 3.5, 2.0]), torch.zeros(3), torch.tensor([0.158, 0.150, 0.951])
@@ -64,6 +64,8 @@ def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the numbers of steps, because operations on the stand-in are slow."""
     monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 4)
     monkeypatch.setattr("learning.baselines.system_identification.STEPS", 4)
+    monkeypatch.setattr("learning.posterior.residuals.SCALE_ITERATIONS", 5)
+    monkeypatch.setattr("learning.posterior.inference.ITERATIONS", 2)
     monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
     monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)
     monkeypatch.setattr("learning.posterior.parameter_posterior.MAX_TEMPERING_STEPS", 2)
@@ -373,7 +375,7 @@ def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytes
         monkeypatch.setattr(module, name, value)
     on_device = None
     for on_device, on_cpu in zip(
-        *(run_study("pendulum", rows=(5,), seeds=1, steps=4, device=at) for at in (device, "cpu")),
+        *(run_study("1d", rows=(5,), seeds=1, steps=4, device=at) for at in (device, "cpu")),
         strict=True,
     ):
         assert on_device.method == on_cpu.method
