@@ -392,6 +392,8 @@ def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(speed, "FITTED_ROWS", 12)
     monkeypatch.setattr(speed, "SIZES", {"small": (4, 2, 9)})
     monkeypatch.setattr(speed, "CAR_FIT", CarFitSettings(steps=5))
+    monkeypatch.setattr(speed, "infer", partial(infer, restart_scales=(1.0,)))
+    monkeypatch.setattr(speed, "_seconds", partial(speed._seconds, times=5))
     synchronise(device)
     training = speed.training_speed(device)
     assert training["small"]["steps_per_s"] > 0.0

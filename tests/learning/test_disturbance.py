@@ -26,8 +26,9 @@ from learning.world.disturbance_fit import (
 
 
 @pytest.fixture(autouse=True)
-def five_correlation_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the shortest and the longest correlation time."""
+def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the shortest and the longest correlation time, and every second number of degrees of freedom."""
+    monkeypatch.setattr(disturbance_fit, "DOF_CANDIDATES", disturbance_fit.DOF_CANDIDATES[::2])
     monkeypatch.setattr(disturbance_fit, "CORRELATION_TIMES_S", disturbance_fit.CORRELATION_TIMES_S[1:-1])
 
 

@@ -88,7 +88,7 @@ def test_noise_of_the_data_is_estimated():
 def test_expected_noise_has_the_weight_of_its_prior_rows():
     """With three rows fitted exactly, the variance is the expected one times prior rows over all rows."""
     x = torch.tensor([[-1.0], [0.0], [1.0]])
-    settings = FsvgdSettings(steps=1500, hidden=(32,), noise_std=0.1, noise_rows=2.0, particles=3, weight_decay=0.0)
+    settings = FsvgdSettings(steps=3000, hidden=(32,), noise_std=0.1, noise_rows=2.0, particles=3, weight_decay=0.0)
     found = deep_ensemble(x, torch.sin(3 * x), UNIT, settings).networks
     assert float(found.noise_std) == pytest.approx(0.1 * math.sqrt(2.0 / 5.0), rel=0.05)
 
