@@ -47,9 +47,15 @@ def main() -> None:
     waves = Manoeuvre(
         "waves", options.seconds, lambda t: carlab.Action(0.5 * math.sin(1.7 * t), 0.4 + 0.3 * math.sin(0.5 * t))
     )  # fmt: skip
-    hall = RecordedTask(carlab.CarState(), max_ticks=int(30 * options.seconds), arena_m=rectangle(-40.0, 40.0, -40.0, 40.0))
+    hall = RecordedTask(
+        carlab.CarState(), max_ticks=int(30 * options.seconds), arena_m=rectangle(-40.0, 40.0, -40.0, 40.0)
+    )
     run = carlab.drive(
-        "sim", reality=CarFile("reality", "", simulator, None), policy=ManoeuvrePolicy(waves), task=hall, out=options.out
+        "sim",
+        reality=CarFile("reality", "", simulator, None),
+        policy=ManoeuvrePolicy(waves),
+        task=hall,
+        out=options.out,
     )
     print(carlab.diagnose(run.recordings, nominal, effects=["cubic_drag"], out=options.out / "diagnosis"))
     print(f"Concealed: 0.5 N s3/m3. Report in {options.out / 'diagnosis' / 'report.html'}")

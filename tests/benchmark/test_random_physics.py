@@ -127,6 +127,7 @@ def test_a_base_parameter_leaves_no_influence(catalogue: CatalogueInfluence) -> 
     assert np.abs(catalogue._base.T @ influence).max() < 1e-9 * np.linalg.norm(influence)
 
 
+@pytest.mark.slow
 def test_random_physics_has_the_asked_strength_and_is_unlike_the_catalogue() -> None:
     case = make_case("outside", 905, effects=["random_throttle_map"], excess=2.0, fit_s=8.0, hold_s=5.0)
     assert case.excess == pytest.approx(2.0, rel=0.15)

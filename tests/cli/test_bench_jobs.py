@@ -106,6 +106,7 @@ def assert_equal_scores(found: list[dict[str, Any]], expected: list[dict[str, An
         assert one["rmse"] == pytest.approx(other["rmse"], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_parallel_jobs_have_the_scores_of_one_process_in_the_same_order(
     carlab: Carlab, regression_scores: list[dict[str, Any]], tmp_path: Path
 ) -> None:

@@ -40,6 +40,7 @@ def test_residuals_of_the_true_simulator_have_the_noise_of_the_case():
     assert torch.allclose(residual_std, torch.tensor(case.noise_std), rtol=0.1)
 
 
+@pytest.mark.usefixtures("short_identification")
 def test_printed_scores_are_written_to_the_file(tmp_path, capsys, monkeypatch):
     out = tmp_path / "study.json"
     arguments = [

@@ -20,7 +20,7 @@ from carlab.core.car import Car
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 README = ROOT / "README.md"
-FASTER = {"diagnose": ("--effects", "steering_lag", "motor_lag")}
+FASTER = {"diagnose": ("--effects", "steering_lag")}
 """Additional arguments of verbs by which a page runs in seconds; the long study runs the commands as they are."""
 MARKER = re.compile(r"^<!-- test: (?P<kind>run|parse|hardware|file|car file)(?P<note>[^>]*)-->$")
 

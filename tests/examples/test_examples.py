@@ -87,6 +87,7 @@ def test_policy_training_in_the_learned_car_prints_returns(output_of: Example) -
     assert "from the goal" in text
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_demo_prints_concealed_and_estimated_values(output_of: Example) -> None:
     text = output_of("demo.py")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from learning_runs import ENVELOPE, TICKS, drive, small_plan
-from short_fits import shorten_inference
 
 from carlab.experiment.campaign.training import train
 from carlab.experiment.cluster.order import TrainingOrder
@@ -19,10 +18,8 @@ from carlab.recording.run_folder import RunDirectory
 def trained(tmp_path_factory: pytest.TempPathFactory) -> RunDirectory:
     """A run with one recording, and the models before its first and second episode."""
     run = drive(tmp_path_factory.mktemp("trained"), TICKS)
-    with pytest.MonkeyPatch.context() as patch:
-        shorten_inference(patch)
-        for recordings in ([], run.recordings()):
-            train(small_plan(), run.models, recordings, ENVELOPE, lambda *what: None)
+    for recordings in ([], run.recordings()):
+        train(small_plan(), run.models, recordings, ENVELOPE, lambda *what: None)
     return run
 
 

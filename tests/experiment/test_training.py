@@ -38,7 +38,6 @@ from learning.world.history import HistoryChoice
 from sim_backends import SimulatorConfig
 from tests.helpers import recorded_drives
 
-
 pytestmark = pytest.mark.usefixtures("short_inference")
 
 

@@ -52,24 +52,21 @@ from sim_backends.car_parameters import SimulatorConfig
 
 ROWS, HISTORY = 42, 1
 TRUE = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6))
-PENDULUM_UNITS = Normaliser(
-    torch.zeros(4), torch.tensor([1.0, 1.0, 3.5, 2.0]), torch.zeros(3), torch.tensor([0.158, 0.150, 0.951])
-)
-NOISE = torch.tensor([0.02, 0.02, 0.02])
+STDS = (torch.tensor([1.0, 1.0, 3.5, 2.0]), torch.tensor([0.158, 0.150, 0.951]))
+PENDULUM_UNITS, NOISE = Normaliser(torch.zeros(4), STDS[0], torch.zeros(3), STDS[1]), torch.full((3,), 0.02)
 RANGES = {"motor.drive_gain": (6.0, 10.0), "steering.max_angle": (0.3, 0.7)}
 
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the numbers of steps, because operations on the stand-in are slow."""
-    monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 4)
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 4)
-    monkeypatch.setattr("learning.posterior.residuals.SCALE_ITERATIONS", 5)
-    monkeypatch.setattr("learning.posterior.inference.ITERATIONS", 2)
-    monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
-    monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)
-    monkeypatch.setattr("learning.posterior.parameter_posterior.MAX_TEMPERING_STEPS", 2)
-    monkeypatch.setattr("learning.posterior.parameter_posterior.RANDOM_WALK_STEPS", 2)
+    for name, value in (
+        *(("posterior.discrepancy.STEPS", 4), ("baselines.system_identification.STEPS", 4)),
+        *(("posterior.residuals.SCALE_ITERATIONS", 5), ("posterior.inference.ITERATIONS", 2)),
+        *(("posterior.inference.PRIOR_DRAWS", 64), ("posterior.inference.PARAMETER_DRAWS", 16)),
+        *(("posterior.parameter_posterior." + part, 2) for part in ("MAX_TEMPERING_STEPS", "RANDOM_WALK_STEPS")),
+    ):
+        monkeypatch.setattr(f"learning.{name}", value)
 
 
 def assert_close(found: Any, expected: Any, tolerance: float = 1e-4) -> None:
@@ -385,6 +382,7 @@ def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytes
     assert on_device.method == list(METHODS)[-1]
 
 
+@pytest.mark.slow
 def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from learning import speed
 
