@@ -330,16 +330,9 @@ class TestRestarts:
         gains = []
         for seed in range(3):
             query, y = rows(300, 100 + seed)
+            options = {"discrepancy_std": expected * UNITS.output_std, "seed": seed}
             single, restarted = (
-                infer(
-                    model,
-                    *rows(60, seed),
-                    UNITS,
-                    NOISE,
-                    discrepancy_std=expected * UNITS.output_std,
-                    seed=seed,
-                    **restart_scales,
-                )  # fmt: skip
+                infer(model, *rows(60, seed), UNITS, NOISE, **options, **restart_scales)
                 for restart_scales in ({"restart_scales": (1.0,)}, {})
             )
             before, after = (
