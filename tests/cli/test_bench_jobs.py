@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 import tomli_w
 import tyro
-from forked_jobs import run_forked_job, run_job_here
+from forked_jobs import run_forked_job
 from linear_cars import linear_car
 
 from carlab.cars import load_car_file
@@ -165,7 +166,7 @@ def test_job_of_recordings_gets_its_files_only(
     model = tmp_path / "model.toml"
 
     model.write_text(tomli_w.dumps(load_car_file(Path("rc_car")).simulator.to_tables()))
-    executor.run_here = run_job_here
+    executor.run_here = partial(run_forked_job, with_short_inference=True)
     out, alone = tmp_path / "out.json", tmp_path / "alone.json"
     study = ("bench", "priors", "--data", recordings, "--car", "rc_car", "--diagnosed", model, "--rows", 20)
     study += ("--seeds", 1, "--first-seed", 3, "--history", 3, "--steps", 30)
