@@ -1,11 +1,11 @@
-# make demo: learn to park, then diagnose a concealed effect, over the whole emulated hardware path.   make test: linters, types, layers, tests.
+# make demo: learn to park, then diagnose a concealed effect, over the whole emulated hardware path.   make test: linters, types, layers, tests.   make test-slow: the long studies.
 # make docs: the documentation site in build/site.   make pictures: the pictures of the documentation.
 # Each sets up .venv by itself on a fresh machine that has Python >= 3.11 and make.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint ruff types layers computing driving docs pictures clean
+.PHONY: demo test test-slow lint ruff types layers computing driving docs pictures clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "carlab needs Python 3.11 or newer; run: make PYTHON=python3.12 ...")'
@@ -45,15 +45,19 @@ COMPUTING := tests/examples tests/diagnosis tests/cli tests/studies tests/benchm
 # One process more than processors: some of these tests also drive, and wait.
 PROCESSES = $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 1)')
 YIELD := nice -n 19
-computing driving: export OMP_NUM_THREADS := 1
+computing driving test-slow: export OMP_NUM_THREADS := 1
 # Processes that the tests start read the bytecode of carlab instead of compiling it again.
-computing driving: export PYTHONDONTWRITEBYTECODE :=
+computing driving test-slow: export PYTHONDONTWRITEBYTECODE :=
 
 computing:
 	$(YIELD) $(BIN)/pytest --numprocesses $(PROCESSES) --dist loadfile --no-loadscope-reorder $(COMPUTING)
 
 driving:
 	$(BIN)/pytest --numprocesses 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))
+
+# Long studies, which `make test` leaves out. Each prints its duration.
+test-slow: $(VENV)/.installed
+	$(YIELD) $(BIN)/pytest --numprocesses 2 --dist loadfile -m slow --durations=0 --durations-min=1
 
 docs: $(VENV)/.installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

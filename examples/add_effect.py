@@ -39,19 +39,26 @@ def main() -> None:
     """Simulate a car with the effect, and diagnose the drive with a car file that does not state it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("runs"))
-    out = parser.parse_args().out
+    parser.add_argument("--seconds", type=float, default=40.0, help="length of the drive")
+    options = parser.parse_args()
     register(CubicDrag())
     nominal = carlab.load_car("sim")
     simulator = nominal.simulator.with_values({"effects.cubic_drag.coefficient": 0.5})
     waves = Manoeuvre(
-        "waves", 40.0, lambda t: carlab.Action(0.5 * math.sin(1.7 * t), 0.4 + 0.3 * math.sin(0.5 * t))
+        "waves", options.seconds, lambda t: carlab.Action(0.5 * math.sin(1.7 * t), 0.4 + 0.3 * math.sin(0.5 * t))
     )  # fmt: skip
-    hall = RecordedTask(carlab.CarState(), max_ticks=1200, arena_m=rectangle(-40.0, 40.0, -40.0, 40.0))
-    run = carlab.drive(
-        "sim", reality=CarFile("reality", "", simulator, None), policy=ManoeuvrePolicy(waves), task=hall, out=out
+    hall = RecordedTask(
+        carlab.CarState(), max_ticks=int(30 * options.seconds), arena_m=rectangle(-40.0, 40.0, -40.0, 40.0)
     )
-    print(carlab.diagnose(run.recordings, nominal, effects=["cubic_drag"], out=out / "diagnosis"))
-    print(f"Concealed: 0.5 N s3/m3. Report in {out / 'diagnosis' / 'report.html'}")
+    run = carlab.drive(
+        "sim",
+        reality=CarFile("reality", "", simulator, None),
+        policy=ManoeuvrePolicy(waves),
+        task=hall,
+        out=options.out,
+    )
+    print(carlab.diagnose(run.recordings, nominal, effects=["cubic_drag"], out=options.out / "diagnosis"))
+    print(f"Concealed: 0.5 N s3/m3. Report in {options.out / 'diagnosis' / 'report.html'}")
 
 
 if __name__ == "__main__":

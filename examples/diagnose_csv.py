@@ -16,7 +16,7 @@ from carlab.core.task import RecordedTask
 from carlab.experiment.episodes.scripted_policies import ManoeuvrePolicy
 
 
-def example_csv(folder: Path) -> Path:
+def example_csv(folder: Path, seconds: float) -> Path:
     """Drive steps of steering at changing speed with a servo that lags by 90 ms, and write the drive as CSV."""
 
     def steps(t_s: float) -> carlab.Action:
@@ -26,8 +26,8 @@ def example_csv(folder: Path) -> Path:
     run = carlab.drive(
         "sim",
         reality=CarFile("reality", "", simulator, None),
-        policy=ManoeuvrePolicy(Manoeuvre("steps", 40.0, steps)),
-        task=RecordedTask(carlab.CarState(), max_ticks=1200, arena_m=rectangle(-60.0, 60.0, -60.0, 60.0)),
+        policy=ManoeuvrePolicy(Manoeuvre("steps", seconds, steps)),
+        task=RecordedTask(carlab.CarState(), max_ticks=int(30 * seconds), arena_m=rectangle(-60.0, 60.0, -60.0, 60.0)),
         out=folder,
     )
     return carlab.load(run.recordings[0]).save(run.folder / "drive.csv")
@@ -39,10 +39,11 @@ def main() -> None:
     parser.add_argument("csv", nargs="?", type=Path, help="the drive; by default one is recorded")
     parser.add_argument("--car", default="sim", help="car file, or the name of a preset")
     parser.add_argument("--effects", nargs="*", default=(), help="try only these effects, which is faster")
+    parser.add_argument("--seconds", type=float, default=40.0, help="length of the recorded drive")
     parser.add_argument("--out", type=Path, default=Path("runs"))
     options = parser.parse_args()
 
-    recording = carlab.load(options.csv or example_csv(options.out))
+    recording = carlab.load(options.csv or example_csv(options.out, options.seconds))
     car = carlab.load_car(options.car)
     print(recording)
     print(f"Errors of the car file:\n{carlab.predict(recording, car)}")

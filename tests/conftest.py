@@ -10,6 +10,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from short_fits import shorten_identification, shorten_inference
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
@@ -51,6 +52,18 @@ def stand_in_device() -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def short_inference(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Posteriors over functions have few draws and steps."""
+    shorten_inference(monkeypatch)
+
+
+@pytest.fixture
+def short_identification(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Identification has few restarts and steps."""
+    shorten_identification(monkeypatch)
 
 
 @pytest.fixture(params=["stand-in", pytest.param("cuda", marks=pytest.mark.gpu)])

@@ -1,6 +1,7 @@
 """Test the architecture beyond `lint-imports`: import cycles, prints, wall-clock reads, package roots, sizes."""
 
 import ast
+import functools
 import graphlib
 import subprocess
 import sys
@@ -13,6 +14,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("carlab", "drivers", "mocap", "learning", "sim_backends")
 SOURCES = sorted(p for package in PACKAGES for p in (ROOT / package).rglob("*.py"))
+
+
+@functools.cache
+def nodes(path: Path) -> list[ast.AST]:
+    """Return all nodes of the syntax tree of a file."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +121,7 @@ def test_core_imports_numpy_array_api_compat_and_the_standard_library_only() -> 
     imported = {
         name.split(".")[0]
         for path in (ROOT / "carlab" / "core").glob("*.py")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in nodes(path)
         if isinstance(node, ast.Import | ast.ImportFrom)
         for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names])
     }
@@ -125,7 +132,7 @@ def test_only_the_command_line_prints() -> None:
     printing = {
         str(path.relative_to(ROOT))
         for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in nodes(path)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     }
     assert {p for p in printing if not p.startswith("carlab/cli/")} == set()
@@ -135,7 +142,7 @@ def test_wall_clock_is_read_in_one_module() -> None:
     reading = {
         str(path.relative_to(ROOT))
         for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in nodes(path)
         if isinstance(node, ast.Attribute)
         and isinstance(node.value, ast.Name)
         and (node.value.id, node.attr) in {("time", "time"), ("time", "time_ns"), ("datetime", "now")}
@@ -158,7 +165,7 @@ def test_functions_have_at_most_60_lines() -> None:
     long = {
         f"{path.relative_to(ROOT)}: {node.name}"
         for path in sources
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in nodes(path)
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         and node.end_lineno is not None
         and node.end_lineno - node.lineno >= 60

@@ -147,6 +147,8 @@ def fit_disturbance(errors: RolloutErrors) -> DisturbanceProcess:
         for t in CORRELATION_TIMES_S:
             ahead, left, yaw = (t if c == channel else own for c, own in enumerate(best.correlation_s))
             times = (ahead, left, yaw)
+            if times == best.correlation_s:
+                continue  # the fit with these times is the best one
             fit = _maximise(errors, [unit[own] for own in times], times)
             best = fit if fit.density > best.density else best
     return DisturbanceProcess(best.scale, best.correlation_s, errors.period_s, best.dof)

@@ -70,7 +70,7 @@ def test_load_refuses_missing_files_and_folders(tmp_path: Path) -> None:
         carlab.load(tmp_path)
 
 
-def drive_of(simulator: SimulatorConfig, seconds: float = 40.0, seed: int = 1) -> EpisodeData:
+def drive_of(simulator: SimulatorConfig, seconds: float = 25.0, seed: int = 1) -> EpisodeData:
     """Simulate a noisy steering chirp with varying throttle."""
     from sim_backends.plant import Plant
 

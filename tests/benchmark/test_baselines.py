@@ -20,7 +20,7 @@ from carlab.benchmark.world.simulation import FloatArray
 
 
 def case(kind: str, seed: int, *effects: str, excess: float = 1.0) -> Case:
-    return make_case(kind, seed, effects=effects, excess=excess, fit_s=60.0, hold_s=25.0)  # type: ignore[arg-type]
+    return make_case(kind, seed, effects=effects, excess=excess, fit_s=30.0, hold_s=15.0)  # type: ignore[arg-type]
 
 
 def prepared(made: Case) -> Prepared:

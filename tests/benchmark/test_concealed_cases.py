@@ -78,7 +78,7 @@ def test_null_car_equals_the_nominal_car() -> None:
     ("name", "form", "excess"), [("steering_lag", "other", 2.0), ("rolling_resistance", "catalogue", 0.5)]
 )
 def test_strength_is_reached(name: str, form: str, excess: float) -> None:
-    case = make_case("single", 21, effects=[name], form=form, excess=excess, fit_s=20.0, hold_s=10.0)  # type: ignore[arg-type]
+    case = make_case("single", 21, effects=[name], form=form, excess=excess, fit_s=10.0, hold_s=6.0)  # type: ignore[arg-type]
     assert case.excess == pytest.approx(excess, rel=0.15)
     lateral = {"y", "yaw", "vy", "yaw_rate"}
     main = set(case.answer()["main_channels"])

@@ -20,7 +20,7 @@ from carlab.benchmark.world.base_car import BaseCar
 from carlab.benchmark.world.measurement import COLUMNS, read_csv
 from carlab.core.errors import ConfigError
 
-SHORT = {"fit_s": 12.0, "hold_s": 8.0}
+SHORT = {"fit_s": 8.0, "hold_s": 5.0}
 PERIOD_S = 1.0 / 30.0
 
 

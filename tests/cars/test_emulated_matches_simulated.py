@@ -26,7 +26,7 @@ from carlab.experiment.episodes.episode import run_episode
 from carlab.experiment.episodes.scripted_policies import ReverseParkingPolicy
 from sim_backends.simulated_car import SimulatedCar
 
-SEEDS = range(10)
+SEEDS = range(5)
 TASK = ParkingTask()
 ENVELOPE = SafetyEnvelope(arena_m=TASK.arena_m)
 PERIOD_S = default_car().simulator.control_period_s

@@ -55,6 +55,7 @@ def model(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("short_inference")
 def test_recordings_are_learned_with_four_priors(carlab: Carlab, folder: Path, model: Path, tmp_path: Path) -> None:
     out = tmp_path / "study.json"
     arguments = ("--rows", 20, "--seeds", 1, "--history", 3, "--steps", 30, "--out", out)

@@ -40,6 +40,7 @@ def test_residuals_of_the_true_simulator_have_the_noise_of_the_case():
     assert torch.allclose(residual_std, torch.tensor(case.noise_std), rtol=0.1)
 
 
+@pytest.mark.usefixtures("short_identification")
 def test_printed_scores_are_written_to_the_file(tmp_path, capsys, monkeypatch):
     out = tmp_path / "study.json"
     arguments = [
@@ -216,8 +217,7 @@ def test_published_errors_weaken_repulsion_and_the_prior_of_fsvgd(monkeypatch):
     ]  # fmt: skip
 
 
-def test_grey_box_improves_on_the_simulator_with_missing_friction(monkeypatch):
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 150)
-    monkeypatch.setattr("learning.baselines.system_identification.N_RESTARTS", 4)
+@pytest.mark.usefixtures("short_identification")
+def test_grey_box_improves_on_the_simulator_with_missing_friction():
     sysid, grey_box = run_study("pendulum", rows=(20,), seeds=1, methods=("SysID", "GreyBox"), steps=300)
     assert grey_box.nll < sysid.nll - 0.5

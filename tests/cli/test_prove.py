@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,15 +15,18 @@ import pytest
 
 from carlab.benchmark.cases import proof_set
 from carlab.benchmark.cases.proof_set import CaseSpec
+from carlab.benchmark.proof.runner import Proof
 from carlab.cli import prove
+from carlab.jobs.child_jobs import LocalExecutor
 
 Carlab = Callable[..., tuple[int, str]]
 ROOT = Path(__file__).resolve().parents[2]
 FAKE_DIAGNOSIS = ROOT / "tests" / "benchmark" / "fake_diagnosis.py"
 SPECS = [
-    CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=10.0, hold_s=6.0),
+    CaseSpec("single", 1, ("steering_lag",), "catalogue", 2.0, fit_s=6.0, hold_s=4.0),
     CaseSpec("null", 2, fit_s=8.0, hold_s=5.0),
 ]
+NULL_SPECS = [CaseSpec("null", k, fit_s=8.0, hold_s=5.0) for k in (2, 3)]
 # Logs whether the proof was sealed at the start of the diagnosis, then runs the fake diagnosis.
 LOGGING_DIAGNOSIS = """
 import json, os, runpy, sys
@@ -46,6 +50,14 @@ def proof_dir(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         prove, "_diagnose_command", lambda: (sys.executable, "-c", LOGGING_DIAGNOSIS, str(root), str(FAKE_DIAGNOSIS))
     )
     return root
+
+
+@pytest.fixture(scope="module")
+def sealed_null_proof(tmp_path_factory: pytest.TempPathFactory) -> Proof:
+    """A proof with two cases without an effect, which one process after another made."""
+    proof = Proof(tmp_path_factory.mktemp("null") / "proof", NULL_SPECS, executor=LocalExecutor(1))
+    assert proof.make() is not None
+    return proof
 
 
 def diagnosis_log(root: Path) -> list[dict[str, Any]]:
@@ -86,14 +98,11 @@ def test_proof_is_sealed_scored_and_not_repeated(proof_dir: Path, carlab: Carlab
     assert "seal is broken" in text
 
 
-def test_cases_do_not_depend_on_the_number_of_jobs(proof_dir: Path, tmp_path: Path) -> None:
-    from carlab.benchmark.proof.runner import Proof
-    from carlab.jobs.child_jobs import LocalExecutor
-
+def test_cases_do_not_depend_on_the_number_of_jobs(sealed_null_proof: Proof, tmp_path: Path) -> None:
+    parallel = Proof(tmp_path / "parallel", NULL_SPECS, executor=LocalExecutor(2))
+    assert parallel.make() is not None
     files = []
-    for jobs in (1, 2):
-        proof = Proof(tmp_path / str(jobs), SPECS, executor=LocalExecutor(jobs))
-        assert proof.make() is not None
+    for proof in (sealed_null_proof, parallel):
         plan = json.loads((proof.root / "answers" / "plan.json").read_text())
         files.append([(proof.root / "handed" / name / "fit.csv").read_bytes() for name in plan["names"]])
     assert files[0] == files[1]
@@ -149,8 +158,11 @@ def wait_for(path: Path, process: subprocess.Popen[str]) -> None:
 
 
 @pytest.mark.parametrize("interrupts", [1, 2])
-def test_first_interrupt_finishes_the_running_case_and_second_drops_it(interrupts: int, tmp_path: Path) -> None:
+def test_first_interrupt_finishes_the_running_case_and_second_drops_it(
+    interrupts: int, sealed_null_proof: Proof, tmp_path: Path
+) -> None:
     root = tmp_path / "proof"
+    shutil.copytree(sealed_null_proof.root, root)
     command = (sys.executable, "-c", PROOF_WITH_WAITING_DIAGNOSIS, str(root), str(FAKE_DIAGNOSIS))
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True

@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from carlab.core.car import Car
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 README = ROOT / "README.md"
+FASTER = {"diagnose": ("--effects", "steering_lag")}
+"""Additional arguments of verbs by which a page runs in seconds; the long study runs the commands as they are."""
 MARKER = re.compile(r"^<!-- test: (?P<kind>run|parse|hardware|file|car file)(?P<note>[^>]*)-->$")
 
 
@@ -99,22 +102,43 @@ def test_makefile_names_existing_tests() -> None:
     assert [path for path in sorted(paths) if not (ROOT / path).exists()] == []
 
 
+RUN_PAGES = sorted({b.page for b in BLOCKS if b.marker == "run"})
+
+
 @pytest.mark.realtime
 @pytest.mark.timeout(1500)
-@pytest.mark.parametrize("page", sorted({b.page for b in BLOCKS if b.marker == "run"}), ids=_name)
+@pytest.mark.parametrize("page", RUN_PAGES, ids=_name)
 def test_commands_of_a_page_run_in_order(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Commands of carlab run in this process, which spares its imports; the shell's patterns are expanded."""
     monkeypatch.chdir(tmp_path)
+    run_commands_of(page, capfd, FASTER)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize("page", [ROOT / "docs" / "tutorials" / "first-diagnosis.md"], ids=_name)
+def test_unchanged_commands_of_a_page_run_in_order(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_commands_of(page, capfd, {})
+
+
+def run_commands_of(page: Path, capfd: pytest.CaptureFixture[str], added: Mapping[str, tuple[str, ...]]) -> None:
+    """Run the commands of a page in this process, which spares its imports, and in the current folder.
+
+    Patterns of the shell are expanded, and ``added`` arguments of a verb are appended.
+    """
     for block in blocks(page):
         if block.marker == "file":
-            (tmp_path / block.note).write_text(block.text, encoding="utf-8")
+            Path(block.note).write_text(block.text, encoding="utf-8")
         if block.marker != "run":
             continue
         for command in (line[2:] for line in block.text.split("\n") if line.startswith("$ ")):
             program, *arguments = shlex.split(command, comments=True)
             assert program == "carlab"
+            arguments += added.get(arguments[0], ())
             code = run([path for argument in arguments for path in sorted(glob.glob(argument)) or [argument]])
             printed = "".join(capfd.readouterr())
             assert code == 0, f"{command}\n{printed}"

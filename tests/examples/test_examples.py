@@ -14,8 +14,8 @@ FEW_STEPS = ["--updates", "64", "--model-steps", "20"]
 SCRIPTS = {
     "own_policy.py": [],
     "write_task.py": [],
-    "add_effect.py": [],
-    "diagnose_csv.py": ["--effects", "steering_lag"],
+    "add_effect.py": ["--seconds", "20"],
+    "diagnose_csv.py": ["--seconds", "20", "--effects", "steering_lag"],
     "train_in_learned_car.py": FEW_STEPS,
     "demo.py": ["--car", "sim", "--episodes", "1", *FEW_STEPS, "--effects", "steering_lag"],
 }
@@ -87,6 +87,7 @@ def test_policy_training_in_the_learned_car_prints_returns(output_of: Example) -
     assert "from the goal" in text
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_demo_prints_concealed_and_estimated_values(output_of: Example) -> None:
     text = output_of("demo.py")

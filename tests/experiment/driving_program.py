@@ -99,6 +99,7 @@ def main(folder: str, misbehaviour: str) -> int:
             replace(_envelope()),
             run,
             1 / 30,
+            record_rerun=misbehaviour == "recorder_error",
             hooks=SessionHooks(on_tick=on_tick, on_abandon=on_abandon),
             hang_timeout_s=1.0,
         )

@@ -26,6 +26,7 @@ from learning.transitions import transitions_of
 pytestmark = pytest.mark.realtime
 
 
+@pytest.mark.usefixtures("short_inference")
 def test_recorded_command_equals_the_command_received_by_the_firmware(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

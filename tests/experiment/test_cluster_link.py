@@ -164,6 +164,7 @@ def learn_with_cuts(cluster: Cluster, tmp_path: Path) -> LearningRun:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("cluster_of", [cluster_without_ray, cluster_of_ray])
 def test_car_is_in_neutral_and_the_run_finishes_while_the_link_is_cut_and_restored(

@@ -59,6 +59,7 @@ def device_of(agent: SacAgent | SacPolicy) -> torch.device:
     return next(sac.policy.parameters()).device
 
 
+@pytest.mark.slow
 def test_run_trains_on_the_device_and_drives_on_the_cpu(
     device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,6 +7,7 @@ import math
 import tomllib
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from carlab.cars import choose_car
 from carlab.core.documents import Tick
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import DataError
+from carlab.diagnosis.diagnose import diagnose
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks, resumed_campaign
 from carlab.experiment.campaign.figures import EpisodeFigures
 from carlab.experiment.campaign.prior_correction import (
@@ -206,7 +208,17 @@ def long_drives(episodes: list[EpisodeData]) -> list[EpisodeData]:
     return [e for e in episodes if e.ticks > 60]
 
 
-def test_real_diagnosis_of_a_run_finds_the_lag(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "candidates",
+    [
+        pytest.param(("steering_lag", "motor_lag"), id="two effects"),
+        pytest.param(None, id="catalogue", marks=pytest.mark.slow),
+    ],
+)
+def test_real_diagnosis_of_a_run_finds_the_lag(
+    candidates: tuple[str, ...] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carlab.diagnosis.diagnose.diagnose", partial(diagnose, effects=candidates))
     true = replace(CAR, effects={"motor_lag": {"time_constant": 0.08}})
     run = drives.drive_like_learning(true, tmp_path, 6, seed=5)
     episodes = long_drives([read_episode(path) for path in run.recordings()])

@@ -38,6 +38,8 @@ from learning.world.history import HistoryChoice
 from sim_backends import SimulatorConfig
 from tests.helpers import recorded_drives
 
+pytestmark = pytest.mark.usefixtures("short_inference")
+
 
 def test_model_uses_the_velocity_delay_of_the_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A line fitted to the poses of the last 50 ms at 100 Hz gives the velocity of 25 ms before."""

@@ -79,9 +79,10 @@ def test_average_drops_models_that_the_data_contradict():
     assert model.weights.tolist() == [1.0]
 
 
+@pytest.mark.slow
 def test_wrong_structure_falls_back_to_other_models(monkeypatch):
     """A detent is outside the structured family: the average is better than the structured simulator alone."""
-    monkeypatch.setattr(averaging, "held_out_log_densities", partial(held_out_log_densities, max_folds=5))
+    monkeypatch.setattr(averaging, "held_out_log_densities", partial(held_out_log_densities, max_folds=3))
     case = CASES["pendulum_detent"].structured()
     data = case.data(10, 100)
     task = FitTask(case, data, 100, None)

@@ -50,24 +50,23 @@ from learning.world.model_env import ModelEnv
 from learning.world.rollout_fit import RolloutFitSettings, fit_rollouts
 from sim_backends.car_parameters import SimulatorConfig
 
-ROWS, HISTORY = 48, 1
+ROWS, HISTORY = 42, 1
 TRUE = Pendulum(frictions=(0.4, 0.6), drags=(0.4, 0.6))
-PENDULUM_UNITS = Normaliser(
-    torch.zeros(4), torch.tensor([1.0, 1.0, 3.5, 2.0]), torch.zeros(3), torch.tensor([0.158, 0.150, 0.951])
-)
-NOISE = torch.tensor([0.02, 0.02, 0.02])
+STDS = (torch.tensor([1.0, 1.0, 3.5, 2.0]), torch.tensor([0.158, 0.150, 0.951]))
+PENDULUM_UNITS, NOISE = Normaliser(torch.zeros(4), STDS[0], torch.zeros(3), STDS[1]), torch.full((3,), 0.02)
 RANGES = {"motor.drive_gain": (6.0, 10.0), "steering.max_angle": (0.3, 0.7)}
 
 
 @pytest.fixture(autouse=True)
 def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reduce the numbers of steps, because operations on the stand-in are slow."""
-    monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 4)
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 4)
-    monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
-    monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)
-    monkeypatch.setattr("learning.posterior.parameter_posterior.MAX_TEMPERING_STEPS", 2)
-    monkeypatch.setattr("learning.posterior.parameter_posterior.RANDOM_WALK_STEPS", 2)
+    for name, value in (
+        *(("posterior.discrepancy.STEPS", 4), ("baselines.system_identification.STEPS", 4)),
+        *(("posterior.residuals.SCALE_ITERATIONS", 5), ("posterior.inference.ITERATIONS", 2)),
+        *(("posterior.inference.PRIOR_DRAWS", 64), ("posterior.inference.PARAMETER_DRAWS", 16)),
+        *(("posterior.parameter_posterior." + part, 2) for part in ("MAX_TEMPERING_STEPS", "RANDOM_WALK_STEPS")),
+    ):
+        monkeypatch.setattr(f"learning.{name}", value)
 
 
 def assert_close(found: Any, expected: Any, tolerance: float = 1e-4) -> None:
@@ -373,7 +372,7 @@ def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytes
         monkeypatch.setattr(module, name, value)
     on_device = None
     for on_device, on_cpu in zip(
-        *(run_study("pendulum", rows=(5,), seeds=1, steps=4, device=at) for at in (device, "cpu")),
+        *(run_study("1d", rows=(5,), seeds=1, steps=4, device=at) for at in (device, "cpu")),
         strict=True,
     ):
         assert on_device.method == on_cpu.method
@@ -383,6 +382,7 @@ def test_regression_study_is_equal_on_the_device(device: str, monkeypatch: pytes
     assert on_device.method == list(METHODS)[-1]
 
 
+@pytest.mark.slow
 def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from learning import speed
 
@@ -390,6 +390,8 @@ def test_speed_is_measured_there(device: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(speed, "FITTED_ROWS", 12)
     monkeypatch.setattr(speed, "SIZES", {"small": (4, 2, 9)})
     monkeypatch.setattr(speed, "CAR_FIT", CarFitSettings(steps=5))
+    monkeypatch.setattr(speed, "infer", partial(infer, restart_scales=(1.0,)))
+    monkeypatch.setattr(speed, "_seconds", partial(speed._seconds, times=5))
     synchronise(device)
     training = speed.training_speed(device)
     assert training["small"]["steps_per_s"] > 0.0

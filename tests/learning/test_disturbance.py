@@ -14,6 +14,7 @@ from torch import Tensor
 from carlab.core.errors import DataError
 from carlab.core.observation import decode_state, encode
 from learning.posterior.draws import Assignment
+from learning.world import disturbance_fit
 from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import DisturbanceProcess, DisturbedCar, start_rollouts
 from learning.world.disturbance_fit import (
@@ -22,6 +23,13 @@ from learning.world.disturbance_fit import (
     pooled,
     rollout_errors,
 )
+
+
+@pytest.fixture(autouse=True)
+def few_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the shortest and the longest correlation time, and every second number of degrees of freedom."""
+    monkeypatch.setattr(disturbance_fit, "DOF_CANDIDATES", disturbance_fit.DOF_CANDIDATES[::2])
+    monkeypatch.setattr(disturbance_fit, "CORRELATION_TIMES_S", disturbance_fit.CORRELATION_TIMES_S[1:-1])
 
 
 def vx_std(scale: float, correlation_s: float, steps: int) -> float:
@@ -79,7 +87,7 @@ def test_each_rollout_keeps_its_particle() -> None:
 
 def test_fit_recovers_scale_and_correlation_time() -> None:
     truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.4,) * 3, PERIOD_S)
-    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 250)))
+    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 160)))
     assert found.dof >= 10.0, "the planted disturbance is Gaussian"
     np.testing.assert_allclose(found.scale, truth.scale, rtol=0.25)
     assert set(found.correlation_s) <= {0.2, 0.4, 0.8}
@@ -89,7 +97,7 @@ def test_fitted_bands_cover_new_windows_at_their_nominal_level() -> None:
     """Sampled bands of 90 % cover 90 % after 0.5 and 1 s; the closed form gives the level of step noise alone."""
     truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.8,) * 3, PERIOD_S)
     car = decaying_car(torch.zeros(2))
-    process = fit_disturbance(rollout_errors(car, driven_windows(truth, 250)))
+    process = fit_disturbance(rollout_errors(car, driven_windows(truth, 160)))
     new = driven_windows(truth, 2000, seed=2)
     for steps in (15, 30):
         undisturbed = (1.0 - DECAY) ** steps * new.velocities[:, 0]
@@ -106,7 +114,7 @@ def test_fitted_bands_cover_new_windows_at_their_nominal_level() -> None:
 
 def test_fit_finds_heavy_tails() -> None:
     truth = DisturbanceProcess((0.8, 0.4, 3.0), (0.4,) * 3, PERIOD_S, dof=3.0)
-    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 250)))
+    found = fit_disturbance(rollout_errors(decaying_car(torch.zeros(2)), driven_windows(truth, 160)))
     assert found.dof <= 6.0
     np.testing.assert_allclose(found.scale, truth.scale, rtol=0.35)
 

@@ -29,7 +29,7 @@ def lines(x, count=400, seed=0):
 def test_fit_to_a_simulator_alone_has_the_moments_of_its_draws():
     pool = torch.linspace(-2, 2, 64)[:, None]
     prior = SimulatorPrior(lines(pool), pool)
-    settings = FsvgdSettings(steps=1500, hidden=(32, 32), fit_noise=False, noise_std=0.05)
+    settings = FsvgdSettings(steps=800, hidden=(32, 32), fit_noise=False, noise_std=0.05)
     prediction = fit_fsvgd(EMPTY, EMPTY, pool, prior, UNIT, settings).predict(pool)
     assert torch.allclose(prediction.mean[:, 0], pool[:, 0], atol=0.25)
     exact = (0.25 * pool[:, 0] ** 2 + 0.09).sqrt()
@@ -42,7 +42,7 @@ def test_fit_to_data_is_close_to_the_conjugate_posterior():
     x, y = torch.tensor([[-1.0], [0.5]]), torch.tensor([[-1.6], [0.9]])
     noise = 0.2
     prior = SimulatorPrior(lines(torch.cat([x, pool]), 4000), torch.cat([x, pool]))
-    settings = FsvgdSettings(steps=3000, hidden=(32, 32), fit_noise=False, noise_std=noise)
+    settings = FsvgdSettings(steps=1200, hidden=(32, 32), fit_noise=False, noise_std=noise)
     prediction = fit_fsvgd(x, y, pool, prior, UNIT, settings).predict(pool)
     features = torch.cat([x, torch.ones_like(x)], dim=1)
     precision = torch.diag(torch.tensor([4.0, 1 / 0.09])) + features.T @ features / noise**2
@@ -61,7 +61,7 @@ def test_one_particle_converges_to_the_maximum_a_posteriori_function():
     prior = GaussianProcessPrior(torch.cat([x, x]), covariance, jitter=1e-2)
     settings = FsvgdSettings(
         particles=1,
-        steps=4000,
+        steps=1500,
         measurement_points=0,
         fit_noise=False,
         noise_std=0.3,
@@ -77,7 +77,7 @@ def test_one_particle_converges_to_the_maximum_a_posteriori_function():
 def test_noise_of_the_data_is_estimated():
     x = 2.0 * torch.rand(400, 1, generator=generator()) - 1.0
     y = 0.5 * x + 0.15 * torch.randn(400, 1, generator=generator(1))
-    settings = FsvgdSettings(steps=1500, hidden=(16,), noise_std=0.6, particles=5)
+    settings = FsvgdSettings(steps=1000, hidden=(16,), noise_std=0.6, particles=5)
     posterior = fit_fsvgd(
         x, y, x, GaussianProcessPrior(torch.cat([x, x]), RbfCovariance((1.0,), (0.8,))), UNIT, settings
     )
@@ -134,7 +134,7 @@ def test_ensemble_noise_is_estimated_from_left_out_rows():
     x = torch.linspace(-1, 1, 40)[:, None]
     clean = torch.sin(3 * x)
     y = clean + 0.2 * torch.randn(x.shape, generator=generator(3))
-    settings = FsvgdSettings(particles=10, steps=4000, hidden=(64, 64), weight_decay=0.0, noise_std=0.05)
+    settings = FsvgdSettings(particles=10, steps=1500, hidden=(64, 64), weight_decay=0.0, noise_std=0.05)
     found = deep_ensemble(x, y, UNIT, settings)
     training_rms = float((found.networks.predict(x).mean - y).std())
     assert training_rms < 0.15

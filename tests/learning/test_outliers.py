@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_t, norm
+from linear_simulator import UNITS
+from scipy.stats import multivariate_normal, multivariate_t, norm
 from scipy.stats import t as student
 
 from learning.outliers import (
@@ -208,3 +209,16 @@ class TestMedianScale:
     def test_median_scale_stays_within_its_range(self):
         found = median_scale(torch.tensor([[1e-9, 1e9]] * 500, dtype=torch.float64), 4.0)
         assert np.allclose(self.unshrunk(found.numpy(), 500), SCALE_RANGE, rtol=1e-6, atol=0.0)
+
+
+def test_densities_of_decorrelated_outputs_differ_by_the_log_determinant():
+    """The reference is scipy's density of normal errors before and after two transformations."""
+    rng = np.random.default_rng(4)
+    first, second, root = rng.normal(size=(3, 2, 2))
+    units = UNITS.decorrelated(torch.tensor(first)).decorrelated(torch.tensor(second))
+    decorrelation, spread = second @ first, root @ root.T + np.eye(2)
+    errors = rng.normal(size=(5, 2))
+    joint = multivariate_normal(cov=spread).logpdf(errors)
+    decorrelated = multivariate_normal(cov=decorrelation @ spread @ decorrelation.T).logpdf(errors @ decorrelation.T)
+    assert np.allclose(decorrelated + units.decorrelation_log_det, joint)
+    assert UNITS.decorrelation_log_det == 0.0

@@ -73,9 +73,8 @@ def driven_episode(seed: int, ticks: int = 400) -> EpisodeData:
     return EpisodeData(times_s, noisy, commands, commands, np.zeros(ticks))
 
 
-def test_last_recording_is_held_out_and_the_simulator_is_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("learning.baselines.system_identification.STEPS", 150)
-    monkeypatch.setattr("learning.baselines.system_identification.N_RESTARTS", 4)
+@pytest.mark.usefixtures("short_identification")
+def test_last_recording_is_held_out_and_the_simulator_is_the_prior() -> None:
     first, last = driven_episode(0), driven_episode(1)
     case = recorded_case([[first], [last]], Path("rc_car"), 3)
     data = case.recorded(Path(), 40, 0)

@@ -8,7 +8,6 @@ import torch
 
 from carlab.core.episode_data import EpisodeData
 from carlab.core.errors import ConfigError
-from learning.baselines import system_identification
 from learning.baselines.system_identification import identify
 from learning.priors.domain_models import draw_parameters
 from learning.priors.simulator_model import CarModel, known_ranges
@@ -71,11 +70,10 @@ def test_draws_fill_their_ranges_and_inputs_have_held_commands():
     assert float(held) == pytest.approx(1 - 1 / 8, abs=0.06)
 
 
-def test_identification_recovers_the_true_parameters(monkeypatch):
-    monkeypatch.setattr(system_identification, "STEPS", 200)
-    monkeypatch.setattr(system_identification, "N_RESTARTS", 4)
+@pytest.mark.usefixtures("short_identification")
+def test_identification_recovers_the_true_parameters():
     truth = SimulatorConfig(mocap=QUIET).with_values({"motor.drive_gain": 9.1, "tyre.rear.mu": 0.62})
-    rows = transitions_of([drive(truth, 240)], HISTORY)
+    rows = transitions_of([drive(truth, 120)], HISTORY)
     ranges = {"motor.drive_gain": (6.0, 11.0), "tyre.rear.mu": (0.3, 1.2)}
     model = CarModel(SimulatorConfig(mocap=QUIET), HISTORY, ranges)
     found = identify(model, torch.from_numpy(rows.inputs), torch.from_numpy(rows.targets), torch.full((6,), 1e-3))

@@ -47,6 +47,7 @@ def test_prediction_speed_reports_networks_predictions_and_learned_car_separatel
     assert np.isfinite(prediction.dof)
 
 
+@pytest.mark.usefixtures("short_inference")
 def test_whole_fit_uses_the_settings_of_carlab_learn(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[tuple[Transitions, CarModel, CarFitSettings, str]] = []
 

@@ -16,8 +16,9 @@ from learning.priors.domain_models import Pendulum, Sinusoids, draw_parameters
 
 
 @pytest.fixture(autouse=True)
-def half_of_the_steps(monkeypatch):
-    monkeypatch.setattr(system_identification, "STEPS", 300)
+def few_steps(monkeypatch):
+    for name, value in (("STEPS", 150), ("N_RESTARTS", 8), ("REFINEMENT_STEPS", 40)):
+        monkeypatch.setattr(system_identification, name, value)
 
 
 def generator(seed=0):

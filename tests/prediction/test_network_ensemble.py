@@ -15,12 +15,12 @@ from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 
-SMALL = EnsembleSettings(updates=250, check_every=50, n_networks=2, hidden_units=32, batch_windows=64)
+SMALL = EnsembleSettings(updates=150, check_every=50, n_networks=2, hidden_units=32, batch_windows=48)
 
 
 @pytest.fixture(scope="module")
 def segments():
-    return segments_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 120.0, 11)])
+    return segments_of([drive(SimulatorConfig(control_period_s=PERIOD_S), 90.0, 11)])
 
 
 @pytest.fixture(scope="module")

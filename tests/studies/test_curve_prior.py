@@ -20,6 +20,7 @@ from carlab.studies.regression.recordings import RecordedCase
 from carlab.studies.rollouts import RolloutScore
 from learning.priors.simulator_model import CarModel
 from learning.world.car_dynamics import CarDynamics
+from learning.world.disturbance import DisturbanceProcess
 from sim_backends import SimulatorConfig
 from tests.helpers.recorded_drives import PERIOD_S, drive
 from tests.studies.test_rollouts import write_drive
@@ -57,6 +58,8 @@ def test_each_fold_has_curves_of_the_other_blocks(folder: Path, monkeypatch: pyt
     monkeypatch.setattr(curve_prior, "simulator_with_curves", simulator)
     monkeypatch.setattr(study, "fit_rows", fit)
     monkeypatch.setattr(study, "fit_rollouts", lambda car, windows, rows, *, seed: car)
+    monkeypatch.setattr(study, "fit_disturbance", lambda errors: DisturbanceProcess((0.5,) * 3, (0.4,) * 3, PERIOD_S))
+    monkeypatch.setattr(study, "N_SAMPLES", 20)
     out = folder.parent / "figures.json"
     command = ["bench", "rollouts", "--data", str(folder), "--seeds", "2", "--history", "3", "--car", "rc_car"]
     assert run([*command, "--curves", "--out", str(out)]) == 0

@@ -83,7 +83,7 @@ def test_world_nll_equals_monte_carlo_at_the_measured_states() -> None:
     rng, yaw = np.random.default_rng(0), before[:, 2:3]
 
     def seven_drawn(factor: FloatArray) -> FloatArray:
-        drawn = mean[:, None] + rng.normal(size=(len(mean), 2000, 6)) @ factor.T
+        drawn = mean[:, None] + rng.normal(size=(len(mean), 500, 6)) @ factor.T
         ahead, left = drawn[..., 0], drawn[..., 1]
         displacement = np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left
         heading, vx, vy = yaw + drawn[..., 2], before[:, 3:4] + drawn[..., 3], before[:, 4:5] + drawn[..., 4]
@@ -128,8 +128,8 @@ def test_expected_discrepancy_is_smaller_with_few_rows_and_for_pose_outputs(
         raise DataError("Enough.")
 
     monkeypatch.setattr(regression_methods, "infer", recorded_call)
-    for name in ("STEPS", "REFINEMENT_STEPS"):  # faster GreyBox; its result is not used
-        monkeypatch.setattr(f"learning.baselines.system_identification.{name}", 10)
+    for name, value in (("STEPS", 4), ("REFINEMENT_STEPS", 2), ("N_SCREENED", 32)):  # GreyBox is not used
+        monkeypatch.setattr(f"learning.baselines.system_identification.{name}", value)
     few, many = 100, 450
     list(run_study(case, rows=(few, many), seeds=1, methods=("gp-sim-posterior", "GreyBox"), data=Path()))
     assert [a.tolist() for a in received] == [pytest.approx([0.03] * 3 + [0.1] * 3)] * 2 + [
@@ -225,6 +225,7 @@ def test_recording_with_another_period_is_refused(tmp_path: Path) -> None:
         recorded_case([[drive(1)], [drive(2)]], path, HISTORY)
 
 
+@pytest.mark.usefixtures("short_inference")
 def test_study_has_a_score_for_each_prior() -> None:
     case = case_of(drive(2))
     models = prior_models(case, SimulatorConfig.from_preset(), KNOWN)
@@ -235,6 +236,7 @@ def test_study_has_a_score_for_each_prior() -> None:
     assert len({s.nll for s in scores}) == 4
 
 
+@pytest.mark.usefixtures("short_inference")
 def test_failed_fit_of_one_prior_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(task: object) -> object:
         raise DataError("The fit diverged; fit again with a smaller learning rate.")

@@ -16,9 +16,10 @@ from carlab.core.episode_data import EpisodeData
 from carlab.studies.rollouts import DISTURBED, INDEPENDENT, energy_score, folds
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
+from learning.world.disturbance import DisturbanceProcess
 from learning.world.drive_windows import DriveWindows
 from sim_backends import SimulatorConfig
-from tests.helpers.recorded_drives import drive
+from tests.helpers.recorded_drives import PERIOD_S, drive
 
 pytestmark = pytest.mark.usefixtures("few_correlation_times")
 
@@ -82,6 +83,8 @@ def test_fit_to_all_rows_has_the_windows_of_its_rows(
 
     monkeypatch.setattr(study, "fit_rows", linear_car)
     monkeypatch.setattr(study, "fit_rollouts", fit)
+    monkeypatch.setattr(study, "fit_disturbance", lambda errors: DisturbanceProcess((0.5,) * 3, (0.4,) * 3, PERIOD_S))
+    monkeypatch.setattr(study, "N_SAMPLES", 20)
     command = ["bench", "rollouts", "--data", str(folder), "--rows", "all", "--seeds", "1", "--history", "3"]
     assert run([*command, "--car", "rc_car"]) == 0
     (*folds, (rows, windows)) = numbers

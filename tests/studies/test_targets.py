@@ -26,9 +26,10 @@ def means(scores: Iterable[Score], figure: str = "nll") -> dict[tuple[str, int],
     return {key: float(np.mean(values)) for key, values in found.items()}
 
 
+@pytest.mark.usefixtures("short_identification")
 def test_simulator_posterior_beats_baselines_on_ten_pendulum_rows() -> None:
     """Drag, friction and motor lag are not in the prior."""
-    nll = means(run_study("pendulum_motor", rows=(10,), seeds=1, methods=(OURS, *BASELINES), steps=1000))
+    nll = means(run_study("pendulum_motor", rows=(10,), seeds=1, methods=(OURS, *BASELINES), steps=400))
     assert nll[OURS, 10] < -5.7
     assert all(nll[OURS, 10] < nll[name, 10] - 1.0 for name in BASELINES), nll
 
