@@ -10,7 +10,7 @@ from carlab.benchmark import CaseSpec, Proof
 from carlab.benchmark.proof.calibration import calibrate, passes
 from carlab.cli import run
 
-CHI2, SHARE = "selection.accept_chi2_min", "selection.accept_unseen_share"
+CHI2, SHARE = "selection.accept_chi2_min", "selection.accept_left_out_share"
 
 
 def decision(stage: str, effect: str, chi2: float, share: float = 1.0, step: int = 0) -> dict[str, Any]:
@@ -42,6 +42,11 @@ def test_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_n
     assert counts[1.5] == (0, 2, 0, 1), "only the first candidate that passes is accepted"
     assert counts[2.0] == (0, 2, 1, 1), "no candidate passes"
     assert [r.is_present_value for r in calibrate(ANSWERS, DECISIONS) if r.value == 20.0] == [True]
+
+
+def test_settings_have_their_present_names_in_decisions_of_earlier_versions() -> None:
+    former = json.loads(json.dumps(DECISIONS).replace(SHARE, "selection.accept_unseen_share"))
+    assert calibrate(ANSWERS, former) == calibrate(ANSWERS, DECISIONS)
 
 
 def test_decisions_of_the_keep_stage_are_counted_separately() -> None:

@@ -15,6 +15,13 @@ from typing import Any
 FACTORS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)
 """Multiples of a threshold at which the decisions are repeated."""
 SCHEMA = "carlab.decisions/1"
+FORMER_SETTINGS = {
+    "selection.accept_unseen_share": "selection.accept_left_out_share",
+    "selection.accept_unseen_ratio": "selection.accept_left_out_ratio",
+    "selection.steady_unseen_share": "selection.steady_left_out_share",
+    "selection.better_rival_z": "selection.replace_z_min",
+}
+"""Present names of settings, by the names in files of earlier versions."""
 COLUMNS = ("threshold", "value", "false names", "missed names")
 
 
@@ -51,7 +58,7 @@ def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, A
         Rates by setting, in the order of the values.
     """
     cases = [
-        ({effect["id"] for effect in answers[name]["effects"]}, list(content["decisions"]))
+        ({effect["id"] for effect in answers[name]["effects"]}, _with_present_settings(content["decisions"]))
         for name, content in sorted(decisions.items())
         if content.get("schema") == SCHEMA
     ]
@@ -62,6 +69,20 @@ def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, A
         _rates(cases, setting, factor * threshold, factor == 1.0)
         for setting, threshold in sorted(present.items())
         for factor in FACTORS
+    ]
+
+
+def _with_present_settings(decisions: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The decisions with the present names of their settings."""
+    return [
+        {
+            **decision,
+            "alternatives": [
+                [{**c, "setting": FORMER_SETTINGS.get(c["setting"], c["setting"])} for c in conditions]
+                for conditions in decision["alternatives"]
+            ],
+        }
+        for decision in decisions
     ]
 
 
