@@ -32,7 +32,7 @@ def observation_effects(effects: Iterable[str]) -> list[ObservationEffect]:
     return sorted(found, key=lambda e: (e.order, e.id))
 
 
-def is_measured(name: str) -> bool:
+def is_measurement_parameter(name: str) -> bool:
     """Whether a parameter belongs to the measurement: motion capture, or an observation effect."""
     table, _, rest = name.partition(".")
     return table == "mocap" or (table == "effects" and EFFECTS[rest.partition(".")[0]].kind == "observation")

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from carlab.core.outcome import EndReason
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.prior_correction import PriorVersion
-    from carlab.experiment.campaign.quick_check import QuickCheck
+    from carlab.experiment.campaign.quick_check import EpisodeCheck
 
 STEPS_PERIOD_S = 600.0
 
@@ -203,7 +203,7 @@ class Learn:
             for message in _training_messages(figures):
                 bar.console.print(f"  {message}", soft_wrap=True, highlight=False)
 
-        def on_check(check: QuickCheck) -> None:
+        def on_check(check: EpisodeCheck) -> None:
             for sentence in check.sentences:
                 bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False)
 
@@ -221,7 +221,7 @@ class Learn:
             on_figures=functools.partial(_print_figures, bar),
             on_checking=functools.partial(show_progress, "quick check of the simulator", 0, 1),
             on_check=on_check,
-            on_repairing=functools.partial(show_progress, "correction of the prior", 0, 1),
+            on_correcting=functools.partial(show_progress, "correction of the prior", 0, 1),
             on_prior=on_prior,
             on_link=lambda sentence: bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False),
         )
@@ -238,9 +238,9 @@ class Learn:
         if run.results:
             self._print_episodes(run)
             console.print(f"Learned and recorded in {run.folder} (learn.png, learn.rrd).", soft_wrap=True)
-        if done < run.wanted:
+        if done < run.target_episodes:
             console.print(
-                f"{done} of {run.wanted} episodes; resume with: "
+                f"{done} of {run.target_episodes} episodes; resume with: "
                 f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}"
                 f"{self.which_task.to_text()}{self.ray_text()}",
                 soft_wrap=True,

@@ -111,9 +111,9 @@ class Replay:
             adapt=self.adapt,
             keep_events=self.keep_events,
         )
-        for note in found.material.notes:
+        for note in found.recordings.notes:
             console.print(note)
-        for fault in (*found.material.faults, *found.score.faults):
+        for fault in (*found.recordings.faults, *found.score.faults):
             console.print(f"{fault.channel}: {fault.action}")
         for part in (found.score.whole, found.score.last):
             if part is None:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.outliers import DOF_CANDIDATES, log_student, tail_scales
-from learning.posterior.draws import Assignment
+from learning.posterior.sampler import Assignment
 from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import CHANNELS, TAIL_COMPONENTS, DisturbanceProcess, change_by
 from learning.world.drive_windows import DriveWindows, roll_out
@@ -64,14 +64,14 @@ class RolloutErrors:
 
 def rollout_errors(car: CarDynamics, windows: DriveWindows) -> RolloutErrors:
     """Errors of a car over windows, and their responses to disturbances."""
-    particles, steps = len(car.draws.parameters), windows.commands.shape[1]
+    particles, steps = len(car.sampler.parameters), windows.commands.shape[1]
     at = sorted({max(round(share * steps), 1) - 1 for share in HORIZON_SHARES})
     count = len(windows)
     every = torch.arange(particles).repeat_interleave(count)
     paths = _paths(car, windows, torch.arange(count).repeat(particles), every, None)
     paths = paths.view(particles, count, steps, 6)[:, :, at]
-    noise = car.draws.noise @ torch.eye(6).to(car.draws.noise)
-    noise_variance = (noise**2).sum(dim=0) * car.draws.scales.flatten().square().median()
+    noise = car.sampler.noise @ torch.eye(6).to(car.sampler.noise)
+    noise_variance = (noise**2).sum(dim=0) * car.sampler.scales.flatten().square().median()
     error = paths.mean(dim=0) - windows.motion[:, at].to(paths)
     variance = paths.var(dim=0) + noise_variance
     pulses = _pulse_responses(car, windows)[:, at]
@@ -96,7 +96,7 @@ def _pulse_responses(car: CarDynamics, windows: DriveWindows) -> Tensor:
     for j in range(steps):
         for c in range(3):
             pulses[:, 1 + 3 * j + c, j, c] = PULSE[c]
-    particle = window % len(car.draws.parameters)
+    particle = window % len(car.sampler.parameters)
     paths = _paths(car, windows, window, particle, pulses.flatten(0, 1)).view(count, 1 + kinds, steps, 6)
     change = (paths[:, 1:] - paths[:, :1]).view(count, steps, 3, steps, 6) / torch.tensor(PULSE)[:, None, None]
     return change.permute(0, 3, 4, 1, 2)
@@ -114,10 +114,10 @@ def _paths(
         particle: index of each rollout's particle (N,).
         accelerations: disturbance of each rollout (N, K, 3); None: zero.
     """
-    assignment = Assignment.of_particles(particle, len(car.draws.parameters))
+    assignment = Assignment.of_particles(particle, len(car.sampler.parameters))
 
     def change(inputs: Tensor, step: int) -> Tensor:
-        undisturbed = car.draws.without_noise(inputs, assignment)
+        undisturbed = car.sampler.without_noise(inputs, assignment)
         if accelerations is None:
             return undisturbed
         return undisturbed + change_by(accelerations[:, step], windows.period_s)

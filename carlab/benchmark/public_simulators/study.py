@@ -185,7 +185,7 @@ def _diagnose(
             (handed / file).unlink(missing_ok=True)
             if (here / "out" / file).exists():
                 shutil.copyfile(here / "out" / file, handed / file)
-    return {"exit_status": end.exit_status, "seconds": round(end.seconds, 1), "words": end.words}
+    return {"exit_status": end.exit_status, "seconds": round(end.seconds, 1), "words": end.output}
 
 
 def _row(car: PublicCar, seed: int, run: dict[str, Any], path: Path) -> dict[str, Any]:

@@ -66,10 +66,10 @@ def predicted_figures(
         cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed))
         cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)
         task = plan.task.resized(drawn_cars.HISTORY)
-        world = model_env.ModelEnv(
+        environment = model_env.ModelEnv(
             cars, task, N_SELECTED, envelope=envelope, period_s=prior.control_period_s, seed=seed
         )
-        totals.append(world.roll_out(lambda seen: agent.act(_own_features(seen, plan.history))).returns.numpy())
+        totals.append(environment.roll_out(lambda seen: agent.act(_own_features(seen, plan.history))).returns.numpy())
         drawn_share = FIRST_DRAWN_SHARE / (len(episodes) + 1) ** 2
         shares = [1.0 - drawn_share, drawn_share]
     weights = np.concatenate([np.full(len(t), w / len(t)) for t, w in zip(totals, shares, strict=True)])
