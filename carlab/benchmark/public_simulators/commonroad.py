@@ -1,18 +1,18 @@
 """Independent simulator: models of the package commonroad-vehicle-models, scaled to a 1:10 car by similarity.
 
-The package (Althoff and Würsching, "CommonRoad: Vehicle models (version 2020a)", TU Munich) brings two models with
+The package (Althoff and Würsching, "CommonRoad: Vehicle models (version 2020a)", TU Munich) has two models with
 tyre forces and wheel spin: ``multi_body`` (29 states: body, axles and four wheels, Magic Formula with combined slip)
-and ``drift`` (9 states: single track, load transfer, wheel spin). Equations and numbers are the package's; what is
-added here is how a radio command reaches it, a driver, and motion capture.
+and ``drift`` (9 states: single track, load transfer, wheel spin). Equations and numbers are the package's. This
+module adds the command interface, a driver, and motion capture.
 
-Scaling. Lengths by 1/10, times by the root of that, masses by its cube, so that accelerations stay what they are
-(Froude's similarity: density and gravity are the same). Every number of the vehicle follows from its dimension; the
-tyre's coefficients are pure numbers and stay, but ``p_vx1``, which the package multiplies with the load inside a sine
-and so is one over a force.
+Scaling: lengths by 1/10, times by its square root, masses by its cube, so that accelerations are unchanged (Froude
+similarity: equal density and gravity). Each number of the vehicle is scaled by its dimension. The tyre's coefficients
+are dimensionless and unchanged, except ``p_vx1``: the package multiplies it by the load inside a sine, so its unit is
+1/N.
 
-Interface. The package asks for a steering rate and a longitudinal acceleration (drive torque over mass and wheel
-radius). The requested rate is the one that reaches the commanded angle in one control period; the package itself bounds
-it. The requested acceleration is FULL_MPS2 times the throttle.
+Interface: the inputs of the package are a steering rate and a longitudinal acceleration (drive torque over mass and
+wheel radius). The requested rate reaches the commanded angle in one control period; the package limits it. The
+requested acceleration is FULL_THROTTLE_MPS2 times the throttle.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ Model = Literal["multi_body", "drift"]
 VEHICLE = 2  # BMW 320i, driven by its rear wheels
 SCALE = 0.1
 MAX_ANGLE_RAD = 0.5
-FULL_MPS2 = 6.0
+FULL_THROTTLE_MPS2 = 6.0
 START_MPS = 1.0
 ROLLING_MPS = 0.7  # below 0.1 m/s the package has no tyre and wheel dynamics
 DRIVER_GRIP = 0.75  # share of the tyres' grip that the driver uses; beyond it inner wheels lift, which is not modelled
 RTOL = 1e-6
-SPUN_RAD = 1.4
-CALLS = 1500
-SMALL_S = 2e-4
+MAX_SIDE_SLIP_RAD = 1.4
+MAX_RATE_CALLS = 1500
+SMALL_STEP_S = 2e-4
 
 # Powers of the length scale: length 1, time 1/2, mass 3.
 _VEHICLE_POWERS = {
@@ -85,8 +85,8 @@ class PublicCar:
     """A model of the package, and an equivalent base car for the driver.
 
     Args:
-        model: Which.
-        command_delay_s: From a command to the package's inputs.
+        model: Model of the package.
+        command_delay_s: Delay from a command to the inputs of the package [s].
     """
 
     def __init__(self, model: Model, command_delay_s: float = 0.05) -> None:
@@ -103,11 +103,11 @@ class PublicCar:
         # Used by the driver only.
         self.car = BaseCar(
             mass=p.m, yaw_inertia=p.I_z, front_axle=p.a, rear_axle=p.b, mu_front=grip, mu_rear=grip,
-            drive_gain=FULL_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=command_delay_s,
+            drive_gain=FULL_THROTTLE_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=command_delay_s,
         )  # fmt: skip
 
     def start(self, x: float, y: float, yaw: float, speed: float) -> FloatArray:
-        """The package's state while rolling straight ahead."""
+        """State (n,) of the package at a pose [m, rad], rolling straight ahead at ``speed`` [m/s]."""
         core = [x, y, 0.0, speed, yaw, 0.0, 0.0]
         if self.model == "multi_body":
             from vehiclemodels.init_mb import init_mb as init
@@ -118,9 +118,9 @@ class PublicCar:
     def rates(self, state: FloatArray, inputs: Sequence[float]) -> list[float]:
         """The package's right-hand side; inputs are the requested steering rate [rad/s] and acceleration [m/s^2].
 
-        The package forbids negative wheel spin by changing its caller's state, and sets the rate to 0 where spin is
-        negative. An integrator that tries states does not hear of the change, and a wheel a hair below 0 would stay
-        locked for ever; so spin is held at 0 before the call and may only grow from there after it.
+        The package changes a negative wheel speed in the state of its caller, and sets its rate to 0. An integrator
+        does not see this change, so a wheel with a slightly negative speed would stay locked. Therefore negative wheel
+        speeds are set to 0 before the call, and their rates are not negative after it.
         """
         x = state.tolist()
         locked = [i for i in self._spins if x[i] <= 0.0]
@@ -150,18 +150,17 @@ class PublicCar:
 class RollingDriver(HumanDriver):
     """A driver that keeps the car rolling forwards and avoids spins.
 
-    Neither model of the package can stand or reverse with its tyres, and past a right angle of side slip its
-    equations mean nothing.
+    The tyre models of the package are not valid at standstill, in reverse, and at side slip angles above 90 degrees.
     """
 
     def __call__(self, t: float, state: FloatArray) -> tuple[float, float]:
         """Commands for the tick at t [s]."""
         steering, throttle = super().__call__(t, state)
         speed = math.hypot(state[3], state[4])
-        most = math.atan(self._car.wheelbase * self._grip / max(speed, 0.3) ** 2) / self._car.max_angle
+        max_steering = math.atan(self._car.wheelbase * self._grip / max(speed, 0.3) ** 2) / self._car.max_angle
         if state[3] < ROLLING_MPS:
             throttle = max(throttle, 0.3)
-        return float(np.clip(steering, -most, most)), throttle
+        return float(np.clip(steering, -max_steering, max_steering)), throttle
 
     def _intend(self, t: float, off: float) -> None:
         super()._intend(t, off)
@@ -171,7 +170,7 @@ class RollingDriver(HumanDriver):
 
 @dataclass(frozen=True)
 class PublicDrive:
-    """A drive of the public car: its recording, and the package's states at the captures, (N, n), noise-free."""
+    """A drive of the public car: its recording, and the noise-free states (N, n) of the package at the captures."""
 
     recording: Recording
     drive: Drive
@@ -189,7 +188,7 @@ def drive_public(
 
     Raises:
         AbandonedError: ``abandon``, called at every tick, returned true.
-        DataError: where the package cannot be integrated or the car has spun.
+        DataError: the package cannot be integrated, or the car has spun.
     """
     track = Track(np.random.default_rng((seed, 1)))
     human = RollingDriver(car.car, track, np.random.default_rng((seed, 2, part)))
@@ -204,6 +203,10 @@ def _integrate(
     car: PublicCar, driver: Callable[[float, FloatArray], tuple[float, float]], duration_s: float, state: FloatArray,
     abandon: Callable[[], bool],
 ) -> tuple[Drive, FloatArray]:  # fmt: skip
+    """The drive from a state (n,) of the package at time 0, and its states (N, n) at the captures.
+
+    Integration stops at each tick and where a delayed command begins to act. Before time 0 the car rolls straight on.
+    """
     base = car.car
     period, per_row = base.control_period, round(base.control_period * base.mocap_rate)
     count = round(duration_s / period) + 1
@@ -223,7 +226,7 @@ def _integrate(
         t, end = tick * period, (tick + 1) * period
         steering, throttle = driver(t, car.motion(states[done - 1 : done])[0])
         commands[tick] = steering, throttle
-        pending.append((t + base.command_delay, (base.max_angle * steering, FULL_MPS2 * throttle)))
+        pending.append((t + base.command_delay, (base.max_angle * steering, FULL_THROTTLE_MPS2 * throttle)))
         while t < end:
             until = min(end, pending[0][0]) if pending else end
             if until > t + 1e-12:
@@ -247,12 +250,13 @@ def _segment(
     car: PublicCar, acting: tuple[float, float], period: float, span: tuple[float, float], state: FloatArray,
     at: FloatArray,
 ) -> FloatArray:  # fmt: skip
+    """States (k, n) at ascending times ``at`` (k,), for a constant wheel angle [rad] and acceleration [m/s2]."""
     calls = 0
 
     def rates(_: float, x: FloatArray) -> list[float]:
         nonlocal calls
         calls += 1
-        if calls > CALLS:
+        if calls > MAX_RATE_CALLS:
             raise _ChatteringError
         return car.rates(x, ((acting[0] - x[2]) / period, acting[1]))
 
@@ -274,7 +278,7 @@ def _segment(
             f"The package's {car.model} model cannot be integrated beyond {span[0]:.2f} s; use another seed."
         )
     motion = car.motion(found)
-    if (np.abs(np.arctan2(motion[:, 4], motion[:, 3])) > SPUN_RAD).any():
+    if (np.abs(np.arctan2(motion[:, 4], motion[:, 3])) > MAX_SIDE_SLIP_RAD).any():
         raise DataError(f"The car has spun at {span[0]:.2f} s, which the package does not model; use another seed.")
     return np.asarray(found[np.searchsorted(once, at)], dtype=np.float64)
 
@@ -286,14 +290,14 @@ class _ChatteringError(Exception):
 def _small_steps(
     rates: Callable[[float, FloatArray], list[float]], t: float, x: FloatArray, at: FloatArray
 ) -> FloatArray:
-    """Runge and Kutta's fourth order at SMALL_S or less: wheels change camber's sign, where the package's force jumps.
+    """States (k, n) at times ``at`` (k,) by the classical Runge-Kutta method with steps of at most ``SMALL_STEP_S``.
 
-    A step control would shrink its steps without end there; steps of 0.2 ms are within the stability bound of wheel
-    slip, the fastest thing in the model, 6000 1/s at walking pace.
+    The package's tyre force jumps where a wheel's camber changes its sign. An adaptive step would become arbitrarily
+    small there. Steps of 0.2 ms are stable for the wheel slip, the fastest mode (6000 1/s at walking pace).
     """
     found = np.empty((len(at), len(x)))
     for row, until in enumerate(at):
-        count = max(1, math.ceil((until - t) / SMALL_S))
+        count = max(1, math.ceil((until - t) / SMALL_STEP_S))
         h = (until - t) / count
         for _ in range(count):
             k1 = np.array(rates(t, x))
