@@ -62,9 +62,9 @@ class Learn:
     interrupted run.
     """
 
-    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
+    car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
+    task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     episodes: int | None = None
     """Total number of episodes, including those already driven; by default 20, or the number of the resumed run."""
@@ -145,9 +145,9 @@ class Learn:
 
         with progress(speed_estimate_period_s=STEPS_PERIOD_S) as bar:
             run = learn(
-                **self.which_car.arguments(),
-                task=self.which_task.task,
-                track=self.which_task.track,
+                **self.car.arguments(),
+                task=self.task.task,
+                track=self.task.track,
                 episodes=self.episodes,
                 ticks=self.ticks,
                 prior=self.prior,
@@ -241,8 +241,8 @@ class Learn:
         if done < run.target_episodes:
             console.print(
                 f"{done} of {run.target_episodes} episodes; resume with: "
-                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}"
-                f"{self.which_task.to_text()}{self.ray_text()}",
+                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.car.to_text()}"
+                f"{self.task.to_text()}{self.ray_text()}",
                 soft_wrap=True,
             )
             last = run.end
