@@ -115,7 +115,7 @@ class MeasurementModel:
                 three ticks.
             velocities_before: Unfiltered measured velocities (vx, vy, yaw rate) at the ticks before the trajectory,
                 from the first of which the filter starts settled.
-            filtered: Output of the filter at the first tick, instead.
+            filtered: Output of the filter at the first tick; by default the filter starts settled.
             ticks: Indices of the ticks to return; all by default.
         """
         wanted = range(len(trajectory)) if ticks is None else ticks

@@ -29,22 +29,25 @@ COLUMNS = ("threshold", "value", "false names", "missed names")
 class Rates:
     """Outcome of the decisions that use one setting, at one value of it.
 
-    false, wrong     names accepted that are not concealed, and opportunities to accept one
-    missed, true     concealed names not accepted, and opportunities to accept one
+    false_names          accepted names that are not concealed
+    false_opportunities  decisions in which such a name may be accepted
+    missed_names         decisions in which a concealed name may be accepted, but no name is
+    true_opportunities   decisions in which a concealed name may be accepted
     """
 
     setting: str
     value: float
     is_present_value: bool
-    false: int
-    wrong: int
-    missed: int
-    true: int
+    false_names: int
+    false_opportunities: int
+    missed_names: int
+    true_opportunities: int
 
     def row(self) -> list[str]:
         """Cells of the table; the present value is marked with an asterisk."""
         value = f"{self.value:.4g}{' *' if self.is_present_value else ''}"
-        return [self.setting, value, _rate(self.false, self.wrong), _rate(self.missed, self.true)]
+        false = _rate(self.false_names, self.false_opportunities)
+        return [self.setting, value, false, _rate(self.missed_names, self.true_opportunities)]
 
 
 def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, Any]]) -> list[Rates]:
@@ -93,7 +96,7 @@ def _conditions(decisions: Iterable[Mapping[str, Any]]) -> Iterable[Mapping[str,
 def _rates(
     cases: Sequence[tuple[set[str], list[dict[str, Any]]]], setting: str, value: float, is_present_value: bool
 ) -> Rates:
-    false = wrong = missed = true = 0
+    false_names = false_opportunities = missed_names = true_opportunities = 0
     for concealed, made in cases:
         for key, group in groupby(made, key=lambda d: (d["stage"], d["step"])):
             decided = list(group)
@@ -104,11 +107,12 @@ def _rates(
                 has_true = any(d["effect"] in concealed for d in step)
                 has_wrong = any(d["effect"] not in concealed for d in step)
                 accepted = next((d["effect"] for d in step if passes(d, setting, value)), None)
-                wrong += has_wrong
-                true += has_true
-                false += accepted is not None and accepted not in concealed
-                missed += has_true and accepted is None
-    return Rates(setting, value, is_present_value, false, wrong, missed, true)
+                false_opportunities += has_wrong
+                true_opportunities += has_true
+                false_names += accepted is not None and accepted not in concealed
+                missed_names += has_true and accepted is None
+    counts = false_names, false_opportunities, missed_names, true_opportunities
+    return Rates(setting, value, is_present_value, *counts)
 
 
 def passes(decision: Mapping[str, Any], setting: str, value: float) -> bool:

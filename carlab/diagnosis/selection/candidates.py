@@ -10,7 +10,7 @@ import logging
 import math
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.identification.fit import Fitter, clustered_gain, design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit_candidate
@@ -90,7 +90,7 @@ def with_left_out_gain(
     return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)
 
 
-def acceptance(problem: SearchProblem, candidate: Candidate) -> tuple[tuple[Condition, ...], ...]:
+def acceptance(problem: SearchProblem, candidate: Candidate) -> Alternatives:
     """Alternative sets of conditions; a candidate is accepted if all conditions of one set hold."""
     settings = problem.settings.selection
     share = candidate.left_out_gain / problem.perfect_loss()

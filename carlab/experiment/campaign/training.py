@@ -273,7 +273,7 @@ def _fitted(
 
     def fitted(rate_factor: float) -> LearnedCar:
         scaled = replace(settings, learning_rate=rate_factor * settings.learning_rate)
-        car = fit_car(rows, model, scaled, before=earlier, progress=report_step, device=plan.device)
+        car = fit_car(rows, model, scaled, earlier=earlier, progress=report_step, device=plan.device)
         return _fitted_to_rollouts(car, episodes, rows, scaled, rate_factor, progress)
 
     return _with_smaller_steps(fitted, "model")
