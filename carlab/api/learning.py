@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from carlab.recording.run_folder import RunDirectory
 
 EPISODES = 20
-PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
+PLAN_ARGUMENTS = ("method", "history", "model_steps", "updates", "seed", "ticks")
 """Arguments that a run keeps when it is resumed."""
 
 
@@ -355,8 +355,8 @@ def _check_as_before(request: LearnRequest, campaign: Campaign, choice: CarChoic
     """Raise ConfigError for a given argument that differs from the run to resume."""
     plan = campaign.plan
     default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
-    saved = {name: getattr(plan, name) for name in PLANNED}
-    changed = [n for n in PLANNED if getattr(request, n) not in (default[n], saved[n])]
+    saved = {name: getattr(plan, name) for name in PLAN_ARGUMENTS}
+    changed = [n for n in PLAN_ARGUMENTS if getattr(request, n) not in (default[n], saved[n])]
     is_same = campaign.corrects_prior == (request.prior == AUTO)
     if request.prior != default["prior"] and not (
         is_same and training_plan(request, choice).prior_toml == plan.prior_toml

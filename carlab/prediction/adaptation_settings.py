@@ -22,7 +22,7 @@ class AdaptationSettings:
     """Time constants [s] of the candidates: from a car that warms up to one that differs from the first row on."""
     white_std: tuple[float, ...] = (0.3, 0.05, 0.3, 0.3, 0.3, 1.5)
     """Unit of the white noise on the same disturbances, on the force to the left per mass [m/s2] and on the moment per
-    yaw inertia [rad/s2]: what the simulator lacks from one window to the next, larger the harder the car drives."""
+    yaw inertia [rad/s2]: errors of the simulator that are independent between windows, larger in harder driving."""
     white_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
     """Sizes of that noise; the one with the highest likelihood is used."""
     error_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)

@@ -26,10 +26,10 @@ CORRELATION_TIMES_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 """Candidates of the correlation time: from one step to longer than a window."""
 HORIZON_SHARES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)
 """Horizons of the likelihood, as shares of a window."""
-PULSE = (1.0, 1.0, 5.0)
+PULSE_SIZES = (1.0, 1.0, 5.0)
 """Accelerations of the finite differences [m/s2, m/s2, rad/s2]."""
 MIN_SCALE, MAX_SCALE = 0.01, 30.0
-"""Bounds of a fitted scale, in the units of ``PULSE``."""
+"""Bounds of a fitted scale, in the units of ``PULSE_SIZES``."""
 MAX_WINDOWS = 300
 """Maximum number of windows; the pulse responses of more take minutes."""
 MIN_WINDOWS = 8
@@ -95,10 +95,10 @@ def _pulse_responses(car: CarDynamics, windows: DriveWindows) -> Tensor:
     pulses = torch.zeros((count, 1 + kinds, steps, 3))
     for j in range(steps):
         for c in range(3):
-            pulses[:, 1 + 3 * j + c, j, c] = PULSE[c]
+            pulses[:, 1 + 3 * j + c, j, c] = PULSE_SIZES[c]
     particle = window % len(car.sampler.parameters)
     paths = _paths(car, windows, window, particle, pulses.flatten(0, 1)).view(count, 1 + kinds, steps, 6)
-    change = (paths[:, 1:] - paths[:, :1]).view(count, steps, 3, steps, 6) / torch.tensor(PULSE)[:, None, None]
+    change = (paths[:, 1:] - paths[:, :1]).view(count, steps, 3, steps, 6) / torch.tensor(PULSE_SIZES)[:, None, None]
     return change.permute(0, 3, 4, 1, 2)
 
 
@@ -171,7 +171,7 @@ def _maximise(errors: RolloutErrors, unit: Sequence[Tensor], times: Times) -> _M
         times: correlation times.
     """
     responses = torch.stack([unit[c][..., c] for c in range(len(CHANNELS))], dim=-1)
-    best = _Maximum(-math.inf, PULSE, times, math.inf)
+    best = _Maximum(-math.inf, PULSE_SIZES, times, math.inf)
     for dof in DOF_CANDIDATES:
         density, scale = _maximise_scale(errors, responses, tail_scales(dof, TAIL_COMPONENTS).double())
         if density > best.density:

@@ -35,9 +35,7 @@ DECISIONS = {
 
 
 def test_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_names() -> None:
-    counts = {
-        r.value / 20.0: dataclasses.astuple(r)[3:] for r in calibrate(ANSWERS, DECISIONS) if r.setting == CHI2
-    }
+    counts = {r.value / 20.0: dataclasses.astuple(r)[3:] for r in calibrate(ANSWERS, DECISIONS) if r.setting == CHI2}
     assert counts[0.5] == (1, 2, 0, 1), "a name in the null case"
     assert counts[1.0] == (0, 2, 0, 1)
     assert counts[1.5] == (0, 2, 0, 1), "only the first candidate that passes is accepted"

@@ -203,47 +203,77 @@ def _integrate(
     car: PublicCar, driver: Callable[[float, FloatArray], tuple[float, float]], duration_s: float, state: FloatArray,
     abandon: Callable[[], bool],
 ) -> tuple[Drive, FloatArray]:  # fmt: skip
-    """The drive from a state (n,) of the package at time 0, and its states (N, n) at the captures.
-
-    Integration stops at each tick and where a delayed command begins to act. Before time 0 the car rolls straight on.
-    """
+    """The drive from a state (n,) of the package at time 0, and its states (N, n) at the captures."""
     base = car.car
     period, per_row = base.control_period, round(base.control_period * base.mocap_rate)
-    count = round(duration_s / period) + 1
-    capture_s = np.arange((count - 1) * per_row + 1, dtype=np.float64) * (period / per_row) - base.latency
-    states = np.empty((len(capture_s), len(state)))
-    commands = np.empty((count, 2))
-    early = int(np.searchsorted(capture_s, 0.0, side="right"))
-    for row in range(early):
-        states[row] = state
-        states[row, :2] += capture_s[row] * START_MPS * np.array([math.cos(state[4]), math.sin(state[4])])
-    done, acting = early, (0.0, 0.0)
-    pending: list[tuple[float, tuple[float, float]]] = []
-    log = [(0.0, *acting)]
-    for tick in range(count):
+    row_s = np.arange(round(duration_s / period) + 1, dtype=np.float64) * period
+    capture_s = np.arange((len(row_s) - 1) * per_row + 1, dtype=np.float64) * (period / per_row) - base.latency
+    run = _Integration(car, state, capture_s)
+    commands = np.empty((len(row_s), 2))
+    for tick in range(len(row_s)):
         if abandon():
             raise AbandonedError
-        t, end = tick * period, (tick + 1) * period
-        steering, throttle = driver(t, car.motion(states[done - 1 : done])[0])
-        commands[tick] = steering, throttle
-        pending.append((t + base.command_delay, (base.max_angle * steering, FULL_THROTTLE_MPS2 * throttle)))
-        while t < end:
-            until = min(end, pending[0][0]) if pending else end
-            if until > t + 1e-12:
-                upto = int(np.searchsorted(capture_s, until, side="right"))
-                at = np.append(capture_s[done:upto], until)
-                found = _segment(car, acting, period, (t, until), state, at)
-                states[done:upto], state = found[:-1], found[-1]
-                done, t = upto, until
-            else:
-                t = until
-            if pending and pending[0][0] <= t + 1e-12:
-                acting = pending.pop(0)[1]
-                log.append((t, *acting))
-    switches = np.array(log)
-    row_s = np.arange(count, dtype=np.float64) * period
-    made = Drive(row_s, commands, capture_s, car.motion(states), per_row, switches[:, 0], switches[:, 1:])
-    return made, states
+        commands[tick] = driver(tick * period, car.motion(run.newest_capture)[0])
+        run.issue(tick * period, *commands[tick].tolist())
+        run.advance((tick + 1) * period)
+    switches = np.array(run.switches)
+    motion = car.motion(run.states)
+    return Drive(row_s, commands, capture_s, motion, per_row, switches[:, 0], switches[:, 1:]), run.states
+
+
+class _Integration:
+    """Integration of the package's model with delayed commands, which stops where a command begins to act.
+
+    Args:
+        car: The car.
+        state: State (n,) of the package at time 0; before it the car rolls straight on at ``START_MPS``.
+        capture_s: Times of the captures (N,) [s].
+
+    Attributes:
+        states: States (N, n) at the captures.
+        switches: Time [s], wheel angle [rad] and acceleration [m/s2] of each change of the acting inputs.
+    """
+
+    def __init__(self, car: PublicCar, state: FloatArray, capture_s: FloatArray) -> None:
+        self._car, self._state, self._t_s, self._capture_s = car, state, 0.0, capture_s
+        self._acting = (0.0, 0.0)
+        self._pending: list[tuple[float, tuple[float, float]]] = []
+        self._n_captured = int(np.searchsorted(capture_s, 0.0, side="right"))
+        self.states = np.empty((len(capture_s), len(state)))
+        self.states[: self._n_captured] = state
+        direction = np.array([math.cos(state[4]), math.sin(state[4])])
+        self.states[: self._n_captured, :2] += capture_s[: self._n_captured, None] * START_MPS * direction
+        self.switches = [(0.0, *self._acting)]
+
+    @property
+    def newest_capture(self) -> FloatArray:
+        """State (1, n) at the newest capture."""
+        return self.states[self._n_captured - 1 : self._n_captured]
+
+    def issue(self, t_s: float, steering: float, throttle: float) -> None:
+        """Issue a command, which acts after the car's command delay."""
+        inputs = self._car.car.max_angle * steering, FULL_THROTTLE_MPS2 * throttle
+        self._pending.append((t_s + self._car.car.command_delay, inputs))
+
+    def advance(self, end_s: float) -> None:
+        """Integrate up to a time [s]."""
+        while self._t_s < end_s:
+            until_s = min(end_s, self._pending[0][0]) if self._pending else end_s
+            if until_s > self._t_s + 1e-12:
+                self._integrate_held(until_s)
+            self._t_s = until_s
+            if self._pending and self._pending[0][0] <= self._t_s + 1e-12:
+                self._acting = self._pending.pop(0)[1]
+                self.switches.append((self._t_s, *self._acting))
+
+    def _integrate_held(self, until_s: float) -> None:
+        """Integrate with the acting inputs up to a time [s], and store the captures on the way."""
+        n_captured = int(np.searchsorted(self._capture_s, until_s, side="right"))
+        at = np.append(self._capture_s[self._n_captured : n_captured], until_s)
+        period_s = self._car.car.control_period
+        found = _segment(self._car, self._acting, period_s, (self._t_s, until_s), self._state, at)
+        self.states[self._n_captured : n_captured], self._state = found[:-1], found[-1]
+        self._n_captured = n_captured
 
 
 def _segment(

@@ -1,4 +1,4 @@
-"""Correction of the simulator prior between episodes: what the recordings support enters, what they contradict leaves.
+"""Correction of the simulator prior between episodes: effects and parameters are added or removed by their evidence.
 
 The prior is the car file's simulator with corrections. After each episode the corrections are tested on the newest
 episode, which none of them was fitted to. If the quick check finds that the prior does not explain the recordings, its

@@ -37,7 +37,7 @@ class CommandResponse:
         time_constant_s: of the first-order lag there [s].
         gain: slope of the explained part over the command: [rad/m] for steering, [m/s^2] for throttle.
         t_s: stamps of the rows used (n,).
-        target: yaw rate or acceleration there (n,), without what the speed explains.
+        target: yaw rate or acceleration there (n,), residual of its regression on the speed.
         predicted: the same by the command at each lag (L, n), with the coefficients of the best lag.
     """
 
@@ -96,7 +96,7 @@ def grid_motion(t_s: FloatArray, motion: PoseMotion, segment: FloatArray) -> Gri
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """Regression of the motion on functions of a delayed command; ``base`` (n, b) is what the speed explains."""
+    """Regression of the motion on functions of a delayed command; ``base`` (n, b) are functions of the speed."""
 
     motion: GridMotion
     channel: str
@@ -104,7 +104,7 @@ class _Regression:
     base: FloatArray
 
     def without_base(self, values: FloatArray) -> FloatArray:
-        """Values (n,) or (n, k) without what the speed explains."""
+        """Residuals of values (n,) or (n, k) in the regression on ``base``."""
         result: FloatArray = values - self.base @ (self.base.T @ values)
         return result
 
@@ -113,7 +113,7 @@ class _Regression:
         return np.asarray(np.interp(self.motion.t_s[self.rows] - lag_s, self.motion.t_s, filtered))
 
     def terms(self, command: FloatArray) -> FloatArray:
-        """Functions (n, k) of the command (n,), without what the speed explains."""
+        """Functions (n, k) of the command (n,), as residuals of the regression on ``base``."""
         size = np.abs(command)
         if self.channel == "throttle":
             return self.without_base(np.column_stack([command, command * size, command * size * size]))
