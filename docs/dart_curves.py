@@ -21,7 +21,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from carlab.api.material import read_material
+from carlab.api.loaded_recordings import load_recordings
 from carlab.cars import load_car_file
 from carlab.diagnosis.curves.support import recorded_forces
 from carlab.prediction.windows import segments_of
@@ -188,8 +188,8 @@ def draw(found: list[Panel], path: Path) -> None:
 def main(model: str, *recordings: str) -> None:
     """Draw the picture and print the table for the results page."""
     config = load_car_file(Path(model)).simulator
-    material = read_material([Path(name) for name in recordings], "fit", config.mocap.latency_s)
-    found = panels(config, segments_of(material.episodes))
+    loaded = load_recordings([Path(name) for name in recordings], "fit", config.mocap.latency_s)
+    found = panels(config, segments_of(loaded.episodes))
     draw(found, IMAGE)
     lines = [
         "| curve | driven range | rms difference | rms of the authors' curve about its mean |",

@@ -15,7 +15,7 @@ INTERVAL_S = 1.0
 """Interval from which only the echo with the shortest round trip is used [s]."""
 MAX_ROUND_TRIP_S = 1.0
 """Longest valid round trip [s]."""
-WINDOW = 60
+MAX_ECHOES = 60
 """Number of intervals in the fit."""
 DRIFT_PRIOR = 100e-6
 """Prior standard deviation of the drift [s/s]: crystals are within 100 ppm."""
@@ -57,7 +57,7 @@ class ClockAlignment:
         self.clock_hz = clock_hz
         self.echoes = 0
         self.resets = 0
-        self._best: deque[Echo] = deque(maxlen=WINDOW)
+        self._best: deque[Echo] = deque(maxlen=MAX_ECHOES)
         self._interval: int | None = None
         self._n_step_echoes = 0
         self._reference: Echo | None = None

@@ -32,7 +32,7 @@ def observation_effects(effects: Iterable[str]) -> list[ObservationEffect]:
     return sorted(found, key=lambda e: (e.order, e.id))
 
 
-def is_measured(name: str) -> bool:
+def is_measurement_parameter(name: str) -> bool:
     """Whether a parameter belongs to the measurement: motion capture, or an observation effect."""
     table, _, rest = name.partition(".")
     return table == "mocap" or (table == "effects" and EFFECTS[rest.partition(".")[0]].kind == "observation")
@@ -115,7 +115,7 @@ class MeasurementModel:
                 three ticks.
             velocities_before: Unfiltered measured velocities (vx, vy, yaw rate) at the ticks before the trajectory,
                 from the first of which the filter starts settled.
-            filtered: Output of the filter at the first tick, instead.
+            filtered: Output of the filter at the first tick; by default the filter starts settled.
             ticks: Indices of the ticks to return; all by default.
         """
         wanted = range(len(trajectory)) if ticks is None else ticks

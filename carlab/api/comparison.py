@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from carlab.api.cars import load_car
-from carlab.api.material import RecordingLike, as_list, recordings_of_runs
-from carlab.api.material import read_material as read
+from carlab.api.loaded_recordings import RecordingLike, as_list, recordings_of_runs
+from carlab.api.loaded_recordings import load_recordings as read
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from carlab.api.arguments import at_least
 from carlab.api.cars import load_car
-from carlab.api.material import Material, RecordingLike, as_list, assigned, read_material
+from carlab.api.loaded_recordings import LoadedRecordings, RecordingLike, as_list, assigned, load_recordings
 
 if TYPE_CHECKING:
     from carlab.cars import CarFile
@@ -191,12 +191,12 @@ def _read_recordings(
     held_out: RecordingLike | Iterable[RecordingLike],
     holdout_share: float | None,
     car: CarFile,
-) -> tuple[Material, Material]:
+) -> tuple[LoadedRecordings, LoadedRecordings]:
     """Recordings to fit and held-out ones. Raises ConfigError for arguments that exclude each other."""
     to_fit, to_validate = assigned(as_list(recordings), as_list(held_out))
     _check_share(holdout_share, to_validate)
     latency_s = car.simulator.mocap.latency_s
-    return read_material(to_fit, "fit", latency_s), read_material(to_validate, "held out", latency_s)
+    return load_recordings(to_fit, "fit", latency_s), load_recordings(to_validate, "held out", latency_s)
 
 
 def _workers(jobs: int | None, episodes: Sequence[EpisodeData]) -> FunctionWorkers:
@@ -209,7 +209,12 @@ def _workers(jobs: int | None, episodes: Sequence[EpisodeData]) -> FunctionWorke
 
 
 def _diagnosed(
-    fit: Material, validation: Material, file: CarFile, seed: int, jobs: int | None, options: Mapping[str, Any]
+    fit: LoadedRecordings,
+    validation: LoadedRecordings,
+    file: CarFile,
+    seed: int,
+    jobs: int | None,
+    options: Mapping[str, Any],
 ) -> DiagnosisReport:
     from carlab.diagnosis.diagnose import Inconclusive
     from carlab.diagnosis.diagnose import diagnose as search

@@ -37,14 +37,14 @@ if TYPE_CHECKING:
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.live_view import LiveView
     from carlab.experiment.campaign.prior_correction import PriorVersion
-    from carlab.experiment.campaign.quick_check import QuickCheck
+    from carlab.experiment.campaign.quick_check import EpisodeCheck
     from carlab.experiment.cluster.trainer import ClusterTrainer
     from carlab.experiment.episodes.interrupts import Interrupts
     from carlab.experiment.episodes.session import EpisodeResult
     from carlab.recording.run_folder import RunDirectory
 
 EPISODES = 20
-PLANNED = ("method", "history", "model_steps", "updates", "seed", "ticks")
+PLAN_ARGUMENTS = ("method", "history", "model_steps", "updates", "seed", "ticks")
 """Arguments that a run keeps when it is resumed."""
 
 
@@ -58,7 +58,7 @@ class LearnHooks(RunHooks):
         on_figures: receives the figures of a finished episode.
         on_checking: called before the quick check of an episode against the simulator.
         on_check: receives the result of the quick check.
-        on_repairing: called before the correction of the prior (``prior="auto"``).
+        on_correcting: called before the correction of the prior (``prior="auto"``).
         on_prior: receives the version of the prior after the correction, with the sentence that states what changed.
         on_link: receives a sentence when the cluster does not answer, is replaced by this computer, or answers again.
     """
@@ -67,8 +67,8 @@ class LearnHooks(RunHooks):
     on_learned: Callable[[dict[str, Any]], None] = lambda figures: None
     on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
     on_checking: Callable[[], None] = lambda: None
-    on_check: Callable[[QuickCheck], None] = lambda check: None
-    on_repairing: Callable[[], None] = lambda: None
+    on_check: Callable[[EpisodeCheck], None] = lambda check: None
+    on_correcting: Callable[[], None] = lambda: None
     on_prior: Callable[[PriorVersion], None] = lambda version: None
     on_link: Callable[[str], None] = lambda sentence: None
 
@@ -79,13 +79,13 @@ class LearnRun:
 
     Attributes:
         folder: the run's folder; ``carlab.learn(resume=folder)`` resumes the run.
-        wanted: target number of episodes.
+        target_episodes: number of episodes of the complete run.
         episodes: figures of the episodes of this call: return, predicted return, success, constraint cost ...
         results: the same episodes with their data and end reasons.
     """
 
     folder: Path
-    wanted: int
+    target_episodes: int
     episodes: tuple[EpisodeFigures, ...]
     results: tuple[EpisodeResult, ...]
 
@@ -99,7 +99,7 @@ class LearnRun:
     @property
     def is_complete(self) -> bool:
         """Whether the run has all its episodes."""
-        return len(self.recordings) >= self.wanted
+        return len(self.recordings) >= self.target_episodes
 
     @property
     def picture(self) -> Path:
@@ -113,7 +113,7 @@ class LearnRun:
 
     def __repr__(self) -> str:
         """One line: folder, number of episodes and their target number."""
-        return f"<LearnRun {self.folder}: {len(self.recordings)} of {self.wanted} episodes>"
+        return f"<LearnRun {self.folder}: {len(self.recordings)} of {self.target_episodes} episodes>"
 
     def _repr_html_(self) -> str:
         rows = [
@@ -204,7 +204,7 @@ class _Progress:
         save_row(self.run, row)
         self.hooks.on_figures(row)
 
-    def on_check(self, check: QuickCheck) -> None:
+    def on_check(self, check: EpisodeCheck) -> None:
         from carlab.experiment.campaign.report import save_check
 
         if self.rows and self.rows[-1].episode == check.episode:
@@ -223,7 +223,7 @@ class _Progress:
             self.on_figures,
             own.on_checking,
             self.on_check,
-            own.on_repairing,
+            own.on_correcting,
             own.on_prior,
             interrupts.requested.is_set,
         )
@@ -355,8 +355,8 @@ def _check_as_before(request: LearnRequest, campaign: Campaign, choice: CarChoic
     """Raise ConfigError for a given argument that differs from the run to resume."""
     plan = campaign.plan
     default = {name: parameter.default for name, parameter in inspect.signature(learn).parameters.items()}
-    saved = {name: getattr(plan, name) for name in PLANNED}
-    changed = [n for n in PLANNED if getattr(request, n) not in (default[n], saved[n])]
+    saved = {name: getattr(plan, name) for name in PLAN_ARGUMENTS}
+    changed = [n for n in PLAN_ARGUMENTS if getattr(request, n) not in (default[n], saved[n])]
     is_same = campaign.corrects_prior == (request.prior == AUTO)
     if request.prior != default["prior"] and not (
         is_same and training_plan(request, choice).prior_toml == plan.prior_toml

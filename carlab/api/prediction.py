@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from carlab.api.cars import load_car
-from carlab.api.material import Material, RecordingLike, as_list, read_material
+from carlab.api.loaded_recordings import LoadedRecordings, RecordingLike, as_list, load_recordings
 from carlab.api.runs import html_table
 
 if TYPE_CHECKING:
@@ -28,12 +28,12 @@ class PredictionErrors:
     """Errors after a horizon, by the same windows and initial states as the held-out errors of a diagnosis.
 
     Attributes:
-        material: the recordings as they were read, with what was repaired.
+        recordings: the recordings as they were read, with their repairs.
         score: windows, errors (S, 6) of each model, and predicted trajectories.
         is_adaptation_noise_known: whether the car file states the noise of the adaptation.
     """
 
-    material: Material
+    recordings: LoadedRecordings
     score: RecordingScore
     is_adaptation_noise_known: bool = False
 
@@ -117,7 +117,7 @@ class PredictionErrors:
         pairs = zip(self.score.episodes, self.score.overlays, strict=True)
         for number, (episode, overlay) in enumerate(pairs, start=1):
             file = first.with_name(f"{first.stem}-{number}.rrd") if several else first
-            name = Path(self.material.uses[0].path).name
+            name = Path(self.recordings.uses[0].path).name
             episode_to_rrd(episode, file, name, overlays={"predicted": overlay})
             written.append(file)
         return written
@@ -167,9 +167,9 @@ def predict(
     from carlab.diagnosis.score_recording import score_recording
 
     file = load_car(car)
-    material = read_material(as_list(recording), "scored", file.simulator.mocap.latency_s)
+    loaded = load_recordings(as_list(recording), "scored", file.simulator.mocap.latency_s)
     score = score_recording(
-        material.episodes,
+        loaded.episodes,
         file.simulator,
         noise=file.recording_noise,
         horizon_s=horizon_s,
@@ -179,4 +179,4 @@ def predict(
         keep_events=keep_events,
     )
     noise = file.recording_noise
-    return PredictionErrors(material, score, noise is not None and noise.adaptation is not None)
+    return PredictionErrors(loaded, score, noise is not None and noise.adaptation is not None)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from carlab.cli.console import progress
 from carlab.jobs.child_jobs import CARLAB, ChildJob, JobEnd
-from carlab.jobs.child_processes import ONE_THREAD, side_by_side
+from carlab.jobs.child_processes import ONE_THREAD, run_parallel
 
 if TYPE_CHECKING:
     from carlab.cli.bench_options import BenchOptions
@@ -90,7 +90,7 @@ def run_jobs(
         def in_order() -> list[Result]:
             return [result for number in sorted(found) for result in found[number]]
 
-        side_by_side(
+        run_parallel(
             executor.jobs,
             range(len(jobs)),
             lambda number: executor.run(jobs[number].job, interrupts.urgent.is_set),

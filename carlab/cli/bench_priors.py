@@ -106,13 +106,13 @@ def check_held_out(model: Path, held_out: Path) -> None:
         )
 
 
-def recordings_in(folder: Path, least: int = 2) -> list[Path]:
-    """Recordings of a folder, sorted by name. Raises ConfigError or DataError for less than ``least``."""
+def recordings_in(folder: Path, min_count: int = 2) -> list[Path]:
+    """Recordings of a folder, sorted by name. Raises ConfigError or DataError for fewer than ``min_count``."""
     if not folder.is_dir():
         raise ConfigError(f"--data {folder} is not a folder; name a folder with recordings (MCAP or CSV).")
     files = sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".csv", ".csv.gz")))
-    if len(files) < least:
-        raise DataError(f"{folder} has {len(files)} recordings; add some (at least {least}).")
+    if len(files) < min_count:
+        raise DataError(f"{folder} has {len(files)} recordings; add some (at least {min_count}).")
     return files
 
 

@@ -24,9 +24,9 @@ class Check:
     Exit code 0 if the car is ready to be armed, 3 if not; all reasons are listed.
     """
 
-    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
+    car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
+    task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     seconds: float = 2.0
     """Duration of the motion-capture measurement [s]."""
@@ -43,10 +43,10 @@ class Check:
 
         hooks = RunHooks(on_start=lambda folder, car: banner(car.reality, car.name, moves=False))
         result = check(
-            **self.which_car.arguments(), task=self.which_task.task, track=self.which_task.track, seconds=self.seconds,
+            **self.car.arguments(), task=self.task.task, track=self.task.track, seconds=self.seconds,
             wheels=self.wheels, hooks=hooks,
         )  # fmt: skip
-        if self.which_task.to_text():
+        if self.task.to_text():
             console.print("No error found in the task.")
         if readings := result.health.readings:
             rows = [[_label(name), f"{value:.4g}", _unit(name)] for name, value in readings.items()]

@@ -32,9 +32,9 @@ class Drive:
     end after the tick, twice to stop at once.
     """
 
-    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
+    car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
+    task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     policy: str = "parking"
     """parking (feedback), neutral (no motion), keyboard or gamepad (hold the dead-man control), a scripted manoeuvre
@@ -84,10 +84,10 @@ class Drive:
 
         with progress() as bar:
             run = drive(
-                **self.which_car.arguments(),
+                **self.car.arguments(),
                 policy=self.policy,
-                task=self.which_task.task,
-                track=self.which_task.track,
+                task=self.task.task,
+                track=self.task.track,
                 episodes=self.episodes,
                 ticks=self.ticks,
                 seed=self.seed,

@@ -12,7 +12,7 @@ import tyro
 
 MARK = "\n\nArgs:\n"
 EMPTY_DEFAULTS = ("", "''", "None")
-"""Defaults that tell nothing, as tyro prints them."""
+"""Empty defaults, as tyro prints them."""
 
 
 def improve_help(option_classes: Iterable[type]) -> None:

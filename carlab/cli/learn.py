@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from carlab.core.outcome import EndReason
     from carlab.experiment.campaign.figures import EpisodeFigures
     from carlab.experiment.campaign.prior_correction import PriorVersion
-    from carlab.experiment.campaign.quick_check import QuickCheck
+    from carlab.experiment.campaign.quick_check import EpisodeCheck
 
 STEPS_PERIOD_S = 600.0
 
@@ -62,9 +62,9 @@ class Learn:
     interrupted run.
     """
 
-    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
+    car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
-    which_task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
+    task: OmitArgPrefixes[TaskOptions] = field(default_factory=TaskOptions)
 
     episodes: int | None = None
     """Total number of episodes, including those already driven; by default 20, or the number of the resumed run."""
@@ -145,9 +145,9 @@ class Learn:
 
         with progress(speed_estimate_period_s=STEPS_PERIOD_S) as bar:
             run = learn(
-                **self.which_car.arguments(),
-                task=self.which_task.task,
-                track=self.which_task.track,
+                **self.car.arguments(),
+                task=self.task.task,
+                track=self.task.track,
                 episodes=self.episodes,
                 ticks=self.ticks,
                 prior=self.prior,
@@ -203,7 +203,7 @@ class Learn:
             for message in _training_messages(figures):
                 bar.console.print(f"  {message}", soft_wrap=True, highlight=False)
 
-        def on_check(check: QuickCheck) -> None:
+        def on_check(check: EpisodeCheck) -> None:
             for sentence in check.sentences:
                 bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False)
 
@@ -221,7 +221,7 @@ class Learn:
             on_figures=functools.partial(_print_figures, bar),
             on_checking=functools.partial(show_progress, "quick check of the simulator", 0, 1),
             on_check=on_check,
-            on_repairing=functools.partial(show_progress, "correction of the prior", 0, 1),
+            on_correcting=functools.partial(show_progress, "correction of the prior", 0, 1),
             on_prior=on_prior,
             on_link=lambda sentence: bar.console.print(f"  {sentence}", soft_wrap=True, markup=False, highlight=False),
         )
@@ -238,11 +238,11 @@ class Learn:
         if run.results:
             self._print_episodes(run)
             console.print(f"Learned and recorded in {run.folder} (learn.png, learn.rrd).", soft_wrap=True)
-        if done < run.wanted:
+        if done < run.target_episodes:
             console.print(
-                f"{done} of {run.wanted} episodes; resume with: "
-                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.which_car.to_text()}"
-                f"{self.which_task.to_text()}{self.ray_text()}",
+                f"{done} of {run.target_episodes} episodes; resume with: "
+                f"carlab learn --resume {shlex.quote(str(run.folder))}{self.car.to_text()}"
+                f"{self.task.to_text()}{self.ray_text()}",
                 soft_wrap=True,
             )
             last = run.end

@@ -166,7 +166,7 @@ class Prove:
         with Interrupts() as interrupts:
             rows = study(
                 self.out, "multi_body" if self.simulator == "commonroad" else "drift", seeds,
-                command=_diagnose_command(), timeout_s=self.timeout, say=console.print,
+                command=_diagnose_command(), timeout_s=self.timeout, progress=console.print,
                 abandon=interrupts.requested.is_set,
             )  # fmt: skip
         met = sum(1 for row in rows if row.get("ratio") is not None and row["ratio"] <= TARGET_RATIO)

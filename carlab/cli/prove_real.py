@@ -57,7 +57,7 @@ def tables_in(folder: Path | None) -> dict[str, dict[str, FloatArray]]:
     if folder is None:
         raise ConfigError("--set real needs --data FOLDER with recordings of one car; add it.")
     tables = {}
-    for path in recordings_in(folder, least=1):
+    for path in recordings_in(folder, min_count=1):
         try:
             whole = table_of(load(path).episode)
         except DataError as error:

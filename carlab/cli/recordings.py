@@ -61,7 +61,7 @@ def print_findings(report: AuditReport) -> None:
 
 
 def print_errors(title: str, first_column: str, errors: Mapping[str, FitErrors]) -> None:
-    """Print errors after a horizon as a table, one row a model."""
+    """Print errors after a horizon as a table, one row per model."""
     figures = ("position_m", "yaw_rad", "vx", "vy", "yaw_rate")
     rows = [
         [name.replace("_", " "), *(f"{getattr(e, k):.4f}" for k in figures), f"{e.score:.2f}"]

@@ -38,7 +38,7 @@ class Replay:
     recording: Positional[Path]
     """An MCAP or a CSV."""
 
-    which_car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
+    car: OmitArgPrefixes[CarOptions] = field(default_factory=CarOptions)
 
     horizon_s: Annotated[float, arg(name="horizon")] = 1.0
     """Prediction horizon [s]."""
@@ -82,13 +82,13 @@ class Replay:
             raise ConfigError(f"--seed {self.seed}: at least 0.")
         if self.save is not None:
             new_file(self.save, "--save", ".rrd")
-        simulated = self.which_car.choose(seed=self.seed).car.reality is Reality.SIMULATED
+        simulated = self.car.choose(seed=self.seed).car.reality is Reality.SIMULATED
         if not simulated or self.drive:
             for option in ("adapt", "save"):
                 if getattr(self, option):
                     raise ConfigError(f"--{option} is for predictions by a simulated car; remove it to drive.")
             return self._drive()
-        for option, value in (("seconds", self.seconds), ("reality", self.which_car.reality)):
+        for option, value in (("seconds", self.seconds), ("reality", self.car.reality)):
             if value is not None:
                 raise ConfigError(f"--{option} has no effect on predictions; add --drive, or remove it.")
         self._predict()
@@ -99,7 +99,7 @@ class Replay:
         from carlab.diagnosis.report.events import event_sentences
         from carlab.diagnosis.score_recording import MODEL, describe_windows
 
-        car = self.which_car
+        car = self.car
         if car.vehicle is not None and car.car != "sim":
             raise ConfigError(f"--vehicle needs --car sim; '{car.car}' has its own physics.")
         found = predict(
@@ -111,9 +111,9 @@ class Replay:
             adapt=self.adapt,
             keep_events=self.keep_events,
         )
-        for note in found.material.notes:
+        for note in found.recordings.notes:
             console.print(note)
-        for fault in (*found.material.faults, *found.score.faults):
+        for fault in (*found.recordings.faults, *found.score.faults):
             console.print(f"{fault.channel}: {fault.action}")
         for part in (found.score.whole, found.score.last):
             if part is None:
@@ -173,7 +173,7 @@ class Replay:
             )
             episode, run = replay(
                 recording,
-                **self.which_car.arguments(),
+                **self.car.arguments(),
                 seconds=self.seconds,
                 seed=self.seed,
                 out=self.out,

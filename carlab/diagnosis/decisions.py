@@ -28,6 +28,10 @@ class Condition:
         return self.statistic > self.threshold if self.above else self.statistic <= self.threshold
 
 
+Alternatives = tuple[tuple[Condition, ...], ...]
+"""Alternative sets of conditions; an effect passes if all conditions of one set hold."""
+
+
 @dataclass(frozen=True, slots=True)
 class Decision:
     """Whether an effect passed a stage: all conditions of one of the alternatives must hold.
@@ -42,7 +46,7 @@ class Decision:
 
     stage: str
     effect: str
-    alternatives: tuple[tuple[Condition, ...], ...]
+    alternatives: Alternatives
     passed: bool
     step: int = 0
 
@@ -75,4 +79,4 @@ def _condition(condition: Condition) -> dict[str, Any]:
     }
 
 
-__all__ = ["SCHEMA", "Condition", "Decision", "to_dict"]
+__all__ = ["SCHEMA", "Alternatives", "Condition", "Decision", "to_dict"]

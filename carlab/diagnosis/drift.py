@@ -24,8 +24,8 @@ from carlab.diagnosis.settings import DEFAULT, DriftSettings
 from carlab.prediction.adaptation import MIN_FEATURE_STD, AdaptiveModel, DisturbanceSeries, adapt, choose_noise
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import DisturbedModel
-from carlab.prediction.error_memory import state_features
 from carlab.prediction.errors import final_errors
+from carlab.prediction.local_error_model import state_features
 from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
@@ -81,13 +81,21 @@ def adapt_to_held_out(
     @cache
     def slowly_adapted(mask: Mask) -> _SlowAdaptation:
         made = adapt(
-            config, held_out_segments, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2
+            config,
+            held_out_segments,
+            noise,
+            slow,
+            drifts=(mask,),
+            with_error_models=False,
+            velocity_window_s2=window_s2,
         )
         return _SlowAdaptation(made, held_out.final_error(made))
 
     @cache
     def along_fitted(mask: Mask) -> FloatArray:
-        fitted = adapt(config, fit_segments, noise, slow, drifts=(mask,), remember=False, velocity_window_s2=window_s2)
+        fitted = adapt(
+            config, fit_segments, noise, slow, drifts=(mask,), with_error_models=False, velocity_window_s2=window_s2
+        )
         return fitted.series().mean
 
     plain = held_out.final_error(config)

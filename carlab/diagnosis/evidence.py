@@ -113,7 +113,7 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
     error = held_out.final_error(without.config)
     gain, spread = held_out.gain(error, full)
     parameters = {p.name: estimate(scored, f"effects.{name}.{p.name}") for p in EFFECTS[name].parameters}
-    rivals = found.rivals.get(name, ())
+    others = found.indistinguishable.get(name, ())
     evidence = Evidence(
         held_out_error_reduction=1.0 - held_out.score(full) / max(held_out.score(error), 1e-12),
         standard_errors=gain / spread,
@@ -122,13 +122,13 @@ def _finding(scored: ScoredSearch, name: str, texts: Texts) -> EffectFinding:
     )
     return EffectFinding(
         id=name,
-        confidence=_confidence(scored, name) / (1 + len(rivals)),
+        confidence=_confidence(scored, name) / (1 + len(others)),
         parameters=parameters,
         where=_where(scored, name, parameters, error, without),
         evidence=evidence,
         sentence=texts.effect(name, parameters),
-        indistinguishable_from=rivals,
-        separating_drive=texts.separating_drive(name, rivals) if rivals else "",
+        indistinguishable_from=others,
+        separating_drive=texts.separating_drive(name, others) if others else "",
     )
 
 

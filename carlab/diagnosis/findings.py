@@ -161,7 +161,7 @@ class Drift:
             than the simulator, than the simulator with the mean disturbance of the fitted recordings, and than the
             simulator corrected by the mean error of fitted windows in similar states.
         changes: quantities that changed, largest gain first; empty without a drift, or if no single one is significant.
-        time_constant_s: likeliest time constant of the slow adaptation [s].
+        time_constant_s: time constant of the slow adaptation with the highest weight [s].
         model_m, adapted_m, slow_m, similar_states_m: root mean square position errors after the horizon [m] of the
             simulator, of the adapted prediction, of the slow adaptation, and of the simulator corrected by errors in
             similar states.

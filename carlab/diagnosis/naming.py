@@ -15,7 +15,7 @@ import numpy as np
 
 from carlab.core.quantities import FloatArray
 from carlab.diagnosis.curves.curve_rival import curve_in_addition, replacing_curve
-from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.findings import Unexplained
 from carlab.diagnosis.identification.free_initial_states import loss_of_free_initial_states
 from carlab.diagnosis.identification.held_out_errors import HeldOut
@@ -116,51 +116,62 @@ def _are_spurious(
 ) -> bool:
     """Whether unnamed physics explains so much that the accepted effects are spurious.
 
-    One or two effects must leave nearly no residual, and must explain about as much as unnamed terms. A car that lacks
-    many effects may also have physics outside the catalogue.
+    One or two effects must leave nearly no residual, and must explain about as much as unnamed terms in their place. A
+    car that lacks many effects may also have physics outside the catalogue.
     """
-    settings = problem.settings.rivals
-    windows, scale = problem.windows, found.scale
-    named = float(problem.fitter(scale).loss(found.base.config).sum() - found.best.loss.sum())
-    is_small_set = len(found.effects) < settings.many_effects
-    min_gain = settings.min_unnamed_share * 0.5 * scale.sigma.size * len(windows)
     is_additional = rival is not None and rival.names == found.effects
-    unnamed = max(residual.gain, rival.gain if rival is not None and is_additional else 0.0)
-    unnamed_share = unnamed / (unnamed + named) if unnamed + named > 0.0 else 0.0
-    relevant = unnamed / (0.5 * scale.sigma.size * len(windows))
-    is_irrelevant = Condition("rivals.min_unnamed_share", relevant, settings.min_unnamed_share, above=False)
+    unnamed_gain = max(residual.gain, rival.gain if rival is not None and is_additional else 0.0)
+    if not _stand(found, _limits_in_addition(problem, found, unnamed_gain, held_out), control):
+        return True
+    is_small_set = len(found.effects) < problem.settings.rivals.many_effects
+    return is_small_set and not _stand(found, _limits_in_place(problem, found), control)
+
+
+def _limits_in_addition(
+    problem: SearchProblem, found: SearchResult, unnamed_gain: float, held_out: HeldOut
+) -> Alternatives:
+    """Conditions on the gain of unnamed physics in addition to the accepted effects."""
+    settings = problem.settings.rivals
+    gain = _gain_of_effects(problem, found)
+    share = unnamed_gain / (unnamed_gain + gain) if unnamed_gain + gain > 0.0 else 0.0
 
     def is_below(setting: str) -> Condition:
-        return Condition(f"rivals.{setting}", unnamed_share, float(getattr(settings, setting)), above=False)
+        return Condition(f"rivals.{setting}", share, float(getattr(settings, setting)), above=False)
 
-    alternatives: tuple[tuple[Condition, ...], ...] = ((is_irrelevant,), (is_below("spurious_share_many"),))
-    if is_small_set:
-        explained = explained_share(problem, found, held_out)
-        most = settings.min_explained_share_of_most
-        explain_most = Condition("rivals.min_explained_share_of_most", explained, most)
-        of_most = (is_below("spurious_share_of_most"), explain_most)
-        alternatives = ((is_irrelevant,), (is_below("spurious_share"),), of_most)
-    spurious = not any(all(c.holds for c in conditions) for conditions in alternatives)
-    _record(control, found, alternatives, not spurious)
-    if spurious or not is_small_set:
-        return spurious
-    free_gain = fit_residual_terms(windows, found.base, scale, None, problem.settings.unexplained).gain
-    spurious = free_gain > max(settings.unnamed_ratio * named, named + min_gain)
-    ratio = free_gain / named if named > 0.0 else np.inf
-    surplus = (free_gain - named) / (0.5 * scale.sigma.size * len(windows))
-    alternatives = (
-        (Condition("rivals.unnamed_ratio", ratio, settings.unnamed_ratio, above=False),),
-        (Condition("rivals.min_unnamed_share", surplus, settings.min_unnamed_share, above=False),),
-    )
-    _record(control, found, alternatives, not spurious)
-    return spurious
+    is_irrelevant = _is_irrelevant(problem, found, unnamed_gain)
+    if len(found.effects) >= settings.many_effects:
+        return (is_irrelevant,), (is_below("spurious_share_many"),)
+    explained = explained_share(problem, found, held_out)
+    explain_most = Condition("rivals.min_explained_share_of_most", explained, settings.min_explained_share_of_most)
+    return (is_irrelevant,), (is_below("spurious_share"),), (is_below("spurious_share_of_most"), explain_most)
 
 
-def _record(
-    control: RunControl, found: SearchResult, alternatives: tuple[tuple[Condition, ...], ...], passed: bool
-) -> None:
+def _limits_in_place(problem: SearchProblem, found: SearchResult) -> Alternatives:
+    """Conditions on the gain of unnamed terms in place of the accepted effects."""
+    gain = _gain_of_effects(problem, found)
+    terms = fit_residual_terms(problem.windows, found.base, found.scale, None, problem.settings.unexplained)
+    ratio = terms.gain / gain if gain > 0.0 else np.inf
+    is_similar = Condition("rivals.unnamed_ratio", ratio, problem.settings.rivals.unnamed_ratio, above=False)
+    return (is_similar,), (_is_irrelevant(problem, found, terms.gain - gain),)
+
+
+def _gain_of_effects(problem: SearchProblem, found: SearchResult) -> float:
+    """Fall of the loss from the refit to the fit with the accepted effects, with the scale of the latter."""
+    return float(problem.fitter(found.scale).loss(found.base.config).sum() - found.best.loss.sum())
+
+
+def _is_irrelevant(problem: SearchProblem, found: SearchResult, gain: float) -> Condition:
+    """That a gain is a small share of the loss of a perfect simulator."""
+    share = gain / (0.5 * found.scale.sigma.size * len(problem.windows))
+    return Condition("rivals.min_unnamed_share", share, problem.settings.rivals.min_unnamed_share, above=False)
+
+
+def _stand(found: SearchResult, alternatives: Alternatives, control: RunControl) -> bool:
+    """Whether all conditions of one alternative hold, so that the accepted effects stand; records the decision."""
+    passed = any(all(c.holds for c in conditions) for conditions in alternatives)
     for name in found.effects:
         control.record(Decision("stand", name, alternatives, passed, len(found.effects)))
+    return passed
 
 
 def _increases_held_out_error(found: SearchResult, held_out: HeldOut) -> bool:
@@ -183,8 +194,7 @@ def _explain_little(problem: SearchProblem, found: SearchResult, held_out: HeldO
     alternatives = tuple(
         (Condition("rivals.min_explained_share", share, settings.min_explained_share),) for share in shares
     )
-    little = max(shares) < settings.min_explained_share
-    _record(control, found, alternatives, not little)
+    little = not _stand(found, alternatives, control)
     if little:
         log.info("%s: withdrawn, because %.2f of the excess is explained", ", ".join(found.effects), max(shares))
     return little
@@ -251,9 +261,10 @@ def describe_unexplained(
             description, naming.vibration, excess, held_out, problem.settings.rivals.vibration_share
         )
     fall = description.fall if description.fall.max() > 0.0 else excess
-    size: FloatArray = np.sqrt(squared.mean(axis=1))
-    seen = start_features(held_out.windows)
-    return describe(share, description.class_statement, description.formula, fall, size, seen), description.model
+    window_errors: FloatArray = np.sqrt(squared.mean(axis=1))
+    features = start_features(held_out.windows)
+    entry = describe(share, description.class_statement, description.formula, fall, window_errors, features)
+    return entry, description.model
 
 
 def _describe_by_rival(

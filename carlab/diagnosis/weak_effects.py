@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.identification.fit import Fit
 from carlab.diagnosis.identification.held_out_errors import HeldOut
 from carlab.diagnosis.selection.problem import Model, RunControl, SearchProblem, SearchResult
@@ -22,9 +22,6 @@ from carlab.prediction.errors import prediction_errors
 from carlab.prediction.predict import simulate_windows
 
 log = logging.getLogger(__name__)
-
-Alternatives = tuple[tuple[Condition, ...], ...]
-"""Alternative sets of conditions; an effect stands if all conditions of one set hold."""
 
 
 def without_negligible_effects(problem: SearchProblem, found: SearchResult, control: RunControl) -> SearchResult:

@@ -30,7 +30,7 @@ class ChildJob:
         inputs: contents of files in the folder, by relative path.
         outputs: files that are read afterwards, relative to the folder, or folders, of which all files are read;
             missing ones are left out.
-        words_in: standard input.
+        stdin_text: standard input.
         environment: changes to the environment.
     """
 
@@ -38,7 +38,7 @@ class ChildJob:
     timeout_s: float
     inputs: Mapping[str, bytes] = field(default_factory=dict)
     outputs: tuple[str, ...] = ()
-    words_in: str = ""
+    stdin_text: str = ""
     environment: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -60,7 +60,7 @@ class JobEnd:
         """Reason of a failed job: the last printed line, or the exit status; empty for a job that succeeded."""
         if self.end.exit_status == 0:
             return ""
-        return (self.end.words.strip().splitlines() or [f"exit status {self.end.exit_status}"])[-1]
+        return (self.end.output.strip().splitlines() or [f"exit status {self.end.exit_status}"])[-1]
 
 
 class Executor(Protocol):
@@ -95,7 +95,7 @@ def run_job(job: ChildJob, abandon: Callable[[], bool] = lambda: False) -> JobEn
         folder = Path(fresh)
         write_files(folder, job.inputs)
         end = run_child(
-            command, folder, timeout_s=job.timeout_s, words_in=job.words_in, environment=job.environment,
+            command, folder, timeout_s=job.timeout_s, stdin_text=job.stdin_text, environment=job.environment,
             abandon=abandon,
         )  # fmt: skip
         return JobEnd(end, {k: v for name in job.outputs for k, v in read_files(folder, name).items()})

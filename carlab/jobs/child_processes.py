@@ -18,23 +18,24 @@ from typing import TypeVar
 from carlab.core.clock import MonotonicClock
 
 POLL_S = 0.02
-TAIL = 2000
+OUTPUT_TAIL_BYTES = 2000
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 Task = TypeVar("Task")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class ChildEnd:
     """End of a child process.
 
-    ``exit_status`` is None after a time-out, negative after a signal. ``peak_memory_mib`` is the largest resident set
-    of the child or of a process that it waited for (getrusage); on Linux at least that of the parent at the start.
+    ``exit_status`` is None after a time-out, negative after a signal. ``output`` is the end of standard output and
+    standard error, at most ``OUTPUT_TAIL_BYTES``, or states the time-out. ``peak_memory_mib`` is the largest resident
+    set of the child or of a process that it waited for (getrusage); on Linux at least that of the parent at the start.
     """
 
     exit_status: int | None
     seconds: float
-    words: str
+    output: str
     peak_memory_mib: float
     abandoned: bool = False
 
@@ -44,7 +45,7 @@ def run_child(
     folder: Path,
     *,
     timeout_s: float,
-    words_in: str = "",
+    stdin_text: str = "",
     environment: Mapping[str, str] | None = None,
     abandon: Callable[[], bool] = lambda: False,
 ) -> ChildEnd:
@@ -54,14 +55,14 @@ def run_child(
         command: Program and arguments.
         folder: Working directory.
         timeout_s: Time after which the child and its session are killed.
-        words_in: Standard input.
+        stdin_text: Standard input.
         environment: Changes to the environment.
         abandon: Polled; True kills the child.
     """
     clock = MonotonicClock()
     inherited = {k: v for k, v in os.environ.items() if k != "PWD"}
     with tempfile.TemporaryFile() as output_file, tempfile.TemporaryFile() as input_file:
-        input_file.write(words_in.encode())
+        input_file.write(stdin_text.encode())
         input_file.seek(0)
         begin_s = clock.now_s()
         child = subprocess.Popen(
@@ -86,12 +87,12 @@ def run_child(
             child.wait()
             raise
         seconds = clock.now_s() - begin_s
-        output_file.seek(max(0, output_file.seek(0, os.SEEK_END) - TAIL))
-        words = output_file.read().decode(errors="replace")
+        output_file.seek(max(0, output_file.seek(0, os.SEEK_END) - OUTPUT_TAIL_BYTES))
+        output = output_file.read().decode(errors="replace")
     if too_long:
-        words = f"ended after {timeout_s:g} s"
+        output = f"ended after {timeout_s:g} s"
     code = None if too_long else int(child.returncode)
-    return ChildEnd(code, seconds, words, usage.ru_maxrss / 1024.0, abandoned)
+    return ChildEnd(code, seconds, output, usage.ru_maxrss / 1024.0, abandoned)
 
 
 def _kill_session(pid: int) -> None:
@@ -101,13 +102,13 @@ def _kill_session(pid: int) -> None:
         return  # the process has ended
 
 
-def side_by_side(
+def run_parallel(
     jobs: int,
     tasks: Iterable[Task],
-    work: Callable[[Task], Made],
+    work: Callable[[Task], Result],
     *,
     stop_requested: Callable[[], bool] = lambda: False,
-    finished: Callable[[Task, Made], None] = lambda task, made: None,
+    finished: Callable[[Task, Result], None] = lambda task, result: None,
 ) -> bool:
     """Run tasks in order, ``jobs`` at a time, each in a thread that waits for a child process.
 
@@ -115,7 +116,7 @@ def side_by_side(
     The first error is raised after the running tasks have ended. Returns whether all tasks were done.
     """
     remaining = iter(tasks)
-    running: dict[Future[Made], Task] = {}
+    running: dict[Future[Result], Task] = {}
     more = True
     with ThreadPoolExecutor(jobs) as pool:
         while more or running:
@@ -134,7 +135,7 @@ def side_by_side(
     return True
 
 
-def _drain(running: Mapping[Future[Made], Task], finished: Callable[[Task, Made], None]) -> None:
+def _drain(running: Mapping[Future[Result], Task], finished: Callable[[Task, Result], None]) -> None:
     pending = set(running)
     while pending:
         done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)

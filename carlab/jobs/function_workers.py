@@ -19,7 +19,7 @@ from carlab.jobs.child_processes import ONE_THREAD
 log = logging.getLogger(__name__)
 
 WORKER = ("-m", "carlab.jobs.function_worker")
-Made = TypeVar("Made")
+Result = TypeVar("Result")
 
 
 def cores_count() -> int:
@@ -59,12 +59,12 @@ class FunctionWorkers:
 
     def map(
         self,
-        function: Callable[..., Made],
+        function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
         *,
         stop: Callable[[], bool] = lambda: False,
         started: Callable[[int], None] = lambda index: None,
-    ) -> list[Made | None]:
+    ) -> list[Result | None]:
         """Call a function with each tuple of arguments.
 
         Args:
@@ -76,7 +76,7 @@ class FunctionWorkers:
         Returns:
             The results in the order of the arguments; None for calls that did not begin.
         """
-        results: list[Made | None] = [None] * len(arguments)
+        results: list[Result | None] = [None] * len(arguments)
         pending = deque(range(len(arguments)))
         threads = self._start_sharing(function, arguments, pending, results)
         try:
@@ -108,10 +108,10 @@ class FunctionWorkers:
 
     def _start_sharing(
         self,
-        function: Callable[..., Made],
+        function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
         pending: deque[int],
-        results: list[Made | None],
+        results: list[Result | None],
     ) -> list[_Sharing]:
         if len(arguments) < 2 or self._child_failed:
             return []

@@ -25,7 +25,7 @@ from carlab.core.recording_noise import AdaptationNoise, FeatureStd, StateStd
 from carlab.prediction.adaptation_filter import Filtered, Processes, run_filter
 from carlab.prediction.adaptation_settings import AdaptationSettings
 from carlab.prediction.disturbances import bounded_final_errors, linearised, simulate_disturbed
-from carlab.prediction.error_memory import ErrorMemory, state_features
+from carlab.prediction.local_error_model import LocalErrorModel, state_features
 from carlab.prediction.predict import simulate_windows
 from carlab.prediction.windows import IndexArray, PredictionWindows, RecordingSegment, cut_windows
 from sim_backends.car_parameters import SimulatorConfig
@@ -48,7 +48,7 @@ class DisturbanceSeries:
         mean: (S, n) share of the drive force [1], steering trim [rad], share of the grip [1], force forward per mass
             [m/s2], under the condition that the car changed.
         std: (S, n) standard deviations of the same.
-        weights: (S, 1 + C + M) of the simulator without a change, of the candidates and of the memories of errors.
+        weights: (S, 1 + C + M) of the simulator without a change, of the candidates and of the error models.
     """
 
     recording: IndexArray
@@ -59,7 +59,7 @@ class DisturbanceSeries:
 
 
 @dataclass(frozen=True, slots=True)
-class Moments:
+class WindowEnds:
     """Ends of windows in the order of recording and time: ``recording`` (S,) and ``end_s`` (S,) [s]."""
 
     recording: IndexArray
@@ -83,10 +83,10 @@ class AdaptiveModel:
     Attributes:
         config: the fitted simulator.
         processes: C candidates.
-        measured: S ends of the windows that measure the disturbances.
+        filter_ends: S ends of the windows that measure the disturbances.
         filtered: estimates of the candidates after each of these windows.
-        memories: M simulators without a change, corrected by their errors in similar states.
-        weighed: L ends of the windows that weigh the candidates.
+        error_models: M simulators without a change, corrected by their errors in similar states.
+        weight_ends: L ends of the windows that weigh the candidates.
         losses: (1 + C + M, L) of the predictions of ``candidates``, summed with forgetting.
         guard_s: minimum time [s] between the end of a used window and the start of a prediction.
         settings: settings of the adaptation.
@@ -94,10 +94,10 @@ class AdaptiveModel:
 
     config: SimulatorConfig
     processes: Processes
-    measured: Moments
+    filter_ends: WindowEnds
     filtered: Filtered
-    memories: tuple[ErrorMemory, ...]
-    weighed: Moments
+    error_models: tuple[LocalErrorModel, ...]
+    weight_ends: WindowEnds
     losses: FloatArray
     guard_s: float
     settings: AdaptationSettings
@@ -108,46 +108,46 @@ class AdaptiveModel:
         return np.asarray(np.einsum("cs,cskj->skj", weights, self.candidates(windows)))
 
     def candidates(self, windows: PredictionWindows) -> FloatArray:
-        """Predictions (1 + C + M, S, K + 1, 6) without a change, by each candidate and by each memory."""
+        """Predictions (1 + C + M, S, K + 1, 6) without a change, by each candidate and by each error model."""
         drifting = self.disturbances(windows.recording, windows.t0_s)
         unchanged = np.zeros((1, *drifting.shape[1:]))
         predicted = simulate_disturbed(windows, self.config, np.concatenate([unchanged, drifting]), self.settings)
-        corrected = [memory.corrected(windows, predicted[0]) for memory in self.memories]
+        corrected = [error_model.corrected(windows, predicted[0]) for error_model in self.error_models]
         return np.concatenate([predicted, np.stack(corrected)]) if corrected else predicted
 
     def disturbances(self, recording: IndexArray, t_s: FloatArray) -> FloatArray:
         """Estimated disturbances (C, S, n) at times of recordings, 0 before the first measured window."""
-        if not len(self.measured.end_s):
+        if not len(self.filter_ends.end_s):
             return np.zeros((len(self.processes.std), len(t_s), self.processes.std.shape[1]))
-        index = self.measured.last_before(recording, t_s - self.guard_s)
-        age_s = t_s - self.measured.end_s[index]
+        index = self.filter_ends.last_before(recording, t_s - self.guard_s)
+        age_s = t_s - self.filter_ends.end_s[index]
         decay = np.exp(-np.maximum(age_s, 0.0) / self.processes.time_constant_s[:, None])
         return np.where(index[:, None] >= 0, self.filtered.mean[:, index] * decay[..., None], 0.0)
 
     def weights(self, recording: IndexArray, t_s: FloatArray) -> FloatArray:
         """Weights (1 + C + M, S) of the predictions of ``candidates`` at times of recordings."""
         logarithm = np.repeat(np.log(self._prior_weights())[:, None], len(t_s), axis=1)
-        if len(self.weighed.end_s):
-            index = self.weighed.last_before(recording, t_s - self.guard_s)
+        if len(self.weight_ends.end_s):
+            index = self.weight_ends.last_before(recording, t_s - self.guard_s)
             logarithm -= np.where(index >= 0, self.losses[:, index], 0.0)
         weights = np.exp(logarithm - logarithm.max(axis=0))
         return np.asarray(weights / weights.sum(axis=0))
 
     def _prior_weights(self) -> FloatArray:
         """Weights (1 + C + M,) without past errors, the same for each of the three kinds of predictions."""
-        kinds = (1, len(self.processes.std), len(self.memories))
+        kinds = (1, len(self.processes.std), len(self.error_models))
         return np.concatenate([np.full(count, 1.0 / (len(kinds) * max(count, 1))) for count in kinds])
 
     def series(self) -> DisturbanceSeries:
         """Mean and standard deviation over the candidates after each measured window."""
-        moments = self.measured
-        weights = self.weights(moments.recording, moments.end_s + self.guard_s)
+        ends = self.filter_ends
+        weights = self.weights(ends.recording, ends.end_s + self.guard_s)
         drifting = weights[1 : 1 + len(self.processes.std)]
         shares = drifting / np.maximum(drifting.sum(axis=0), 1e-300)
         mean = np.einsum("cs,csn->sn", shares, self.filtered.mean)
         variance = np.einsum("csnn->csn", self.filtered.covariance) + (self.filtered.mean - mean) ** 2
         std = np.sqrt(np.einsum("cs,csn->sn", shares, variance))
-        return DisturbanceSeries(moments.recording, moments.end_s, mean, std, weights.T)
+        return DisturbanceSeries(ends.recording, ends.end_s, mean, std, weights.T)
 
 
 def adapt(
@@ -158,7 +158,7 @@ def adapt(
     *,
     drifts: Sequence[Sequence[bool]] = SINGLE_AND_ALL,
     fitted: Sequence[RecordingSegment] = (),
-    remember: bool = True,
+    with_error_models: bool = True,
     velocity_window_s2: float = 0.0,
 ) -> AdaptiveModel:
     """Estimate the disturbances of a simulator along recordings.
@@ -170,8 +170,8 @@ def adapt(
         settings: settings of the adaptation.
         drifts: which of the n drifting disturbances may differ from 0, for each group of candidates; a group has one
             candidate for each time constant.
-        fitted: segments of earlier recordings, whose errors are also remembered.
-        remember: whether errors in similar states are remembered at all.
+        fitted: segments of earlier recordings, whose errors also correct the simulator.
+        with_error_models: also correct the simulator by its errors in similar states of the past.
         velocity_window_s2: variance [s2] of the window over which the recorded velocities were differentiated.
 
     Raises:
@@ -185,22 +185,22 @@ def adapt(
         measured = linearised(windows, config, at, settings)
         filtered = run_filter(measured, processes)
         at = filtered.predicted
-    memories = tuple(
-        ErrorMemory(
+    error_models = tuple(
+        LocalErrorModel(
             config, segments, earlier, np.array(noise.feature_std), guard_s(windows), velocity_window_s2, settings
         )
         for earlier in ([(), fitted] if fitted else [()])
-        if remember
+        if with_error_models
     )
-    none = Moments(np.zeros(0, dtype=np.int64), np.zeros(0))
+    none = WindowEnds(np.zeros(0, dtype=np.int64), np.zeros(0))
     model = AdaptiveModel(
         config,
         processes,
-        Moments(measured.recording, measured.end_s),
+        WindowEnds(measured.recording, measured.end_s),
         filtered,
-        memories,
+        error_models,
         none,
-        np.zeros((1 + len(at) + len(memories), 0)),
+        np.zeros((1 + len(at) + len(error_models), 0)),
         guard_s(windows),
         settings,
     )
@@ -272,16 +272,16 @@ def _with_losses(
     errors = bounded_final_errors(windows, model.candidates(windows), settings)
     distance_sq = np.sum((errors / noise.loss_std) ** 2, axis=-1)
     losses = 0.5 * (settings.dof + errors.shape[-1]) * np.log1p(distance_sq / settings.dof)
-    weighed = Moments(windows.recording, windows.t0_s + windows.horizon_s)
-    return replace(model, weighed=weighed, losses=_remembered(losses, weighed, settings))
+    weight_ends = WindowEnds(windows.recording, windows.t0_s + windows.horizon_s)
+    return replace(model, weight_ends=weight_ends, losses=_forgetting_sums(losses, weight_ends, settings))
 
 
-def _remembered(losses: FloatArray, moments: Moments, settings: AdaptationSettings) -> FloatArray:
+def _forgetting_sums(losses: FloatArray, ends: WindowEnds, settings: AdaptationSettings) -> FloatArray:
     """Sums of losses (C, L) of each recording up to each window, with exponential forgetting."""
     total = losses * min(settings.weight_stride_s / settings.weight_dependence_s, 1.0)
-    for k in range(1, len(moments.end_s)):
-        if moments.recording[k] == moments.recording[k - 1]:
-            elapsed_s = moments.end_s[k] - moments.end_s[k - 1]
+    for k in range(1, len(ends.end_s)):
+        if ends.recording[k] == ends.recording[k - 1]:
+            elapsed_s = ends.end_s[k] - ends.end_s[k - 1]
             total[:, k] += np.exp(-elapsed_s / settings.weight_memory_s) * total[:, k - 1]
     return total
 

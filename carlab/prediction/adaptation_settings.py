@@ -22,9 +22,9 @@ class AdaptationSettings:
     """Time constants [s] of the candidates: from a car that warms up to one that differs from the first row on."""
     white_std: tuple[float, ...] = (0.3, 0.05, 0.3, 0.3, 0.3, 1.5)
     """Unit of the white noise on the same disturbances, on the force to the left per mass [m/s2] and on the moment per
-    yaw inertia [rad/s2]: what the simulator lacks from one window to the next, larger the harder the car drives."""
+    yaw inertia [rad/s2]: errors of the simulator that are independent between windows, larger in harder driving."""
     white_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0)
-    """Sizes of that noise, of which the likeliest is used."""
+    """Sizes of that noise; the one with the highest likelihood is used."""
     error_shares: tuple[float, ...] = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
     """Sizes of the error after a window in addition to that noise, in units of the error in calm windows."""
     calm_quantile: float = 0.25
@@ -42,11 +42,11 @@ class AdaptationSettings:
     """Time [s] within which errors count as one, because they are dependent. 1 s is 2 % worse, 10 s 1 %."""
     weight_stride_s: float = 0.25
     """Time [s] between the starts of the windows that weigh the candidates."""
-    memory_neighbours: int = 30
+    local_neighbours: int = 30
     """Number of past windows that give the expected error of a prediction; bounds the time."""
-    memory_length: float = 2.0
+    local_length: float = 2.0
     """Length scale of the kernel over the state, in standard deviations of the states of the fitted recordings."""
-    memory_noise: float = 0.5
+    local_noise: float = 0.5
     """Variance of an error about its expectation, over that of the expectation. From 0.3 to 1 the results differ by
     1 %."""
     limits: tuple[float, ...] = (0.9, 0.4, 0.9, 10.0, 10.0, 100.0)

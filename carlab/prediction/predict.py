@@ -26,7 +26,7 @@ from sim_backends.measurement import (
     MeasurementModel,
     State,
     delay_as_recorded_s,
-    is_measured,
+    is_measurement_parameter,
 )
 from sim_backends.measurement import velocity_curvature as state_curvature
 
@@ -124,7 +124,7 @@ def simulate_windows(
     numbers: dict[str, float | FloatArray] = {**whole.values(), **given}
     shaped = {name: _by_set(value, sets) for name, value in numbers.items()}
     measurement = MeasurementModel(ARRAYS, shaped, whole.effects)
-    inner = {n: shaped[n] for n in given if not is_measured(n)}
+    inner = {n: shaped[n] for n in given if not is_measurement_parameter(n)}
     effects = {name: v for name, v in whole.effects.items() if EFFECTS[name].kind != "observation"}
     delay_s = delay_as_recorded_s(ARRAYS, shaped, effects, measurement.latency_s)
     inner[COMMAND_DELAY] = np.asarray(delay_s)

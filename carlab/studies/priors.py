@@ -25,7 +25,7 @@ from learning.priors.simulator_model import DELAY, CarModel, known_ranges
 from learning.transitions import velocity_delay_s
 from sim_backends.car_parameters import SimulatorConfig
 
-NONE, KINEMATIC, NOMINAL, DIAGNOSED = "none (FSVGD)", "kinematic", "nominal", "diagnosed"
+NONE, KINEMATIC, NOMINAL, DIAGNOSED = "none (gp-posterior)", "kinematic", "nominal", "diagnosed"
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,8 +32,8 @@ from learning.functional_svgd.fsvgd import (
 )
 from learning.networks.normaliser import Normaliser
 from learning.networks.particles import Network
-from learning.posterior.draws import Draws
 from learning.posterior.particle_posterior import ParticlePosterior
+from learning.posterior.sampler import PosteriorSampler
 from learning.priors.domain_models import draw_parameters
 from learning.priors.function_prior import RbfCovariance
 from learning.priors.simulator_model import CarModel
@@ -80,15 +80,15 @@ class WorldDynamics:
 
     posterior: ParticlePosterior
     history: int
-    _draws: Draws = field(init=False, repr=False, compare=False)
+    _sampler: PosteriorSampler = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_draws", Draws.of(self.posterior))
+        object.__setattr__(self, "_sampler", PosteriorSampler.of(self.posterior))
 
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
         """Features (N, 7 + 2 H) a step later; sine and cosine are projected onto the unit circle."""
         now = in_world(features)
-        after = now + self._draws(_inputs(now, features, action), generator)
+        after = now + self._sampler(_inputs(now, features, action), generator)
         yaw = torch.atan2(after[:, 2:3], after[:, 3:4])
         ahead, left = to_body(after[:, 4], after[:, 5], yaw[:, 0])
         state = torch.cat([after[:, :2], yaw, ahead[:, None], left[:, None], after[:, 6:7]], dim=1)

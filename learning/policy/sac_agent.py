@@ -27,8 +27,8 @@ AGENT_FILE = "policy.npz"
 EARLIER_AGENT_FILE = "agent.zip"
 FILE_VERSION = 1
 MAX_OBSERVATION_SIZE = 1000
-NEVER = 2**62
-"""Number of steps that no training reaches."""
+UNLIMITED_STEPS = 2**62
+"""A number of steps that no training reaches; callbacks end it."""
 DIVERGED = "The policy diverged; train it with a smaller learning rate."
 
 
@@ -115,10 +115,10 @@ class SacAgent:
         try:
             if earlier is not None:
                 check()
-            sac.learn(self._settings.warm_up, log_interval=NEVER)
+            sac.learn(self._settings.warm_up, log_interval=UNLIMITED_STEPS)
             sac.gradient_steps = self._settings.updates
             callback = _Milestones(milestones, progress, check)
-            sac.learn(NEVER, callback=callback, log_interval=NEVER, reset_num_timesteps=False)
+            sac.learn(UNLIMITED_STEPS, callback=callback, log_interval=UNLIMITED_STEPS, reset_num_timesteps=False)
         except BaseException as error:
             self._sac = earlier
             if isinstance(error, ValueError) and "nan" in str(error):  # torch's distributions refuse NaN.

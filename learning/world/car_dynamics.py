@@ -18,8 +18,8 @@ from carlab.core.angles import wrap
 from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import STATE_FEATURES, decode_history, decode_state, encode, push_action
 from learning.evaluation import Mixture, calibration_error, negative_log_likelihood
-from learning.posterior.draws import Draws
 from learning.posterior.particle_posterior import ParticlePosterior
+from learning.posterior.sampler import PosteriorSampler
 from learning.transitions import transitions_of
 
 
@@ -61,15 +61,15 @@ class CarDynamics(StepInBody):
 
     posterior: ParticlePosterior
     history: int
-    _draws: Draws = field(init=False, repr=False, compare=False)
+    _sampler: PosteriorSampler = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_draws", Draws.of(self.posterior))
+        object.__setattr__(self, "_sampler", PosteriorSampler.of(self.posterior))
 
     @property
-    def draws(self) -> Draws:
+    def sampler(self) -> PosteriorSampler:
         """Sampler of the particles."""
-        return self._draws
+        return self._sampler
 
     def predict(self, inputs: Tensor) -> Mixture:
         """Predictive distribution of changes at inputs (N, 3 + 2 (H + 1))."""
@@ -77,7 +77,7 @@ class CarDynamics(StepInBody):
 
     def sample(self, inputs: Tensor, generator: torch.Generator) -> Tensor:
         """One sample (N, 6) of the mixture for each row."""
-        return self._draws(inputs, generator)
+        return self._sampler(inputs, generator)
 
     def score_episode(self, episode: EpisodeData) -> tuple[float, float]:
         """Negative log-likelihood of an episode's steps [nat per step], and calibration error."""

@@ -89,7 +89,7 @@ def fit_car(
     model: CarModel,
     settings: CarFitSettings,
     *,
-    before: CarDynamics | None = None,
+    earlier: CarDynamics | None = None,
     device: torch.device | str = "cpu",
     progress: Callable[[int], None] = lambda step: None,
 ) -> CarDynamics:
@@ -99,7 +99,7 @@ def fit_car(
         rows: recorded transitions; None: the prior alone is distilled.
         model: the simulator: the prior, or (``gp-posterior``) only the source of units and domain.
         settings: of the fit.
-        before: an earlier fit of the same car, on any device, with the units and initial particles.
+        earlier: an earlier fit of the same car, on any device, with the units and initial particles.
         device: of the fit; random numbers are drawn on the CPU.
         progress: called with the number of optimiser steps done.
 
@@ -108,13 +108,13 @@ def fit_car(
     """
     if rows is not None and rows.history != model.history:
         raise DataError(f"The rows have {rows.history} past commands, the model {model.history}; use the same number.")
-    if before is not None and before.history != model.history:
+    if earlier is not None and earlier.history != model.history:
         raise DataError(
-            f"The earlier car has {before.history} past commands, the model {model.history}; remove its folder to "
+            f"The earlier car has {earlier.history} past commands, the model {model.history}; remove its folder to "
             "train again."
         )
     generator = torch.Generator().manual_seed(settings.seed)
-    earlier_units = None if before is None else before.posterior.normaliser.without_decorrelation()
+    earlier_units = None if earlier is None else earlier.posterior.normaliser.without_decorrelation()
     units = (car_units(model, generator) if earlier_units is None else earlier_units).to(device)
     width = 3 + 2 * (model.history + 1)
     inputs, outputs = torch.zeros((0, width)), torch.zeros((0, len(OUTPUTS)))
@@ -134,7 +134,7 @@ def fit_car(
         particles=settings.particles, steps=settings.steps, learning_rate=settings.learning_rate, seed=settings.seed
     )
     points = measurement_points(model, inputs, units, generator, particles.domain_points)
-    start = None if before is None else before.posterior.to(device).parameters_for(target.normaliser)
+    start = None if earlier is None else earlier.posterior.to(device).parameters_for(target.normaliser)
     return CarDynamics(distil(target, points, particles, progress, start), model.history)
 
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from learning.outliers import tail_scales
-from learning.posterior.draws import Assignment
+from learning.posterior.sampler import Assignment
 from learning.world.car_dynamics import CarDynamics, OneStep, advance, inputs_of
 
 CHANNELS = ("ahead_mps2", "left_mps2", "yaw_radps2")
@@ -126,8 +126,8 @@ class DisturbedRollouts:
     """Rollouts of a disturbed car: each has one particle and one path of the disturbance."""
 
     def __init__(self, model: DisturbedCar, count: int, generator: torch.Generator) -> None:
-        self._model, self._draws = model, model.car.draws
-        particles = len(self._draws.parameters)
+        self._model, self._sampler = model, model.car.sampler
+        particles = len(self._sampler.parameters)
         self._assignment = Assignment.random(count, particles, generator, spare=1)
         self._unit, self._tail_factor = model.process.initial(count, generator)
         self._scale = torch.tensor(model.process.scale)
@@ -135,7 +135,7 @@ class DisturbedRollouts:
     def step(self, features: Tensor, action: Tensor, generator: torch.Generator) -> Tensor:
         """As ``Rollouts``."""
         process = self._model.process
-        change = self._draws.without_noise(inputs_of(features, action), self._assignment)
+        change = self._sampler.without_noise(inputs_of(features, action), self._assignment)
         acceleration = self._scale * self._tail_factor * self._unit
         change = change + change_by(acceleration, process.period_s).to(change)
         self._unit = process.next(self._unit, generator)
@@ -143,12 +143,12 @@ class DisturbedRollouts:
 
     def restart(self, rows: Tensor, generator: torch.Generator) -> None:
         """As ``Rollouts``."""
-        self._assignment = self._assignment.reassigned(rows, len(self._draws.parameters), generator)
+        self._assignment = self._assignment.reassigned(rows, len(self._sampler.parameters), generator)
         self._unit[rows], self._tail_factor[rows] = self._model.process.initial(len(rows), generator)
 
     def measurement_noise(self, generator: torch.Generator) -> Tensor | None:
         """As ``Rollouts``: noise of the one-step likelihood."""
-        return self._draws.noise_samples(len(self._unit), generator)
+        return self._sampler.noise_samples(len(self._unit), generator)
 
 
 @runtime_checkable

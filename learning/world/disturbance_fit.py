@@ -17,7 +17,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from learning.outliers import DOF_CANDIDATES, log_student, tail_scales
-from learning.posterior.draws import Assignment
+from learning.posterior.sampler import Assignment
 from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import CHANNELS, TAIL_COMPONENTS, DisturbanceProcess, change_by
 from learning.world.drive_windows import DriveWindows, roll_out
@@ -26,10 +26,10 @@ CORRELATION_TIMES_S = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 """Candidates of the correlation time: from one step to longer than a window."""
 HORIZON_SHARES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)
 """Horizons of the likelihood, as shares of a window."""
-PULSE = (1.0, 1.0, 5.0)
+PULSE_SIZES = (1.0, 1.0, 5.0)
 """Accelerations of the finite differences [m/s2, m/s2, rad/s2]."""
 MIN_SCALE, MAX_SCALE = 0.01, 30.0
-"""Bounds of a fitted scale, in the units of ``PULSE``."""
+"""Bounds of a fitted scale, in the units of ``PULSE_SIZES``."""
 MAX_WINDOWS = 300
 """Maximum number of windows; the pulse responses of more take minutes."""
 MIN_WINDOWS = 8
@@ -64,14 +64,14 @@ class RolloutErrors:
 
 def rollout_errors(car: CarDynamics, windows: DriveWindows) -> RolloutErrors:
     """Errors of a car over windows, and their responses to disturbances."""
-    particles, steps = len(car.draws.parameters), windows.commands.shape[1]
+    particles, steps = len(car.sampler.parameters), windows.commands.shape[1]
     at = sorted({max(round(share * steps), 1) - 1 for share in HORIZON_SHARES})
     count = len(windows)
     every = torch.arange(particles).repeat_interleave(count)
     paths = _paths(car, windows, torch.arange(count).repeat(particles), every, None)
     paths = paths.view(particles, count, steps, 6)[:, :, at]
-    noise = car.draws.noise @ torch.eye(6).to(car.draws.noise)
-    noise_variance = (noise**2).sum(dim=0) * car.draws.scales.flatten().square().median()
+    noise = car.sampler.noise @ torch.eye(6).to(car.sampler.noise)
+    noise_variance = (noise**2).sum(dim=0) * car.sampler.scales.flatten().square().median()
     error = paths.mean(dim=0) - windows.motion[:, at].to(paths)
     variance = paths.var(dim=0) + noise_variance
     pulses = _pulse_responses(car, windows)[:, at]
@@ -95,10 +95,10 @@ def _pulse_responses(car: CarDynamics, windows: DriveWindows) -> Tensor:
     pulses = torch.zeros((count, 1 + kinds, steps, 3))
     for j in range(steps):
         for c in range(3):
-            pulses[:, 1 + 3 * j + c, j, c] = PULSE[c]
-    particle = window % len(car.draws.parameters)
+            pulses[:, 1 + 3 * j + c, j, c] = PULSE_SIZES[c]
+    particle = window % len(car.sampler.parameters)
     paths = _paths(car, windows, window, particle, pulses.flatten(0, 1)).view(count, 1 + kinds, steps, 6)
-    change = (paths[:, 1:] - paths[:, :1]).view(count, steps, 3, steps, 6) / torch.tensor(PULSE)[:, None, None]
+    change = (paths[:, 1:] - paths[:, :1]).view(count, steps, 3, steps, 6) / torch.tensor(PULSE_SIZES)[:, None, None]
     return change.permute(0, 3, 4, 1, 2)
 
 
@@ -114,10 +114,10 @@ def _paths(
         particle: index of each rollout's particle (N,).
         accelerations: disturbance of each rollout (N, K, 3); None: zero.
     """
-    assignment = Assignment.of_particles(particle, len(car.draws.parameters))
+    assignment = Assignment.of_particles(particle, len(car.sampler.parameters))
 
     def change(inputs: Tensor, step: int) -> Tensor:
-        undisturbed = car.draws.without_noise(inputs, assignment)
+        undisturbed = car.sampler.without_noise(inputs, assignment)
         if accelerations is None:
             return undisturbed
         return undisturbed + change_by(accelerations[:, step], windows.period_s)
@@ -173,7 +173,7 @@ def _maximise(errors: RolloutErrors, unit: Sequence[Tensor], times: Times) -> _M
         times: correlation times.
     """
     responses = torch.stack([unit[c][..., c] for c in range(len(CHANNELS))], dim=-1)
-    best = _Maximum(-math.inf, PULSE, times, math.inf)
+    best = _Maximum(-math.inf, PULSE_SIZES, times, math.inf)
     for dof in DOF_CANDIDATES:
         density, scale = _maximise_scale(errors, responses, tail_scales(dof, TAIL_COMPONENTS).double())
         if density > best.density:

@@ -28,8 +28,8 @@ from carlab.core.errors import DataError, DivergedError
 from carlab.core.robust import STD_OVER_MAD
 from learning.networks.adam import Adam
 from learning.networks.particles import Layers
-from learning.posterior.draws import with_raw_outputs
 from learning.posterior.particle_posterior import ParticlePosterior
+from learning.posterior.sampler import with_raw_outputs
 from learning.transitions import Transitions
 from learning.world.car_dynamics import CarDynamics
 from learning.world.drive_windows import DriveWindows, roll_out

@@ -135,12 +135,12 @@ class Row(NamedTuple):
     """A row of a matrix of one value per car and row; its address follows from that of the matrix."""
 
     matrix: Value
-    index: int
+    number: int
 
     @property
     def value(self) -> Value:
         """The row."""
-        return self.matrix[self.index]
+        return self.matrix[self.number]
 
 
 class Segment(NamedTuple):

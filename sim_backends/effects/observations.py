@@ -64,7 +64,7 @@ class MarkerOffset(ObservationEffect):
 
 
 class MocapYawMisalignment(ObservationEffect):
-    """``yaw_meas = yaw + angle``: the tracked body's axes are turned against the car's.
+    """``yaw_meas = yaw + angle``: the axes of the tracked body are rotated relative to the car's.
 
     So ``vx_meas = vx cos(angle) + vy sin(angle)`` and ``vy_meas = vy cos(angle) - vx sin(angle)``, for small angles
     ``vx + angle vy`` and ``vy - angle vx``. Acts after ``marker_offset``, which is given in the car's own axes.
@@ -80,13 +80,13 @@ class MocapYawMisalignment(ObservationEffect):
     parameters = (EffectParameter("angle", "rad", 0.0, -3.2, 3.2, 0.03),)
 
     def observe(self, ops: Ops, state: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Turn the axes."""
+        """Rotate the axes."""
         x, y, yaw, vx, vy, yaw_rate = state
         sin, cos = ops.sin(values["angle"]), ops.cos(values["angle"])
         return x, y, yaw + values["angle"], vx * cos + vy * sin, vy * cos - vx * sin, yaw_rate
 
     def invert(self, ops: Ops, measured: tuple[Value, ...], values: Parameters) -> tuple[Value, ...]:
-        """Turn the axes back."""
+        """Rotate the axes back."""
         x, y, yaw, vx, vy, yaw_rate = measured
         sin, cos = ops.sin(values["angle"]), ops.cos(values["angle"])
         return x, y, yaw - values["angle"], cos * vx - sin * vy, sin * vx + cos * vy, yaw_rate

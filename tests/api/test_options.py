@@ -37,15 +37,15 @@ CASES = [
     (Check, carlab.check, {"verbose"}),
 ]
 
-GROUPS = {"which_car": CarOptions, "which_task": TaskOptions}
+GROUPS = (CarOptions, TaskOptions)
 
 
 def options_of(verb: type) -> dict[str, object]:
     """Return the options of a verb with their defaults, including those of car and task."""
     found: dict[str, object] = {}
     for option in dataclasses.fields(verb):
-        if option.name in GROUPS:
-            found |= options_of(GROUPS[option.name])
+        if option.default_factory in GROUPS:
+            found |= options_of(option.default_factory)
         else:
             found[option.name] = option.default
     return found

@@ -1,5 +1,6 @@
 """Test that calibration repeats recorded decisions at other thresholds and counts false and missed names."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from carlab.benchmark import CaseSpec, Proof
 from carlab.benchmark.proof.calibration import calibrate, passes
 from carlab.cli import run
 
-CHI2, SHARE = "selection.accept_chi2_min", "selection.accept_unseen_share"
+CHI2, SHARE = "selection.accept_chi2_min", "selection.accept_left_out_share"
 
 
 def decision(stage: str, effect: str, chi2: float, share: float = 1.0, step: int = 0) -> dict[str, Any]:
@@ -34,9 +35,7 @@ DECISIONS = {
 
 
 def test_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_names() -> None:
-    counts = {
-        r.value / 20.0: (r.false, r.wrong, r.missed, r.true) for r in calibrate(ANSWERS, DECISIONS) if r.setting == CHI2
-    }
+    counts = {r.value / 20.0: dataclasses.astuple(r)[3:] for r in calibrate(ANSWERS, DECISIONS) if r.setting == CHI2}
     assert counts[0.5] == (1, 2, 0, 1), "a name in the null case"
     assert counts[1.0] == (0, 2, 0, 1)
     assert counts[1.5] == (0, 2, 0, 1), "only the first candidate that passes is accepted"
@@ -44,9 +43,14 @@ def test_lower_threshold_accepts_wrong_names_and_a_higher_one_misses_concealed_n
     assert [r.is_present_value for r in calibrate(ANSWERS, DECISIONS) if r.value == 20.0] == [True]
 
 
+def test_settings_have_their_present_names_in_decisions_of_earlier_versions() -> None:
+    former = json.loads(json.dumps(DECISIONS).replace(SHARE, "selection.accept_unseen_share"))
+    assert calibrate(ANSWERS, former) == calibrate(ANSWERS, DECISIONS)
+
+
 def test_decisions_of_the_keep_stage_are_counted_separately() -> None:
     kept = {"a": content(decision("keep", "steering_lag", 25.0), decision("keep", "motor_lag", 25.0))}
-    by_value = {r.value / 20.0: (r.false, r.missed) for r in calibrate(ANSWERS, kept) if r.setting == CHI2}
+    by_value = {r.value / 20.0: (r.false_names, r.missed_names) for r in calibrate(ANSWERS, kept) if r.setting == CHI2}
     assert by_value[1.0] == (1, 0)
     assert by_value[1.5] == (0, 1)
 

@@ -156,8 +156,8 @@ def test_each_effect_has_a_statement_for_both_models() -> None:
     assert set(PHYSICS) == set(EFFECT_IDS)
     for effect, statements in PHYSICS.items():
         assert sorted(m for s in statements for m in s.models) == sorted(MODELS), effect
-    assert physics_of("roll_dynamics", "multi_body").stance == "yes"
-    assert physics_of("roll_dynamics", "drift").stance == "no"
+    assert physics_of("roll_dynamics", "multi_body").presence == "yes"
+    assert physics_of("roll_dynamics", "drift").presence == "no"
 
 
 def test_study_writes_results_and_page(tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ def test_recordings_are_learned_with_four_priors(carlab: Carlab, folder: Path, m
     assert code == 0, text
     assert "Held out: 2.csv." in text
     study = json.loads(out.read_text())
-    names = ["none (FSVGD)", "kinematic", "nominal", "diagnosed"]
+    names = ["none (gp-posterior)", "kinematic", "nominal", "diagnosed"]
     assert [(r["method"], r["rows"], r["seeds"]) for r in study["rows"]] == [(name, 20, 1) for name in names]
     for row in study["rows"]:
         assert f"{row['nll']:.2f}" in text

@@ -50,7 +50,7 @@ def test_each_method_has_a_line_and_its_variant_another_line_style(panels):
 
 @pytest.mark.parametrize("known", [(), ("gp-sim-posterior", "SysID")])
 def test_methods_of_another_study_have_different_colours(known):
-    priors = ("none (FSVGD)", "kinematic", "nominal", "diagnosed")
+    priors = ("none (gp-posterior)", "kinematic", "nominal", "diagnosed")
     figure = picture([row(name, n, -6.0 - k) for k, name in enumerate(known + priors) for n in (20, 50)])
     try:
         lines = figure.axes[0].get_lines()

@@ -21,7 +21,7 @@ from carlab.diagnosis.findings import (
 )
 from carlab.diagnosis.report.curves import curves_advice
 from carlab.diagnosis.report.sentences import (
-    confidence_words,
+    confidence_text,
     drive_command,
     effect_sentence,
     explained_share,
@@ -239,10 +239,10 @@ def test_next_drive_separates_the_strongest_set() -> None:
 
 
 def test_confidence_words_match_the_probability() -> None:
-    assert confidence_words(0.99) == "almost certain"
-    assert confidence_words(0.6) == "more likely than not"
-    assert confidence_words(0.4).startswith("uncertain")
-    assert confidence_words(0.49, 1) == "one of 2 indistinguishable effects"
+    assert confidence_text(0.99) == "almost certain"
+    assert confidence_text(0.6) == "more likely than not"
+    assert confidence_text(0.4).startswith("uncertain")
+    assert confidence_text(0.49, 1) == "one of 2 indistinguishable effects"
 
 
 @pytest.mark.parametrize(

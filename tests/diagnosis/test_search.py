@@ -40,8 +40,8 @@ HALF = replace(DEFAULT, windows=replace(DEFAULT.windows, fit_stride_s=0.6, held_
 LENIENT = replace(
     DEFAULT.selection,
     accept_chi2_min=1.0,
-    accept_unseen_share=-1.0,
-    accept_unseen_ratio=-1.0,
+    accept_left_out_share=-1.0,
+    accept_left_out_ratio=-1.0,
     keep_z_min=-5.0,
     min_score_chi2=0.0,
 )

@@ -70,7 +70,7 @@ def test_shared_delay_is_compared_with_the_shorter_of_two_lags() -> None:
     assert ("motor_lag", DELAY) in confusable_shared_delays(model)
     control = RunControl()
     pairs = compare_pairs(problem, EliminationResult(model, delete_each(problem, model, control)), control)
-    assert DELAY in pairs.rivals["motor_lag"]
-    assert DELAY not in pairs.rivals["steering_lag"]
+    assert DELAY in pairs.indistinguishable["motor_lag"]
+    assert DELAY not in pairs.indistinguishable["steering_lag"]
     with_delay = fitted({DELAY: 0.004, "steering_lag": 0.05}, (DELAY, "steering_lag"))[1]
     assert confusable_shared_delays(with_delay) == []

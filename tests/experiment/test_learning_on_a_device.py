@@ -33,7 +33,7 @@ def small_training(monkeypatch: pytest.MonkeyPatch) -> None:
         return training.train(plan, models, recordings, envelope, on_progress)
 
     monkeypatch.setattr(campaign, "train_in_subprocess", train_here)
-    monkeypatch.setattr("carlab.experiment.campaign.predicted_return.MORE_TICKS", (1.5,))
+    monkeypatch.setattr("carlab.experiment.campaign.predicted_return.LONGER_EPISODE_FACTORS", (1.5,))
     monkeypatch.setattr("learning.posterior.discrepancy.STEPS", 10)
     monkeypatch.setattr("learning.posterior.inference.PRIOR_DRAWS", 64)
     monkeypatch.setattr("learning.posterior.inference.PARAMETER_DRAWS", 16)

@@ -13,7 +13,7 @@ from carlab.cars import choose_car
 from carlab.core.errors import DataError
 from carlab.experiment.campaign.campaign import Campaign, CampaignHooks
 from carlab.experiment.campaign.figures import EpisodeFigures
-from carlab.experiment.campaign.quick_check import QuickCheck, check, check_path, run_check_subprocess
+from carlab.experiment.campaign.quick_check import EpisodeCheck, check, check_path, run_check_subprocess
 from carlab.experiment.campaign.report import learning_curve, save_check, save_row
 from carlab.experiment.campaign.training_plan import TrainingPlan
 from carlab.recording.run_folder import RunDirectory
@@ -66,9 +66,9 @@ def test_stopped_check_writes_nothing_and_is_repeated(tmp_path: Path) -> None:
     assert run_check_subprocess(run, SIMULATOR, stop=lambda: True) is None
     assert not check_path(run, 1).exists()
     save_row(run, ROW)
-    checks: list[QuickCheck] = []
+    checks: list[EpisodeCheck] = []
 
-    def on_check(check_result: QuickCheck) -> None:
+    def on_check(check_result: EpisodeCheck) -> None:
         checks.append(check_result)
         save_check(run, check_result)
 
@@ -85,7 +85,7 @@ def test_stopped_check_writes_nothing_and_is_repeated(tmp_path: Path) -> None:
 
 def test_learning_curve_rows_are_read_with_and_without_a_check(tmp_path: Path) -> None:
     run = make_run(tmp_path, SIMULATOR, 0)
-    check_result = QuickCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
+    check_result = EpisodeCheck(2, "left", 3.5, float("nan"), ("It has left.", "First guess: motor_lag."), "left")
     save_row(run, replace(ROW, episode=2))
     save_check(run, check_result)
     save_row(run, ROW)

@@ -43,7 +43,7 @@ def test_job_reads_its_input_files_and_returns_its_output_files(executor: Execut
     )
     job = ChildJob((PYTHON, "-c", program), 60.0, {"a.txt": b"a"}, ("out/sum.txt", "absent"), "b", {"C": "c"})
     done = executor.run(job, never)
-    assert (done.end.exit_status, done.end.words.strip()) == (0, "printed")
+    assert (done.end.exit_status, done.end.output.strip()) == (0, "printed")
     assert done.outputs == {"out/sum.txt": b"abc"}
 
 
@@ -89,7 +89,7 @@ def test_job_of_a_killed_worker_runs_again(cluster: RayExecutor, tmp_path: Path)
         "print('second attempt')"
     )
     done = cluster.run(ChildJob((PYTHON, "-c", program, str(mark)), 60.0), never)
-    assert (done.end.exit_status, done.end.words.strip()) == (0, "second attempt")
+    assert (done.end.exit_status, done.end.output.strip()) == (0, "second attempt")
 
 
 def test_proof_on_ray_has_the_reports_and_the_seal_of_a_proof_on_this_machine(

@@ -263,8 +263,8 @@ def test_learned_car_is_equal_on_the_device_and_can_be_saved_and_refitted(
     assert loaded.posterior.parameters.device.type == "cpu"
     assert torch.equal(loaded.posterior.parameters, on_device.posterior.parameters.cpu())
     assert_close(load_car(tmp_path / "car.pt", device).posterior.noise_std, loaded.posterior.noise_std, 0.0)
-    refitted = fit_car(car_rows, model, settings, before=loaded, device=device)
-    refitted_on_cpu = fit_car(car_rows, model, settings, before=on_device)
+    refitted = fit_car(car_rows, model, settings, earlier=loaded, device=device)
+    refitted_on_cpu = fit_car(car_rows, model, settings, earlier=on_device)
     assert_close(refitted.posterior.parameters, refitted_on_cpu.posterior.parameters, 1e-3)
     assert torch.equal(refitted.posterior.normaliser.output_std.cpu(), on_cpu.posterior.normaliser.output_std)
 

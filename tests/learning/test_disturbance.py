@@ -13,7 +13,7 @@ from torch import Tensor
 
 from carlab.core.errors import DataError
 from carlab.core.observation import decode_state, encode
-from learning.posterior.draws import Assignment
+from learning.posterior.sampler import Assignment
 from learning.world import disturbance_fit
 from learning.world.car_dynamics import CarDynamics
 from learning.world.disturbance import DisturbanceProcess, DisturbedCar, start_rollouts

@@ -174,7 +174,7 @@ class TestTails:
 
 class TestMedianScale:
     def test_half_of_the_rows_lie_within_the_corrected_quartiles(self):
-        """Draws of a Student-t distribution whose assumed scales are too small by 1.5 and too large by 2."""
+        """PosteriorSampler of a Student-t distribution whose assumed scales are too small by 1.5 and too large by 2."""
         draws = student(4.0).rvs((20_001, 2), random_state=6) * np.array([1.5, 0.5])
         found = median_scale(torch.tensor(draws**2), 4.0)
         assert np.allclose(found, [1.5, 0.5], rtol=0.03)

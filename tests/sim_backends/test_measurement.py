@@ -15,7 +15,7 @@ from sim_backends.measurement import (
     delay_as_recorded_s,
     filter_velocities,
     filters_velocities,
-    is_measured,
+    is_measurement_parameter,
 )
 
 OBSERVATIONS = [e.id for e in EFFECTS.values() if e.kind == "observation"]
@@ -142,10 +142,10 @@ def test_command_delay_relative_to_a_recording_includes_the_latency_and_is_not_n
 
 
 def test_measurement_parameters_are_distinguished_from_dynamics_parameters():
-    assert is_measured("mocap.latency")
-    assert is_measured("effects.marker_offset.ahead")
-    assert not is_measured("effects.steering_lag.time_constant")
-    assert not is_measured("timing.command_delay")
+    assert is_measurement_parameter("mocap.latency")
+    assert is_measurement_parameter("effects.marker_offset.ahead")
+    assert not is_measurement_parameter("effects.steering_lag.time_constant")
+    assert not is_measurement_parameter("timing.command_delay")
 
 
 def test_one_effect_of_the_catalogue_filters_velocities():

@@ -15,13 +15,13 @@ from scipy.signal import lfilter
 from carlab.benchmark.baselines.data import SLOW_MPS, Prepared, Steps
 from carlab.benchmark.world.simulation import FloatArray
 
-ORDER = 8
+AR_ORDER = 8
 STEP_S = 0.1
-# Range of lags in rows of 1/30 s before and after zero, and number of summed lags.
-BEFORE, AFTER, WIDE = 7, 10, 12
+# Range of lags before and after zero, and number of summed lags, all in rows of 1/30 s.
+ROWS_BEFORE, ROWS_AFTER, SUMMED_LAGS = 7, 10, 12
 # Threshold in standard errors of a sum of correlations, without false alarms on the development set.
 MIN_Z = 1.8
-CLIP = 6.0
+CLIP_MEDIANS = 6.0
 
 
 def largest_correlation(data: Prepared) -> str | None:
@@ -38,32 +38,35 @@ def _strongest(data: Prepared, command: int, channels: tuple[int, ...]) -> float
     """The largest summed correlation of a command with the errors of some channels, in standard errors."""
     fit, car = data.fit, data.car
     count = max(1, round(STEP_S / car.control_period))
-    rows = np.arange(ORDER + AFTER, len(fit.t_s) - count - BEFORE, dtype=np.int64)
+    rows = np.arange(AR_ORDER + ROWS_AFTER, len(fit.t_s) - count - ROWS_BEFORE, dtype=np.int64)
     steps = Steps(car, fit.measured[rows], rows, fit.t_s[rows], data.steps.fine, data.steps.parts, count)
     errors = fit.measured[rows + count, 3:] - steps.ends[:, 3:]
     whitener = _whitener(fit.commands[:, command])
-    pushes = lfilter(whitener, [1.0], fit.commands[:, command] - fit.commands[:, command].mean())
-    fast = (fit.measured[rows, 3] > 2.0 * SLOW_MPS)[ORDER:]
+    whitened_commands = lfilter(whitener, [1.0], fit.commands[:, command] - fit.commands[:, command].mean())
+    fast = (fit.measured[rows, 3] > 2.0 * SLOW_MPS)[AR_ORDER:]
     best = 0.0
     for channel in channels:
-        left = lfilter(whitener, [1.0], errors[:, channel] * _sense(data, rows, command))[ORDER:]
-        ceiling = CLIP * float(np.median(np.abs(left)))
-        left = np.clip(left, -ceiling, ceiling) * fast
-        each = [_correlation(pushes[rows[ORDER:] - lag], left) for lag in range(-BEFORE, AFTER)]
-        sums = np.convolve(each, np.ones(WIDE), "valid") * np.sqrt(len(left) / WIDE)
+        whitened_errors = lfilter(whitener, [1.0], errors[:, channel] * _speed_weight(data, rows, command))[AR_ORDER:]
+        clip_at = CLIP_MEDIANS * float(np.median(np.abs(whitened_errors)))
+        whitened_errors = np.clip(whitened_errors, -clip_at, clip_at) * fast
+        correlations = [
+            _correlation(whitened_commands[rows[AR_ORDER:] - lag], whitened_errors)
+            for lag in range(-ROWS_BEFORE, ROWS_AFTER)
+        ]
+        sums = np.convolve(correlations, np.ones(SUMMED_LAGS), "valid") * np.sqrt(len(whitened_errors) / SUMMED_LAGS)
         best = max(best, float(np.abs(sums).max()))
     return best
 
 
-def _sense(data: Prepared, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]], command: int) -> FloatArray:
-    """The effect of steering grows with speed; that of throttle does not."""
+def _speed_weight(data: Prepared, rows: np.ndarray[tuple[int, ...], np.dtype[np.int64]], command: int) -> FloatArray:
+    """Weights (M,) of the errors: the speed for steering, whose influence grows with it, and 1 for throttle."""
     return data.fit.measured[rows, 3] if command == 0 else np.ones(len(rows))
 
 
 def _whitener(series: FloatArray) -> FloatArray:
     """Coefficients of the prediction error of an autoregression (Yule and Walker)."""
     centred = series - series.mean()
-    moments = np.array([centred[: len(centred) - k] @ centred[k:] for k in range(ORDER + 1)]) / len(centred)
+    moments = np.array([centred[: len(centred) - k] @ centred[k:] for k in range(AR_ORDER + 1)]) / len(centred)
     moments[0] = 1.001 * moments[0] + 1e-12
     return np.concatenate([[1.0], -solve_toeplitz(moments[:-1], moments[1:])])
 

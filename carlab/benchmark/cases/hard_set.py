@@ -15,7 +15,7 @@ HARD_SEED_BASE = {"test": 4_000_000, "development": 5_000_000}
 SHORT_HOLD_S = 20.0
 STAMP_DELAY_PERIODS = 0.1
 """Mean delay of a stamp: 3.3 ms at 30 Hz, as a logger on a computer without a real-time kernel has."""
-PER_COUNT, ALL_CONDITIONS, NULLS_PER_CONDITION, RANDOM = 12, 12, 10, 40
+N_PER_EFFECT_COUNT, N_UNDER_ALL_CONDITIONS, N_NULLS_PER_CONDITION, N_RANDOM_PHYSICS = 12, 12, 10, 40
 CONDITIONS = ("short", "base_model", "feedback", "stamps")
 
 
@@ -32,7 +32,7 @@ def hard_set(purpose: Purpose, seed: int = 0) -> list[CaseSpec]:
     specs = [*_singles(rng), *_multiples(rng), *_nulls()]
     first = HARD_SEED_BASE[purpose] + 100_000 * seed
     specs = [replace(spec, seed=first + k) for k, spec in enumerate(specs)]
-    return specs + random_physics(rng, RANDOM, first + len(specs))
+    return specs + random_physics(rng, N_RANDOM_PHYSICS, first + len(specs))
 
 
 def drawn_evenly(specs: list[CaseSpec], count: int, seed: int = 0) -> list[CaseSpec]:
@@ -73,8 +73,8 @@ def _singles(rng: np.random.Generator) -> list[CaseSpec]:
 
 
 def _multiples(rng: np.random.Generator) -> list[CaseSpec]:
-    specs = [_multiple(rng, count, k) for count in (3, 4, 5) for k in range(PER_COUNT)]
-    for k in range(ALL_CONDITIONS):
+    specs = [_multiple(rng, count, k) for count in (3, 4, 5) for k in range(N_PER_EFFECT_COUNT)]
+    for k in range(N_UNDER_ALL_CONDITIONS):
         spec = _multiple(rng, 3, k)
         for condition in ("short", "feedback", "stamps"):
             spec = under(spec, condition)
@@ -97,5 +97,5 @@ def _nulls() -> list[CaseSpec]:
     return [
         under(CaseSpec("null" if k % 2 == 0 else "parameters", 0), condition, k // 2)
         for condition in CONDITIONS
-        for k in range(NULLS_PER_CONDITION)
+        for k in range(N_NULLS_PER_CONDITION)
     ]

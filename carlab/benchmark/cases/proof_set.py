@@ -19,7 +19,7 @@ SEED_BASE = {"development": 1_000_000, "test": 2_000_000}
 MAX_DEVELOPMENT_SEED = 9
 """Largest seed of a set for development, and of a hard set: cases of seed 10 share seeds with the other set."""
 # Faults that leave the concealed effects identifiable.
-ON_TOP = ("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples")
+FAULTS_OF_SINGLE_CASES = ("yaw_wrap_spikes", "outliers", "dropouts", "stale_samples")
 Purpose = Literal["development", "test"]
 Spec = TypeVar("Spec")
 
@@ -128,7 +128,7 @@ def _specs(
         for k in range(per_effect):
             wanted: FormName = "catalogue" if k % 2 == 0 else "other"
             form = wanted if (name, wanted) in known else "catalogue" if wanted == "other" else "other"
-            fault = str(rng.choice(ON_TOP)) if rng.random() < 0.1 else None
+            fault = str(rng.choice(FAULTS_OF_SINGLE_CASES)) if rng.random() < 0.1 else None
             add("single", (name,), form, float(strengths[k]), fault)
     for k in range(nulls):
         add("null" if k % 2 == 0 else "parameters")

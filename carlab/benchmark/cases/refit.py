@@ -18,7 +18,7 @@ from carlab.benchmark.world.simulation import FloatArray
 
 HORIZON_S = 1.0
 PRIOR_SHARE = 0.15
-_SUB = 4
+_SUBSTEPS_PER_PERIOD = 4
 # Change of the fine command series: (steering and throttle (n, 2), step lengths (n,) [s]) -> changed series.
 CommandChange = Callable[[FloatArray, FloatArray], FloatArray]
 
@@ -70,8 +70,8 @@ def fine_commands(
     period = car.control_period
     age = car.command_delay + car.latency + shift_s
     switch = age % period
-    before = max(1, round(_SUB * switch / period)) if switch > 1e-6 else 0
-    after = max(1, _SUB - before)
+    before = max(1, round(_SUBSTEPS_PER_PERIOD * switch / period)) if switch > 1e-6 else 0
+    after = max(1, _SUBSTEPS_PER_PERIOD - before)
     parts = [np.linspace(0.0, switch, before, endpoint=False), np.linspace(switch, period, after, endpoint=False)]
     edges = np.concatenate(parts) if before else np.linspace(0.0, period, after, endpoint=False)
     steps = np.diff(np.append(edges, period))

@@ -27,7 +27,7 @@ SIZES = (1.0, 4.0)
 """Sizes of an effect of the catalogue, in typical sizes (excess about 1 and 4)."""
 SHARES = (0.1, 0.35, 0.6, 0.85)
 """Random shares of the compared draws: directions a quarter turn apart, four places."""
-WINDOW = 9
+VELOCITY_WINDOW_ROWS = 9
 """Captures of the local parabola that differentiates a changed pose."""
 COVERED_BY_PARAMETERS = ("tyre_saturation",)
 """Effects that change the shape of a tyre curve, as B, C and mu do."""
@@ -103,7 +103,11 @@ class CatalogueInfluence:
         pose = late[:, :3]
         for change in world.pose_changes:
             pose = change(t, pose)
-        velocity = late[:, 3:] + body_velocity(pose, gap, WINDOW) - body_velocity(late[:, :3], gap, WINDOW)
+        velocity = (
+            late[:, 3:]
+            + body_velocity(pose, gap, VELOCITY_WINDOW_ROWS)
+            - body_velocity(late[:, :3], gap, VELOCITY_WINDOW_ROWS)
+        )
         for change in world.velocity_changes:
             velocity = change(t, velocity)
         seen = dataclasses.replace(self._driven, captures=np.concatenate([pose, velocity], axis=1))

@@ -20,7 +20,7 @@ from carlab.benchmark.world.physics import World
 from carlab.benchmark.world.simulation import Drive, drive
 from carlab.core.errors import DataError
 
-NEAR = 0.10  # relative tolerance of the search for a strength
+STRENGTH_TOLERANCE = 0.10  # relative tolerance of the search for a strength
 MAX_RESEMBLANCE = 0.5
 """Random physics is drawn again if one effect of the catalogue explains a larger share of it. Other forms of an effect
 reach 0.88 to 1.0 with their own effect."""
@@ -110,7 +110,11 @@ class Scene:
             miss = abs(math.log(max(ratio, 1e-3))) if math.isfinite(ratio) else math.inf
             if miss < best_miss:
                 best, best_miss, best_excess = candidate, miss, ratio * target
-            if miss < NEAR or (ratio < 1.0 and size >= form.largest) or (ratio > 1.0 and size <= form.smallest):
+            if (
+                miss < STRENGTH_TOLERANCE
+                or (ratio < 1.0 and size >= form.largest)
+                or (ratio > 1.0 and size <= form.smallest)
+            ):
                 break
             low, high = (size, high) if ratio < 1.0 else (low, min(high, size))
             slope = 1.0

@@ -15,6 +15,13 @@ from typing import Any
 FACTORS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 4.0)
 """Multiples of a threshold at which the decisions are repeated."""
 SCHEMA = "carlab.decisions/1"
+FORMER_SETTINGS = {
+    "selection.accept_unseen_share": "selection.accept_left_out_share",
+    "selection.accept_unseen_ratio": "selection.accept_left_out_ratio",
+    "selection.steady_unseen_share": "selection.steady_left_out_share",
+    "selection.better_rival_z": "selection.replace_z_min",
+}
+"""Present names of settings, by the names in files of earlier versions."""
 COLUMNS = ("threshold", "value", "false names", "missed names")
 
 
@@ -22,22 +29,25 @@ COLUMNS = ("threshold", "value", "false names", "missed names")
 class Rates:
     """Outcome of the decisions that use one setting, at one value of it.
 
-    false, wrong     names accepted that are not concealed, and opportunities to accept one
-    missed, true     concealed names not accepted, and opportunities to accept one
+    false_names          accepted names that are not concealed
+    false_opportunities  decisions in which such a name may be accepted
+    missed_names         decisions in which a concealed name may be accepted, but no name is
+    true_opportunities   decisions in which a concealed name may be accepted
     """
 
     setting: str
     value: float
     is_present_value: bool
-    false: int
-    wrong: int
-    missed: int
-    true: int
+    false_names: int
+    false_opportunities: int
+    missed_names: int
+    true_opportunities: int
 
     def row(self) -> list[str]:
         """Cells of the table; the present value is marked with an asterisk."""
         value = f"{self.value:.4g}{' *' if self.is_present_value else ''}"
-        return [self.setting, value, _rate(self.false, self.wrong), _rate(self.missed, self.true)]
+        false = _rate(self.false_names, self.false_opportunities)
+        return [self.setting, value, false, _rate(self.missed_names, self.true_opportunities)]
 
 
 def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, Any]]) -> list[Rates]:
@@ -51,7 +61,7 @@ def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, A
         Rates by setting, in the order of the values.
     """
     cases = [
-        ({effect["id"] for effect in answers[name]["effects"]}, list(content["decisions"]))
+        ({effect["id"] for effect in answers[name]["effects"]}, _with_present_settings(content["decisions"]))
         for name, content in sorted(decisions.items())
         if content.get("schema") == SCHEMA
     ]
@@ -65,6 +75,20 @@ def calibrate(answers: Mapping[str, Any], decisions: Mapping[str, Mapping[str, A
     ]
 
 
+def _with_present_settings(decisions: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The decisions with the present names of their settings."""
+    return [
+        {
+            **decision,
+            "alternatives": [
+                [{**c, "setting": FORMER_SETTINGS.get(c["setting"], c["setting"])} for c in conditions]
+                for conditions in decision["alternatives"]
+            ],
+        }
+        for decision in decisions
+    ]
+
+
 def _conditions(decisions: Iterable[Mapping[str, Any]]) -> Iterable[Mapping[str, Any]]:
     return (c for decision in decisions for conditions in decision["alternatives"] for c in conditions)
 
@@ -72,7 +96,7 @@ def _conditions(decisions: Iterable[Mapping[str, Any]]) -> Iterable[Mapping[str,
 def _rates(
     cases: Sequence[tuple[set[str], list[dict[str, Any]]]], setting: str, value: float, is_present_value: bool
 ) -> Rates:
-    false = wrong = missed = true = 0
+    false_names = false_opportunities = missed_names = true_opportunities = 0
     for concealed, made in cases:
         for key, group in groupby(made, key=lambda d: (d["stage"], d["step"])):
             decided = list(group)
@@ -83,11 +107,12 @@ def _rates(
                 has_true = any(d["effect"] in concealed for d in step)
                 has_wrong = any(d["effect"] not in concealed for d in step)
                 accepted = next((d["effect"] for d in step if passes(d, setting, value)), None)
-                wrong += has_wrong
-                true += has_true
-                false += accepted is not None and accepted not in concealed
-                missed += has_true and accepted is None
-    return Rates(setting, value, is_present_value, false, wrong, missed, true)
+                false_opportunities += has_wrong
+                true_opportunities += has_true
+                false_names += accepted is not None and accepted not in concealed
+                missed_names += has_true and accepted is None
+    counts = false_names, false_opportunities, missed_names, true_opportunities
+    return Rates(setting, value, is_present_value, *counts)
 
 
 def passes(decision: Mapping[str, Any], setting: str, value: float) -> bool:

@@ -172,7 +172,7 @@ class Proof(SealedRun):
         done = self.executor.run(job, self.abandon)
         end = done.end
         if end.exit_status != 0 and not end.abandoned:
-            last = end.words.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
+            last = end.output.strip().splitlines()[-1:] or [f"exit status {end.exit_status}"]
             raise DataError(f"A case of the proof failed ({what}): {last[0]}")
         return done
 
@@ -188,5 +188,5 @@ class Proof(SealedRun):
             return end
         done.write_outputs(to)
         run = {"exit_status": end.exit_status, "seconds": round(end.seconds, 3), "jobs": self.executor.jobs}
-        write_json(to / "run.json", {**run, "peak_memory_mib": round(end.peak_memory_mib, 1), "words": end.words})
+        write_json(to / "run.json", {**run, "peak_memory_mib": round(end.peak_memory_mib, 1), "words": end.output})
         return end

@@ -11,7 +11,7 @@ from carlab.benchmark.cases.seal import check, digest, file_digest, new_name, ne
 from carlab.benchmark.proof.worker import read_json, write_json
 from carlab.core.errors import DataError
 from carlab.jobs.child_jobs import Executor, LocalExecutor
-from carlab.jobs.child_processes import ONE_THREAD, ChildEnd, side_by_side
+from carlab.jobs.child_processes import ONE_THREAD, ChildEnd, run_parallel
 
 Progress = Callable[[str, int, int, str], None]
 LOCAL = LocalExecutor()
@@ -119,7 +119,7 @@ class SealedRun:
             done += 1
             self.progress(stage, done, len(names), name)
 
-        complete = side_by_side(
+        complete = run_parallel(
             self.executor.jobs,
             todo,
             work,

@@ -1,18 +1,18 @@
 """Independent simulator: models of the package commonroad-vehicle-models, scaled to a 1:10 car by similarity.
 
-The package (Althoff and Würsching, "CommonRoad: Vehicle models (version 2020a)", TU Munich) brings two models with
+The package (Althoff and Würsching, "CommonRoad: Vehicle models (version 2020a)", TU Munich) has two models with
 tyre forces and wheel spin: ``multi_body`` (29 states: body, axles and four wheels, Magic Formula with combined slip)
-and ``drift`` (9 states: single track, load transfer, wheel spin). Equations and numbers are the package's; what is
-added here is how a radio command reaches it, a driver, and motion capture.
+and ``drift`` (9 states: single track, load transfer, wheel spin). Equations and numbers are the package's. This
+module adds the command interface, a driver, and motion capture.
 
-Scaling. Lengths by 1/10, times by the root of that, masses by its cube, so that accelerations stay what they are
-(Froude's similarity: density and gravity are the same). Every number of the vehicle follows from its dimension; the
-tyre's coefficients are pure numbers and stay, but ``p_vx1``, which the package multiplies with the load inside a sine
-and so is one over a force.
+Scaling: lengths by 1/10, times by its square root, masses by its cube, so that accelerations are unchanged (Froude
+similarity: equal density and gravity). Each number of the vehicle is scaled by its dimension. The tyre's coefficients
+are dimensionless and unchanged, except ``p_vx1``: the package multiplies it by the load inside a sine, so its unit is
+1/N.
 
-Interface. The package asks for a steering rate and a longitudinal acceleration (drive torque over mass and wheel
-radius). The requested rate is the one that reaches the commanded angle in one control period; the package itself bounds
-it. The requested acceleration is FULL_MPS2 times the throttle.
+Interface: the inputs of the package are a steering rate and a longitudinal acceleration (drive torque over mass and
+wheel radius). The requested rate reaches the commanded angle in one control period; the package limits it. The
+requested acceleration is FULL_THROTTLE_MPS2 times the throttle.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ Model = Literal["multi_body", "drift"]
 VEHICLE = 2  # BMW 320i, driven by its rear wheels
 SCALE = 0.1
 MAX_ANGLE_RAD = 0.5
-FULL_MPS2 = 6.0
+FULL_THROTTLE_MPS2 = 6.0
 START_MPS = 1.0
 ROLLING_MPS = 0.7  # below 0.1 m/s the package has no tyre and wheel dynamics
 DRIVER_GRIP = 0.75  # share of the tyres' grip that the driver uses; beyond it inner wheels lift, which is not modelled
 RTOL = 1e-6
-SPUN_RAD = 1.4
-CALLS = 1500
-SMALL_S = 2e-4
+MAX_SIDE_SLIP_RAD = 1.4
+MAX_RATE_CALLS = 1500
+SMALL_STEP_S = 2e-4
 
 # Powers of the length scale: length 1, time 1/2, mass 3.
 _VEHICLE_POWERS = {
@@ -85,8 +85,8 @@ class PublicCar:
     """A model of the package, and an equivalent base car for the driver.
 
     Args:
-        model: Which.
-        command_delay_s: From a command to the package's inputs.
+        model: Model of the package.
+        command_delay_s: Delay from a command to the inputs of the package [s].
     """
 
     def __init__(self, model: Model, command_delay_s: float = 0.05) -> None:
@@ -103,11 +103,11 @@ class PublicCar:
         # Used by the driver only.
         self.car = BaseCar(
             mass=p.m, yaw_inertia=p.I_z, front_axle=p.a, rear_axle=p.b, mu_front=grip, mu_rear=grip,
-            drive_gain=FULL_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=command_delay_s,
+            drive_gain=FULL_THROTTLE_MPS2 * p.m, damping=0.0, max_angle=MAX_ANGLE_RAD, command_delay=command_delay_s,
         )  # fmt: skip
 
     def start(self, x: float, y: float, yaw: float, speed: float) -> FloatArray:
-        """The package's state while rolling straight ahead."""
+        """State (n,) of the package at a pose [m, rad], rolling straight ahead at ``speed`` [m/s]."""
         core = [x, y, 0.0, speed, yaw, 0.0, 0.0]
         if self.model == "multi_body":
             from vehiclemodels.init_mb import init_mb as init
@@ -118,9 +118,9 @@ class PublicCar:
     def rates(self, state: FloatArray, inputs: Sequence[float]) -> list[float]:
         """The package's right-hand side; inputs are the requested steering rate [rad/s] and acceleration [m/s^2].
 
-        The package forbids negative wheel spin by changing its caller's state, and sets the rate to 0 where spin is
-        negative. An integrator that tries states does not hear of the change, and a wheel a hair below 0 would stay
-        locked for ever; so spin is held at 0 before the call and may only grow from there after it.
+        The package changes a negative wheel speed in the state of its caller, and sets its rate to 0. An integrator
+        does not see this change, so a wheel with a slightly negative speed would stay locked. Therefore negative wheel
+        speeds are set to 0 before the call, and their rates are not negative after it.
         """
         x = state.tolist()
         locked = [i for i in self._spins if x[i] <= 0.0]
@@ -150,18 +150,17 @@ class PublicCar:
 class RollingDriver(HumanDriver):
     """A driver that keeps the car rolling forwards and avoids spins.
 
-    Neither model of the package can stand or reverse with its tyres, and past a right angle of side slip its
-    equations mean nothing.
+    The tyre models of the package are not valid at standstill, in reverse, and at side slip angles above 90 degrees.
     """
 
     def __call__(self, t: float, state: FloatArray) -> tuple[float, float]:
         """Commands for the tick at t [s]."""
         steering, throttle = super().__call__(t, state)
         speed = math.hypot(state[3], state[4])
-        most = math.atan(self._car.wheelbase * self._grip / max(speed, 0.3) ** 2) / self._car.max_angle
+        max_steering = math.atan(self._car.wheelbase * self._grip / max(speed, 0.3) ** 2) / self._car.max_angle
         if state[3] < ROLLING_MPS:
             throttle = max(throttle, 0.3)
-        return float(np.clip(steering, -most, most)), throttle
+        return float(np.clip(steering, -max_steering, max_steering)), throttle
 
     def _intend(self, t: float, off: float) -> None:
         super()._intend(t, off)
@@ -171,7 +170,7 @@ class RollingDriver(HumanDriver):
 
 @dataclass(frozen=True)
 class PublicDrive:
-    """A drive of the public car: its recording, and the package's states at the captures, (N, n), noise-free."""
+    """A drive of the public car: its recording, and the noise-free states (N, n) of the package at the captures."""
 
     recording: Recording
     drive: Drive
@@ -189,7 +188,7 @@ def drive_public(
 
     Raises:
         AbandonedError: ``abandon``, called at every tick, returned true.
-        DataError: where the package cannot be integrated or the car has spun.
+        DataError: the package cannot be integrated, or the car has spun.
     """
     track = Track(np.random.default_rng((seed, 1)))
     human = RollingDriver(car.car, track, np.random.default_rng((seed, 2, part)))
@@ -204,55 +203,90 @@ def _integrate(
     car: PublicCar, driver: Callable[[float, FloatArray], tuple[float, float]], duration_s: float, state: FloatArray,
     abandon: Callable[[], bool],
 ) -> tuple[Drive, FloatArray]:  # fmt: skip
+    """The drive from a state (n,) of the package at time 0, and its states (N, n) at the captures."""
     base = car.car
     period, per_row = base.control_period, round(base.control_period * base.mocap_rate)
-    count = round(duration_s / period) + 1
-    capture_s = np.arange((count - 1) * per_row + 1, dtype=np.float64) * (period / per_row) - base.latency
-    states = np.empty((len(capture_s), len(state)))
-    commands = np.empty((count, 2))
-    early = int(np.searchsorted(capture_s, 0.0, side="right"))
-    for row in range(early):
-        states[row] = state
-        states[row, :2] += capture_s[row] * START_MPS * np.array([math.cos(state[4]), math.sin(state[4])])
-    done, acting = early, (0.0, 0.0)
-    pending: list[tuple[float, tuple[float, float]]] = []
-    log = [(0.0, *acting)]
-    for tick in range(count):
+    row_s = np.arange(round(duration_s / period) + 1, dtype=np.float64) * period
+    capture_s = np.arange((len(row_s) - 1) * per_row + 1, dtype=np.float64) * (period / per_row) - base.latency
+    run = _Integration(car, state, capture_s)
+    commands = np.empty((len(row_s), 2))
+    for tick in range(len(row_s)):
         if abandon():
             raise AbandonedError
-        t, end = tick * period, (tick + 1) * period
-        steering, throttle = driver(t, car.motion(states[done - 1 : done])[0])
-        commands[tick] = steering, throttle
-        pending.append((t + base.command_delay, (base.max_angle * steering, FULL_MPS2 * throttle)))
-        while t < end:
-            until = min(end, pending[0][0]) if pending else end
-            if until > t + 1e-12:
-                upto = int(np.searchsorted(capture_s, until, side="right"))
-                at = np.append(capture_s[done:upto], until)
-                found = _segment(car, acting, period, (t, until), state, at)
-                states[done:upto], state = found[:-1], found[-1]
-                done, t = upto, until
-            else:
-                t = until
-            if pending and pending[0][0] <= t + 1e-12:
-                acting = pending.pop(0)[1]
-                log.append((t, *acting))
-    switches = np.array(log)
-    row_s = np.arange(count, dtype=np.float64) * period
-    made = Drive(row_s, commands, capture_s, car.motion(states), per_row, switches[:, 0], switches[:, 1:])
-    return made, states
+        commands[tick] = driver(tick * period, car.motion(run.newest_capture)[0])
+        run.issue(tick * period, *commands[tick].tolist())
+        run.advance((tick + 1) * period)
+    switches = np.array(run.switches)
+    motion = car.motion(run.states)
+    return Drive(row_s, commands, capture_s, motion, per_row, switches[:, 0], switches[:, 1:]), run.states
+
+
+class _Integration:
+    """Integration of the package's model with delayed commands, which stops where a command begins to act.
+
+    Args:
+        car: The car.
+        state: State (n,) of the package at time 0; before it the car rolls straight on at ``START_MPS``.
+        capture_s: Times of the captures (N,) [s].
+
+    Attributes:
+        states: States (N, n) at the captures.
+        switches: Time [s], wheel angle [rad] and acceleration [m/s2] of each change of the acting inputs.
+    """
+
+    def __init__(self, car: PublicCar, state: FloatArray, capture_s: FloatArray) -> None:
+        self._car, self._state, self._t_s, self._capture_s = car, state, 0.0, capture_s
+        self._acting = (0.0, 0.0)
+        self._pending: list[tuple[float, tuple[float, float]]] = []
+        self._n_captured = int(np.searchsorted(capture_s, 0.0, side="right"))
+        self.states = np.empty((len(capture_s), len(state)))
+        self.states[: self._n_captured] = state
+        direction = np.array([math.cos(state[4]), math.sin(state[4])])
+        self.states[: self._n_captured, :2] += capture_s[: self._n_captured, None] * START_MPS * direction
+        self.switches = [(0.0, *self._acting)]
+
+    @property
+    def newest_capture(self) -> FloatArray:
+        """State (1, n) at the newest capture."""
+        return self.states[self._n_captured - 1 : self._n_captured]
+
+    def issue(self, t_s: float, steering: float, throttle: float) -> None:
+        """Issue a command, which acts after the car's command delay."""
+        inputs = self._car.car.max_angle * steering, FULL_THROTTLE_MPS2 * throttle
+        self._pending.append((t_s + self._car.car.command_delay, inputs))
+
+    def advance(self, end_s: float) -> None:
+        """Integrate up to a time [s]."""
+        while self._t_s < end_s:
+            until_s = min(end_s, self._pending[0][0]) if self._pending else end_s
+            if until_s > self._t_s + 1e-12:
+                self._integrate_held(until_s)
+            self._t_s = until_s
+            if self._pending and self._pending[0][0] <= self._t_s + 1e-12:
+                self._acting = self._pending.pop(0)[1]
+                self.switches.append((self._t_s, *self._acting))
+
+    def _integrate_held(self, until_s: float) -> None:
+        """Integrate with the acting inputs up to a time [s], and store the captures on the way."""
+        n_captured = int(np.searchsorted(self._capture_s, until_s, side="right"))
+        at = np.append(self._capture_s[self._n_captured : n_captured], until_s)
+        period_s = self._car.car.control_period
+        found = _segment(self._car, self._acting, period_s, (self._t_s, until_s), self._state, at)
+        self.states[self._n_captured : n_captured], self._state = found[:-1], found[-1]
+        self._n_captured = n_captured
 
 
 def _segment(
     car: PublicCar, acting: tuple[float, float], period: float, span: tuple[float, float], state: FloatArray,
     at: FloatArray,
 ) -> FloatArray:  # fmt: skip
+    """States (k, n) at ascending times ``at`` (k,), for a constant wheel angle [rad] and acceleration [m/s2]."""
     calls = 0
 
     def rates(_: float, x: FloatArray) -> list[float]:
         nonlocal calls
         calls += 1
-        if calls > CALLS:
+        if calls > MAX_RATE_CALLS:
             raise _ChatteringError
         return car.rates(x, ((acting[0] - x[2]) / period, acting[1]))
 
@@ -274,7 +308,7 @@ def _segment(
             f"The package's {car.model} model cannot be integrated beyond {span[0]:.2f} s; use another seed."
         )
     motion = car.motion(found)
-    if (np.abs(np.arctan2(motion[:, 4], motion[:, 3])) > SPUN_RAD).any():
+    if (np.abs(np.arctan2(motion[:, 4], motion[:, 3])) > MAX_SIDE_SLIP_RAD).any():
         raise DataError(f"The car has spun at {span[0]:.2f} s, which the package does not model; use another seed.")
     return np.asarray(found[np.searchsorted(once, at)], dtype=np.float64)
 
@@ -286,14 +320,14 @@ class _ChatteringError(Exception):
 def _small_steps(
     rates: Callable[[float, FloatArray], list[float]], t: float, x: FloatArray, at: FloatArray
 ) -> FloatArray:
-    """Runge and Kutta's fourth order at SMALL_S or less: wheels change camber's sign, where the package's force jumps.
+    """States (k, n) at times ``at`` (k,) by the classical Runge-Kutta method with steps of at most ``SMALL_STEP_S``.
 
-    A step control would shrink its steps without end there; steps of 0.2 ms are within the stability bound of wheel
-    slip, the fastest thing in the model, 6000 1/s at walking pace.
+    The package's tyre force jumps where a wheel's camber changes its sign. An adaptive step would become arbitrarily
+    small there. Steps of 0.2 ms are stable for the wheel slip, the fastest mode (6000 1/s at walking pace).
     """
     found = np.empty((len(at), len(x)))
     for row, until in enumerate(at):
-        count = max(1, math.ceil((until - t) / SMALL_S))
+        count = max(1, math.ceil((until - t) / SMALL_STEP_S))
         h = (until - t) / count
         for _ in range(count):
             k1 = np.array(rates(t, x))

@@ -1,10 +1,10 @@
 """Presence of each effect of the catalogue in the equations of the package commonroad-vehicle-models.
 
-Read off vehicle_dynamics_mb.py, vehicle_dynamics_std.py, tire_model.py, steering_constraints.py and
-acceleration_constraints.py of version 3.0.2. ``yes``: the effect is in the equations. ``akin``: something else is
-there that acts alike, so the name is a fair reading of it but not its own. ``no``: nothing there acts like it.
-Written from the equations and the interface alone, before any diagnosis was looked at; only ``steering_lag`` was
-raised from ``akin`` to ``yes`` afterwards, because the interface is that lag exactly.
+Source: vehicle_dynamics_mb.py, vehicle_dynamics_std.py, tire_model.py, steering_constraints.py and
+acceleration_constraints.py of version 3.0.2. ``yes``: the equations contain the effect. ``similar``: they contain other
+physics with a similar influence. ``no``: they contain neither. The table was written before any diagnosis, from the
+equations and the interface alone. Only ``steering_lag`` was changed afterwards, from ``similar`` to ``yes``, because
+the interface is exactly this lag.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal
 
 from carlab.benchmark.public_simulators.commonroad import Model, PublicCar
 
-Stance = Literal["yes", "akin", "no"]
+Presence = Literal["yes", "similar", "no"]
 BOTH: tuple[Model, ...] = ("multi_body", "drift")
 
 
@@ -22,44 +22,44 @@ BOTH: tuple[Model, ...] = ("multi_body", "drift")
 class Physics:
     """Whether an effect is in the equations of ``models``, and where."""
 
-    stance: Stance
+    presence: Presence
     why: str
     models: tuple[Model, ...] = BOTH
 
 
-_NO_OBSERVATION = Physics("no", "pose and velocities are measured as the nominal car file has it")
+_NO_OBSERVATION = Physics("no", "pose and velocities are measured as the nominal car file states")
 _NO_DRAG = Physics("no", "the package has no resistance to rolling or air; only slip and the front wheels' side force")
 
 PHYSICS: dict[str, tuple[Physics, ...]] = {
-    "command_delay": (Physics("no", "both commands act after the delay that the car file has"),),
-    "steering_delay": (Physics("akin", "no delay beyond the file's; the bounded steering rate comes late, too"),),
-    "throttle_delay": (Physics("akin", "no delay beyond the file's; wheel and tyre slip take a while to build force"),),
-    "steering_lag": (Physics("yes", "of the interface: the rate asked is (command - angle) / (1/30 s), a lag"),),
+    "command_delay": (Physics("no", "both commands act after the delay that the car file states"),),
+    "steering_delay": (Physics("similar", "no delay beyond the file's; the limited steering rate delays the angle"),),
+    "throttle_delay": (Physics("similar", "no delay beyond the file's; force builds up with wheel and tyre slip"),),
+    "steering_lag": (Physics("yes", "in the interface: the requested rate is (command - angle) / (1/30 s)"),),
     "steering_rate_limit": (Physics("yes", "steering_constraints.py: abs(d delta/dt) <= v_max, 1.26 rad/s as scaled"),),
     "steering_deadband": (Physics("no", "the angle follows its input without play or threshold"),),
     "steering_backlash": (Physics("no", "the angle follows its input without play"),),
     "steering_offset": (
         Physics("no", "left and right alike", ("drift",)),
-        Physics("akin", "p_vy1 and p_hy1 push sideways by the sign of camber, alike to both sides", ("multi_body",)),
+        Physics("similar", "p_vy1, p_hy1: side forces with the sign of camber, equal on both sides", ("multi_body",)),
     ),
     "steering_asymmetry": (Physics("no", "left and right alike"),),
-    "steering_nonlinearity": (Physics("akin", "the angle is linear; the front tyre's Magic Formula saturates"),),
-    "throttle_deadband": (Physics("no", "acceleration is asked in proportion to the throttle"),),
-    "throttle_nonlinearity": (Physics("akin", "asked in proportion; the tyre's force over slip is no straight line"),),
-    "motor_lag": (Physics("akin", "no motor state; force follows torque through wheel inertia and slip"),),
-    "motor_saturation": (Physics("akin", "a_max = 11.5 m/s2 is beyond the commands; the rear tyres bound force"),),
+    "steering_nonlinearity": (Physics("similar", "the angle is linear; the front tyre's Magic Formula saturates"),),
+    "throttle_deadband": (Physics("no", "the requested acceleration is proportional to the throttle"),),
+    "throttle_nonlinearity": (Physics("similar", "the request is proportional; the tyre's force over slip is not"),),
+    "motor_lag": (Physics("similar", "no motor state; force follows torque through wheel inertia and slip"),),
+    "motor_saturation": (Physics("similar", "commands stay below a_max = 11.5 m/s2; the rear tyres limit the force"),),
     "traction_limit": (Physics("yes", "F_x saturates at p_dx1 F_z of the driven rear wheels (tire_model.py)"),),
     "brake_asymmetry": (Physics("yes", "engine torque goes to the rear (T_se = 0), brake torque 66 % to the front"),),
     "battery_sag": (Physics("no", "nothing depends on time"),),
     "rolling_resistance": (_NO_DRAG,),
     "aerodynamic_drag": (_NO_DRAG,),
-    "cornering_drag": (Physics("akin", "slip lowers F_x (r_bx1, combined slip) and camber and load shift add to it"),),
+    "cornering_drag": (Physics("similar", "slip (r_bx1, combined slip), camber and load transfer lower F_x"),),
     "tyre_saturation": (Physics("yes", "Magic Formula; the nominal car file has one already"),),
     "friction_ellipse": (Physics("yes", "combined slip: formula_lateral_comb, formula_longitudinal_comb"),),
     "longitudinal_slip": (Physics("yes", "wheel-speed states, I_y_w d omega/dt = T - R_w F_x(slip)"),),
     "tyre_relaxation": (
         Physics("no", "tyre forces follow slip at once", ("drift",)),
-        Physics("akin", "forces follow slip at once, but the compliant joint K_ras, K_rad and the roll delay them",
+        Physics("similar", "forces follow slip at once, but the compliant joint K_ras, K_rad and the roll delay them",
                 ("multi_body",)),
     ),
     "load_transfer": (
@@ -74,16 +74,16 @@ PHYSICS: dict[str, tuple[Physics, ...]] = {
     "low_friction_patch": (Physics("no", "nothing depends on place"),),
     "aerodynamic_downforce": (Physics("no", "no aerodynamics"),),
     "yaw_damping": (
-        Physics("no", "no moment against the yaw rate beside the tyres'", ("drift",)),
-        Physics("akin", "(F_x,left - F_x,right) T / 2: wheels of one axle slip unlike in a turn", ("multi_body",)),
+        Physics("no", "no moment against the yaw rate but the tyres'", ("drift",)),
+        Physics("similar", "(F_x,left - F_x,right) T / 2: an axle's wheels slip differently in turns", ("multi_body",)),
     ),
     "torque_steer": (
         Physics("no", "single track", ("drift",)),
-        Physics("akin", "(F_x,left - F_x,right) T / 2, but of the sign of the turn", ("multi_body",)),
+        Physics("similar", "(F_x,left - F_x,right) T / 2, but of the sign of the turn", ("multi_body",)),
     ),
     "lateral_bias": (
         Physics("no", "left and right alike", ("drift",)),
-        Physics("akin", "p_vy1 and p_hy1 push sideways by the sign of camber, alike to both sides", ("multi_body",)),
+        Physics("similar", "p_vy1, p_hy1: side forces with the sign of camber, equal on both sides", ("multi_body",)),
     ),
     "road_slope": (Physics("no", "the ground is level"),),
     "mocap_latency": (_NO_OBSERVATION,),

@@ -28,7 +28,7 @@ from carlab.core.errors import DataError
 from carlab.jobs.child_processes import run_child
 
 PACKAGE = "commonroad-vehicle-models"
-KEPT = ("report.json", "report.html", "model.toml")
+REPORT_FILES = ("report.json", "report.html", "model.toml")
 
 
 def nominal_text(car: PublicCar) -> str:
@@ -120,27 +120,27 @@ def study(
     command: Sequence[str] = DIAGNOSE,
     timeout_s: float = 1800.0,
     lengths_s: Sequence[float] = (100.0, 40.0),
-    say: Callable[[str], None] = lambda words: None,
+    progress: Callable[[str], None] = lambda activity: None,
     abandon: Callable[[], bool] = lambda: False,
 ) -> list[dict[str, Any]]:
     """Drive, diagnose and report every seed; writes seed_N/, study.json and study.md into ``out``.
 
     Args:
-        out: Folder; what is there of the same names is overwritten.
-        model: Of the package.
-        seeds: One drive to fit and one held out each.
-        command: How a diagnosis is started, as in ``runner.Proof``.
-        timeout_s: A diagnosis that takes longer is ended and counts as failed.
-        lengths_s: Seconds to fit and held out.
-        say: called with what is being done.
-        abandon: Asked all along; True ends the study after what is done.
+        out: Folder; files of the same names are replaced.
+        model: Model of the package.
+        seeds: Each gives one drive to fit and one held-out drive.
+        command: Command of a diagnosis, as for ``runner.Proof``.
+        timeout_s: Time-out of a diagnosis, which then counts as failed.
+        lengths_s: Durations of the drive to fit and of the held-out drive [s].
+        progress: Called with the current activity.
+        abandon: Polled; True ends the study, and the finished seeds are written.
 
     Returns:
         One row per seed, as in study.json; a seed that cannot be driven has the reason instead of a verdict.
 
     Raises:
-        ConfigError: where the package is not installed.
-        DataError: where a diagnosis left something that is no report.
+        ConfigError: the package is not installed.
+        DataError: a diagnosis wrote a file that is no report.
     """
     facts = {
         "package": f"{PACKAGE} {version(PACKAGE)}, model {model}, vehicle 2 (BMW 320i)",
@@ -152,7 +152,7 @@ def study(
     for seed in seeds:
         car = PublicCar(model)
         handed = out / f"seed_{seed}"
-        say(f"seed {seed}: driving the package's {model} car")
+        progress(f"seed {seed}: driving the package's {model} car")
         try:
             drive = hand_over(car, seed, handed, lengths_s, abandon)
         except AbandonedError:
@@ -160,7 +160,7 @@ def study(
         except DataError as error:
             rows.append({"seed": seed, "verdict": None, "exit_status": None, "seconds": 0.0, "words": str(error)})
             continue
-        say(f"seed {seed}: diagnosing")
+        progress(f"seed {seed}: diagnosing")
         run = _diagnose(handed, command, timeout_s, abandon)
         if run is None:
             break
@@ -181,11 +181,11 @@ def _diagnose(
         end = run_child(arguments, here, timeout_s=timeout_s, abandon=abandon)
         if end.abandoned:
             return None
-        for file in KEPT:
+        for file in REPORT_FILES:
             (handed / file).unlink(missing_ok=True)
             if (here / "out" / file).exists():
                 shutil.copyfile(here / "out" / file, handed / file)
-    return {"exit_status": end.exit_status, "seconds": round(end.seconds, 1), "words": end.words}
+    return {"exit_status": end.exit_status, "seconds": round(end.seconds, 1), "words": end.output}
 
 
 def _row(car: PublicCar, seed: int, run: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -213,8 +213,8 @@ def _named(car: PublicCar, effect: dict[str, Any]) -> dict[str, Any]:
     return {
         **{k: effect.get(k) for k in ("id", "confidence", "parameters", "where", "evidence", "sentence")},
         "indistinguishable_from": others,
-        "in_equations": physics.stance,
+        "in_equations": physics.presence,
         "why": physics.why,
         "true_values": truth,
-        "others": {name: physics_of(name, car.model).stance for name in others},
+        "others": {name: physics_of(name, car.model).presence for name in others},
     }

@@ -7,10 +7,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from carlab.benchmark.proof.results_page import markdown
-from carlab.benchmark.public_simulators.commonroad import DRIVER_GRIP, FULL_MPS2, MAX_ANGLE_RAD, SCALE
+from carlab.benchmark.public_simulators.commonroad import DRIVER_GRIP, FULL_THROTTLE_MPS2, MAX_ANGLE_RAD, SCALE
 
 TARGET_RATIO = 0.5
-STANCES = {"yes": "in the equations", "akin": "resembles a term of the equations", "no": "not in the equations"}
+PRESENCE_TEXTS = {
+    "yes": "in the equations",
+    "similar": "resembles a term of the equations",
+    "no": "not in the equations",
+}
 
 
 def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
@@ -18,7 +22,7 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
     parts = [
         "# Diagnosis of recordings of an independent simulator",
         f"{facts['package']}, scaled by {SCALE:g} in length and by dynamic similarity in all else. Full steering is "
-        f"{MAX_ANGLE_RAD:g} rad, full throttle requests {FULL_MPS2:g} m/s2; the limits of the package also apply. A "
+        f"{MAX_ANGLE_RAD:g} rad, full throttle requests {FULL_THROTTLE_MPS2:g} m/s2; the package limits both. A "
         f"simulated person drives without stopping and uses {DRIVER_GRIP:.0%} of the grip of the tyres. "
         f"{facts['seconds_to_fit']:g} s are fitted and {facts['seconds_held_out']:g} s held out, at 30 Hz, with noise "
         "on the pose and velocities differentiated from it. The nominal car file has measured mass, axle distances "
@@ -53,7 +57,7 @@ def study_page(facts: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
 def _verdict(rows: Sequence[dict[str, Any]]) -> str:
     met = [row for row in rows if row.get("ratio") is not None and row["ratio"] <= TARGET_RATIO]
     named = [effect["in_equations"] for row in rows for effect in row.get("named", [])]
-    counts = ", ".join(f"{named.count(stance)} {words}" for stance, words in STANCES.items())
+    counts = ", ".join(f"{named.count(presence)} {words}" for presence, words in PRESENCE_TEXTS.items())
     return f"Met for {len(met)} of {len(rows)} seeds. Names given: {len(named)} ({counts})."
 
 
@@ -69,9 +73,9 @@ def _evidence(effect: dict[str, Any]) -> str:
     given = {k: v for k, v in (effect["evidence"] or {}).items() if isinstance(v, int | float)}
     cells = [(k.replace("_", " "), f"{v:.3g}") for k, v in given.items()]
     cells += [(name, _value(p, effect["true_values"].get(name))) for name, p in (effect["parameters"] or {}).items()]
-    others = [f"{name} ({STANCES[stance]})" for name, stance in effect["others"].items()]
+    others = [f"{name} ({PRESENCE_TEXTS[presence]})" for name, presence in effect["others"].items()]
     cells += [("indistinguishable from", ", ".join(others))] if others else []
-    cells.append((f"the package: {STANCES[effect['in_equations']]}", effect["why"]))
+    cells.append((f"the package: {PRESENCE_TEXTS[effect['in_equations']]}", effect["why"]))
     return markdown(("evidence", "value"), cells)
 
 

@@ -1,4 +1,4 @@
-"""Cases of a proof on real recordings: parts that are left out of a reference, and what is concealed in them.
+"""Cases of a proof on real recordings: parts that are left out of a reference, and effects concealed in them.
 
 A car differs from drive to drive (battery, tyres), so a whole drive differs from others without anything concealed.
 Therefore a part consists of short pieces of many drives, and a reference of the pieces between them.
@@ -17,7 +17,7 @@ import numpy as np
 
 from carlab.benchmark.cases.seal import file_digest
 from carlab.benchmark.effects.data_faults import Table
-from carlab.benchmark.real.kinds import FULL_LOCK, KINDS, MAX_INEXACT, Kind, Truth
+from carlab.benchmark.real.kinds import FULL_LOCK, KINDS, MAX_INEXACT_SHARE, Kind, Truth
 from carlab.benchmark.world.measurement import COLUMNS, write_csv
 from carlab.core.errors import DataError
 
@@ -25,11 +25,11 @@ PIECE_S = 20.0
 """Aimed length of a piece [s]."""
 MAX_PARTS = 4
 """Maximum number of parts, each with its own reference."""
-SHORTEST_S, LONGEST_S = 60.0, 100.0
+MIN_CASE_S, MAX_CASE_S = 60.0, 100.0
 """Minimum and maximum total length of the pieces of a case, before the guards are cut [s]."""
 GUARD_S = 1.0
 """Time between a piece and the recordings of its reference, and cut at both ends of a changed piece [s]."""
-SHORTEST_REFERENCE_S = 10.0
+MIN_REFERENCE_STRETCH_S = 10.0
 """Shorter stretches are not used in a reference [s]."""
 MAX_GAP_PERIODS = 3.0
 MAX_SIZE_RATIO = 0.02
@@ -99,16 +99,16 @@ def parts(recordings: Mapping[str, Table]) -> list[Part]:
     """Cut recordings into pieces of about ``PIECE_S``, and assign them in turn to parts that a reference can leave out.
 
     Raises:
-        DataError: there are fewer than two parts of ``SHORTEST_S`` of driving.
+        DataError: there are fewer than two parts of ``MIN_CASE_S`` of driving.
     """
     pieces = [piece for name, table in recordings.items() for piece in _pieces(name, table)]
     driven = [piece for piece in pieces if _is_driven(recordings, piece)]
     driven_s = sum(piece.duration_s for piece in driven)
-    count = min(MAX_PARTS, int(driven_s / (SHORTEST_S + PIECE_S)))
+    count = min(MAX_PARTS, int(driven_s / (MIN_CASE_S + PIECE_S)))
     if count < 2:
         raise DataError(
             f"The recordings have {driven_s:.0f} s of driving with varying commands in pieces of {PIECE_S:.0f} s; a "
-            f"proof needs {2.0 * (SHORTEST_S + PIECE_S):.0f} s; add recordings."
+            f"proof needs {2.0 * (MIN_CASE_S + PIECE_S):.0f} s; add recordings."
         )
     return [tuple(driven[k::count]) for k in range(count)]
 
@@ -124,7 +124,9 @@ def reference(recordings: Mapping[str, Table], left_out: Part) -> list[Table]:
                     edges += [piece.begin_s - GUARD_S, piece.end_s + GUARD_S]
             edges.append(end_s)
             kept += [
-                cut(table, a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= SHORTEST_REFERENCE_S
+                cut(table, a, b)
+                for a, b in zip(edges[::2], edges[1::2], strict=True)
+                if b - a >= MIN_REFERENCE_STRETCH_S
             ]
     return kept
 
@@ -163,12 +165,12 @@ def make_real_case(
 
 
 def _drawn_pieces(part: Part, rng: np.random.Generator) -> list[Piece]:
-    """Random pieces of a part, in their order, whose total length is within ``SHORTEST_S`` and ``LONGEST_S``."""
-    aimed_s = rng.uniform(SHORTEST_S, LONGEST_S)
+    """Random pieces of a part, in their order, whose total length is within ``MIN_CASE_S`` and ``MAX_CASE_S``."""
+    aimed_s = rng.uniform(MIN_CASE_S, MAX_CASE_S)
     chosen: list[int] = []
     total_s = 0.0
     for k in rng.permutation(len(part)):
-        if total_s < SHORTEST_S or total_s + part[k].duration_s <= aimed_s:
+        if total_s < MIN_CASE_S or total_s + part[k].duration_s <= aimed_s:
             chosen.append(int(k))
             total_s += part[k].duration_s
     return [part[k] for k in sorted(chosen)]
@@ -198,7 +200,7 @@ def _largest_exact(
             raise DataError("The recordings have different periods; use recordings of one period.")
         commands = [change.table[name] for change in changes for name in ("steering", "throttle")]
         inexact = max(change.inexact for change in changes)
-        if all(np.abs(command).max() <= 1.0 for command in commands) and inexact <= MAX_INEXACT:
+        if all(np.abs(command).max() <= 1.0 for command in commands) and inexact <= MAX_INEXACT_SHARE:
             answer = kind.as_dict(replace(changes[0], inexact=inexact), kind.sizes[index])
             return [change.table for change in changes], {**answer, "size_index": index}
     return None

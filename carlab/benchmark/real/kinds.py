@@ -15,7 +15,7 @@ from carlab.benchmark.real import columns as c
 
 FULL_LOCK = 0.7
 """Full steering lock in the files of a proof; room for transformations that enlarge commands."""
-MAX_INEXACT = 0.1
+MAX_INEXACT_SHARE = 0.1
 """Largest error of a transformation, as a share of the effect itself (root mean square); clipping causes it."""
 Channel = Literal["steering", "throttle", "both", "observation"]
 

@@ -161,7 +161,7 @@ class RealProof(SealedRun):
         done = self.executor.run(job, self.abandon)
         if not done.end.abandoned:
             if not done.outputs:
-                last = done.end.words.strip().splitlines()[-1:] or [f"exit status {done.end.exit_status}"]
+                last = done.end.output.strip().splitlines()[-1:] or [f"exit status {done.end.exit_status}"]
                 raise DataError(f"The diagnosis of a reference failed: {last[0]}")
             done.write_outputs(folder / "out")
         return done.end

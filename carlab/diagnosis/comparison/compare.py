@@ -75,54 +75,54 @@ def compare(
     """
     began_s = MonotonicClock().now_s()
     progress("fitting the simulator to the first group", 0.0)
-    material = compared_groups(reference, changed, nominal, settings)
-    screened = _screen(material, candidates, settings, progress, stop)
-    changes, tested = _select(material, screened, settings.comparison, progress, stop)
+    compared = compared_groups(reference, changed, nominal, settings)
+    screened = _screen(compared, candidates, settings, progress, stop)
+    changes, tested = _select(compared, screened, settings.comparison, progress, stop)
     verdict: ComparisonVerdict = "changed" if changes else "inconclusive" if stop() else "nothing"
     seconds = MonotonicClock().now_s() - began_s
     return Comparison(verdict, verdict_sentence(verdict, changes), changes, seconds, tested)
 
 
 def _screen(
-    material: ComparedGroups,
+    compared: ComparedGroups,
     only: Sequence[str] | None,
     settings: DiagnosisSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
 ) -> list[Secants]:
     """Secants of all candidates in both groups."""
-    first = material.fitters[0]
+    first = compared.fitters[0]
     few = Fitter(first.windows.thinned(settings.comparison.max_point_windows), first.scale, first.settings)
-    candidates = change_candidates(material.config, only)
+    candidates = change_candidates(compared.config, only)
     found = []
     for k, candidate in enumerate(candidates):
         if stop():
             break
         progress(f"influence of {candidate.id}", 0.1 + 0.6 * k / len(candidates))
-        at = candidate_points(few, material.config, candidate, settings)
+        at = candidate_points(few, compared.config, candidate, settings)
         secants = [
             at.secants(fitter, errors, settings.comparison.max_secant)
-            for fitter, errors in zip(material.fitters, material.errors, strict=True)
+            for fitter, errors in zip(compared.fitters, compared.errors, strict=True)
         ]
-        found.append(Secants(at, material.decorrelated(secants)))
+        found.append(Secants(at, compared.decorrelated(secants)))
     return found
 
 
 def _select(
-    material: ComparedGroups,
+    compared: ComparedGroups,
     screened: Sequence[Secants],
     settings: ComparisonSettings,
     progress: Callable[[str, float], None],
     stop: Callable[[], bool],
 ) -> tuple[tuple[Change, ...], tuple[Tested, ...]]:
     """Forward selection: the change with the largest likelihood ratio comes first."""
-    windows = [fitter.windows for fitter in material.fitters]
+    windows = [fitter.windows for fitter in compared.fitters]
     first, second = (
         GroupErrors(errors, w.block, part)
-        for errors, w, part in zip(material.decorrelated(material.errors), windows, material.parts, strict=True)
+        for errors, w, part in zip(compared.decorrelated(compared.errors), windows, compared.parts, strict=True)
     )
     length_ratio = longest_drive_blocks(windows[1]) / part_blocks(windows, settings)
-    model = material.model
+    model = compared.model
     progress("comparing parts of the first group", 0.7)
     null = null_p_values(screened, first, int(second.part.max()) + 1, model, settings, stop)
 
@@ -142,12 +142,12 @@ def _select(
         tested = tested or tuple(x.tested() for x in linear)
         if not any(adjusted(x.p_value) < settings.p_max for x in linear):
             break
-        refined = [_refine(x, found, material, settings) for x in linear[: settings.max_refined]]
+        refined = [_refine(x, found, compared, settings) for x in linear[: settings.max_refined]]
         significant = [r for r in refined if adjusted(max(r.p_value, r.linear.p_value)) < settings.p_max]
         best = max(significant, key=lambda r: r.likelihood_ratio, default=None)
         if best is None or (found and best.likelihood_ratio < settings.min_share_of_first * found[0].likelihood_ratio):
             break
-        ties.append(_ties(best, refined, material, settings.tie_z))
+        ties.append(_ties(best, refined, compared, settings.tie_z))
         found.append(best)
     changes = [
         _change(one, _joint(one, found[-1].fit), near, adjusted(one.p_value), settings.model_error_share)
@@ -159,13 +159,13 @@ def _select(
 def _refine(
     linear: LinearChange,
     found: Sequence[_Refined],
-    material: ComparedGroups,
+    compared: ComparedGroups,
     settings: ComparisonSettings,
 ) -> _Refined:
     """Fit a candidate to the second group, together with the changes found before."""
     at = linear.secants.at
     before = found[-1] if found else None
-    config = with_candidate(before.fit.fitted if before else material.config, at.candidate)
+    config = with_candidate(before.fit.fitted if before else compared.config, at.candidate)
     free = (*(before.fit.free if before else ()), *at.candidate.free)
     known = before.fit.z if before else np.zeros(0)
     step = min(linear.difference.step, settings.max_start_step)
@@ -173,19 +173,19 @@ def _refine(
     starts = np.array([np.concatenate([known, z]) for z in (at.z0, at.z0 + step * (point - at.z0), point)])
     offset = linear.difference.common * linear.secants.of_group[1][linear.point]
     offset = offset + (before.offset if before else 0.0)
-    fit = fit_change(material.fitters[1], config, free, starts, material.model, offset, settings)
+    fit = fit_change(compared.fitters[1], config, free, starts, compared.model, offset, settings)
     ratio = 2.0 * fit.gain / linear.difference.variance_ratio
     p = p_value(linear.difference, ratio, len(at.z0))
     return _Refined(linear, fit, ratio, p, offset)
 
 
-def _ties(best: _Refined, refined: Sequence[_Refined], material: ComparedGroups, tie_z: float) -> tuple[str, ...]:
+def _ties(best: _Refined, refined: Sequence[_Refined], compared: ComparedGroups, tie_z: float) -> tuple[str, ...]:
     """Candidates whose loss on the second group is not significantly larger, the closest first, at most two.
 
     The comparison is that of non-nested models (Vuong 1989), with a standard error clustered by block and multiplied by
     the spread between drives.
     """
-    windows, model = material.fitters[1].windows, material.model
+    windows, model = compared.fitters[1].windows, compared.model
     loss = model.loss(best.fit.errors)
     near = []
     for other in refined:

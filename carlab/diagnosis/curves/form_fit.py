@@ -95,7 +95,7 @@ def identify_form(curve: CurveFinding, covariance: FloatArray | None, settings: 
         return None
     found.sort(key=lambda c: (not c.fits, c.cost(settings)))
     best = found[0]
-    rivals = [c.form for c in found[1:] if c.fits and c.cost(settings) - best.cost(settings) < settings.form_tie_chi2]
+    others = [c.form for c in found[1:] if c.fits and c.cost(settings) - best.cost(settings) < settings.form_tie_chi2]
     return FormFinding(
         id=best.form.id,
         name=best.form.name,
@@ -105,7 +105,7 @@ def identify_form(curve: CurveFinding, covariance: FloatArray | None, settings: 
         max_chi2_per_knot=best.limit / len(knots),
         rms_difference=best.rms,
         knots=len(knots),
-        indistinguishable_from=tuple(form.name for form in rivals) if best.fits else (),
+        indistinguishable_from=tuple(form.name for form in others) if best.fits else (),
     )
 
 

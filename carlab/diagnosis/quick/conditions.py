@@ -16,7 +16,7 @@ BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class ErrorCondition:
     """A condition.
 
     text               such as ``speed > 2 m/s``
@@ -32,12 +32,12 @@ class Condition:
 
 def find_conditions(
     windows: PredictionWindows, size: FloatArray, settings: QuickSettings = DEFAULT.quick
-) -> tuple[Condition, ...]:
+) -> tuple[ErrorCondition, ...]:
     """Conditions in which errors ``size`` (S,) are significantly larger than elsewhere, the most significant first.
 
     Of conditions of one kind (thresholds of a feature, places) only the most significant is returned.
     """
-    best: dict[str, tuple[float, Condition]] = {}
+    best: dict[str, tuple[float, ErrorCondition]] = {}
     for kind, text, inside in _candidates(windows, settings):
         if min(inside.sum(), (~inside).sum()) < settings.condition_windows_min:
             continue
@@ -45,7 +45,7 @@ def find_conditions(
         within, outside = squared[inside], squared[~inside]
         error = np.sqrt(within.var() / len(within) + outside.var() / len(outside))
         z = float(within.mean() - outside.mean()) / max(float(error), 1e-9)
-        found = Condition(text, float(np.sqrt(within.mean())), float(np.sqrt(outside.mean())), int(inside.sum()))
+        found = ErrorCondition(text, float(np.sqrt(within.mean())), float(np.sqrt(outside.mean())), int(inside.sum()))
         if found.inside < settings.condition_ratio_min * found.outside or z < settings.condition_z_min:
             continue
         if kind not in best or z > best[kind][0]:
@@ -97,4 +97,4 @@ def _places(windows: PredictionWindows, settings: QuickSettings) -> Iterator[tup
         yield "place", f"within {settings.place_radius_m:.1f} m of ({x:.1f}, {y:.1f})", near
 
 
-__all__ = ["Condition", "find_conditions"]
+__all__ = ["ErrorCondition", "find_conditions"]

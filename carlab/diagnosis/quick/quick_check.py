@@ -22,7 +22,7 @@ from carlab.diagnosis.identification.held_out_errors import noise_floor
 from carlab.diagnosis.identification.measurement_noise import estimate_noise
 from carlab.diagnosis.identification.velocity_window import velocity_window_variance_s2
 from carlab.diagnosis.quick.causes import Cause, find_causes, scale_of
-from carlab.diagnosis.quick.conditions import Condition, find_conditions
+from carlab.diagnosis.quick.conditions import ErrorCondition, find_conditions
 from carlab.diagnosis.recording_faults import find as data_faults
 from carlab.diagnosis.settings import DEFAULT, QuickSettings
 from carlab.diagnosis.state_alignment import align_states, window_variance_s2, with_known_latency
@@ -35,11 +35,11 @@ from sim_backends.car_parameters import SimulatorConfig
 SCHEMA = "carlab.light_diagnosis/1"
 JSON_KEYS = {"windows": "shots", "with_refit": "beside_numbers", "ties_with_first": "like_the_first"}
 """Keys of the file format that differ from the attributes."""
-Verdict = Literal["explains", "left", "undecided"]
+CheckVerdict = Literal["explains", "left", "undecided"]
 
 
 @dataclass(frozen=True, slots=True)
-class ChannelError:
+class ChannelScore:
     """Error of one channel at the end of windows: root mean square and noise floor, both in ``unit``."""
 
     channel: str
@@ -68,13 +68,13 @@ class QuickCheck:
         windows, episodes, seconds: amount of data; seconds of driving.
     """
 
-    verdict: Verdict
+    verdict: CheckVerdict
     why: str = ""
     score: float = float("nan")
     score_std: float = float("nan")
     horizon_s: float = DEFAULT.quick.window_s
-    channels: tuple[ChannelError, ...] = ()
-    conditions: tuple[Condition, ...] = ()
+    channels: tuple[ChannelScore, ...] = ()
+    conditions: tuple[ErrorCondition, ...] = ()
     causes: tuple[Cause, ...] = ()
     windows: int = 0
     episodes: int = 0
@@ -210,12 +210,12 @@ def _blocks_above(final: FloatArray, windows: PredictionWindows, score_max: floa
     return int(np.sum(np.sqrt(squared) > score_max))
 
 
-def _channels(final: FloatArray, floor: FloatArray) -> tuple[ChannelError, ...]:
+def _channels(final: FloatArray, floor: FloatArray) -> tuple[ChannelScore, ...]:
     rms = np.sqrt(np.mean(final**2, axis=0))
     return tuple(
-        ChannelError(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), STATE_UNITS[k])
+        ChannelScore(STATE_NAMES[k], float(rms[k] * floor[k]), float(floor[k]), STATE_UNITS[k])
         for k in np.argsort(-rms)
     )
 
 
-__all__ = ["SCHEMA", "ChannelError", "QuickCheck", "Verdict", "held_out_loss", "quick_check"]
+__all__ = ["SCHEMA", "ChannelScore", "CheckVerdict", "QuickCheck", "held_out_loss", "quick_check"]

@@ -6,7 +6,7 @@ import math
 
 from carlab.diagnosis.quick.causes import ALL_PARAMETERS, GRIP, Cause
 from carlab.diagnosis.quick.quick_check import QuickCheck
-from carlab.diagnosis.report.sentences import CHANNEL_WORDS, number, percent, with_unit
+from carlab.diagnosis.report.sentences import CHANNEL_NAMES, number, percent, with_unit
 
 
 def sentences(check: QuickCheck, decide: str = "carlab diagnose decides") -> tuple[str, ...]:
@@ -28,7 +28,7 @@ def sentences(check: QuickCheck, decide: str = "carlab diagnose decides") -> tup
     worst = check.channels[0]
     text = (
         f"The simulator does not explain the recordings: {errors}. The largest error is in "
-        f"{CHANNEL_WORDS[worst.channel]} ({with_unit(worst.rms, worst.unit)}; "
+        f"{CHANNEL_NAMES[worst.channel]} ({with_unit(worst.rms, worst.unit)}; "
         f"noise {with_unit(worst.floor, worst.unit)})"
     )
     if check.conditions:

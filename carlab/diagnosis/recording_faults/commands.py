@@ -43,11 +43,11 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
     motions = [grid_motion(repair.times_s, repair.motion(), repair.segment) for repair in repairs]
     _check_clock(repairs, motions)
     for channel in range(len(COMMAND_CHANNELS)):
-        answers = [_response(repair, motion, channel) for repair, motion in zip(repairs, motions, strict=True)]
-        clear = [a for a in answers if a is not None and a.best > LIMITS.command_explained[channel]]
+        responses = [_response(repair, motion, channel) for repair, motion in zip(repairs, motions, strict=True)]
+        clear = [r for r in responses if r is not None and r.best > LIMITS.command_explained[channel]]
         if clear:
             _check_sign(repairs, clear, channel)
-            _check_shift(repairs, answers, channel, expected_s)
+            _check_shift(repairs, responses, channel, expected_s)
 
 
 def _response(repair: EpisodeRepair, motion: GridMotion, channel: int) -> CommandResponse | None:
@@ -65,17 +65,17 @@ def _check_sign(repairs: Sequence[EpisodeRepair], clear: Sequence[CommandRespons
 
 
 def _check_shift(
-    repairs: Sequence[EpisodeRepair], answers: Sequence[CommandResponse | None], channel: int, expected_s: float
+    repairs: Sequence[EpisodeRepair], responses: Sequence[CommandResponse | None], channel: int, expected_s: float
 ) -> None:
     """Shift a column if the response precedes it, or follows later than a plausible delay."""
     zero_s = expected_s + METHOD_LAG_S[channel]
-    shifts = [zero_s - a.lag_s for a in answers if a is not None and _is_impossible(a, channel, expected_s)]
+    shifts = [zero_s - r.lag_s for r in responses if r is not None and _is_impossible(r, channel, expected_s)]
     name = COMMAND_CHANNELS[channel]
-    for repair, answer in zip(repairs, answers, strict=True):
-        if answer is None or not shifts:
+    for repair, response in zip(repairs, responses, strict=True):
+        if response is None or not shifts:
             continue
-        shift_s = zero_s - answer.lag_s
-        if not _is_impossible(answer, channel, expected_s) and abs(shift_s - np.median(shifts)) > SAME_SHIFT_S:
+        shift_s = zero_s - response.lag_s
+        if not _is_impossible(response, channel, expected_s) and abs(shift_s - np.median(shifts)) > SAME_SHIFT_S:
             continue
         rows = round(shift_s / repair.period_s)
         is_late = shift_s > 0
@@ -89,14 +89,14 @@ def _check_shift(
         repair.repaired(Fault("column_shift", name, observation), remedy)
 
 
-def _is_impossible(answer: CommandResponse, channel: int, expected_s: float) -> bool:
+def _is_impossible(response: CommandResponse, channel: int, expected_s: float) -> bool:
     """Whether no plausible delay explains nearly as much of the motion as the best delay."""
     earliest = METHOD_LAG_S[channel] - LIMITS.early_response_s
     latest = METHOD_LAG_S[channel] + expected_s + PLAUSIBLE_EXTRA_S[channel]
-    if answer.best < LIMITS.command_explained[channel] or answer.gain <= 0 or earliest <= answer.lag_s <= latest:
+    if response.best < LIMITS.command_explained[channel] or response.gain <= 0 or earliest <= response.lag_s <= latest:
         return False
-    plausible = answer.explained[(earliest <= LAGS_S) & (latest >= LAGS_S)].max()
-    return bool((1.0 - plausible) / max(1.0 - answer.best, 1e-9) > MIN_VARIANCE_RATIO)
+    plausible = response.explained[(earliest <= LAGS_S) & (latest >= LAGS_S)].max()
+    return bool((1.0 - plausible) / max(1.0 - response.best, 1e-9) > MIN_VARIANCE_RATIO)
 
 
 def _check_clock(repairs: Sequence[EpisodeRepair], motions: Sequence[GridMotion]) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from carlab.core.angles import wrap
 from carlab.core.quantities import STATE_NAMES, STATE_UNITS, FloatArray
 from carlab.diagnosis.findings import EffectFinding, FigureData, Trace
-from carlab.diagnosis.report.sentences import CHANNEL_WORDS, number, percent, unit_text
+from carlab.diagnosis.report.sentences import CHANNEL_NAMES, number, percent, unit_text
 from carlab.diagnosis.report.svg import Chart, bar_rows, padded
 
 MODELS = ("nominal", "refit", "with_effects")
@@ -125,11 +125,11 @@ def overlay(trace: Trace, stretch: tuple[float, float], effects: Sequence[Effect
     for k in (3, 4, 5):
         values = np.concatenate([seen[:, k], *(trace.predicted[m][rows][:, k] for m in models)])
         chart = Chart(
-            f"{CHANNEL_WORDS[STATE_NAMES[k]]}: {names}",
+            f"{CHANNEL_NAMES[STATE_NAMES[k]]}: {names}",
             (float(trace.times_s[rows[0]]), float(trace.times_s[rows[-1]]) + 1e-9),
             padded(values, 0.1, 1e-3),
             (420, 300),
-            ("time [s]", f"{CHANNEL_WORDS[STATE_NAMES[k]]} [{STATE_UNITS[k]}]"),
+            ("time [s]", f"{CHANNEL_NAMES[STATE_NAMES[k]]} [{STATE_UNITS[k]}]"),
         )
         chart.line(trace.times_s[rows], seen[:, k], "recorded")
         for model in models:
@@ -196,17 +196,17 @@ def correlation_chart(figure_data: FigureData, effect_id: str) -> Figure | None:
     peak = int(np.argmax(finite)) if len(finite) else 0
     beyond = int((finite > bound).sum())
     if beyond:
-        words = (
+        caption = (
             f"Correlation of the residual of the refitted simulator with earlier commands. {beyond} of {len(values)} "
             f"lags lie outside the shaded 99 % band of uncorrelated data. The largest correlation is "
             f"{number(float(values[peak]))} at a lag of {number(float(lags_s[peak]))} s."
         )
     else:
-        words = (
+        caption = (
             "Correlation of the residual of the refitted simulator with earlier commands. All lags lie inside the "
             "shaded 99 % band of uncorrelated data. The correlation alone does not show the effect."
         )
-    return Figure(chart.render(), words)
+    return Figure(chart.render(), caption)
 
 
 def score_chart(figure_data: FigureData) -> Figure | None:
@@ -216,9 +216,9 @@ def score_chart(figure_data: FigureData) -> Figure | None:
     rows = []
     for label, score in figure_data.scores_by_step:
         added = label.startswith("+ ")
-        words = "+ " + label[2:].replace("_", " ") if added else LABELS.get(label, label)
+        bar_label = "+ " + label[2:].replace("_", " ") if added else LABELS.get(label, label)
         style = "with_effects" if added else "floor" if "floor" in label else label if label in MODELS else "other"
-        rows.append((words, score, number(score), style))
+        rows.append((bar_label, score, number(score), style))
     svg = bar_rows("Error by added effect", rows, reference=1.0, label_px=200, size=(760, 34))
     return Figure(svg, "")
 
@@ -228,7 +228,7 @@ def fingerprint_chart(effect: EffectFinding) -> Markup:
     known = effect.evidence.deletion_fingerprint
     ordered = sorted(known.items(), key=lambda item: -item[1] if np.isfinite(item[1]) else 0.0)
     rows = [
-        (CHANNEL_WORDS.get(c, c), rise, ("+" if rise > 0 else "") + percent(rise), "with_effects")
+        (CHANNEL_NAMES.get(c, c), rise, ("+" if rise > 0 else "") + percent(rise), "with_effects")
         for c, rise in ordered
     ]
     return bar_rows("Increase of each channel's error without the effect", rows, label_px=150, size=(430, 23))

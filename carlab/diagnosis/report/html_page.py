@@ -65,13 +65,13 @@ def page_context(diagnosis: Diagnosis, figure_data: FigureData) -> dict[str, Any
         "drift_sentences": drift_sentences(diagnosis),
         "event_sentences": diagnosed_event_sentences(diagnosis),
         "rest": rest if rest is not None and rest.share >= DEFAULT.evidence.unexplained_share_min else None,
-        "rest_where": text.listed([text.CHANNEL_WORDS.get(c, c) for c in rest.channels]) if rest else "",
-        "rest_regime": text.regime_words(rest.regime) if rest else "",
+        "rest_where": text.listed([text.CHANNEL_NAMES.get(c, c) for c in rest.channels]) if rest else "",
+        "rest_regime": text.regime_clause(rest.regime) if rest else "",
         "drive": text.drive_command(drive),
         "drive_name": drive,
         "why": why,
         "parameters": [(name, e, _bar(e)) for name, e in diagnosis.parameters.items()],
-        "channels": text.CHANNEL_WORDS,
+        "channels": text.CHANNEL_NAMES,
     }
 
 
@@ -93,8 +93,8 @@ def _cards(diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
     where, evidence = effect.where, effect.evidence
-    places = [f"in {text.listed([text.CHANNEL_WORDS.get(c, c) for c in where.channels])}"] if where.channels else []
-    places.append(text.regime_words(where.regime))
+    places = [f"in {text.listed([text.CHANNEL_NAMES.get(c, c) for c in where.channels])}"] if where.channels else []
+    places.append(text.regime_clause(where.regime))
     if where.lag_s is not None:
         places.append(f"at a lag of {text.with_unit(where.lag_s, 's')}")
     if where.time is not None:
@@ -111,10 +111,10 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
         "noun": noun[0].upper() + noun[1:],
         "sentence": effect.sentence or text.effect_sentence(effect.id, effect.parameters),
         "confidence": effect.confidence,
-        "confidence_words": text.confidence_words(effect.confidence, len(effect.indistinguishable_from)),
+        "confidence_text": text.confidence_text(effect.confidence, len(effect.indistinguishable_from)),
         "where": ", ".join(places),
         "evidence": evidence,
-        "evidence_words": _evidence_words(effect),
+        "evidence_texts": _evidence_texts(effect),
         "parameters": [(name, e, _bar(e)) for name, e in effect.parameters.items()],
         "others": [(other, text.effect_noun(other)) for other in effect.indistinguishable_from],
         "drive": text.drive_command(drive),
@@ -127,22 +127,22 @@ def _effect(effect: EffectFinding, figure_data: FigureData) -> dict[str, Any]:
     }
 
 
-def _evidence_words(effect: EffectFinding) -> list[str]:
+def _evidence_texts(effect: EffectFinding) -> list[str]:
     evidence = effect.evidence
-    words = []
+    texts = []
     fall = evidence.held_out_error_reduction
     if math.isfinite(fall):
         verb = "lowers" if fall >= 0 else "raises"
-        words.append(f"Added last, the effect {verb} the error on held-out recordings by {text.percent(abs(fall))}.")
+        texts.append(f"Added last, the effect {verb} the error on held-out recordings by {text.percent(abs(fall))}.")
     strength = evidence.standard_errors
     if math.isfinite(strength):
         verb = "lowers" if strength < 0 else "raises"
         weak = " (weak evidence)" if abs(strength) < 3 else ""
         size = text.number(abs(strength))
-        words.append(f"The effect {verb} the held-out log-likelihood by {size} standard errors{weak}.")
+        texts.append(f"The effect {verb} the held-out log-likelihood by {size} standard errors{weak}.")
     visible = evidence.visibility
     if math.isfinite(visible):
         hidden = " Most of it is confounded with other parameters." if visible < 0.3 else ""
         share = text.percent(visible)
-        words.append(f"Other parameters cannot reproduce {share} of its influence on the errors.{hidden}")
-    return words
+        texts.append(f"Other parameters cannot reproduce {share} of its influence on the errors.{hidden}")
+    return texts

@@ -17,9 +17,9 @@ ORDER = ("nominal", "refit", "with_effects")
 LABELS = {"nominal": "car file", "refit": "refit", "with_effects": "with effects"}
 
 
-def _escaped(words: str) -> str:
+def _escaped(text: str) -> str:
     """Escape text for matplotlib; file names may contain any character."""
-    return "".join(c if " " <= c <= "~" else "?" for c in words).replace("$", r"\$")
+    return "".join(c if " " <= c <= "~" else "?" for c in text).replace("$", r"\$")
 
 
 def _color(rgb: tuple[int, int, int]) -> tuple[float, float, float]:

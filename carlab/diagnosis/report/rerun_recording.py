@@ -164,11 +164,11 @@ def _send_marks(stream: rr.RecordingStream, part: str, trace: Trace, diagnosis: 
     if circles:
         width = rr.Radius.ui_points(2.0)
         stream.log(f"{part}/map/place", rr.LineStrips3D(circles, radii=width, colors=blueprint.PURPLE), static=True)
-    for at_s, words, level in sorted(marks):
+    for at_s, text, level in sorted(marks):
         step = int(np.searchsorted(trace.times_s, at_s))
         stream.set_time(blueprint.CAR_TIME, duration=at_s)
         stream.set_time(blueprint.STEP, sequence=step)
-        stream.log(f"{part}/marks", rr.TextLog(words, level=level))
+        stream.log(f"{part}/marks", rr.TextLog(text, level=level))
 
 
 def _blueprint(parts: list[str], figure_data: FigureData) -> rrb.Blueprint:

@@ -20,7 +20,7 @@ from carlab.diagnosis.report.numbers import with_unit as with_unit
 from carlab.diagnosis.settings import DEFAULT
 from sim_backends.effects import EFFECTS, Confusable, separation
 
-CHANNEL_WORDS = {
+CHANNEL_NAMES = {
     "x": "longitudinal position",
     "y": "lateral position",
     "yaw": "heading",
@@ -148,12 +148,12 @@ def verdict_title(diagnosis: Diagnosis) -> str:
     return VERDICT_TITLES[diagnosis.verdict]
 
 
-def confidence_words(confidence: float, rivals: int = 0) -> str:
-    """A confidence in words; ``rivals`` is the number of effects that are indistinguishable from it."""
-    if rivals:
-        return f"one of {rivals + 1} indistinguishable effects"
+def confidence_text(confidence: float, n_indistinguishable: int = 0) -> str:
+    """A confidence in words; ``n_indistinguishable`` is the number of other effects that may be the cause."""
+    if n_indistinguishable:
+        return f"one of {n_indistinguishable + 1} indistinguishable effects"
     levels = ((0.98, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.5, "more likely than not"))
-    return next((words for level, words in levels if confidence >= level), "uncertain, record another drive")
+    return next((text for level, text in levels if confidence >= level), "uncertain, record another drive")
 
 
 def set_noun(effect: EffectFinding) -> str:
@@ -308,9 +308,9 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         text = "The search for effects did not finish, and it has not found what the simulator lacks"
     if rest is None:
         return text + "."
-    where = listed([CHANNEL_WORDS.get(c, c) for c in rest.channels])
+    where = listed([CHANNEL_NAMES.get(c, c) for c in rest.channels])
     shows = f" The error appears in {where}" if where else " The error appears"
-    sentence = f"{text}.{shows}, {regime_words(rest.regime)}."
+    sentence = f"{text}.{shows}, {regime_clause(rest.regime)}."
     if not diagnosis.search.is_complete:
         return sentence
     return f"{sentence} Class of the missing physics: {rest.kind or 'unknown'}."
@@ -321,7 +321,7 @@ def _inconclusive(diagnosis: Diagnosis) -> str:
     return f"No verdict. {why}" if why else "No verdict. The recordings are not sufficient."
 
 
-def regime_words(regime: str) -> str:
+def regime_clause(regime: str) -> str:
     """A regime as a clause: ``mostly where speed > 2 m/s``."""
     if not regime or regime == "everywhere alike":
         return "equally in all driving conditions"

@@ -117,14 +117,14 @@ class Chart:
                     f'<path class="stem {style}" d="M{self.px(a):.1f} {self.py(0.0):.1f}V{self.py(b):.1f}"/>'
                 )
 
-    def across(self, y: float, style: str, words: str = "") -> None:
-        """A level all the way across, with words at its right end."""
+    def across(self, y: float, style: str, label: str = "") -> None:
+        """A level all the way across, with a label at its right end."""
         if not self._y[0] <= y <= self._y[1]:
             return
         right = self._size[0] - self._right
         self._back.append(f'<path class="level {style}" d="M{self._left:.1f} {self.py(y):.1f}H{right:.1f}"/>')
-        if words:
-            self.text(self._x[1], y, words, "end", -4.0)
+        if label:
+            self.text(self._x[1], y, label, "end", -4.0)
 
     def spans(self, pieces: Sequence[tuple[float, float]], style: str) -> None:
         """Stretches of the abscissa, shaded from top to bottom."""
@@ -218,7 +218,7 @@ def bar_rows(
     label_px: int = 150,
     size: tuple[int, int] = (560, 26),
 ) -> Markup:
-    """Horizontal bars from zero: label, value, words at the end, style; with a dashed line at ``reference``."""
+    """Horizontal bars from zero: label, value, text at the end, style; with a dashed line at ``reference``."""
     wide, row_px = size
     finite = [v for _, v, _, _ in rows if math.isfinite(v)]
     top = max([*finite, reference or 0.0, 1e-12])
@@ -230,7 +230,7 @@ def bar_rows(
         return label_px + (v - low) / (top - low) * room
 
     parts = [f'<svg viewBox="0 0 {wide} {height}" role="img"><title>{escape(title)}</title>']
-    for k, (label, value, words, style) in enumerate(rows):
+    for k, (label, value, end_text, style) in enumerate(rows):
         middle = 4 + row_px * (k + 0.5)
         parts.append(
             f'<text class="row" x="{label_px - 8}" y="{middle + 4:.1f}" text-anchor="end">{escape(label)}</text>'
@@ -242,7 +242,7 @@ def bar_rows(
                 f'width="{max(end - start, 1.5):.1f}" height="{row_px * 0.66:.1f}"/>'
             )
         end = at(max(value, 0.0)) if math.isfinite(value) else at(0.0)
-        parts.append(f'<text class="value" x="{end + 7:.1f}" y="{middle + 4:.1f}">{escape(words)}</text>')
+        parts.append(f'<text class="value" x="{end + 7:.1f}" y="{middle + 4:.1f}">{escape(end_text)}</text>')
     if reference is not None:
         parts.append(f'<path class="level floor" d="M{at(reference):.1f} 0V{height}"/>')
     parts.append("</svg>")

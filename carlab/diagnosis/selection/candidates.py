@@ -10,7 +10,7 @@ import logging
 import math
 
 from carlab.core.quantities import FloatArray
-from carlab.diagnosis.decisions import Condition, Decision
+from carlab.diagnosis.decisions import Alternatives, Condition, Decision
 from carlab.diagnosis.identification.fit import Fitter, clustered_gain, design_effect_of
 from carlab.diagnosis.selection.problem import Candidate, Model, RunControl, SearchProblem
 from carlab.diagnosis.selection.refit import refit_candidate
@@ -90,23 +90,23 @@ def with_left_out_gain(
     return Candidate(candidate.effect, fit, candidate.gain, chi2, gain, error, loss)
 
 
-def acceptance(problem: SearchProblem, candidate: Candidate) -> tuple[tuple[Condition, ...], ...]:
+def acceptance(problem: SearchProblem, candidate: Candidate) -> Alternatives:
     """Alternative sets of conditions; a candidate is accepted if all conditions of one set hold."""
     settings = problem.settings.selection
     share = candidate.left_out_gain / problem.perfect_loss()
     ratio = candidate.left_out_gain / candidate.gain if candidate.gain > 0.0 else -math.inf
     extra = problem.required_chi2(candidate.effect) - settings.accept_chi2_min
-    holds_left_out = Condition("selection.accept_unseen_ratio", ratio, settings.accept_unseen_ratio)
+    holds_left_out = Condition("selection.accept_left_out_ratio", ratio, settings.accept_left_out_ratio)
     return (
         (
             holds_left_out,
             Condition("selection.accept_chi2_min", candidate.chi2 - extra, settings.accept_chi2_min),
-            Condition("selection.accept_unseen_share", share, settings.accept_unseen_share),
+            Condition("selection.accept_left_out_share", share, settings.accept_left_out_share),
         ),
         (
             holds_left_out,
             Condition("selection.steady_z_min", candidate.standard_errors, settings.steady_z_min),
-            Condition("selection.steady_unseen_share", share, settings.steady_unseen_share),
+            Condition("selection.steady_left_out_share", share, settings.steady_left_out_share),
         ),
     )
 

@@ -1,6 +1,6 @@
 """Forward selection along several paths.
 
-A greedy search can take a wrong turn: its first effect may be a proxy of two others. Where the greedy path has several
+The first effect of a greedy search may be a proxy of two others. Where the greedy path has several
 effects and leaves a part of the excess, other choices are followed to their end, and left-out blocks choose between the
 paths (limited discrepancy search, Harvey and Ginsberg 1995, with one deviation from the greedy choices).
 """

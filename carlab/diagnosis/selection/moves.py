@@ -47,10 +47,10 @@ def _swap(problem: SearchProblem, model: Model, reduced: Model, name: str, contr
     arguments = [(problem.without_refits(), model, reduced, screen, other, min_score) for other in others]
     for swap in control.workers.map(_fitted_swap, arguments, stop=control.ends_search):
         if swap is not None and swap[1] > settings.keep_chi2_min:
-            rival, chi2 = swap
-            log.info("%s replaces %s (chi2 %.1f)", rival.effect, name, chi2)
-            fit = rival.fit
-            return fit_with_scale(problem, (*reduced.effects, rival.effect), fit.config, fit.free, fit.z)
+            candidate, chi2 = swap
+            log.info("%s replaces %s (chi2 %.1f)", candidate.effect, name, chi2)
+            fit = candidate.fit
+            return fit_with_scale(problem, (*reduced.effects, candidate.effect), fit.config, fit.free, fit.z)
     return None
 
 
@@ -64,9 +64,9 @@ def _fitted_swap(
     screened = screen.score(other, effect_parameters(other, problem.nominal))
     if screened.score < min_score:
         return None
-    rival = refit_candidate(problem, reduced, screened)
-    design_effect = design_effect_of(problem.fitter(model.scale).with_covariance(rival.fit), other)
-    return rival, 2.0 * (model.fit.cost - rival.fit.cost) / design_effect
+    candidate = refit_candidate(problem, reduced, screened)
+    design_effect = design_effect_of(problem.fitter(model.scale).with_covariance(candidate.fit), other)
+    return candidate, 2.0 * (model.fit.cost - candidate.fit.cost) / design_effect
 
 
 __all__ = ["apply_moves"]

@@ -26,15 +26,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class PairwiseResult:
-    """Strength and rivals of each accepted effect.
+    """Strength and indistinguishable effects of each accepted effect.
 
-    chi2     twice the gain of the effect over its design effect
-    rivals   effects that left-out blocks do not distinguish from it, the nearest first
-    better   the confusable effect that predicts left-out blocks best, if it does so better than the effect
+    chi2               twice the gain of the effect over its design effect
+    indistinguishable  effects that left-out blocks do not distinguish from it, the nearest first
+    better             the confusable effect that predicts left-out blocks best, if it does so better than the effect
     """
 
     chi2: Mapping[str, float] = field(default_factory=dict)
-    rivals: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    indistinguishable: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     better: Mapping[str, Candidate] = field(default_factory=dict)
 
 
@@ -46,11 +46,11 @@ def choose_confusable(
     for _ in eliminated.model.effects:
         if not pairs.better or control.stop():
             break
-        name, rival = next(iter(pairs.better.items()))
-        log.info("%s replaces %s", rival.effect, name)
+        name, candidate = next(iter(pairs.better.items()))
+        log.info("%s replaces %s", candidate.effect, name)
         before = eliminated.model
-        effects = tuple(rival.effect if e == name else e for e in before.effects)
-        model = refit(problem, effects, rival.fit, before.scale)
+        effects = tuple(candidate.effect if e == name else e for e in before.effects)
+        model = refit(problem, effects, candidate.fit, before.scale)
         eliminated = EliminationResult(model, delete_each(problem, model, control))
         pairs = compare_pairs(problem, eliminated, control)
     return eliminated.model, pairs
@@ -63,24 +63,27 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
         return PairwiseResult()
     with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
     own_loss = left_out_loss(problem, model.fit, model.scale)
-    fitted = _fitted_rivals(problem, eliminated, control)
-    chi2, rivals, better = {}, {}, {}
+    fitted = _fitted_alternatives(problem, eliminated, control)
+    chi2, indistinguishable, better = {}, {}, {}
     for name in model.effects:
         gain = eliminated.deletions[name].without.cost - model.fit.cost
         chi2[name] = 2.0 * gain / design_effect_of(with_covariance, name)
         compared = []
-        for rival, loss in fitted[name]:
+        for candidate, loss in fitted[name]:
             difference, error = clustered_gain(loss, own_loss, problem.windows)
-            log.info("%s against %s: %.1f (%.1f standard errors)", name, rival.effect, difference, difference / error)
-            compared.append((difference, error, rival))
+            log.info(
+                "%s against %s: %.1f (%.1f standard errors)", name, candidate.effect, difference, difference / error
+            )
+            compared.append((difference, error, candidate))
         compared.sort(key=lambda each: each[0])
-        rivals[name] = tuple(r.effect for d, e, r in compared if d < settings.rival_z * e)[: settings.max_set_rivals]
-        if compared and compared[0][0] < -settings.better_rival_z * compared[0][1]:
+        close = [c.effect for d, e, c in compared if d < settings.indistinguishable_z * e]
+        indistinguishable[name] = tuple(close[: settings.max_indistinguishable])
+        if compared and compared[0][0] < -settings.replace_z_min * compared[0][1]:
             better[name] = compared[0][2]
-    return PairwiseResult(chi2, rivals, better)
+    return PairwiseResult(chi2, indistinguishable, better)
 
 
-def _fitted_rivals(
+def _fitted_alternatives(
     problem: SearchProblem, eliminated: EliminationResult, control: RunControl
 ) -> dict[str, list[tuple[Candidate, FloatArray]]]:
     """For each effect of a model, the confusable effects in its place that explain a similar part.
@@ -95,19 +98,19 @@ def _fitted_rivals(
         if other not in model.effects and problem.is_candidate(other)
     ]
     fitted = control.workers.map(
-        _fitted_rival,
+        _fitted_alternative,
         [(problem.without_refits(), model, eliminated.deletions[name].without, name, other) for name, other in pairs],
         stop=control.stop,
         started=lambda k: control.progress(f"comparing {pairs[k][0]} with {pairs[k][1]}", 0.95),
     )
     found: dict[str, list[tuple[Candidate, FloatArray]]] = {name: [] for name in model.effects}
-    for (name, _), rival in zip(pairs, fitted, strict=True):
-        if rival is not None:
-            found[name].append(rival)
+    for (name, _), candidate in zip(pairs, fitted, strict=True):
+        if candidate is not None:
+            found[name].append(candidate)
     return found
 
 
-def _fitted_rival(
+def _fitted_alternative(
     problem: SearchProblem, model: Model, without: Fit, name: str, other: str
 ) -> tuple[Candidate, FloatArray] | None:
     """Fit ``other`` in place of ``name``, with its loss on left-out blocks (S,); None if it explains too little."""
@@ -115,10 +118,10 @@ def _fitted_rival(
     reduced = Model(tuple(e for e in model.effects if e != name), without, model.scale)
     fitter, config = problem.fitter(model.scale), problem.config_with(reduced.effects)
     screen = Screen(fitter, config, without, screening.max_windows, screening)
-    rival = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
-    if rival.gain < problem.settings.selection.min_gain_share * (without.cost - model.fit.cost):
+    candidate = refit_candidate(problem, reduced, screen.score(other, effect_parameters(other, problem.nominal)))
+    if candidate.gain < problem.settings.selection.min_gain_share * (without.cost - model.fit.cost):
         return None
-    return rival, left_out_loss(problem, rival.fit, model.scale)
+    return candidate, left_out_loss(problem, candidate.fit, model.scale)
 
 
 def left_out_loss(problem: SearchProblem, fit: Fit, scale: Scale) -> FloatArray:

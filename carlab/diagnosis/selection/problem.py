@@ -138,22 +138,22 @@ class Candidate:
 class SearchResult:
     """Result of a search.
 
-    base              refit without effects
-    best              fit with the accepted effects
-    effects           accepted, the strongest first
-    chi2              chi2 of the removal of each accepted effect from ``best``
-    rivals            effects that left-out blocks do not distinguish from each accepted effect
-    history           (effect, fit) in the order of acceptance
-    first_candidates  candidates for the first effect
-    scale             error scale of ``best``
-    is_complete       whether the search ended by itself and was not cut short
+    base               refit without effects
+    best               fit with the accepted effects
+    effects            accepted, the strongest first
+    chi2               chi2 of the removal of each accepted effect from ``best``
+    indistinguishable  effects that left-out blocks do not distinguish from each accepted effect
+    history            (effect, fit) in the order of acceptance
+    first_candidates   candidates for the first effect
+    scale              error scale of ``best``
+    is_complete        whether the search ended by itself and was not cut short
     """
 
     base: Fit
     best: Fit
     effects: tuple[str, ...]
     chi2: Mapping[str, float]
-    rivals: Mapping[str, tuple[str, ...]]
+    indistinguishable: Mapping[str, tuple[str, ...]]
     history: tuple[tuple[str, Fit], ...]
     first_candidates: tuple[Candidate, ...]
     scale: Scale
@@ -166,7 +166,7 @@ class SearchResult:
 
     def without_effects(self) -> SearchResult:
         """The result with no accepted effect."""
-        return replace(self, best=self.base, effects=(), chi2={}, rivals={}, history=())
+        return replace(self, best=self.base, effects=(), chi2={}, indistinguishable={}, history=())
 
 
 @dataclass(frozen=True, slots=True)

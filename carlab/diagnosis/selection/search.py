@@ -34,7 +34,7 @@ def search(problem: SearchProblem, control: RunControl) -> SearchResult:
         model.fit,
         ordered,
         pairs.chi2,
-        pairs.rivals,
+        pairs.indistinguishable,
         path.history,
         greedy.first_candidates,
         model.scale,
@@ -49,7 +49,14 @@ def restrict(problem: SearchProblem, found: SearchResult, names: tuple[str, ...]
     model = refit(problem, names, found.best, found.scale)
     pairs = compare_pairs(problem, EliminationResult(model, delete_each(problem, model, control)), control)
     history = tuple((name, step) for name, step in found.history if name in names)
-    return replace(found, best=model.fit, effects=names, chi2=pairs.chi2, rivals=pairs.rivals, history=history)
+    return replace(
+        found,
+        best=model.fit,
+        effects=names,
+        chi2=pairs.chi2,
+        indistinguishable=pairs.indistinguishable,
+        history=history,
+    )
 
 
 __all__ = ["restrict", "search"]

@@ -148,7 +148,7 @@ def _conditions(replacement: _Replacement, z: float, settings: SelectionSettings
             Condition("selection.split_z_min", z, settings.split_z_min),
         )
     if len(replacement.new) == len(replacement.old):
-        return (Condition("selection.better_rival_z", z, settings.better_rival_z),)
+        return (Condition("selection.replace_z_min", z, settings.replace_z_min),)
     return (Condition("selection.keep_z_min", -z, settings.keep_z_min, above=False),)
 
 

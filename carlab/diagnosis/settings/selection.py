@@ -33,10 +33,7 @@ class ScreeningSettings:
 
 @dataclass(frozen=True, slots=True)
 class SelectionSettings:
-    """Joint refits, tests on left-out blocks, acceptance, moves, elimination and pairwise tests.
-
-    ``unseen`` in the name of a setting means left-out blocks; ``decisions.json`` has these names.
-    """
+    """Joint refits, tests on left-out blocks, acceptance, moves, elimination and pairwise tests."""
 
     max_refits: int = 10
     """Maximum number of candidates, by screening score, that are refitted together with the base parameters."""
@@ -54,16 +51,16 @@ class SelectionSettings:
     """Whitened errors on left-out blocks are clipped here [standard deviations], to limit the influence of one spin."""
     accept_chi2_min: float = 25.0
     """Minimum chi2 (twice the gain over the design effect) of an accepted effect with one parameter; well above the
-    usual limit of one test, because about 60 candidates are compared."""
+    usual limit of one test, because 37 candidates are compared."""
     accept_chi2_per_number: float = 8.0
     """Additional chi2 per additional parameter and for an infinite identity value."""
-    accept_unseen_share: float = 0.015
+    accept_left_out_share: float = 0.015
     """Minimum gain on left-out blocks of an accepted effect, as a share of the loss of a perfect simulator."""
-    accept_unseen_ratio: float = 0.3
+    accept_left_out_ratio: float = 0.3
     """Minimum gain on left-out blocks of an accepted effect, as a share of its gain on the fitted blocks."""
     steady_z_min: float = 3.0
-    """Alternative: minimum gain on left-out blocks [standard errors] together with ``steady_unseen_share``."""
-    steady_unseen_share: float = 0.03
+    """Alternative: minimum gain on left-out blocks [standard errors] together with ``steady_left_out_share``."""
+    steady_left_out_share: float = 0.03
     """Alternative: minimum gain on left-out blocks, as a share of the loss of a perfect simulator."""
     keep_chi2_min: float = 16.0
     """Minimum chi2 of an earlier effect after others were added, and minimum chi2 of a swap."""
@@ -103,16 +100,16 @@ class SelectionSettings:
     much weight to single windows, for example in a spin; the robust likelihood does not."""
     tie_z: float = 2.0
     """Another path replaces the greedy path if its loss on left-out blocks is lower by this [standard errors]."""
-    rival_z: float = 3.0
+    indistinguishable_z: float = 3.0
     """Two confusable effects are indistinguishable if their losses on left-out blocks, with free initial states, differ
     by less [standard errors]."""
-    better_rival_z: float = 1.0
+    replace_z_min: float = 1.0
     """A confusable effect replaces an effect if its loss on left-out blocks, with free initial states, is lower by this
     [standard errors]."""
     split_z_min: float = 2.0
     """An effect of each command replaces one effect of both commands if the loss on left-out blocks, with free initial
     states, is lower by this [standard errors], and if the gain is that of a further effect (``accept_chi2_min``)."""
-    max_set_rivals: int = 2
+    max_indistinguishable: int = 2
     """Maximum number of effects in ``indistinguishable_from`` of report.json."""
 
 

@@ -127,11 +127,11 @@ def _library(
 ) -> _Library | None:
     """Columns of all terms that change the errors, or None."""
     response = responses(windows, fit.config, scale, settings)
-    arms = _arms(fit.config)
+    yaw_per_side = _yaw_per_side_acceleration(fit.config)
     columns, labels = [], []
     for term in TERMS:
         vx, vy, rate = (screen.projected(response.of(term, k)) for k in range(3))
-        for channel, column in enumerate((vx, vy, rate, *(vy + arm * rate for arm in arms))):
+        for channel, column in enumerate((vx, vy, rate, *(vy + arm * rate for arm in yaw_per_side))):
             size = float(np.linalg.norm(column))
             if size > 1e-6:
                 columns.append(column / size)
@@ -164,7 +164,7 @@ def _select(
     return picked, gains
 
 
-def _arms(config: SimulatorConfig) -> tuple[float, float]:
+def _yaw_per_side_acceleration(config: SimulatorConfig) -> tuple[float, float]:
     """Yaw acceleration [rad/s2] by a side force of the front and of the rear axle that gives 1 m/s2."""
     values = config.values()
     per_inertia = values["vehicle.mass"] / values["vehicle.yaw_inertia"]
@@ -172,7 +172,12 @@ def _arms(config: SimulatorConfig) -> tuple[float, float]:
 
 
 def describe(
-    share: float, statement: str, formula: str, of_channel: FloatArray, size: FloatArray, seen: dict[str, FloatArray]
+    share: float,
+    statement: str,
+    formula: str,
+    channel_errors_sq: FloatArray,
+    window_errors: FloatArray,
+    features: dict[str, FloatArray],
 ) -> Unexplained:
     """Entry of the report for the unexplained residual.
 
@@ -180,17 +185,21 @@ def describe(
         share: unexplained share of the squared excess.
         statement: class of the missing physics.
         formula: formula of the missing accelerations.
-        of_channel: squared error of the missing physics in each channel (6,), in squared noise floors.
-        size: error of each held-out window (S,).
-        seen: features at the starts of the held-out windows, each (S,).
+        channel_errors_sq: squared error of the missing physics in each channel (6,), in squared noise floors.
+        window_errors: error of each held-out window (S,) [noise floors].
+        features: features at the starts of the held-out windows, each (S,).
     """
-    order = np.argsort(-of_channel)
-    channels = tuple(STATE_NAMES[k] for k in order if of_channel[k] > 0.5 * of_channel[order[0]])
-    return Unexplained(share, channels, worst_regime(seen, size), statement, formula)
+    order = np.argsort(-channel_errors_sq)
+    channels = tuple(STATE_NAMES[k] for k in order if channel_errors_sq[k] > 0.5 * channel_errors_sq[order[0]])
+    return Unexplained(share, channels, worst_regime(features, window_errors), statement, formula)
 
 
 def start_features(windows: PredictionWindows) -> dict[str, FloatArray]:
-    """Speeds, yaw rate, commands and their rates, and time at the start of each window (S,)."""
+    """Features at the start of each window (S,).
+
+    v, w, r: vx, vy [m/s], yaw rate [rad/s]; d, u: steering, throttle; dd, du: their rates [1/s]; t: time as a share of
+    the recording.
+    """
     past = windows.past_commands[:, -max(round(0.1 / windows.period_s), 2) :]
     span = past.shape[1] * windows.period_s
     return {
@@ -217,14 +226,20 @@ REGIMES: tuple[tuple[str, str, Callable[[dict[str, FloatArray]], FloatArray]], .
 
 
 def worst_regime(
-    seen: dict[str, FloatArray], size: FloatArray, settings: UnexplainedSettings = DEFAULT.unexplained
+    features: dict[str, FloatArray], window_errors: FloatArray, settings: UnexplainedSettings = DEFAULT.unexplained
 ) -> str:
-    """The feature whose upper third has the largest errors, as a rule such as ``speed > 2 m/s``."""
+    """The feature whose upper third has the largest errors, as a rule such as ``speed > 2 m/s``.
+
+    Args:
+        features: from ``start_features``, each (S,).
+        window_errors: error of each window (S,).
+        settings: settings of the regimes.
+    """
     best, text = 1.0, "everywhere alike"
     for name, unit, value in REGIMES:
-        feature = value(seen)
+        feature = value(features)
         limit = float(np.quantile(feature, settings.regime_quantile))
-        high, low = size[feature > limit], size[feature <= limit]
+        high, low = window_errors[feature > limit], window_errors[feature <= limit]
         if min(len(high), len(low)) < settings.regime_windows_min:
             continue
         ratio = float(np.sqrt(np.mean(high**2)) / (np.sqrt(np.mean(low**2)) + 1e-9))

@@ -35,7 +35,7 @@ from carlab.experiment.campaign.prior_correction_process import (
     read_version,
     run_correction_subprocess,
 )
-from carlab.experiment.campaign.quick_check import QuickCheck, check_path, run_check_subprocess
+from carlab.experiment.campaign.quick_check import EpisodeCheck, check_path, run_check_subprocess
 from carlab.experiment.campaign.training import Progress, model_folder, training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan, plan_as_json, plan_from_json
 from carlab.experiment.campaign.training_process import Trainer, train_in_subprocess
@@ -109,7 +109,7 @@ class CampaignHooks:
     on_learned: Callable[[dict[str, Any]], None] = lambda figures: None
     on_figures: Callable[[EpisodeFigures], None] = lambda figures: None
     on_checking: Callable[[], None] = lambda: None
-    on_check: Callable[[QuickCheck], None] = lambda check: None
+    on_check: Callable[[EpisodeCheck], None] = lambda check: None
     on_correcting: Callable[[], None] = lambda: None
     on_prior: Callable[[PriorVersion], None] = lambda version: None
     stop: Callable[[], bool] = lambda: False

@@ -15,7 +15,7 @@ from carlab.core.episode_data import EpisodeData
 from carlab.core.observation import decode_state
 from carlab.core.quantities import FloatArray
 from carlab.core.task import Task
-from carlab.experiment.campaign.quick_check import QuickCheck
+from carlab.experiment.campaign.quick_check import EpisodeCheck
 from carlab.experiment.episodes.session import EpisodeResult
 from carlab.prediction.learned import sample_paths
 from learning.world.car_dynamics import OneStep
@@ -95,7 +95,7 @@ class EpisodeFigures:
         row = asdict(self)
         return _with_null({**row, "task_figures": _with_null(row["task_figures"])})
 
-    def with_check(self, check: QuickCheck) -> EpisodeFigures:
+    def with_check(self, check: EpisodeCheck) -> EpisodeFigures:
         """Copy with the result of a quick check."""
         text = " ".join(check.sentences)
         return replace(self, verdict=check.verdict, excess=check.excess, excess_std=check.excess_std, diagnosis=text)

@@ -22,7 +22,7 @@ from carlab.core.documents import Document, EpisodeStarted, Tick
 from carlab.core.errors import CarlabError
 from carlab.experiment.campaign.child_process import interrupts_blocked
 from carlab.experiment.campaign.figures import EpisodeFigures
-from carlab.experiment.campaign.quick_check import QuickCheck
+from carlab.experiment.campaign.quick_check import EpisodeCheck
 from carlab.experiment.campaign.run_recording import TICKS_BETWEEN_PATHS, LearnedDriver, add_windows
 from carlab.recording.rerun.blueprint import LOG, send_blueprint
 from carlab.recording.rerun.run_recording import RunRecording, episode_number
@@ -79,7 +79,7 @@ class LiveView:
         self._queue: Queue[Any] = context.Queue(capacity)
         self._process = context.Process(target=show, args=(settings, self._queue), daemon=True, name="live view")
 
-    def emit(self, message: Document | EpisodeFigures | QuickCheck) -> None:
+    def emit(self, message: Document | EpisodeFigures | EpisodeCheck) -> None:
         """Pass a document of the control loop, or figures or a quick check of the newest episode."""
         try:
             self._queue.put_nowait(message)
@@ -165,7 +165,7 @@ class _LiveWriter:
         self._row: EpisodeFigures | None = None
         self._activity = ""
 
-    def write(self, message: Document | EpisodeFigures | QuickCheck | Activity) -> None:
+    def write(self, message: Document | EpisodeFigures | EpisodeCheck | Activity) -> None:
         """Write a document, figures, a quick check or an activity."""
         match message:
             case Activity():
@@ -174,7 +174,7 @@ class _LiveWriter:
                     self._recording.documents.text(LOG, message.name)
             case EpisodeFigures():
                 self._write_figures(message)
-            case QuickCheck():
+            case EpisodeCheck():
                 if self._row is not None and self._row.episode == message.episode:
                     row = self._row.with_check(message)
                     self._recording.add_figures(row.episode, row.to_dict(), row.diagnosis)

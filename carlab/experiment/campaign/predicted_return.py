@@ -30,9 +30,9 @@ QUANTILES = (0.05, 0.5, 0.95)
 FIRST_DRAWN_SHARE = 0.5
 """Weight of the drawn cars without recordings; with n episodes it is divided by (n + 1)**2. With equal weights the
 90 % intervals contained all of 36 returns (docs/results/learning.md)."""
-MORE_TICKS = (1.5, 2.0, 3.0)
+LONGER_EPISODE_FACTORS = (1.5, 2.0, 3.0)
 """Lengths of longer drives in the learned car, in lengths of an episode."""
-ENOUGH_SUCCESS = 0.5
+MIN_SUCCESS_SHARE = 0.5
 """Share of drives in the learned car that must succeed for the length of a drive to count as sufficient."""
 
 
@@ -66,10 +66,10 @@ def predicted_figures(
         cars = drawn_cars.draw_cars(prior, N_DRAWN, torch.Generator().manual_seed(seed))
         cars = drawn_cars.select_cars(cars, episodes, N_SELECTED)
         task = plan.task.resized(drawn_cars.HISTORY)
-        world = model_env.ModelEnv(
+        environment = model_env.ModelEnv(
             cars, task, N_SELECTED, envelope=envelope, period_s=prior.control_period_s, seed=seed
         )
-        totals.append(world.roll_out(lambda seen: agent.act(_own_features(seen, plan.history))).returns.numpy())
+        totals.append(environment.roll_out(lambda seen: agent.act(_own_features(seen, plan.history))).returns.numpy())
         drawn_share = FIRST_DRAWN_SHARE / (len(episodes) + 1) ** 2
         shares = [1.0 - drawn_share, drawn_share]
     weights = np.concatenate([np.full(len(t), w / len(t)) for t, w in zip(totals, shares, strict=True)])
@@ -89,10 +89,10 @@ def _own_features(seen: NDArray[np.float32], history: int) -> NDArray[np.float32
 def _sufficient_ticks(plan: TrainingPlan, agent: SacAgent, learned: ModelEnv) -> dict[str, Any]:
     """``needed_ticks`` if the policy parks the learned car only in longer drives than an episode; empty otherwise."""
     ticks = plan.task.max_ticks
-    for factor in (1.0, *MORE_TICKS):
+    for factor in (1.0, *LONGER_EPISODE_FACTORS):
         length = round(factor * ticks)
         ends = learned.roll_out(agent.act, max_ticks=length).final
-        if float(plan.task.success(ends).float().mean()) >= ENOUGH_SUCCESS:
+        if float(plan.task.success(ends).float().mean()) >= MIN_SUCCESS_SHARE:
             return {} if length == ticks else {"needed_ticks": length}
     return {}
 

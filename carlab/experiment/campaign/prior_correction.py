@@ -1,4 +1,4 @@
-"""Correction of the simulator prior between episodes: what the recordings support enters, what they contradict leaves.
+"""Correction of the simulator prior between episodes: effects and parameters are added or removed by their evidence.
 
 The prior is the car file's simulator with corrections. After each episode the corrections are tested on the newest
 episode, which none of them was fitted to. If the quick check finds that the prior does not explain the recordings, its
@@ -209,7 +209,7 @@ def _by_check(before: PriorVersion, car: SimulatorConfig, found: Findings) -> tu
 
 
 def _entry(found: Findings) -> Correction | None:
-    """The likeliest usable cause of the quick check as a correction; None if the prior explains the recordings."""
+    """The most likely usable cause of the quick check as a correction; None if the prior explains the recordings."""
     causes = found.check.get("causes") or ()
     likely = [c for k, c in enumerate(causes) if k == 0 or c["like_the_first"]]
     usable = [c for c in likely if _is_usable(c)]

@@ -28,7 +28,7 @@ MIN_DIAGNOSIS_EPISODES = 4
 
 
 @dataclass(frozen=True, slots=True)
-class QuickCheck:
+class EpisodeCheck:
     """Result of a quick check: verdict, excess over the noise floor with its standard error, and messages."""
 
     episode: int
@@ -39,7 +39,7 @@ class QuickCheck:
     short: str
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> QuickCheck:
+    def from_dict(cls, content: Mapping[str, Any]) -> EpisodeCheck:
         """Read the content of a file. Raises KeyError, TypeError or ValueError for other content."""
         excess, excess_std = (
             float("nan") if content[k] is None else float(content[k]) for k in ("excess", "score_std")
@@ -55,7 +55,7 @@ def check_path(run: RunDirectory, episode: int) -> Path:
 
 def run_check_subprocess(
     run: RunDirectory, simulator: SimulatorConfig, stop: Callable[[], bool] = lambda: False
-) -> QuickCheck | None:
+) -> EpisodeCheck | None:
     """Check all recordings so far against the simulator, in another process; None if it was stopped.
 
     The result is written to the model folder of the last episode, the simulator to ``simulator.toml`` of the run.
@@ -75,7 +75,7 @@ def run_check_subprocess(
         else:
             log.warning("The quick check of episode %d failed: %s", number, error)
             result = _failed(f"its process failed ({error})")
-    return None if result is None else QuickCheck.from_dict(_saved(path, number, result))
+    return None if result is None else EpisodeCheck.from_dict(_saved(path, number, result))
 
 
 def _check(run: Path, recordings: list[Path], simulator_toml: str) -> dict[str, Any]:
@@ -126,4 +126,4 @@ def _saved(path: Path, episode: int, result: dict[str, Any]) -> dict[str, Any]:
     return content
 
 
-__all__ = ["CHECK_FILE", "SIMULATOR_FILE", "QuickCheck", "check", "check_path", "next_step", "run_check_subprocess"]
+__all__ = ["CHECK_FILE", "SIMULATOR_FILE", "EpisodeCheck", "check", "check_path", "next_step", "run_check_subprocess"]

@@ -9,7 +9,7 @@ from carlab.core.json_files import read_json
 from carlab.core.task import Task
 from carlab.experiment.campaign.figures import EpisodeFigures, figures_of
 from carlab.experiment.campaign.picture import draw
-from carlab.experiment.campaign.quick_check import QuickCheck
+from carlab.experiment.campaign.quick_check import EpisodeCheck
 from carlab.experiment.campaign.run_recording import write_run_recording
 from carlab.experiment.campaign.training import training_figures
 from carlab.experiment.campaign.training_plan import TrainingPlan
@@ -54,7 +54,7 @@ def restore_missing_rows(run: RunDirectory, task: Task) -> None:
             log.warning("The row of episode %d in %s cannot be restored: %s", number, CURVE_FILE, error)
 
 
-def save_check(run: RunDirectory, check: QuickCheck) -> None:
+def save_check(run: RunDirectory, check: EpisodeCheck) -> None:
     """Add a quick check to the row of its episode; without a row, do nothing."""
     for row in learning_curve(run):
         if row.episode == check.episode:

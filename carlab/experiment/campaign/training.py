@@ -133,12 +133,12 @@ def train(
     figures["model_seconds"] = clock.now_s() - began_s
 
     began_s = clock.now_s()
-    worlds = _worlds(plan, dynamics, usable, envelope, seed)
+    environments = _environments(plan, dynamics, usable, envelope, seed)
     agent, policy_figures = _trained_policy(
-        plan, *worlds, None if earlier_car is None else earlier, plan.updates_before(number), progress
+        plan, *environments, None if earlier_car is None else earlier, plan.updates_before(number), progress
     )
     figures |= {**policy_figures, "policy_seconds": clock.now_s() - began_s}
-    figures |= predicted_figures(plan, agent, worlds[1], usable, envelope, seed)
+    figures |= predicted_figures(plan, agent, environments[1], usable, envelope, seed)
 
     def write(folder: Path) -> None:
         save_car(dynamics, folder / DYNAMICS_FILE)
@@ -172,7 +172,7 @@ def _history_figures(episodes: list[EpisodeData], progress: Progress) -> dict[st
     return {} if choice is None else {"supported_history": choice.history, "history_message": choice.message()}
 
 
-def _worlds(
+def _environments(
     plan: TrainingPlan, dynamics: LearnedCar, episodes: list[EpisodeData], envelope: SafetyEnvelope, seed: int
 ) -> tuple[ModelEnv, ModelEnv]:
     """Environments of the learned car for training and for evaluation; the latter has the task's reward alone."""
@@ -194,13 +194,13 @@ def _worlds(
 
 
 def _trained_policy(
-    plan: TrainingPlan, world: ModelEnv, evaluation: ModelEnv, earlier: Path | None, updates: int, progress: Progress
+    plan: TrainingPlan, training: ModelEnv, evaluation: ModelEnv, earlier: Path | None, updates: int, progress: Progress
 ) -> tuple[SacAgent, dict[str, Any]]:
     """Train a policy, starting from the previous one if it exists; returns the policy and its figures.
 
     Args:
         plan: settings of the run.
-        world: environment of the training.
+        training: environment of the training.
         evaluation: environment of the evaluation, which selects the best policy.
         earlier: folder of the previous policy.
         updates: gradient steps.
@@ -223,7 +223,9 @@ def _trained_policy(
             agent = SacAgent.load(earlier, settings, plan.seed, plan.device)
             agent.widen(feature_size(plan.history))
         progress("learning to drive", 0, updates)
-        figures.update(agent.train(world, updates, lambda done: progress("learning to drive", done, updates), evaluate))
+        figures.update(
+            agent.train(training, updates, lambda done: progress("learning to drive", done, updates), evaluate)
+        )
         return agent
 
     agent = _with_smaller_steps(trained, "policy")
@@ -271,7 +273,7 @@ def _fitted(
 
     def fitted(rate_factor: float) -> LearnedCar:
         scaled = replace(settings, learning_rate=rate_factor * settings.learning_rate)
-        car = fit_car(rows, model, scaled, before=earlier, progress=report_step, device=plan.device)
+        car = fit_car(rows, model, scaled, earlier=earlier, progress=report_step, device=plan.device)
         return _fitted_to_rollouts(car, episodes, rows, scaled, rate_factor, progress)
 
     return _with_smaller_steps(fitted, "model")

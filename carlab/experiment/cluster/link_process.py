@@ -14,7 +14,7 @@ from typing import Protocol
 from carlab.core.clock import MonotonicClock
 from carlab.experiment.cluster.link_protocol import LinkEvent, LinkRequest
 
-CHUNK = 1 << 16
+READ_BYTES = 1 << 16
 PROGRAM = (sys.executable, "-m", "carlab.experiment.cluster.link")
 END_TIMEOUT_S = 4.0
 
@@ -87,7 +87,7 @@ class LinkProcess:
             readable, _, _ = select.select([self._process.stdout], [], [], max(0.0, end_s - clock.now_s()))
             if not readable:
                 return None
-            chunk = os.read(self._process.stdout.fileno(), CHUNK)
+            chunk = os.read(self._process.stdout.fileno(), READ_BYTES)
             if not chunk:
                 self.cut()
                 return LinkEvent("unreachable", "the process of the link ended")

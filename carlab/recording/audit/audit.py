@@ -208,32 +208,32 @@ def _check_commands(channels: Channels, motion: PoseMotion, mapping: ColumnMappi
         command = np.nan_to_num(channels.values[channel])
         if channel == "throttle" and mapping.throttle_gate:
             command = command * channels.extra[mapping.throttle_gate]
-        answer = command_response(grid, channels.t_s, command, channel)
+        response = command_response(grid, channels.t_s, command, channel)
         effect = EFFECTS[channel]
-        evidence = {} if answer is None else _command_evidence(channel, channels.t_s, command, motion, answer)
-        if answer is None or answer.best < LIMITS.command_explained[index]:
+        evidence = {} if response is None else _command_evidence(channel, channels.t_s, command, motion, response)
+        if response is None or response.best < LIMITS.command_explained[index]:
             if np.ptp(command) > MIN_COMMAND_RANGE and grid.rows.sum() >= MIN_ROWS:
                 sentence = f"{channel.capitalize()} explains too little of {effect}: its sign is unknown."
                 findings.append(Finding("unclear_sign", channel, Severity.INFO, sentence, evidence=evidence))
-        elif answer.gain < 0 and answer.lag_s > -LIMITS.early_response_s:
-            fault = wrong_command_sign(channel, answer, evidence)
+        elif response.gain < 0 and response.lag_s > -LIMITS.early_response_s:
+            fault = wrong_command_sign(channel, response, evidence)
             findings.append(Finding.of_fault(fault, remedy=SIGN_REMEDIES[channel]))
-        elif answer.is_lag_inside:  # at the edge, the drive does not show the delay
+        elif response.is_lag_inside:  # at the edge, the drive does not show the delay
             delay_s = evidence["delay_s"]
             sentence = (
                 f"{effect[0].upper()}{effect[1:]} {'follows' if delay_s >= 0 else 'precedes'} {channel} by about "
-                f"{abs(delay_s):.2f} s ({answer.best:.0%} explained), delay, servo or motor and tyres together."
+                f"{abs(delay_s):.2f} s ({response.best:.0%} explained), delay, servo or motor and tyres together."
             )
             findings.append(Finding("command_delay", channel, Severity.INFO, sentence, evidence=evidence))
     return findings
 
 
 def _command_evidence(
-    channel: str, t_s: FloatArray, command: FloatArray, motion: PoseMotion, answer: CommandResponse
+    channel: str, t_s: FloatArray, command: FloatArray, motion: PoseMotion, response: CommandResponse
 ) -> dict[str, float]:
     """Delay with the time constant [s], gain, share explained, and correlations of the delayed command (N,)."""
-    delay_s = answer.lag_s + answer.time_constant_s
-    evidence = {"explained": answer.best, "gain": answer.gain, "delay_s": delay_s}
+    delay_s = response.lag_s + response.time_constant_s
+    evidence = {"explained": response.best, "gain": response.gain, "delay_s": delay_s}
     held = held_at(t_s, command, delay_s)
     moving = np.abs(motion.vx) > LIMITS.moving_mps
     if channel == "throttle":

@@ -1,1 +1,1 @@
-"""Fault detection on arrays, one module a concept: stamps, pose, heading, velocity columns, commands."""
+"""Fault detection on arrays, one module per concept: stamps, pose, heading, velocity columns, commands."""

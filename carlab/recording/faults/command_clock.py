@@ -37,23 +37,23 @@ class WindowLags:
 def window_lags(responses: Sequence[CommandResponse | None]) -> WindowLags:
     """Delays of steering and throttle in windows of a recording."""
     parts = []
-    for channel, answer in enumerate(responses):
-        if answer is None or answer.best < LIMITS.command_explained[channel]:
+    for channel, response in enumerate(responses):
+        if response is None or response.best < LIMITS.command_explained[channel]:
             continue
-        number = ((answer.t_s - answer.t_s[0]) / WINDOW_S).astype(np.int64)
+        number = ((response.t_s - response.t_s[0]) / WINDOW_S).astype(np.int64)
         times, lags = [], []
         for k in np.unique(number):
             rows = number == k
             if rows.sum() < MIN_WINDOW_ROWS:
                 continue
-            target = answer.target[rows] - answer.target[rows].mean()
-            predicted = answer.predicted[:, rows]
+            target = response.target[rows] - response.target[rows].mean()
+            predicted = response.predicted[:, rows]
             predicted = predicted - predicted.mean(axis=1, keepdims=True)
             product = np.maximum(predicted @ target, 0.0)
             power = np.einsum("lr,lr->l", predicted, predicted)
             explained = product**2 / np.maximum(power, 1e-12) / max(float(target @ target), 1e-12)
             if explained.max() >= 0.4 and 0 < np.argmax(explained) < len(explained) - 1:
-                times.append(float(answer.t_s[rows].mean()))
+                times.append(float(response.t_s[rows].mean()))
                 lags.append(parabola_minimum(LAGS_S, -explained))
         if len(lags) >= 4:
             lag, when = np.array(lags), np.array(times)

@@ -37,7 +37,7 @@ class CommandResponse:
         time_constant_s: of the first-order lag there [s].
         gain: slope of the explained part over the command: [rad/m] for steering, [m/s^2] for throttle.
         t_s: stamps of the rows used (n,).
-        target: yaw rate or acceleration there (n,), without what the speed explains.
+        target: yaw rate or acceleration there (n,), residual of its regression on the speed.
         predicted: the same by the command at each lag (L, n), with the coefficients of the best lag.
     """
 
@@ -96,15 +96,15 @@ def grid_motion(t_s: FloatArray, motion: PoseMotion, segment: FloatArray) -> Gri
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """Regression of the motion on functions of a delayed command; ``base`` (n, b) is what the speed explains."""
+    """Regression of the motion on functions of a delayed command; ``base`` (n, b) are functions of the speed."""
 
     motion: GridMotion
     channel: str
     rows: np.ndarray
     base: FloatArray
 
-    def remainder(self, values: FloatArray) -> FloatArray:
-        """Values (n,) or (n, k) without what the speed explains."""
+    def without_base(self, values: FloatArray) -> FloatArray:
+        """Residuals of values (n,) or (n, k) in the regression on ``base``."""
         result: FloatArray = values - self.base @ (self.base.T @ values)
         return result
 
@@ -113,14 +113,14 @@ class _Regression:
         return np.asarray(np.interp(self.motion.t_s[self.rows] - lag_s, self.motion.t_s, filtered))
 
     def terms(self, command: FloatArray) -> FloatArray:
-        """Functions (n, k) of the command (n,), without what the speed explains."""
+        """Functions (n, k) of the command (n,), as residuals of the regression on ``base``."""
         size = np.abs(command)
         if self.channel == "throttle":
-            return self.remainder(np.column_stack([command, command * size, command * size * size]))
+            return self.without_base(np.column_stack([command, command * size, command * size * size]))
         vx = self.motion.vx[self.rows]
         product = command * vx
         terms = [product, product * size * size, product * np.abs(vx), product * size]
-        return self.remainder(np.column_stack(terms))
+        return self.without_base(np.column_stack(terms))
 
 
 def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, channel: str) -> CommandResponse | None:
@@ -134,7 +134,7 @@ def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, c
     if channel == "throttle":
         columns += [rate**2, np.abs(rate), np.abs(rate * vx)]
     fit = _Regression(motion, channel, rows, np.linalg.qr(np.column_stack(columns))[0])
-    target = fit.remainder(rate if channel == "steering" else motion.acceleration[rows])
+    target = fit.without_base(rate if channel == "steering" else motion.acceleration[rows])
     total = float(target @ target)
     if total < 1e-9:
         return None
@@ -157,16 +157,16 @@ def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, c
     filtered = first_order_lag(smooth, motion.period_s, time_constant)
     predicted = np.stack([fit.terms(fit.delayed(filtered, lag_s)) @ coefficients for lag_s in LAGS_S])
     command_there = fit.delayed(filtered, lag)
-    lever = fit.remainder(command_there * vx if channel == "steering" else command_there)
+    lever = fit.without_base(command_there * vx if channel == "steering" else command_there)
     gain = float(predicted[int(np.argmin(np.abs(LAGS_S - lag)))] @ lever) / (float(lever @ lever) + 1e-18)
     lag_s = parabola_minimum(LAGS_S, -explained)
     return CommandResponse(explained, lag_s, time_constant, gain, motion.t_s[rows], target, predicted)
 
 
-def wrong_command_sign(channel: str, answer: CommandResponse, evidence: Mapping[str, float] | None = None) -> Fault:
+def wrong_command_sign(channel: str, response: CommandResponse, evidence: Mapping[str, float] | None = None) -> Fault:
     """The fault of a command that the motion follows the other way round."""
     effect = "turns right" if channel == "steering" else "is driven backward"
-    observation = f"with positive {channel} the car {effect} (this explains {answer.best:.0%} of the motion)"
+    observation = f"with positive {channel} the car {effect} (this explains {response.best:.0%} of the motion)"
     return Fault("wrong_sign", channel, observation, evidence or {}, f"--{channel}-sign -1")
 
 

@@ -1,4 +1,4 @@
-"""A fault as the detection returns it; the audit and the diagnosis say what is done about it."""
+"""A fault of a recording, as the detection returns it. Audit and diagnosis decide about its repair."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Fault:
     """One fault of a recording.
 
     Attributes:
-        id: what it is, as in reports.
+        id: kind of the fault, as in reports.
         channel: the columns that it touches.
         observation: one clause without full stop.
         evidence: numbers by name, in SI units.

@@ -83,7 +83,7 @@ class ColumnFit:
     Attributes:
         scale: in the column's unit over the reference's.
         lag_s: dead time [s].
-        unexplained: mean square of the remainder over that of the column, without the 5 % of rows that fit worst.
+        unexplained: mean square of the residual over that of the column, without the 5 % of rows that fit worst.
         unexplained_unshifted: the same without filter and dead time.
         rms: root mean square of the column.
         prediction: scale * filtered reference(t - lag), (N,).
@@ -97,8 +97,8 @@ class ColumnFit:
     prediction: FloatArray
 
     @property
-    def remainder(self) -> float:
-        """Root mean square of the remainder, in the column's unit."""
+    def residual_rms(self) -> float:
+        """Root mean square of the residual, in the column's unit."""
         return self.rms * math.sqrt(self.unexplained)
 
 

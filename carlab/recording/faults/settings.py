@@ -1,4 +1,4 @@
-"""Thresholds of the fault detection, one a concept, with unit and reason."""
+"""Thresholds of the fault detection, one per concept, with unit and reason."""
 
 from __future__ import annotations
 

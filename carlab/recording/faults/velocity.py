@@ -165,7 +165,7 @@ def velocity_lag(channel: str, period_s: float, fit: ColumnFit) -> Fault | None:
     evidence: Mapping[str, float] = {
         "lag_s": fit.lag_s,
         "rows": rows,
-        "remainder": fit.remainder,
+        "remainder": fit.residual_rms,
         "remainder_unshifted": fit.rms * math.sqrt(fit.unexplained_unshifted),
     }
     verb = "lag" if "," in channel else "lags"

@@ -48,7 +48,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """One panel a figure, one line a method, a band of one standard error about each.
+    """One panel per figure, one line per method, with a band of one standard error.
 
     Fits that failed are left out; at least one must have succeeded. A method has the same colour in every picture.
     Values far above the others are arrows at the upper edge with their number.

@@ -74,7 +74,7 @@ def recorded_case(recordings: Sequence[Sequence[EpisodeData]], car: Path, histor
 
     Raises:
         ConfigError: the recordings were made with another control period than the car's file has.
-        DataError: fewer than two recordings, or too short to tell the history.
+        DataError: fewer than two recordings, or too short to estimate the history.
     """
     if len(recordings) < 2:
         raise DataError("The study of the real car needs at least two recordings; the last one is held out.")

@@ -1,4 +1,4 @@
-"""Memory of a simulator's errors: the expected error of a prediction from errors of the past in similar states.
+"""Local model of a simulator's errors: the expected error of a prediction from errors of the past in similar states.
 
 A Gaussian process over the state of the car (body velocities and commands) with a squared exponential kernel predicts
 the error along a window. Each prediction uses the nearest windows of the past only (local Gaussian process regression:
@@ -29,7 +29,7 @@ BATCH = 128
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorMemory:
+class LocalErrorModel:
     """Simulator corrected by its errors in similar states of the past.
 
     Attributes:
@@ -102,15 +102,15 @@ def _weights(
 ) -> FloatArray:
     """Weights (s, N) of past errors in the posterior mean at ``states`` (s, 7); 0 where they are not ``known``."""
     distance_sq = np.where(known, cdist(states, past_states, "sqeuclidean"), np.inf)
-    count = min(settings.memory_neighbours, len(past_states))
+    count = min(settings.local_neighbours, len(past_states))
     nearest = np.argpartition(distance_sq, count - 1, axis=1)[:, :count]
-    kernel = np.exp(-0.5 * np.take_along_axis(distance_sq, nearest, axis=1) / settings.memory_length**2)
+    kernel = np.exp(-0.5 * np.take_along_axis(distance_sq, nearest, axis=1) / settings.local_length**2)
     chosen = past_states[nearest]
     between = np.sum((chosen[:, :, None] - chosen[:, None]) ** 2, axis=-1)
-    covariance = np.exp(-0.5 * between / settings.memory_length**2) + settings.memory_noise * np.eye(count)
+    covariance = np.exp(-0.5 * between / settings.local_length**2) + settings.local_noise * np.eye(count)
     weights = np.zeros(distance_sq.shape)
     used = np.isfinite(np.take_along_axis(distance_sq, nearest, axis=1))
-    covariance = np.where(used[:, :, None] & used[:, None], covariance, (1.0 + settings.memory_noise) * np.eye(count))
+    covariance = np.where(used[:, :, None] & used[:, None], covariance, (1.0 + settings.local_noise) * np.eye(count))
     np.put_along_axis(weights, nearest, np.linalg.solve(covariance, kernel[..., None])[..., 0], axis=1)
     return weights
 

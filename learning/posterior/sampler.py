@@ -50,7 +50,7 @@ class Assignment:
 
 
 @dataclass(frozen=True, slots=True)
-class Draws:
+class PosteriorSampler:
     """Sampler of a posterior; units, decorrelation and correlation are precomputed in its matrices.
 
     Attributes:
@@ -68,7 +68,7 @@ class Draws:
     scales: Tensor
 
     @classmethod
-    def of(cls, posterior: ParticlePosterior) -> Draws:
+    def of(cls, posterior: ParticlePosterior) -> PosteriorSampler:
         """Create the sampler of a posterior, on its device."""
         noise = posterior.noise_std.double().diag()
         if posterior.correlation is not None:
@@ -144,4 +144,4 @@ def _to_raw(posterior: ParticlePosterior) -> Tensor:
     return to_raw
 
 
-__all__ = ["Assignment", "Draws", "with_raw_outputs"]
+__all__ = ["Assignment", "PosteriorSampler", "with_raw_outputs"]

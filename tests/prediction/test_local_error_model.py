@@ -1,4 +1,4 @@
-"""Memory of errors: the Gaussian process against its closed form, and errors that depend on the state."""
+"""Local error model: the Gaussian process against its closed form, and errors that depend on the state."""
 
 from dataclasses import replace
 
@@ -7,8 +7,8 @@ import pytest
 
 from carlab.prediction.adaptation import adapt, choose_noise
 from carlab.prediction.adaptation_settings import AdaptationSettings
-from carlab.prediction.error_memory import _weights
 from carlab.prediction.errors import final_errors
+from carlab.prediction.local_error_model import _weights
 from carlab.prediction.predict import SimulatorModel
 from carlab.prediction.windows import cut_windows, segments_of
 from sim_backends import SimulatorConfig
@@ -18,7 +18,7 @@ CONFIG = SimulatorConfig(control_period_s=PERIOD_S)
 
 
 def test_weights_give_the_posterior_mean_of_known_windows():
-    """With at most ``memory_neighbours`` known windows the local process is the whole one."""
+    """With at most ``local_neighbours`` known windows the local process is the whole one."""
     settings = AdaptationSettings()
     rng = np.random.default_rng(0)
     states, past = rng.normal(size=(5, 7)), rng.normal(size=(25, 7))
@@ -26,12 +26,12 @@ def test_weights_give_the_posterior_mean_of_known_windows():
     errors = rng.normal(size=25)
 
     def kernel(a, b):
-        return np.exp(-0.5 * ((a[:, None] - b[None]) ** 2).sum(axis=-1) / settings.memory_length**2)
+        return np.exp(-0.5 * ((a[:, None] - b[None]) ** 2).sum(axis=-1) / settings.local_length**2)
 
     found = _weights(states, past, known, settings) @ errors
     for k in range(5):
         own = past[known[k]]
-        total = kernel(own, own) + settings.memory_noise * np.eye(len(own))
+        total = kernel(own, own) + settings.local_noise * np.eye(len(own))
         assert found[k] == pytest.approx(kernel(states[k : k + 1], own)[0] @ np.linalg.solve(total, errors[known[k]]))
 
 

@@ -24,7 +24,7 @@ REPORTED_FAULTS = (
 
 
 @dataclass(slots=True)
-class Material:
+class LoadedRecordings:
     """Episodes with the names of their recordings and data faults; ``notes`` are sentences about conversions."""
 
     episodes: list[EpisodeData] = field(default_factory=list)
@@ -111,16 +111,16 @@ def _path_of(item: RecordingLike) -> Path | None:
     return item.path if isinstance(item, Recording) else item if isinstance(item, Path) else None
 
 
-def read_material(items: list[RecordingLike], role: str, latency_s: float) -> Material:
+def load_recordings(items: list[RecordingLike], role: str, latency_s: float) -> LoadedRecordings:
     """Read episodes for a diagnosis: CSV files are repaired, states of MCAP files get one known age."""
-    material = Material()
+    loaded = LoadedRecordings()
     for item in items:
-        material.uses.append(_read_item(item, role, latency_s, material))
-        material.names += [material.uses[-1].path] * (len(material.episodes) - len(material.names))
-    return material
+        loaded.uses.append(_read_item(item, role, latency_s, loaded))
+        loaded.names += [loaded.uses[-1].path] * (len(loaded.episodes) - len(loaded.names))
+    return loaded
 
 
-def _read_item(item: RecordingLike, role: str, latency_s: float, material: Material) -> RecordingUse:
+def _read_item(item: RecordingLike, role: str, latency_s: float, loaded: LoadedRecordings) -> RecordingUse:
     """Add the episodes of one recording."""
     from carlab.api.recordings import load
     from carlab.diagnosis.findings import RecordingUse
@@ -128,32 +128,32 @@ def _read_item(item: RecordingLike, role: str, latency_s: float, material: Mater
 
     path = _path_of(item)
     if path is None:
-        material.episodes.append(align_states(item, latency_s))
+        loaded.episodes.append(align_states(item, latency_s))
         digest = hashlib.sha256(item.times_s.tobytes() + item.states.tobytes()).hexdigest()
         return RecordingUse(str(item.metadata.get("source", "episode")), digest, role)
     if is_csv(required_file(path)):
-        _read_csv(path, item.mapping if isinstance(item, Recording) else None, material)
+        _read_csv(path, item.mapping if isinstance(item, Recording) else None, loaded)
     else:
         read = item if isinstance(item, Recording) else load(path)
-        material.episodes += [align_states(episode, latency_s) for episode in read.episodes]
+        loaded.episodes += [align_states(episode, latency_s) for episode in read.episodes]
         if read.is_recovered:
             ticks = read.episode.ticks
-            material.notes.append(f"{path} is an incomplete recording; {ticks} complete ticks were recovered.")
+            loaded.notes.append(f"{path} is an incomplete recording; {ticks} complete ticks were recovered.")
     return RecordingUse(str(path), hashlib.sha256(path.read_bytes()).hexdigest(), role)
 
 
-def _read_csv(path: Path, mapping: Any, material: Material) -> None:
+def _read_csv(path: Path, mapping: Any, loaded: LoadedRecordings) -> None:
     """Add a CSV's episodes and its repaired data faults; the diagnosis detects faults without repair itself."""
     from carlab.diagnosis.findings import DataFault
     from carlab.recording.audit.report import Severity
     from carlab.recording.csv.repairing_import import import_repaired
 
     read = import_repaired(path, mapping=mapping)
-    material.episodes += list(read.imported.episodes)
-    material.notes.append(read.imported.announcement)
+    loaded.episodes += list(read.imported.episodes)
+    loaded.notes.append(read.imported.announcement)
     repaired = [f for f in read.imported.report.findings if f.severity is Severity.REPAIRED]
     rows = read.imported.episodes[-1].ticks + 1
-    material.faults += [
+    loaded.faults += [
         DataFault(f.id, f.channel, f.count or rows, f"repaired: {f.sentence}")
         for f in (*read.repaired, *repaired)
         if f.id in REPORTED_FAULTS
