@@ -32,7 +32,7 @@ class Ops(Protocol):
     def pow(self, x: Value, exponent: Value, /) -> Value: ...  # noqa: D102
     def abs(self, x: Value, /) -> Value: ...  # noqa: D102
     def sign(self, x: Value, /) -> Value: ...  # noqa: D102
-    def floor(self, x: Value, low: float, /) -> Value:
+    def at_least(self, x: Value, low: float, /) -> Value:
         """``max(x, low)`` with a constant."""
 
     def clip(self, x: Value, low: Value, high: Value, /) -> Value: ...  # noqa: D102
@@ -69,7 +69,7 @@ class FloatOps:
         return math.copysign(1.0, x) if x else 0.0
 
     @staticmethod
-    def floor(x: Value, low: float) -> Value:
+    def at_least(x: Value, low: float) -> Value:
         """Not below ``low``."""
         return x if x > low else low
 
@@ -108,7 +108,7 @@ class NumpyOps:
     pow = staticmethod(np.power)
     abs = staticmethod(np.abs)
     sign = staticmethod(np.sign)
-    floor = staticmethod(np.maximum)
+    at_least = staticmethod(np.maximum)
     where = staticmethod(np.where)
 
     @staticmethod

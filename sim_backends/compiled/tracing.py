@@ -133,7 +133,7 @@ class Tracer:
         """``atan2(y, x)`` for positive x."""
         return self.make("atan", self.make("div", y, x))
 
-    def floor(self, x: Any, low: float) -> Any:
+    def at_least(self, x: Any, low: float) -> Any:
         """Not below ``low``."""
         return self.make("maximum", x, low)
 

@@ -23,7 +23,7 @@ class TorchOps:
     exp = staticmethod(torch.exp)
     atan2 = staticmethod(torch.atan2)
     slope_angle = staticmethod(torch.atan2)
-    floor = staticmethod(torch.clamp_min)
+    at_least = staticmethod(torch.clamp_min)
     clip = staticmethod(torch.clip)
     where = staticmethod(torch.where)
 

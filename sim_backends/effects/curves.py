@@ -321,7 +321,7 @@ class FrontTyreMap(_SideForceMap):
         front = forces.vy + forces.front_axle * forces.yaw_rate
         along = forces.vx * forces.wheel_cos + front * forces.wheel_sin
         across = front * forces.wheel_cos - forces.vx * forces.wheel_sin
-        return ops.slope_angle(across, ops.floor(ops.abs(along), SLIP_FLOOR_MPS))
+        return ops.slope_angle(across, ops.at_least(ops.abs(along), SLIP_FLOOR_MPS))
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add the deviation to the side force of the front axle."""
@@ -340,7 +340,7 @@ class RearTyreMap(_SideForceMap):
     def slip_rad(self, ops: Ops, forces: Forces) -> Value:
         """As in the base model."""
         rear = forces.vy - forces.rear_axle * forces.yaw_rate
-        return ops.slope_angle(rear, ops.floor(ops.abs(forces.vx), SLIP_FLOOR_MPS))
+        return ops.slope_angle(rear, ops.at_least(ops.abs(forces.vx), SLIP_FLOOR_MPS))
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add the deviation to the side force of the rear axle."""

@@ -35,7 +35,7 @@ class BatterySag(DynamicsEffect):
 
     def on_drive(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Multiply the drive force by the remaining share."""
-        forces.drive = forces.drive * ops.floor(1.0 - values["rate"] * forces.t_s, 0.0)
+        forces.drive = forces.drive * ops.at_least(1.0 - values["rate"] * forces.t_s, 0.0)
 
 
 class BrakeAsymmetry(DynamicsEffect):

@@ -39,7 +39,7 @@ class LagWeights(NamedTuple):
 def lag_weights(ops: Ops, time_constant_s: Value, step_s: Value) -> LagWeights:
     """Weights for a time constant and a step [s], each a number or one per car; both may be 0."""
     ratio = time_constant_s / (step_s + NO_STEP_S)
-    span = 0.5 / ops.floor(ratio, _MIN_RATIO)  # half a step in time constants
+    span = 0.5 / ops.at_least(ratio, _MIN_RATIO)  # half a step in time constants
     decay = ops.exp(-span)
     whole = decay * decay
     # For slow lags the differences lose digits: use their series, or their limit (error below 1e-5).

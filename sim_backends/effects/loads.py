@@ -31,7 +31,7 @@ class AerodynamicDownforce(DynamicsEffect):
     def on_load(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale both loads."""
         extra = values["coefficient"] * forces.vx * forces.vx
-        factor = ops.floor(1.0 + extra / (forces.mass * GRAVITY_MPS2), 0.0)
+        factor = ops.at_least(1.0 + extra / (forces.mass * GRAVITY_MPS2), 0.0)
         forces.load_front, forces.load_rear = forces.load_front * factor, forces.load_rear * factor
 
 
@@ -58,9 +58,9 @@ class LoadTransfer(DynamicsEffect):
         """Move load."""
         lever = values["height"] / (forces.front_axle + forces.rear_axle)
         pull = forces.front_per_load * forces.wheel_sin
-        moved = lever * (forces.force_x - pull * forces.load_front) / ops.floor(1.0 - lever * pull, 0.1)
-        forces.load_front = ops.floor(forces.load_front - moved, 0.0)
-        forces.load_rear = ops.floor(forces.load_rear + moved, 0.0)
+        moved = lever * (forces.force_x - pull * forces.load_front) / ops.at_least(1.0 - lever * pull, 0.1)
+        forces.load_front = ops.at_least(forces.load_front - moved, 0.0)
+        forces.load_rear = ops.at_least(forces.load_rear + moved, 0.0)
 
 
 class RollDynamics(DynamicsEffect):
@@ -103,7 +103,7 @@ class RollDynamics(DynamicsEffect):
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale both side forces and set the rates of the roll."""
         shift, rate = forces.states["roll_dynamics.shift"], forces.states["roll_dynamics.shift_rate"]
-        kept = ops.floor(1.0 - _loss(ops, values) * shift * shift, MIN_FORCE_SHARE)
+        kept = ops.at_least(1.0 - _loss(ops, values) * shift * shift, MIN_FORCE_SHARE)
         forces.side_front, forces.side_rear = forces.side_front * kept, forces.side_rear * kept
         omega = 2.0 * math.pi * ops.where(values["frequency"] < MAX_ROLL_HZ, values["frequency"], MAX_ROLL_HZ)
         forces.rates["roll_dynamics.shift"] = rate
@@ -126,4 +126,4 @@ def _loss(ops: Ops, values: Parameters) -> Value:
 def _used_grip(ops: Ops, forces: Forces) -> Value:
     side = forces.side_front * forces.wheel_cos + forces.side_rear
     grip = forces.grip_front * forces.load_front + forces.grip_rear * forces.load_rear
-    return ops.clip(side / ops.floor(grip, 1e-6), -1.0, 1.0)
+    return ops.clip(side / ops.at_least(grip, 1e-6), -1.0, 1.0)

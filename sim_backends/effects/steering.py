@@ -70,7 +70,7 @@ class SteeringRateLimit(ActuatorEffect):
         rate = ops.where(limited, values["rate"], 1.0)
         reach = 0.5 * rate * duration_s
         gap = start - state
-        first = start - gap * ops.clip(1.5 * ops.abs(gap) / ops.floor(reach, 1e-12), 0.0, 1.0)
+        first = start - gap * ops.clip(1.5 * ops.abs(gap) / ops.at_least(reach, 1e-12), 0.0, 1.0)
         central = _towards(ops, state, middle, reach)
         last = _towards(ops, central, end, reach)
         out = tuple(ops.where(limited, a, b) for a, b in zip((first, central, last), command, strict=True))

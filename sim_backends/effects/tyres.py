@@ -98,7 +98,7 @@ class FrictionDrift(DynamicsEffect):
 
     def on_grip(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Multiply the grip of both axles."""
-        factor = ops.floor(1.0 + values["rate"] * forces.t_s, 0.0)
+        factor = ops.at_least(1.0 + values["rate"] * forces.t_s, 0.0)
         forces.grip_front, forces.grip_rear = forces.grip_front * factor, forces.grip_rear * factor
 
 
@@ -169,7 +169,7 @@ class FrictionEllipse(DynamicsEffect):
 
     def on_tyre(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Scale the rear's side force."""
-        peak = ops.floor(forces.grip_rear * forces.load_rear, 1e-6)
+        peak = ops.at_least(forces.grip_rear * forces.load_rear, 1e-6)
         share = ops.clip(values["scale"] * forces.axle_force / peak, -MAX_SHARE, MAX_SHARE)
         forces.side_rear = forces.side_rear * ops.sqrt(1.0 - share * share)
 
@@ -197,7 +197,7 @@ class TyreRelaxation(DynamicsEffect):
         if self.id in forces.stiff:
             forces.side_front, forces.side_rear = forces.stiff[self.id].at_stage(forces.vx, front, rear)
             return
-        rate = ops.floor(ops.abs(forces.vx), RELAXATION_FLOOR_MPS) / ops.floor(values["length"], MIN_LENGTH_M)
+        rate = ops.at_least(ops.abs(forces.vx), RELAXATION_FLOOR_MPS) / ops.at_least(values["length"], MIN_LENGTH_M)
         lags = values["length"] >= MIN_LENGTH_M
         for name, steady in (("front", front), ("rear", rear)):
             force = forces.states[f"{self.id}.{name}"]
@@ -234,7 +234,7 @@ class RelaxedSides:
         """Forces at the next stage, from vx and the steady forces there."""
         now = (front, rear)
         if self._weights is None or self._stage == 1:
-            speed = self._ops.floor(self._ops.abs(vx), RELAXATION_FLOOR_MPS)
+            speed = self._ops.at_least(self._ops.abs(vx), RELAXATION_FLOOR_MPS)
             self._weights = lag_weights(self._ops, self._length / speed, self._step_s)
         weights = self._weights
         if self._stage == 0:

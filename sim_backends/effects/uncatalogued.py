@@ -138,7 +138,7 @@ class LockedAxle(DynamicsEffect):
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Subtract the scrub moment of the tyres."""
-        speed = ops.floor(ops.abs(forces.vx), SCRUB_FLOOR_MPS)
+        speed = ops.at_least(ops.abs(forces.vx), SCRUB_FLOOR_MPS)
         scrub = ops.tanh(forces.yaw_rate / speed * (1.0 / SCRUB_CURVATURE))
         forces.moment = forces.moment - values["moment"] * scrub
 
@@ -155,7 +155,7 @@ class BrakingPull(DynamicsEffect):
 
     def on_body(self, ops: Ops, forces: Forces, values: Parameters) -> None:
         """Add the moment of the brakes."""
-        forces.moment = forces.moment + values["coefficient"] * ops.floor(-forces.throttle, 0.0)
+        forces.moment = forces.moment + values["coefficient"] * ops.at_least(-forces.throttle, 0.0)
 
 
 class CoastBrake(DynamicsEffect):

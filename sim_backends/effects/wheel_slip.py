@@ -73,7 +73,7 @@ class LongitudinalSlip(DynamicsEffect):
             forces.axle_force = ops.where(rolls, forces.stiff[self.id].axle_force, forces.axle_force)
             return
         force = _force(ops, forces, values, forces.states[_SLIP_SPEED])
-        per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], MIN_INERTIA_KGM2)
+        per_inertia = WHEEL_RADIUS_M**2 / ops.at_least(values["inertia"], MIN_INERTIA_KGM2)
         rate = per_inertia * (forces.axle_force - force)
         forces.rates[_RIM_ACCELERATION] = rate
         forces.axle_force = ops.where(rolls, force, forces.axle_force)
@@ -90,20 +90,20 @@ class LongitudinalSlip(DynamicsEffect):
     def settled(self, ops: Ops, forces: Forces, values: Parameters) -> dict[str, Value]:
         """Slip speed at which wheels and car have equal acceleration; at most 0.95 of the force limit."""
         _, peak = _limits(ops, forces, values)
-        wheels = ops.floor(values["inertia"], MIN_INERTIA_KGM2) / WHEEL_RADIUS_M**2
+        wheels = ops.at_least(values["inertia"], MIN_INERTIA_KGM2) / WHEEL_RADIUS_M**2
         share = ops.clip(forces.axle_force * forces.mass / ((forces.mass + wheels) * peak), -0.95, 0.95)
         return {_SLIP_SPEED: _atanh(ops, share) / _per_speed(ops, forces.vx, forces, values)}
 
 
 def _limits(ops: Ops, forces: Forces, values: Parameters) -> tuple[Value, Value]:
     stiffness = ops.where(values["stiffness"] < MAX_STIFFNESS_N, values["stiffness"], MAX_STIFFNESS_N)
-    return stiffness, ops.floor(forces.grip_rear * forces.load_rear, _MIN_GRIP_N)
+    return stiffness, ops.at_least(forces.grip_rear * forces.load_rear, _MIN_GRIP_N)
 
 
 def _per_speed(ops: Ops, vx: Value, forces: Forces, values: Parameters) -> Value:
     """Slip of 1 in the argument of the tanh, for each m/s of slip speed."""
     stiffness, peak = _limits(ops, forces, values)
-    return stiffness / (ops.floor(ops.abs(vx), SLIP_FLOOR_MPS) * peak)
+    return stiffness / (ops.at_least(ops.abs(vx), SLIP_FLOOR_MPS) * peak)
 
 
 def _force(ops: Ops, forces: Forces, values: Parameters, slip_mps: Value) -> Value:
@@ -151,7 +151,7 @@ def step_wheels(
     """
     _, peak = _limits(ops, forces, values)
     per_mass = 1.0 / forces.mass
-    per_inertia = WHEEL_RADIUS_M**2 / ops.floor(values["inertia"], MIN_INERTIA_KGM2)
+    per_inertia = WHEEL_RADIUS_M**2 / ops.at_least(values["inertia"], MIN_INERTIA_KGM2)
     both = per_inertia + per_mass
     short_s = step_s * (1.0 / SUBSTEPS)
     slip, vx = forces.states[_SLIP_SPEED], forces.vx

@@ -33,7 +33,7 @@ class CasadiOps:
     def __init__(self, casadi: Any) -> None:
         for name in ("sin", "cos", "atan", "atan2", "tanh", "exp", "sqrt", "hypot", "fabs", "sign"):
             setattr(self, name, getattr(casadi, name))
-        self.slope_angle, self.abs, self.floor = casadi.atan2, casadi.fabs, casadi.fmax
+        self.slope_angle, self.abs, self.at_least = casadi.atan2, casadi.fabs, casadi.fmax
         self.pow, self.where = casadi.power, casadi.if_else
 
     @staticmethod
