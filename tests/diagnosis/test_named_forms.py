@@ -176,7 +176,9 @@ def random_smooth(curve_id, seed):
     return truth
 
 
-@pytest.mark.parametrize("curve_id", list(FORMS))
+@pytest.mark.parametrize(
+    "curve_id", ["front_tyre_map", *(pytest.param(c, marks=pytest.mark.slow) for c in FORMS if c != "front_tyre_map")]
+)
 def test_random_smooth_curves_are_not_named(curve_id):
     forms = [
         identify_form(*measured_curve(curve_id, random_smooth(curve_id, seed), seed, anchored=False), DEFAULT.curves)

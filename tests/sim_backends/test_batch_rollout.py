@@ -185,9 +185,8 @@ def all_effects():
     return {n: {p.name: p.typical for p in e.parameters} for n, e in EFFECTS.items() if n != "tyre_saturation"}
 
 
-@pytest.mark.parametrize(
-    "kind", ["blend", *(pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS if kind != "blend")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
 def test_gradients_equal_finite_differences_for_each_number(kind):
     # These delays do not coincide with changes of the number of steps.
     delays = {"steering_delay": {"delay": 0.0273}, "throttle_delay": {"delay": 0.0214}}
