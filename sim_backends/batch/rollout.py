@@ -279,7 +279,7 @@ class _Batch:
                 held = (Row(commands[0], before + k), Row(commands[1], before + k))
                 t_s = self.t0_s + k * self.period_s + piece.start_s
                 if measured and piece.capture_step_s is not None:
-                    yield Segment(t_s, held, piece.capture_step_s, piece.capture_steps, is_probe=True)
+                    yield Segment(t_s, held, piece.capture_step_s, piece.capture_steps, for_measurement=True)
                 yield Segment(t_s, held, piece.step_s, piece.steps)
 
     def _advance(self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None) -> list[_Moment]:
@@ -299,7 +299,7 @@ class _Batch:
     def _advance_by_operators(
         self, now: _Moment, segments: Sequence[Segment], lag_s: Value | None
     ) -> Iterator[_Moment]:
-        for t_s, (steering, throttle), step_s, steps, is_probe in segments:
+        for t_s, (steering, throttle), step_s, steps, for_measurement in segments:
             moment, held = now, (steering.value, throttle.value)
             for i in range(steps):
                 state, memory = integrate_held(
@@ -311,7 +311,7 @@ class _Batch:
                     filtered = filter_step(self.ops, moment.filtered, first, last, step_s, lag_s)
                 moment = _Moment(state, memory, filtered)
             yield moment
-            now = now if is_probe else moment
+            now = now if for_measurement else moment
 
     def _acting_commands(self, plan: PeriodPlan, before: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
         """Steering and throttle acting in each piece of each period, each (before + ticks, cars)."""

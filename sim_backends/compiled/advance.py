@@ -1,7 +1,7 @@
 """Compiled advance of a batch of cars: actuators, dynamics and the filter of measured velocities in one function.
 
 The equations (``ActuatorChain.step``, ``rk4_step``, ``filter_step``) are traced once for each kind of model and set of
-effects, and compiled to machine code: a loop over integration steps, and the derivative of one step.
+effects, and compiled to machine code: loops over segments and integration steps, and the derivative of one step.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sim_backends.compiled.machine_code import (
     compile_segments,
     vector_length,
 )
-from sim_backends.compiled.tracing import Node, Tracer, gradients
+from sim_backends.compiled.tracing import Node, Tracer, gradients, needed_nodes
 from sim_backends.dynamics.actuators import ActuatorChain
 from sim_backends.dynamics.integrate import integrate_held
 from sim_backends.dynamics.single_track import SingleTrack
@@ -86,21 +86,10 @@ def trace_step(key: Key) -> Graph:
         measurement = MeasurementModel(ops, values, ids)
         first, last = (measurement.observe(s[:6])[3:6] for s in (state, after))
         outputs += filter_step(ops, filtered, first, last, step_s, measurement.velocity_time_constant_s)
-    used = _used(outputs)
+    used = {node.index for node in needed_nodes(outputs)}
     parameters = {name: node for name, node in values.items() if node.index in used}
     commands, uses_time = (steering, throttle), t_s.index in used
     return Graph(tracer, parameters, step_s, commands, t_s, uses_time, [*state, *memory, *filtered], outputs)
-
-
-def _used(outputs: Sequence[Any]) -> set[int]:
-    found: set[int] = set()
-    stack = [o for o in outputs if isinstance(o, Node)]
-    while stack:
-        node = stack.pop()
-        if node.index not in found:
-            found.add(node.index)
-            stack += [a for a in node.arguments if isinstance(a, Node)]
-    return found
 
 
 @functools.lru_cache(maxsize=256)
@@ -151,8 +140,8 @@ class Segment(NamedTuple):
     commands: tuple[Row, Row]
     step_s: Value
     steps: int
-    is_probe: bool = False
-    """Whether the next segment starts at the same instant as this one."""
+    for_measurement: bool = False
+    """Whether the segment only leads to a capture: the next one starts where this one started."""
 
 
 class CompiledCars:
@@ -185,7 +174,7 @@ class CompiledCars:
             given = (*self._parameters, segment.step_s, *commands, segment.t_s, *carried)
             after = tuple(_Advance.apply(self._key, segment.steps, *given))  # type: ignore[no-untyped-call]
             found.append(after)
-            carried = carried if segment.is_probe else after
+            carried = carried if segment.for_measurement else after
         return found
 
 
@@ -203,11 +192,11 @@ def _run(
     uses_time = trace_step(key).uses_time
     out, size = results.ctypes.data, results.strides[0]
     lines = []
-    for k, (t_s, (steering, throttle), step_s, steps, is_probe) in enumerate(segments):
+    for k, (t_s, (steering, throttle), step_s, steps, for_measurement) in enumerate(segments):
         step = rows.address(step_s)
         time = rows.address(t_s) if uses_time else step
         commands = rows.address_in(*steering), rows.address_in(*throttle)
-        lines.append((steps, is_probe, step, time, *commands, out + k * size))
+        lines.append((steps, for_measurement, step, time, *commands, out + k * size))
     table = np.array(lines, np.uint64)
     if segments:
         code.call(rows.length, len(segments), inputs.ctypes.data, table.ctypes.data)

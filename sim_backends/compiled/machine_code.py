@@ -17,7 +17,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.compiled.tracing import Node
+from sim_backends.compiled.tracing import Node, needed_nodes
 from sim_backends.compiled.vector_math import Name, VectorWriter
 
 FloatRow = NDArray[np.floating[Any]]
@@ -73,8 +73,9 @@ class MachineCode:
 class SegmentTable:
     """Columns of the table of segments: whole numbers, and addresses of rows."""
 
-    STEPS, PROBE, STEP, TIME, STEERING, THROTTLE, OUT = range(7)
-    """Number of steps (one or more); whether the next segment starts where this one started; then addresses."""
+    STEPS, FOR_MEASUREMENT, STEP, TIME, STEERING, THROTTLE, OUT = range(7)
+    """Number of steps (one or more); whether the segment is for a measurement, so that the next one starts where it
+    started; then addresses."""
 
 
 def addresses(rows: Iterable[FloatRow]) -> NDArray[np.uint64]:
@@ -84,12 +85,12 @@ def addresses(rows: Iterable[FloatRow]) -> NDArray[np.uint64]:
 
 def compile_function(inputs: Sequence[Node], outputs: Sequence[Any], dtype: np.dtype[Any]) -> MachineCode:
     """Compile a function from the rows ``inputs`` to the rows ``outputs`` (nodes or numbers)."""
-    writer, names = _started(inputs, dtype)
-    for node in _needed(outputs, names):
+    writer, names = _load_inputs(inputs, dtype)
+    for node in needed_nodes(outputs, names):
         names[node.index] = _operation(writer, node, names)
     for k, output in enumerate(outputs):
         _store_row(writer, _row(writer, "%out", k), _value(writer, output, names))
-    return _compiled(writer, ["  br label %next", "next:"])
+    return _compile(writer, ["  br label %next", "next:"])
 
 
 def compile_segments(
@@ -107,25 +108,25 @@ def compile_segments(
     addresses of the rows ``held``, ``step`` and ``time`` at the start, and of the block of carried rows at the end.
     Each operation runs in the outermost loop that has its arguments.
     """
-    writer, names = _started([*parameters, *carried], dtype)
+    writer, names = _load_inputs([*parameters, *carried], dtype)
     at_start = [names.pop(node.index) for node in carried]
     at_segment = [writer.variable() for _ in carried]
     at_step = [writer.variable() for _ in (time, *carried)]
     before, writer.lines = writer.lines, []
-    steps, probe, rows = _segment_columns(writer)
+    steps, for_measurement, rows = _segment_columns(writer)
     for node, row in zip((step, time, *held), rows, strict=False):
         names[node.index] = _load_row(writer, row)
     start_time, segment = names[time.index], writer.lines
     names |= {node.index: name for node, name in zip((time, *carried), at_step, strict=True)}
     depths = {node.index: 1 for node in (step, *held)} | {node.index: 2 for node in (time, *carried)}
     body = list[str]()
-    _write_by_depth(writer, _needed(outputs, names), names, depths, (before, segment, body))
+    _write_by_depth(writer, needed_nodes(outputs, names), names, depths, (before, segment, body))
     writer.lines = body
     after = [writer.add(names[time.index], names[step.index]), *(_value(writer, o, names) for o in outputs)]
     ends = writer.lines = list[str]()
-    kept = _end_of_segment(writer, rows[-1], probe, at_segment, after[1:])
+    next_start = _end_of_segment(writer, rows[-1], for_measurement, at_segment, after[1:])
     writer.lines = before
-    next_segment = zip(at_segment, at_start, kept, strict=True)
+    next_segment = zip(at_segment, at_start, next_start, strict=True)
     next_step = zip(at_step, [start_time, *at_segment], after, strict=True)
     rest = [
         "  br label %segments",
@@ -150,14 +151,16 @@ def compile_segments(
         "  br i1 %another, label %segments, label %next",
         "next:",
     ]
-    return _compiled(writer, rest)
+    return _compile(writer, rest)
 
 
 def _segment_columns(writer: VectorWriter) -> tuple[Name, Name, list[Name]]:
-    """Number of steps, probe or not, and addresses of the rows of the segment."""
+    """Number of steps, whether the segment is for a measurement, and addresses of the rows of the segment."""
     columns = [writer.write(f"getelementptr i64, ptr %segment, i64 {k}") for k in range(SegmentTable.OUT + 1)]
-    steps, probe = (writer.write(f"load i64, ptr {columns[k]}") for k in (SegmentTable.STEPS, SegmentTable.PROBE))
-    return steps, probe, [writer.write(f"load ptr, ptr {column}") for column in columns[SegmentTable.STEP :]]
+    steps, for_measurement = (
+        writer.write(f"load i64, ptr {columns[k]}") for k in (SegmentTable.STEPS, SegmentTable.FOR_MEASUREMENT)
+    )
+    return steps, for_measurement, [writer.write(f"load ptr, ptr {column}") for column in columns[SegmentTable.STEP :]]
 
 
 def _write_by_depth(
@@ -175,24 +178,24 @@ def _write_by_depth(
 
 
 def _end_of_segment(
-    writer: VectorWriter, block: Name, probe: Name, before: Sequence[Name], after: Sequence[Name]
+    writer: VectorWriter, block: Name, for_measurement: Name, before: Sequence[Name], after: Sequence[Name]
 ) -> list[Name]:
-    """Store the carried values; after a probe the next segment starts with those before it."""
+    """Store the carried values; the next segment starts with them, or after a measurement with those before."""
     for k, value in enumerate(after):
         offset = writer.write(f"mul i64 %cars, {k}")
         _store_row(writer, writer.write(f"getelementptr {writer.number}, ptr {block}, i64 {offset}"), value)
-    is_probe = writer.write(f"icmp ne i64 {probe}, 0")
+    restarts = writer.write(f"icmp ne i64 {for_measurement}, 0")
     kind = writer.type
     pairs = zip(before, after, strict=True)
-    return [writer.write(f"select i1 {is_probe}, {kind} {old}, {kind} {new}") for old, new in pairs]
+    return [writer.write(f"select i1 {restarts}, {kind} {old}, {kind} {new}") for old, new in pairs]
 
 
-def _started(inputs: Sequence[Node], dtype: np.dtype[Any]) -> tuple[VectorWriter, dict[int, Name]]:
+def _load_inputs(inputs: Sequence[Node], dtype: np.dtype[Any]) -> tuple[VectorWriter, dict[int, Name]]:
     writer = VectorWriter(8 * dtype.itemsize, vector_length(dtype))
     return writer, {node.index: _load_row(writer, _row(writer, "%in", k)) for k, node in enumerate(inputs)}
 
 
-def _compiled(writer: VectorWriter, rest: Sequence[str]) -> MachineCode:
+def _compile(writer: VectorWriter, rest: Sequence[str]) -> MachineCode:
     """Compile the code of a vector: the writer's lines, then ``rest`` with the label ``next``."""
     name = f"function_{next(_IDS)}"
     source = [
@@ -233,18 +236,6 @@ def _load_row(writer: VectorWriter, row: str) -> Name:
 def _store_row(writer: VectorWriter, row: str, value: Name) -> None:
     address = writer.write(f"getelementptr {writer.number}, ptr {row}, i64 %at")
     writer.lines.append(f"  store {writer.type} {value}, ptr {address}, align {writer.bits // 8}")
-
-
-def _needed(outputs: Sequence[Any], given: dict[int, Name]) -> list[Node]:
-    """The operations that ``outputs`` need, each after its arguments."""
-    order: dict[int, Node] = {}
-    stack = [o for o in outputs if isinstance(o, Node)]
-    while stack:
-        node = stack.pop()
-        if node.index not in order and node.index not in given:
-            order[node.index] = node
-            stack += [a for a in node.arguments if isinstance(a, Node)]
-    return [order[index] for index in sorted(order)]
 
 
 def _value(writer: VectorWriter, value: Any, names: dict[int, Name]) -> Name:

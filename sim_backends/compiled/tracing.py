@@ -8,7 +8,7 @@ to the graph itself (Griewank and Walther, "Evaluating Derivatives", ch. 3).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -163,6 +163,18 @@ def _neutral(operation: str, arguments: tuple[Any, ...]) -> Any:
             return 0.0
         return last if first is constants[0] else first
     return None
+
+
+def needed_nodes(outputs: Sequence[Any], given: Container[int] = ()) -> list[Node]:
+    """The nodes that ``outputs`` need, except those with the indices ``given``, each after its arguments."""
+    found: dict[int, Node] = {}
+    stack = [o for o in outputs if isinstance(o, Node)]
+    while stack:
+        node = stack.pop()
+        if node.index not in found and node.index not in given:
+            found[node.index] = node
+            stack += [a for a in node.arguments if isinstance(a, Node)]
+    return [found[index] for index in sorted(found)]
 
 
 def gradients(outputs: Sequence[Any], seeds: Sequence[Node], inputs: Sequence[Node]) -> list[Any]:

@@ -37,7 +37,7 @@ _TANH_BY_POLYNOMIAL = 0.625
 
 @dataclass(slots=True)
 class VectorWriter:
-    """Writes straight-line LLVM code on vectors of ``lanes`` numbers with ``bits`` bits; values are never changed.
+    """Writes straight-line LLVM code on vectors of ``lanes`` numbers with ``bits`` bits; each name is assigned once.
 
     Each method writes one operation or one function, and returns the name of its result.
     """

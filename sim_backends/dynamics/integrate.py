@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
-from typing import Protocol
 
 from sim_backends.array_ops import Value
 from sim_backends.dynamics.actuators import ActuatorChain, ActuatorState
@@ -71,15 +69,6 @@ def _stiff_steps(
     return model.hooks.stiff_steps(StepStart(states, step_s, model.damping, forces))
 
 
-class Stepper(Protocol):
-    """Function that advances a state by one step: ``rk4_step`` of a model, or its compiled form."""
-
-    def __call__(
-        self, t_s: Value, state: State, step_s: Value, start: Actuation, middle: Actuation, end: Actuation
-    ) -> State:
-        """State after ``step_s``, with the actuation at start, middle and end (the same object if it is held)."""
-
-
 def integrate_held(
     model: SingleTrack,
     chain: ActuatorChain,
@@ -89,7 +78,6 @@ def integrate_held(
     commands: tuple[Value, Value],
     step_s: Value,
     steps: int,
-    stepper: Stepper | None = None,
 ) -> tuple[State, ActuatorState]:
     """Advance by ``steps`` steps of ``step_s`` each with constant delayed commands.
 
@@ -102,19 +90,17 @@ def integrate_held(
         commands: Acting steering and throttle in [-1, 1].
         step_s: A number or one per car.
         steps: Number of Runge-Kutta steps.
-        stepper: Function for one step; by default ``rk4_step`` of ``model``.
 
     Returns:
         State of car and actuators at the end.
     """
-    advance = functools.partial(rk4_step, model) if stepper is None else stepper
     if not chain.has_memory:
         held = model.actuation(*chain.settled_output(commands))
         for i in range(steps):
-            state = advance(t_s + i * step_s, state, step_s, held, held, held)
+            state = rk4_step(model, t_s + i * step_s, state, step_s, held, held, held)
         return state, memory
     for i in range(steps):
         (angles, throttles), memory = chain.step(commands, memory, step_s)
         start, middle, end = (model.actuation(a, u) for a, u in zip(angles, throttles, strict=True))
-        state = advance(t_s + i * step_s, state, step_s, start, middle, end)
+        state = rk4_step(model, t_s + i * step_s, state, step_s, start, middle, end)
     return state, memory

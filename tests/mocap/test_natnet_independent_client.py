@@ -115,7 +115,7 @@ def test_independent_client_receives_the_frames(
     # From the first exposure to the last, so that the time until the client is connected does not count.
     exposures = [frame.suffix.stamp_camera_mid_exposure for frame in (frames[0], frames[-1])]
     elapsed_s = (exposures[1] - exposures[0]) / CLOCK_HZ
-    assert 20.0 < (len(numbers) - 1) / elapsed_s < 260.0, "the server skips frames on a busy machine"
+    assert 100.0 < (len(numbers) - 1) / elapsed_s < 260.0, "the server skips frames on a busy machine"
 
     for frame in frames:
         check_frame(frame, sent[frame.prefix.frame_number], server)
