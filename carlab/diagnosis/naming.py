@@ -116,7 +116,7 @@ def _are_spurious(
 ) -> bool:
     """Whether unnamed physics explains so much that the accepted effects are spurious.
 
-    One or two effects must leave nearly no residual, and must explain about as much as unnamed terms in their place. A
+    With one or two effects the residual must be nearly zero, and they must explain about as much as unnamed terms in their place. A
     car that lacks many effects may also have physics outside the catalogue.
     """
     is_additional = rival is not None and rival.names == found.effects

@@ -1,4 +1,4 @@
-"""Cases of a proof on real recordings: parts that are left out of a reference, and effects concealed in them.
+"""Cases of a proof on real recordings: held-out parts with concealed effects, and a reference of the other parts.
 
 A car differs from drive to drive (battery, tyres), so a whole drive differs from others without anything concealed.
 Therefore a part consists of short pieces of many drives, and a reference of the pieces between them.

@@ -30,12 +30,12 @@ class PairwiseResult:
 
     chi2               twice the gain of the effect over its design effect
     indistinguishable  effects that left-out blocks do not distinguish from it, the nearest first
-    better             the confusable effect that predicts left-out blocks best, if it does so better than the effect
+    replacements       for an effect: the confusable effect with the lowest loss on left-out blocks, if that is lower
     """
 
     chi2: Mapping[str, float] = field(default_factory=dict)
     indistinguishable: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    better: Mapping[str, Candidate] = field(default_factory=dict)
+    replacements: Mapping[str, Candidate] = field(default_factory=dict)
 
 
 def choose_confusable(
@@ -44,9 +44,9 @@ def choose_confusable(
     """Replace effects of a model by confusable effects that predict left-out blocks better."""
     pairs = compare_pairs(problem, eliminated, control)
     for _ in eliminated.model.effects:
-        if not pairs.better or control.stop():
+        if not pairs.replacements or control.stop():
             break
-        name, candidate = next(iter(pairs.better.items()))
+        name, candidate = next(iter(pairs.replacements.items()))
         log.info("%s replaces %s", candidate.effect, name)
         before = eliminated.model
         effects = tuple(candidate.effect if e == name else e for e in before.effects)
@@ -64,7 +64,7 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
     with_covariance = problem.fitter(model.scale).with_covariance(model.fit)
     own_loss = left_out_loss(problem, model.fit, model.scale)
     fitted = _fitted_alternatives(problem, eliminated, control)
-    chi2, indistinguishable, better = {}, {}, {}
+    chi2, indistinguishable, replacements = {}, {}, {}
     for name in model.effects:
         gain = eliminated.deletions[name].without.cost - model.fit.cost
         chi2[name] = 2.0 * gain / design_effect_of(with_covariance, name)
@@ -79,8 +79,8 @@ def compare_pairs(problem: SearchProblem, eliminated: EliminationResult, control
         close = [c.effect for d, e, c in compared if d < settings.indistinguishable_z * e]
         indistinguishable[name] = tuple(close[: settings.max_indistinguishable])
         if compared and compared[0][0] < -settings.replace_z_min * compared[0][1]:
-            better[name] = compared[0][2]
-    return PairwiseResult(chi2, indistinguishable, better)
+            replacements[name] = compared[0][2]
+    return PairwiseResult(chi2, indistinguishable, replacements)
 
 
 def _fitted_alternatives(
