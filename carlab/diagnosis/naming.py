@@ -116,8 +116,8 @@ def _are_spurious(
 ) -> bool:
     """Whether unnamed physics explains so much that the accepted effects are spurious.
 
-    With one or two effects the residual must be nearly zero, and they must explain about as much as unnamed terms in their place. A
-    car that lacks many effects may also have physics outside the catalogue.
+    With one or two effects the residual must be nearly zero, and they must explain about as much as unnamed
+    terms in their place. A car that lacks many effects may also have physics outside the catalogue.
     """
     is_additional = rival is not None and rival.names == found.effects
     unnamed_gain = max(residual.gain, rival.gain if rival is not None and is_additional else 0.0)
