@@ -41,17 +41,27 @@ def check_commands(repairs: Sequence[EpisodeRepair], nominal: SimulatorConfig) -
     """Check and repair the command columns of all recordings; a common fault needs less evidence in each of them."""
     expected_s = nominal.command_delay_s + nominal.mocap.latency_s
     motions = [grid_motion(repair.times_s, repair.motion(), repair.segment) for repair in repairs]
-    _check_clock(repairs, motions)
+    pairs = list(zip(repairs, motions, strict=True))
+    by_recording = [_responses(repair, motion) for repair, motion in pairs]
+    is_restamped = _check_clock(repairs, motions, by_recording)
+    by_recording = [
+        _responses(*pair) if is_new else found
+        for pair, found, is_new in zip(pairs, by_recording, is_restamped, strict=True)
+    ]
     for channel in range(len(COMMAND_CHANNELS)):
-        responses = [_response(repair, motion, channel) for repair, motion in zip(repairs, motions, strict=True)]
+        responses = [found[channel] for found in by_recording]
         clear = [r for r in responses if r is not None and r.best > LIMITS.command_explained[channel]]
         if clear:
             _check_sign(repairs, clear, channel)
             _check_shift(repairs, responses, channel, expected_s)
 
 
-def _response(repair: EpisodeRepair, motion: GridMotion, channel: int) -> CommandResponse | None:
-    return command_response(motion, repair.times_s, repair.commands[:, channel], COMMAND_CHANNELS[channel])
+def _responses(repair: EpisodeRepair, motion: GridMotion) -> list[CommandResponse | None]:
+    """Response to each command."""
+    return [
+        command_response(motion, repair.times_s, command, name)
+        for command, name in zip(repair.commands.T, COMMAND_CHANNELS, strict=True)
+    ]
 
 
 def _check_sign(repairs: Sequence[EpisodeRepair], clear: Sequence[CommandResponse], channel: int) -> None:
@@ -99,12 +109,17 @@ def _is_impossible(response: CommandResponse, channel: int, expected_s: float) -
     return bool((1.0 - plausible) / max(1.0 - response.best, 1e-9) > MIN_VARIANCE_RATIO)
 
 
-def _check_clock(repairs: Sequence[EpisodeRepair], motions: Sequence[GridMotion]) -> None:
-    """Correct the stamps of commands from a clock that runs fast or slow."""
-    lags = [_window_lags(repair, motion) for repair, motion in zip(repairs, motions, strict=True)]
+def _check_clock(
+    repairs: Sequence[EpisodeRepair],
+    motions: Sequence[GridMotion],
+    responses: Sequence[Sequence[CommandResponse | None]],
+) -> list[bool]:
+    """Correct the stamps of commands from a clock that runs fast or slow; whether each recording was changed."""
+    is_changed = [False] * len(repairs)
+    lags = [window_lags(found) for found in responses]
     longest_s = max((float(np.ptp(repair.times_s)) for repair in repairs), default=0.0)
     pooled = clock_rate(WindowLags.joined(lags))
-    for repair, motion, windows in zip(repairs, motions, lags, strict=True):
+    for k, (repair, motion, windows) in enumerate(zip(repairs, motions, lags, strict=True)):
         length_s = float(np.ptp(repair.times_s))
         own = clock_rate(windows)
         rate = _significant(own, length_s)
@@ -113,7 +128,7 @@ def _check_clock(repairs: Sequence[EpisodeRepair], motions: Sequence[GridMotion]
             rate = _significant(pooled, longest_s) if is_common else None
         if rate is None:
             continue
-        rate = _restamp(repair, motion, rate)
+        rate, is_changed[k] = _restamp(repair, motion, rate), True
         if rate < 0:  # the last commands were recorded after the last pose
             repair.trim(math.ceil(-rate * length_s / repair.period_s) + 1, at_end=True)
         observation = (
@@ -124,10 +139,7 @@ def _check_clock(repairs: Sequence[EpisodeRepair], motions: Sequence[GridMotion]
             Fault("clock_drift", "steering, throttle", observation),
             "the commands were converted to the clock of the poses",
         )
-
-
-def _window_lags(repair: EpisodeRepair, motion: GridMotion) -> WindowLags:
-    return window_lags([_response(repair, motion, channel) for channel in range(len(COMMAND_CHANNELS))])
+    return is_changed
 
 
 def _significant(found: tuple[float, float] | None, length_s: float) -> float | None:
@@ -147,7 +159,7 @@ def _restamp(repair: EpisodeRepair, motion: GridMotion, rate: float) -> float:
         moments = repair.times_s - rate * (repair.times_s - repair.times_s[0])
         rows = np.searchsorted(repair.times_s, moments - 0.02 * repair.period_s)
         repair.commands = recorded[np.minimum(rows, len(recorded) - 1)]
-        remaining = clock_rate(_window_lags(repair, motion))
+        remaining = clock_rate(window_lags(_responses(repair, motion)))
         if remaining is None or abs(remaining[0]) < remaining[1]:
             break
         rate += remaining[0]

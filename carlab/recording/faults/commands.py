@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from carlab.core.quantities import FloatArray
@@ -96,31 +97,74 @@ def grid_motion(t_s: FloatArray, motion: PoseMotion, segment: FloatArray) -> Gri
 
 @dataclass(frozen=True, slots=True)
 class _Regression:
-    """Regression of the motion on functions of a delayed command; ``base`` (n, b) are functions of the speed."""
+    """Regression of the motion on functions of a delayed command, at every lag of ``LAGS_S``.
 
-    motion: GridMotion
+    Attributes:
+        channel: of the command.
+        vx: speed at the rows (n,).
+        base: orthonormal functions of the speed (n, b).
+        target: residual of the motion in the regression on ``base`` (n,).
+        before: rows of the grid at or before each delayed time (L, n).
+        share: position of the delayed times between that row and the next one (L,).
+    """
+
     channel: str
-    rows: np.ndarray
+    vx: FloatArray
     base: FloatArray
+    target: FloatArray
+    before: NDArray[np.intp]
+    share: FloatArray
 
-    def without_base(self, values: FloatArray) -> FloatArray:
-        """Residuals of values (n,) or (n, k) in the regression on ``base``."""
-        result: FloatArray = values - self.base @ (self.base.T @ values)
-        return result
+    @classmethod
+    def of(cls, motion: GridMotion, channel: str, rows: NDArray[np.intp]) -> _Regression:
+        """The regression at rows of the grid."""
+        vx, rate = motion.vx[rows], motion.yaw_rate[rows]
+        columns = [np.ones_like(vx), vx, vx * np.abs(vx)]
+        if channel == "throttle":
+            columns += [rate**2, np.abs(rate), np.abs(rate * vx)]
+        base = np.linalg.qr(np.column_stack(columns))[0]
+        values = rate if channel == "steering" else motion.acceleration[rows]
+        lags = LAGS_S / motion.period_s
+        whole = np.ceil(lags - 1e-9)
+        before = np.clip(rows - whole[:, None].astype(np.intp), 0, len(motion.t_s) - 2)
+        return cls(channel, vx, base, values - base @ (base.T @ values), before, whole - lags)
 
-    def delayed(self, filtered: FloatArray, lag_s: float) -> FloatArray:
-        """The command at the rows (n,), ``lag_s`` before."""
-        return np.asarray(np.interp(self.motion.t_s[self.rows] - lag_s, self.motion.t_s, filtered))
+    def delayed(self, filtered: FloatArray, lag: int) -> FloatArray:
+        """The command on the grid, at the rows before a lag (n,)."""
+        share = self.share[lag]
+        first = filtered[self.before[lag]]
+        return np.asarray(first + share * (filtered[self.before[lag] + 1] - first))
 
     def terms(self, command: FloatArray) -> FloatArray:
-        """Functions (n, k) of the command (n,), as residuals of the regression on ``base``."""
+        """Functions (k, n) of the delayed command (n,)."""
         size = np.abs(command)
         if self.channel == "throttle":
-            return self.without_base(np.column_stack([command, command * size, command * size * size]))
-        vx = self.motion.vx[self.rows]
-        product = command * vx
-        terms = [product, product * size * size, product * np.abs(vx), product * size]
-        return self.without_base(np.column_stack(terms))
+            return np.stack([command, command * size, command * size * size])
+        product = command * self.vx
+        return np.stack([product, product * size * size, product * np.abs(self.vx), product * size])
+
+    def fit(self, filtered: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Shares of variance explained (L,) and coefficients (L, k), in addition to ``base``, at each lag."""
+        known = np.column_stack([self.base, self.target])
+        products = []
+        for lag in range(len(LAGS_S)):
+            terms = self.terms(self.delayed(filtered, lag))
+            products.append((terms @ known, terms @ terms.T))
+        by_known, normal = (np.stack(part) for part in zip(*products, strict=True))
+        by_base, product = by_known[:, :, :-1], by_known[:, :, -1]
+        normal = normal - by_base @ by_base.transpose(0, 2, 1)
+        ridge = 1e-9 * np.eye(normal.shape[1])
+        solved = (np.linalg.pinv(normal + ridge, hermitian=True) @ product[:, :, None])[:, :, 0]
+        left = np.einsum("lk,lkj,lj->l", solved, normal, solved) - 2.0 * np.einsum("lk,lk->l", solved, product)
+        return -left / float(self.target @ self.target), solved
+
+    def predicted(self, filtered: FloatArray, lag: int, coefficients: FloatArray) -> FloatArray:
+        """What the terms explain (n,) at a lag, in addition to ``base``."""
+        return self.without_base(coefficients @ self.terms(self.delayed(filtered, lag)))
+
+    def without_base(self, values: FloatArray) -> FloatArray:
+        """Residuals of values (n,) in the regression on ``base``."""
+        return np.asarray(values - self.base @ (self.base.T @ values))
 
 
 def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, channel: str) -> CommandResponse | None:
@@ -129,38 +173,27 @@ def command_response(motion: GridMotion, t_s: FloatArray, command: FloatArray, c
     if len(rows) < MIN_ROWS or np.std(command) < LIMITS.constant_command:
         return None
     rows = rows[:: max(1, len(rows) // 6000)]
-    vx, rate = motion.vx[rows], motion.yaw_rate[rows]
-    columns = [np.ones_like(vx), vx, vx * np.abs(vx)]
-    if channel == "throttle":
-        columns += [rate**2, np.abs(rate), np.abs(rate * vx)]
-    fit = _Regression(motion, channel, rows, np.linalg.qr(np.column_stack(columns))[0])
-    target = fit.without_base(rate if channel == "steering" else motion.acceleration[rows])
-    total = float(target @ target)
-    if total < 1e-9:
+    regression = _Regression.of(motion, channel, rows)
+    if float(regression.target @ regression.target) < 1e-9:
         return None
     smooth = held_means(t_s, command, motion.t_s - 0.5 * motion.period_s, motion.period_s)
     for span_s in motion.spans_s[: 1 + COMMAND_CHANNELS.index(channel)]:
         smooth = _slope_average(smooth, round(span_s / motion.period_s))
-    explained = np.zeros(len(LAGS_S))
-    best_share, time_constant, lag, coefficients = -np.inf, 0.0, 0.0, np.zeros(0)
+    explained = np.full(len(LAGS_S), -np.inf)
+    best_share, time_constant, lag, coefficients = -np.inf, 0.0, 0, np.zeros(0)
     for time_constant_s in TIME_CONSTANTS_S:
-        filtered = first_order_lag(smooth, motion.period_s, time_constant_s)
-        for k, lag_s in enumerate(LAGS_S):
-            terms = fit.terms(fit.delayed(filtered, lag_s))
-            normal = terms.T @ terms + 1e-9 * np.eye(terms.shape[1])
-            solved = np.asarray(np.linalg.lstsq(normal, terms.T @ target, rcond=None)[0], dtype=np.float64)
-            residual = target - terms @ solved
-            share = 1.0 - float(residual @ residual) / total
-            explained[k] = max(explained[k], share)
-            if share > best_share:
-                best_share, time_constant, lag, coefficients = share, time_constant_s, float(lag_s), solved
+        shares, solved = regression.fit(first_order_lag(smooth, motion.period_s, time_constant_s))
+        explained = np.maximum(explained, shares)
+        if shares.max() > best_share:
+            lag = int(np.argmax(shares))
+            best_share, time_constant, coefficients = float(shares[lag]), time_constant_s, solved[lag]
     filtered = first_order_lag(smooth, motion.period_s, time_constant)
-    predicted = np.stack([fit.terms(fit.delayed(filtered, lag_s)) @ coefficients for lag_s in LAGS_S])
-    command_there = fit.delayed(filtered, lag)
-    lever = fit.without_base(command_there * vx if channel == "steering" else command_there)
-    gain = float(predicted[int(np.argmin(np.abs(LAGS_S - lag)))] @ lever) / (float(lever @ lever) + 1e-18)
+    predicted = np.stack([regression.predicted(filtered, k, coefficients) for k in range(len(LAGS_S))])
+    lever = regression.delayed(filtered, lag)
+    lever = regression.without_base(lever * regression.vx if channel == "steering" else lever)
+    gain = float(predicted[lag] @ lever) / (float(lever @ lever) + 1e-18)
     lag_s = parabola_minimum(LAGS_S, -explained)
-    return CommandResponse(explained, lag_s, time_constant, gain, motion.t_s[rows], target, predicted)
+    return CommandResponse(explained, lag_s, time_constant, gain, motion.t_s[rows], regression.target, predicted)
 
 
 def wrong_command_sign(channel: str, response: CommandResponse, evidence: Mapping[str, float] | None = None) -> Fault:
