@@ -13,10 +13,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import llvmlite
 import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backends.compiled.code_store import object_code
 from sim_backends.compiled.tracing import Node, needed_nodes
 from sim_backends.compiled.vector_math import Name, VectorWriter
 
@@ -24,26 +26,39 @@ FloatRow = NDArray[np.floating[Any]]
 _FUNCTION = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_int64, ctypes.c_void_p, ctypes.c_void_p)
 _BOOLEAN = ("less", "less_equal")
 _IDS = itertools.count()
+_NAME = "carlab_function"
 OPTIMISATION = 1
 """Level of LLVM's optimisation: level 2 compiles 10 % longer and is not faster, level 0 is up to 1.8 times as slow."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Compiler:
+    """The compiler for this processor."""
+
+    machine: Any
+    """LLVM's target machine, which compiles to object code."""
+    linker: Any
+    """LLVM's just-in-time linker, which loads object code."""
+    vector_bits: int
+    name: str
+    """Processor, its features, version and settings of the compiler: what the object code of a source depends on."""
+
+
 @functools.cache
-def _compiler() -> tuple[Any, int]:
-    """The compiler for this processor, and the number of bits of its vectors."""
+def _compiler() -> _Compiler:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    features = llvm.get_host_cpu_features()
-    machine = llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=features.flatten(), opt=OPTIMISATION, jit=True
-    )
+    target, cpu, features = llvm.Target.from_default_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features()
+    settings = {"cpu": cpu, "features": features.flatten(), "opt": OPTIMISATION, "jit": True}
+    machine, for_linker = (target.create_target_machine(**settings) for _ in range(2))
     bits = 512 if features.get("avx512f") else 256 if features.get("avx") else 128
-    return llvm.create_lljit_compiler(machine), bits
+    name = f"{target.triple} {settings} llvmlite {llvmlite.__version__} LLVM {llvm.llvm_version_info}"
+    return _Compiler(machine, llvm.create_lljit_compiler(for_linker), bits, name)
 
 
 def vector_length(dtype: np.dtype[Any]) -> int:
     """Cars in a vector of this processor."""
-    return _compiler()[1] // (8 * dtype.itemsize)
+    return _compiler().vector_bits // (8 * dtype.itemsize)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,10 +212,9 @@ def _load_inputs(inputs: Sequence[Node], dtype: np.dtype[Any]) -> tuple[VectorWr
 
 def _compile(writer: VectorWriter, rest: Sequence[str]) -> MachineCode:
     """Compile the code of a vector: the writer's lines, then ``rest`` with the label ``next``."""
-    name = f"function_{next(_IDS)}"
     source = [
         *writer.declarations(),
-        f"define void @{name}(i64 %cars, i64 %count, ptr %in, ptr %out) {{",
+        f"define void @{_NAME}(i64 %cars, i64 %count, ptr %in, ptr %out) {{",
         "entry:",
         f"  %last = sub i64 %cars, {writer.lanes}",
         "  br label %vector",
@@ -217,8 +231,21 @@ def _compile(writer: VectorWriter, rest: Sequence[str]) -> MachineCode:
         "  ret void",
         "}",
     ]
-    library = llvm.JITLibraryBuilder().add_ir("\n".join(source)).export_symbol(name).link(_compiler()[0], name)
-    return MachineCode(_FUNCTION(library[name]), library)
+    return _linked("\n".join(source))
+
+
+def _linked(source: str) -> MachineCode:
+    """The function of LLVM code, from its stored object code or compiled."""
+    compiler = _compiler()
+
+    def compiled() -> bytes:
+        code: bytes = compiler.machine.emit_object(llvm.parse_assembly(source))
+        return code
+
+    code = object_code((compiler.name, source), compiled)
+    builder = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(_NAME)
+    library = builder.link(compiler.linker, f"library_{next(_IDS)}")
+    return MachineCode(_FUNCTION(library[_NAME]), library)
 
 
 def _row(writer: VectorWriter, table: str, k: int) -> str:

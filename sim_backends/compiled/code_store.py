@@ -1,0 +1,82 @@
+"""Machine code kept between runs, in the user's own cache folder.
+
+Compiling takes a fifth of a short diagnosis. A file holds the object code of one function; its name is the hash of
+everything that the code depends on. Nothing is ever read from a recording, car file or run folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import platformdirs
+
+MAX_FILES = 2000
+"""Number of files from which the older half is removed; 20 kB each."""
+_SUFFIX = ".object"
+_HASH_BYTES = 32
+
+
+def folder() -> Path:
+    """The folder of the files."""
+    return platformdirs.user_cache_path("carlab", appauthor=False) / "machine-code"
+
+
+def object_code(depends_on: tuple[str, ...], compiled: Callable[[], bytes]) -> bytes:
+    """The object code from its file, or from ``compiled``, which is then written to the file.
+
+    A file that is damaged is replaced; a folder that cannot be read or written is ignored.
+
+    Args:
+        depends_on: everything that the code depends on: source, processor, version of the compiler.
+        compiled: compiles it.
+    """
+    path = folder() / (_hash("\0".join(depends_on).encode()).hex() + _SUFFIX)
+    code = _read(path)
+    if code is None:
+        code = compiled()
+        with contextlib.suppress(OSError):
+            _write(path, code)
+    return code
+
+
+def _hash(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest()
+
+
+def _read(path: Path) -> bytes | None:
+    """The code of a file; None if the file is missing or damaged."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, code = content[:_HASH_BYTES], content[_HASH_BYTES:]
+    return code if code and _hash(code) == digest else None
+
+
+def _write(path: Path, code: bytes) -> None:
+    """Write a file at once, so that another process never reads a part of it."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _remove_older_half(path.parent)
+    handle, unfinished = tempfile.mkstemp(dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(_hash(code) + code)
+        os.replace(unfinished, path)
+    except OSError:
+        Path(unfinished).unlink(missing_ok=True)
+        raise
+
+
+def _remove_older_half(place: Path) -> None:
+    files = list(place.glob(f"*{_SUFFIX}"))
+    if len(files) >= MAX_FILES:
+        for path in sorted(files, key=lambda p: p.stat().st_mtime)[: len(files) // 2]:
+            path.unlink(missing_ok=True)
+
+
+__all__ = ["MAX_FILES", "folder", "object_code"]
